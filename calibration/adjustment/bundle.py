@@ -185,15 +185,10 @@ def adjust(
 ) -> BundleSolution:
     """Minimises the cost of the bundle adjustment, starting from ``state``.
 
-    Args:
-        state: where to start.
-        observed: the corners of all views.
-        prior: of the intrinsics.
-        sigma: noise of a corner's coordinate by camera, px.
-        free: which parameters change; by default all but the time offsets.
-        loss: robust loss of |r|^2 / sigma^2; least squares by default.
-        steps: how many steps are taken at most.
-        tick: called before every step; an exception that it raises ends the adjustment.
+    ``state``: where to start. ``observed``: the corners of all views. ``prior``: of the intrinsics. ``sigma``: noise of
+    a corner's coordinate by camera, px. ``free``: which parameters change; by default all but the time offsets.
+    ``loss``: robust loss of |r|^2 / sigma^2; least squares by default. ``steps``: how many steps are taken at most.
+    ``tick``: called before every step; an exception that it raises ends the adjustment.
     """
     problem = bundle_problem(state, CornerTerm(observed, sigma, loss or LeastSquares()), prior, free or Free())
     limits = Limits(steps=steps, tolerance=TOLERANCE, tries=6, first_damping=1e-4)

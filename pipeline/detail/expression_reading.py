@@ -87,13 +87,9 @@ def with_read_expression(
     """Returns the fit with expression weights, and their deviations, estimated anew from the deformed head. Returns the
     fit unchanged if the model has no expressions, or if the population does not explain the head.
 
-    Args:
-        fit: to the photographs.
-        model: with the modes that the fit has.
-        population: the model with all its eigenheads.
-        vertices_world: the deformed head, full level, mm.
-        observed: which of its vertices a point of skin shows.
-        eigenheads: how many of the fit's modes are eigenheads.
+    ``fit``: to the photographs. ``model``: with the modes that the fit has. ``population``: the model with all its
+    eigenheads. ``vertices_world``: the deformed head, full level, mm. ``observed``: which of its vertices a point of
+    skin shows. ``eigenheads``: how many of the fit's modes are eigenheads.
     """
     if not len(model.posed):
         return fit

@@ -79,13 +79,9 @@ def patch_search(
 ) -> PatchSearch:
     """Prepares the search: chooses patches on ``model``, and loads the photographs of the views that have a silhouette.
 
-    Args:
-        model: the patches lie on its full level.
-        fit: has the cameras' corrections.
-        images: sRGB photographs by camera.
-        distances: signed distances to the silhouettes (px), by camera.
-        hair: for each camera, the probability that a pixel shows hair.
-        rig: the cameras as calibrated.
+    ``model``: the patches lie on its full level. ``fit``: has the cameras' corrections. ``images``: sRGB photographs by
+    camera. ``distances``: signed distances to the silhouettes (px), by camera. ``hair``: for each camera, the
+    probability that a pixel shows hair. ``rig``: the cameras as calibrated.
     """
     views = pack_views(rig, dict(distances))
     cameras = tuple(corrected(rig[name], fit) for name in views.names)

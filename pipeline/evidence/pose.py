@@ -60,14 +60,10 @@ def judge_pose(
     """Compares the delivered head with the faces in the photographs. Returns the evidence and the warnings about the
     pose.
 
-    Args:
-        head_world: full level, mm.
-        world_from_head: its pose.
-        rig: the cameras as calibrated.
-        subject: the faces; None if they were not searched for.
-        places: where on the head the landmarks are; None if there is no face.
-        method: how the pose was found: features, landmarks or silhouettes.
-        rival: how much more the best other pose costs (``FoundPose.rival``).
+    ``head_world``: full level, mm. ``world_from_head``: its pose. ``rig``: the cameras as calibrated. ``subject``: the
+    faces; None if they were not searched for. ``places``: where on the head the landmarks are; None if there is no
+    face. ``method``: how the pose was found: features, landmarks or silhouettes. ``rival``: how much more the best
+    other pose costs (``FoundPose.rival``).
     """
     warnings: list[ReportWarning] = []
     off: dict[str, float] = {}

@@ -95,13 +95,9 @@ def find_subject(
 ) -> SubjectFaces:
     """Finds the subject's face in the views of one shot.
 
-    Args:
-        images: by camera; those of cameras that the rig lacks are ignored.
-        rig: the cameras.
-        networks: the result of ``load_networks``.
-        eye_distance_mm: limits of a face's size; None if the rig's scale is not known.
-        effort: how thorough the search is.
-        report: called with the share that is done.
+    ``images``: by camera; those of cameras that the rig lacks are ignored. ``rig``: the cameras. ``networks``: the
+    result of ``load_networks``. ``eye_distance_mm``: limits of a face's size; None if the rig's scale is not known.
+    ``effort``: how thorough the search is. ``report``: called with the share that is done.
     """
     views = rig.subset(name for name in rig.names if name in images)
     if not len(views):

@@ -23,12 +23,8 @@ def parallax(
     for each millimetre that the surface moves along its normal. It is the root mean square over all pairs of views,
     weighted.
 
-    Args:
-        points: on a surface, mm.
-        normals: unit normals of the surface there.
-        centres: of the cameras, in the same frame.
-        view: the cameras that compare each point; -1 for none.
-        value: their weights; 0 for none.
+    ``points``: on a surface, mm. ``normals``: unit normals of the surface there. ``centres``: of the cameras, in the
+    same frame. ``view``: the cameras that compare each point; -1 for none. ``value``: their weights; 0 for none.
     """
     towards = centres[np.maximum(view, 0)] - points[:, None]
     towards /= np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-9)

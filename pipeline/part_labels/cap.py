@@ -58,15 +58,9 @@ def find_cap(
 ) -> Cap:
     """Finds the cap's pixels in every view that has a photograph and a mask.
 
-    Args:
-        images: sRGB photographs by camera.
-        masks: of the subject, by camera.
-        rig: the cameras as calibrated.
-        head_world: a head at the subject's pose, the mean one will do (mm).
-        face_region: its vertices.
-        landmarks_world: its landmarks (mm).
-        colour: of the cap, linear RGB, about.
-        thickness_mm: of the cap.
+    ``images``: sRGB photographs by camera. ``masks``: of the subject, by camera. ``rig``: the cameras as calibrated.
+    ``head_world``: a head at the subject's pose, the mean one will do (mm). ``face_region``: its vertices.
+    ``landmarks_world``: its landmarks (mm). ``colour``: of the cap, linear RGB, about. ``thickness_mm``: of the cap.
     """
     guide = head_guide(head_world, face_region, landmarks_world)
     used = rig.subset(name for name in rig.names if name in masks and name in images)

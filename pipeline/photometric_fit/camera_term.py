@@ -56,13 +56,9 @@ def camera_sensitivity(
 ) -> CameraSensitivity:
     """Computes how the depths of n patches depend on the cameras.
 
-    Args:
-        view: the views of each patch, -1 for none.
-        value: their weights.
-        grams: the result of ``gram_matrices``.
-        places: the surface points of the patches, world, mm.
-        axes: unit normals along which they move, world.
-        cameras: of the views, at their current poses.
+    ``view``: the views of each patch, -1 for none. ``value``: their weights. ``grams``: the result of
+    ``gram_matrices``. ``places``: the surface points of the patches, world, mm. ``axes``: unit normals along which they
+    move, world. ``cameras``: of the views, at their current poses.
     """
     slopes, mixed = grams
     axis_value = np.repeat(value, 2, axis=1)  # of the 2 v image axes

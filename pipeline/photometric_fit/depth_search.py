@@ -100,13 +100,9 @@ def visibility_of(
 ) -> SampleVisibility:
     """Finds which samples of a head each camera sees. A coarser mesh of the same surface decides what hides them.
 
-    Args:
-        head_world: the mesh that the patches belong to, mm.
-        coarse_world: the same surface with fewer triangles.
-        cameras: of the views, at their current poses.
-        views: the silhouettes.
-        patches: whose samples are looked up.
-        speaks: which views have a photograph with texture; the others see nothing.
+    ``head_world``: the mesh that the patches belong to, mm. ``coarse_world``: the same surface with fewer triangles.
+    ``cameras``: of the views, at their current poses. ``views``: the silhouettes. ``patches``: whose samples are looked
+    up. ``speaks``: which views have a photograph with texture; the others see nothing.
     """
     normals = head_world.normals()
     points, outward = patches.points(head_world.vertices), patches.normals(normals)
@@ -148,12 +144,8 @@ def facing_of(
 ) -> Float32[np.ndarray, " s"]:
     """Returns the cosine between normal and line of sight for every sample that the camera sees; 0 for hidden samples.
 
-    Args:
-        points: the samples, world, mm.
-        normals: unit, world.
-        camera: at its current pose.
-        depth: z-buffer (mm) of the head in this camera.
-        distance: signed distance (px) to the silhouette.
+    ``points``: the samples, world, mm. ``normals``: unit, world. ``camera``: at its current pose. ``depth``: z-buffer
+    (mm) of the head in this camera. ``distance``: signed distance (px) to the silhouette.
     """
     cosine = facing_cosine(camera.centre_world, points, normals)
     height, width = depth.shape
@@ -187,15 +179,10 @@ def observe(
     """Measures the surface at the patches' centres. Returns the observations, and the vertices of patches that several
     cameras see but whose views do not match.
 
-    Args:
-        problem: the contour solver's.
-        state: the current head and cameras.
-        photographs: of the views.
-        patches: to be measured.
-        visibility: of the patches' samples at ``state``.
-        hair: patches under hair, which only bound the head from outside.
-        basis: the model's modes at the patches' centres.
-        each: lengths of the search.
+    ``problem``: the contour solver's. ``state``: the current head and cameras. ``photographs``: of the views.
+    ``patches``: to be measured. ``visibility``: of the patches' samples at ``state``. ``hair``: patches under hair,
+    which only bound the head from outside. ``basis``: the model's modes at the patches' centres. ``each``: lengths of
+    the search.
     """
     scale = pixels_per_mm(visibility.cameras, state.world_from_head.translation)
     found = find_places(photographs, patches, visibility, problem.views, scale, each=each)

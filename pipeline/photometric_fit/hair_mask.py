@@ -29,13 +29,9 @@ def under_hair(
 ) -> Bool[np.ndarray, " c"]:
     """Tells which patches show hair or lie within ``REACH_MM`` of one that does.
 
-    Args:
-        patches: samples of the face and patches of them.
-        hair: probability that a pixel shows hair, by camera; cameras without a map are ignored.
-        names: of the k cameras.
-        pixel: the pixel at which each camera sees each sample.
-        seen: whether it sees the sample.
-        centres: of the patches, mm.
+    ``patches``: samples of the face and patches of them. ``hair``: probability that a pixel shows hair, by camera;
+    cameras without a map are ignored. ``names``: of the k cameras. ``pixel``: the pixel at which each camera sees each
+    sample. ``seen``: whether it sees the sample. ``centres``: of the patches, mm.
     """
     total, views = np.zeros(pixel.shape[1]), np.zeros(pixel.shape[1])
     for k, name in enumerate(names):

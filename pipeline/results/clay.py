@@ -30,15 +30,10 @@ def clay(
 ) -> Resized:
     """Draws a mesh (head frame, mm), supersampled twice.
 
-    Args:
-        mesh: the head.
-        colours: sRGB of its vertices; None draws clay.
-        azimuth_deg: direction from which it is seen, 0 = from the front, positive from its left.
-        panel: width and height of the picture, px.
-        box: two opposite corners (mm) of what fills the picture, so that several meshes can share a scale; None fits
-            the mesh.
-        paper: sRGB of the background.
-        darkest: brightness of surfaces in full shadow.
+    ``mesh``: the head. ``colours``: sRGB of its vertices; None draws clay. ``azimuth_deg``: direction from which it is
+    seen, 0 = from the front, positive from its left. ``panel``: width and height of the picture, px. ``box``: two
+    opposite corners (mm) of what fills the picture, so that several meshes can share a scale; None fits the mesh.
+    ``paper``: sRGB of the background. ``darkest``: brightness of surfaces in full shadow.
     """
     low, high = (mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) if box is None else box
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2

@@ -46,14 +46,10 @@ def select_views(
     """Chooses a view for each vertex, -1 where none sees it. Also returns the candidate views of each vertex and their
     quality.
 
-    Args:
-        weights: of the views by angle and distance, 0 = not seen.
-        codes: sRGB codes of every view at every vertex, gains applied.
-        levelled: the same after ``pipeline.texturing.seam_levelling``, which does not remove the edge of a shadow.
-        agreed: codes on which the views agree.
-        gains: of the cameras; their product is 1.
-        around: the mesh's edges.
-        seam_cost: of an edge where views differ.
+    ``weights``: of the views by angle and distance, 0 = not seen. ``codes``: sRGB codes of every view at every vertex,
+    gains applied. ``levelled``: the same after ``pipeline.texturing.seam_levelling``, which does not remove the edge of
+    a shadow. ``agreed``: codes on which the views agree. ``gains``: of the cameras; their product is 1. ``around``: the
+    mesh's edges. ``seam_cost``: of an edge where views differ.
     """
     quality = ring_quality(weights, around.starts, around.indices)
     best = quality.max(axis=1, keepdims=True)

@@ -89,18 +89,13 @@ def assign_images(
 ) -> ImageAssignment:
     """Segments a capture, and files exchanged pictures and plates under the right cameras.
 
-    Args:
-        capture: as it was read.
-        rig: the cameras as calibrated.
-        segmented: computes the silhouettes of a capture; called again after every change.
-        exchanged: whether to repair or refuse an exchange that is beyond doubt.
-        guards: what is refused.
+    ``capture``: as it was read. ``rig``: the cameras as calibrated. ``segmented``: computes the silhouettes of a
+    capture; called again after every change. ``exchanged``: whether to repair or refuse an exchange that is beyond
+    doubt. ``guards``: what is refused.
 
-    Refuses with:
-        ExchangedPictures: an exchange that may not be repaired, or is not certain enough and the face confirms no
-            picture of it as filed.
-        SamePictures: fewer than three pictures are different.
-        WrongRig: most cameras contradict the others, no exchange explains it, and the face does not hold the rig.
+    Refuses with: ExchangedPictures: an exchange that may not be repaired, or is not certain enough and the face
+    confirms no picture of it as filed. SamePictures: fewer than three pictures are different. WrongRig: most cameras
+    contradict the others, no exchange explains it, and the face does not hold the rig.
     """
     overruled: list[ReportWarning] = []
     plates = misplaced_plates(capture, rig)

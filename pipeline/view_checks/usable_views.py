@@ -85,18 +85,13 @@ def usable_views(
 ) -> UsableViews:
     """Segments a capture, files exchanged pictures right, and marks views that contradict the others as not usable.
 
-    Args:
-        capture: as it was read.
-        rig: the cameras as calibrated.
-        segmented: computes the silhouettes of a capture.
-        exchanged: whether to repair or refuse an exchange of pictures that is beyond doubt.
-        guards: what is refused.
+    ``capture``: as it was read. ``rig``: the cameras as calibrated. ``segmented``: computes the silhouettes of a
+    capture. ``exchanged``: whether to repair or refuse an exchange of pictures that is beyond doubt. ``guards``: what
+    is refused.
 
-    Refuses with:
-        ExchangedPictures, WrongRig: as of ``assign_images``.
-        WrongScale: as of ``judge_head_size``.
-        TooFewViews: fewer than ``MIN_VIEWS`` silhouettes are usable, or, of a subject whose face is found, fewer than
-            ``MIN_VIEWS_OF_FACE``.
+    Refuses with: ExchangedPictures, WrongRig: as of ``assign_images``. WrongScale: as of ``judge_head_size``.
+    TooFewViews: fewer than ``MIN_VIEWS`` silhouettes are usable, or, of a subject whose face is found, fewer than
+    ``MIN_VIEWS_OF_FACE``.
     """
     assigned = assign_images(capture, rig, segmented, exchanged=exchanged, guards=guards)
     find_face = cache(lambda: guards.find_face(assigned.capture.images, rig))

@@ -44,17 +44,12 @@ def animated_mesh(
     *,
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> AnimatedMesh:
-    """Carries shapes to a mesh and keeps its lips and lids apart; adds the visemes, pivots, eyeballs, teeth and
-    tongue.
+    """Carries shapes to a mesh and keeps its lips and lids apart; adds the visemes, pivots, eyeballs, teeth and tongue.
 
-    Args:
-        surface_binding: how the model carries the mesh.
-        triangles: of the mesh.
-        vertices: the model's full level without expression, head frame, mm.
-        faces: its triangles.
-        shapes: displacements of that level, by Apple's names or the model's.
-        landmark_rows: the model's landmarks, rows of that level.
-        gazes: where eyes look (unit vectors, head frame), by pivot; straight ahead where there is none.
+    ``surface_binding``: how the model carries the mesh. ``triangles``: of the mesh. ``vertices``: the model's full
+    level without expression, head frame, mm. ``faces``: its triangles. ``shapes``: displacements of that level, by
+    Apple's names or the model's. ``landmark_rows``: the model's landmarks, rows of that level. ``gazes``: where eyes
+    look (unit vectors, head frame), by pivot; straight ahead where there is none.
     """
     mesh = surface_binding.on(vertices, faces)
     landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}

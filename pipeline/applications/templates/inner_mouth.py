@@ -106,13 +106,9 @@ def placed_inner_mouth(
 ) -> InnerMouth:
     """Returns teeth and tongue of a mesh without expression, or why there are none.
 
-    Args:
-        mesh: vertices, head frame, mm.
-        triangles: of the mesh.
-        shapes: the mesh's displacements by Apple's names, mm.
-        landmarks: of the head.
-        jaw: how the lower jaw moves with the shapes that move it.
-        loose: number of the part of its own that a vertex belongs to, -1 of the skin and of eyeballs.
+    ``mesh``: vertices, head frame, mm. ``triangles``: of the mesh. ``shapes``: the mesh's displacements by Apple's
+    names, mm. ``landmarks``: of the head. ``jaw``: how the lower jaw moves with the shapes that move it. ``loose``:
+    number of the part of its own that a vertex belongs to, -1 of the skin and of eyeballs.
     """
     shipped, anchors = load_inner_mouth()
     place = procrustes(np.stack([anchors[name] for name in ANCHORS]), np.stack([landmarks[name] for name in ANCHORS]))

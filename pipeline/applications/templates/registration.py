@@ -84,12 +84,8 @@ def register(
 ) -> Registration:
     """Registers a mesh to a model: places it, fits the model to it, deforms the mesh onto that head, and binds it.
 
-    Args:
-        mesh: in any unit and with any axes.
-        model: the head model.
-        name: of the mesh, for messages.
-        landmarks: in the mesh's frame; None searches for the placement.
-        report: progress.
+    ``mesh``: in any unit and with any axes. ``model``: the head model. ``name``: of the mesh, for messages.
+    ``landmarks``: in the mesh's frame; None searches for the placement. ``report``: progress.
 
     Raises InputError if the mesh is no head, and NotRegistered if the model cannot follow it.
     """

@@ -49,12 +49,8 @@ def carried_shapes(
 ) -> dict[str, Float[np.ndarray, "t 3"]]:
     """Returns the displacement of each vertex of a mesh (mm, weight 1), by shape; everything in the head frame.
 
-    Args:
-        surface_binding: how the model carries the mesh.
-        triangles: of the mesh.
-        neutral: the head that the shapes start from.
-        shapes: displacements of the model's full level.
-        landmarks: of that head.
+    ``surface_binding``: how the model carries the mesh. ``triangles``: of the mesh. ``neutral``: the head that the
+    shapes start from. ``shapes``: displacements of the model's full level. ``landmarks``: of that head.
     """
     names = list(shapes)
     mesh, count = neutral.mesh, len(neutral.mesh)

@@ -52,12 +52,8 @@ def colour_odds(
 ) -> Float32[np.ndarray, "h w"]:
     """Returns the log odds of subject against background for every pixel, from its colour.
 
-    Args:
-        image: reduced.
-        samples: pixels that are certain.
-        common: counts of the subject's colours in all views.
-        noise: grey levels.
-        nearby: whether colours near the pixel count too; they need nearly complete samples.
+    ``image``: reduced. ``samples``: pixels that are certain. ``common``: counts of the subject's colours in all views.
+    ``noise``: grey levels. ``nearby``: whether colours near the pixel count too; they need nearly complete samples.
     """
     subject = _log_density(image, (common, histogram(image[samples.subject])))
     background = _log_density(image, (histogram(image[samples.background]),))

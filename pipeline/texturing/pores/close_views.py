@@ -59,13 +59,9 @@ def read_close_views(
 ) -> CloseViews:
     """Reads the pictures of the views that see most of the face, one after the other, and keeps what shows the head.
 
-    Args:
-        read: a picture at the size of its file.
-        mesh_world: the head.
-        coloured: with the gains and offsets of the cameras, and a decision.
-        face: vertices of the face.
-        sources: the name under which a camera's picture is filed, where that is another's.
-        chart: by which the colours of the pictures of work size were corrected.
+    ``read``: a picture at the size of its file. ``mesh_world``: the head. ``coloured``: with the gains and offsets of
+    the cameras, and a decision. ``face``: vertices of the face. ``sources``: the name under which a camera's picture is
+    filed, where that is another's. ``chart``: by which the colours of the pictures of work size were corrected.
     """
     decision = coloured.decision
     assert decision is not None, "the head has a texture"

@@ -64,16 +64,10 @@ def skin_maps(
 ) -> tuple[SkinMaps, Atlas]:
     """Estimates the skin's relief from the full-size pictures. Returns the maps, and the texture with their detail.
 
-    Args:
-        layout: of the head.
-        atlas: its texture, which sets the size of the maps.
-        mesh_world: the head, mm.
-        normals: unit, of its vertices.
-        coloured: its colours.
-        close: the full-size pictures.
-        face: vertices from whose shading the light is estimated.
-        skin: probability that a vertex shows skin.
-        world_from_head: pose, which says how the views stand around the head.
+    ``layout``: of the head. ``atlas``: its texture, which sets the size of the maps. ``mesh_world``: the head, mm.
+    ``normals``: unit, of its vertices. ``coloured``: its colours. ``close``: the full-size pictures. ``face``: vertices
+    from whose shading the light is estimated. ``skin``: probability that a vertex shows skin. ``world_from_head``:
+    pose, which says how the views stand around the head.
     """
     white = transfer(mesh_world, normals, layout.around)
     light = fit_light(white, linear_from_srgb(coloured.colours / 255.0), (coloured.views > 0) & face)

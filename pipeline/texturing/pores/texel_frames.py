@@ -52,13 +52,9 @@ def texel_frames(
 ) -> TexelFrames:
     """Computes the images of a head.
 
-    Args:
-        layout: of its vertices.
-        mesh_world: the head, mm.
-        normals: unit, of the vertices.
-        light: harmonics of the light (``pipeline.texturing.light``).
-        shading: of the vertices in that light, shadows included.
-        skin: share of the relief that is wanted at each vertex, 0 to 1.
+    ``layout``: of its vertices. ``mesh_world``: the head, mm. ``normals``: unit, of the vertices. ``light``: harmonics
+    of the light (``pipeline.texturing.light``). ``shading``: of the vertices in that light, shadows included. ``skin``:
+    share of the relief that is wanted at each vertex, 0 to 1.
     """
     along_u, along_v = _steps(layout, mesh_world)
     pull = light_slopes(normals, light) / np.maximum(shading, 1e-3)[:, None]

@@ -110,14 +110,9 @@ def specular_light(
 ) -> Specular:
     """Computes the mirrored light of every texel.
 
-    Args:
-        cross: pictures without mirrored light, by camera.
-        parallel: pictures with it.
-        gains: of the cameras and channels, as the crossed set's texture has them.
-        decision: how well the cameras see each vertex.
-        silhouettes: by camera.
-        layout: of the head.
-        size: of the map, texels.
+    ``cross``: pictures without mirrored light, by camera. ``parallel``: pictures with it. ``gains``: of the cameras and
+    channels, as the crossed set's texture has them. ``decision``: how well the cameras see each vertex.
+    ``silhouettes``: by camera. ``layout``: of the head. ``size``: of the map, texels.
     """
     views = decision.views
     exposure = exposure_ratios(cross, parallel, silhouettes, views.names)

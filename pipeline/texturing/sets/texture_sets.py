@@ -105,14 +105,9 @@ def set_texture(
 ) -> tuple[Atlas, Float[np.ndarray, "k 3"]]:
     """Paints the texture of one set. Also returns the gain of each camera and channel (k, 3).
 
-    Args:
-        images: of the set, by camera.
-        decision: which views colour each vertex.
-        mesh_world: the head, mm.
-        silhouettes: by camera.
-        layout: of the head, with its edges.
-        size: of the texture, texels.
-        settings: of the texture.
+    ``images``: of the set, by camera. ``decision``: which views colour each vertex. ``mesh_world``: the head, mm.
+    ``silhouettes``: by camera. ``layout``: of the head, with its edges. ``size``: of the texture, texels. ``settings``:
+    of the texture.
     """
     views, weights = decision.views, decision.weights
 
