@@ -73,8 +73,8 @@ def solve_contour(
     report: Progress = lambda stage, fraction: None,
 ) -> ContourSolution:
     """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes, from a start
-    pose: the first ``settings.modes`` modes first, the rest once those have converged. ``features`` are pixels by camera
-    and landmark, ``landmarks`` the face's. ``finish`` adds the covariance, which takes longer."""
+    pose: the first ``settings.modes`` modes first, the rest once those have converged. ``features`` are pixels by
+    camera and landmark, ``landmarks`` the face's. ``finish`` adds the covariance, which takes longer."""
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)
     few, span, whole, *rest = schedule(settings, len(model.modes))
     evidence, state = first_evidence(settings), start_state(problem, world_from_head)
