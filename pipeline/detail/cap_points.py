@@ -20,11 +20,8 @@ FOLDS_MM = 0.3  # how far a cap lies off the skin beyond its thickness, standard
 def skin_under_cap(points: SurfacePoints, depth_maps: Sequence[DepthMap], cap: Cap, rig: Rig) -> SurfacePoints:
     """Moves the points that show the cap inwards by its thickness, and counts them as skin.
 
-    Args:
-        points: of the visible surface, world, mm, with outward normals.
-        depth_maps: of which they come.
-        cap: the pixels that show it.
-        rig: the cameras as calibrated.
+    ``points``: of the visible surface, world, mm, with outward normals. ``depth_maps``: of which they come. ``cap``:
+    the pixels that show it. ``rig``: the cameras as calibrated.
     """
     worn = {
         name: PartMap(name, np.zeros((*shown.shape, 3), np.uint8)).with_clothes(shown)

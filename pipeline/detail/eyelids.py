@@ -101,12 +101,9 @@ def measure_eye_appearance(
 ) -> dict[str, EyeEvidence]:
     """Measures what the photographs show between the lids of each eye (``right``, ``left``).
 
-    Args:
-        model: the head model.
-        vertices: the fitted head, full level, world frame, mm.
-        images: photographs by camera, sRGB.
-        rig: the cameras.
-        openings: how far the lids of the found face stand apart, by side; empty without a face.
+    ``model``: the head model. ``vertices``: the fitted head, full level, world frame, mm. ``images``: photographs by
+    camera, sRGB. ``rig``: the cameras. ``openings``: how far the lids of the found face stand apart, by side; empty
+    without a face.
     """
     normals = vertex_normals(vertices, model.levels["full"].faces)
     found = {}

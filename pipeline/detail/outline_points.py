@@ -86,12 +86,9 @@ def outline_search(
 ) -> OutlineSearch:
     """Prepares the search.
 
-    Args:
-        model: whose full level is deformed.
-        fit: has the cameras' corrections.
-        distances: signed distances to the silhouettes (px), by camera.
-        hair: for each camera, the probability that a pixel shows hair.
-        rig: the cameras as calibrated.
+    ``model``: whose full level is deformed. ``fit``: has the cameras' corrections. ``distances``: signed distances to
+    the silhouettes (px), by camera. ``hair``: for each camera, the probability that a pixel shows hair. ``rig``: the
+    cameras as calibrated.
     """
     level = model.levels["full"]
     moved = Rig(tuple(corrected(camera, fit) for camera in rig))

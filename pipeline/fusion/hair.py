@@ -248,11 +248,8 @@ def smooth_hair(
     """Returns the mesh with the vertices of hair, and those far from all that is seen, moved to the mean of their
     surroundings.
 
-    Args:
-        mesh_world: closed, mm.
-        hair: probability that a vertex shows hair.
-        seen: by a view; the others are what is seen next to them.
-        held: vertices that stay.
+    ``mesh_world``: closed, mm. ``hair``: probability that a vertex shows hair. ``seen``: by a view; the others are what
+    is seen next to them. ``held``: vertices that stay.
     """
     beside = neighbours(mesh_world.faces, len(seen))
     share = skin_share(beside, mesh_world.vertices, 1.0 - hair, seen)

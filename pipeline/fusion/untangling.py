@@ -33,6 +33,8 @@ SMALL_RINGS = (1, 2, 3)  # about spots of a fused surface: a larger membrane wou
 HALVINGS = 2  # rounds in which vertices go half their way to safe places; in later ones they go all of it
 PLACED_BY = 32  # every so-many-th vertex places the mean head; of so few, BLAS sums alike with any number of threads
 ENCLOSED_SHARE = 0.04  # of the vertices: a smaller piece that spoilt triangles cut off is a part of their loop or lens
+Vertices = Float[np.ndarray, "v 3"]
+Faces = Int[np.ndarray, "f 3"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +42,7 @@ class Topology:
     """Holds a mesh's triangles, the pairs of triangles that share an edge (``pairs``), and a sparse matrix with 1 for
     every two vertices joined by an edge (``beside``)."""
 
-    faces: Int[np.ndarray, "f 3"]
+    faces: Faces
     pairs: Int[np.ndarray, "e 2"]
     beside: sparse.csr_array  # (v, v)
 
@@ -63,7 +65,7 @@ class MeshFaults:
 CLEAN = MeshFaults(turned=0, folded=0, crossing=0)
 
 
-def topology_of(faces: Int[np.ndarray, "f 3"], count: int) -> Topology:
+def topology_of(faces: Faces, count: int) -> Topology:
     """Returns the topology of a mesh with ``count`` vertices."""
     ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
     key, owner = ends[:, 0] * count + ends[:, 1], np.repeat(np.arange(len(faces)), 3)
@@ -84,15 +86,12 @@ def head_topology(model: HeadModel) -> Topology:
 
 
 def untangled_head(
-    model: HeadModel, vertices: Float[np.ndarray, "v 3"], deviation_mm: Float[np.ndarray, " v"]
+    model: HeadModel, vertices: Vertices, deviation_mm: Float[np.ndarray, " v"]
 ) -> tuple[Mesh, Float[np.ndarray, " v"]]:
     """Returns the head without degenerate triangles, and the standard deviation of each vertex enlarged by the distance
     that it was moved.
 
-    Args:
-        model: the head model.
-        vertices: full level, mm.
-        deviation_mm: standard deviation of each vertex.
+    ``model``: the head model. ``vertices``: full level, mm. ``deviation_mm``: standard deviation of each vertex.
     """
     clean = untangled(vertices, head_topology(model), clean_mean_head(model))
     moved_mm = np.linalg.norm(clean - vertices, axis=1)
@@ -100,7 +99,7 @@ def untangled_head(
 
 
 @lru_cache(maxsize=2)
-def clean_mean_head(model: HeadModel) -> Float[np.ndarray, "v 3"]:
+def clean_mean_head(model: HeadModel) -> Vertices:
     """Returns the full level of the model's mean head (head frame, mm) without degenerate triangles."""
 
     def make() -> dict[str, np.ndarray]:
@@ -110,9 +109,7 @@ def clean_mean_head(model: HeadModel) -> Float[np.ndarray, "v 3"]:
     return cached_arrays("clean-mean-head", inputs, make, made_by=(crossing_faces, component_of, HeadModel))["vertices"]
 
 
-def untangled(
-    vertices: Float[np.ndarray, "v 3"], topology: Topology, rest: Float[np.ndarray, "v 3"] | None = None
-) -> Float[np.ndarray, "v 3"]:
+def untangled(vertices: Vertices, topology: Topology, rest: Vertices | None = None) -> Vertices:
     """Returns the vertices with every degenerate spot mended. The result is tested in single precision, as files
     store it.
 
@@ -132,9 +129,7 @@ def untangled(
     return np.where((touched | spot)[:, None], out, vertices)
 
 
-def smooth_spots(
-    vertices: Float[np.ndarray, "v 3"], topology: Topology, safe: Float[np.ndarray, "v 3"]
-) -> Float[np.ndarray, "v 3"]:
+def smooth_spots(vertices: Vertices, topology: Topology, safe: Vertices) -> Vertices:
     """Returns the vertices (mm) of a fused surface without degenerate spots, tested in single precision. Small spots
     become membranes; where thin sheets would collapse so, vertices go to the places ``safe``, at which the whole mesh
     is clean."""
@@ -152,14 +147,14 @@ def smooth_spots(
 
 
 def _mended(
-    vertices: Float[np.ndarray, "v 3"],
+    vertices: Vertices,
     spoilt: Bool[np.ndarray, " f"],
     topology: Topology,
-    shape: Float[np.ndarray, "v 3"],
+    shape: Vertices,
     rings: tuple[int, ...],
     *,
     enclosing: bool = True,
-) -> tuple[Float[np.ndarray, "v 3"], Bool[np.ndarray, " f"], Bool[np.ndarray, " v"]]:
+) -> tuple[Vertices, Bool[np.ndarray, " f"], Bool[np.ndarray, " v"]]:
     """Gives spots the shape ``shape``, displaced as their surroundings are, each at most as often as ``rings`` has
     entries: how far it reaches at each time. Returns the vertices in single precision, the triangles that are still
     spoilt, and the vertices that were moved. ``enclosing`` adds the small pieces that spots cut off."""
@@ -179,7 +174,7 @@ def _mended(
 
 
 def spoilt_faces(
-    vertices: Float[np.ndarray, "v 3"], topology: Topology, within: Bool[np.ndarray, " v"] | None = None
+    vertices: Vertices, topology: Topology, within: Bool[np.ndarray, " v"] | None = None
 ) -> Bool[np.ndarray, " f"]:
     """Tells which triangles are turned over, folded onto a neighbour, or crossing another one. If ``within`` is not
     None, only triangles with a corner among those vertices, and those that they touch or cross, are tested."""
@@ -188,7 +183,7 @@ def spoilt_faces(
 
 
 def turned_faces(
-    vertices: Float[np.ndarray, "v 3"], topology: Topology, active: Bool[np.ndarray, " f"] | None = None
+    vertices: Vertices, topology: Topology, active: Bool[np.ndarray, " f"] | None = None
 ) -> Bool[np.ndarray, " f"]:
     """Tells which triangles face against the mean normal of their corners, or are folded by more than ``MAX_FOLD_DEG``
     against a neighbour. If ``active`` is not None, only those triangles and their neighbours are tested."""
@@ -200,9 +195,7 @@ def turned_faces(
     return turned if active is None else turned & _around(active, faces, count)
 
 
-def mesh_faults(
-    vertices: Float[np.ndarray, "v 3"], topology: Topology, moved: Bool[np.ndarray, " v"] | None = None
-) -> MeshFaults:
+def mesh_faults(vertices: Vertices, topology: Topology, moved: Bool[np.ndarray, " v"] | None = None) -> MeshFaults:
     """Counts what is wrong with a mesh. Nothing that the model's own mean head has is excepted. If ``moved`` is not
     None, no triangles crossed before those vertices moved, and only theirs are tested for it."""
     active = None if moved is None else _any_corner(moved, topology.faces)
@@ -211,7 +204,7 @@ def mesh_faults(
 
 
 def _turned_and_folded(
-    vertices: Float[np.ndarray, "v 3"], topology: Topology, near: Bool[np.ndarray, " f"]
+    vertices: Vertices, topology: Topology, near: Bool[np.ndarray, " f"]
 ) -> tuple[Bool[np.ndarray, " f"], Int[np.ndarray, "e 2"]]:
     """Returns which triangles face against the mean normal of their corners, and the pairs of triangles that are folded
     at their common edge; of those in ``near`` alone."""
@@ -233,19 +226,19 @@ def _turned_and_folded(
     return turned, pairs[cosine < np.cos(np.radians(MAX_FOLD_DEG))]
 
 
-def _around(chosen: Bool[np.ndarray, " f"], faces: Int[np.ndarray, "f 3"], count: int) -> Bool[np.ndarray, " f"]:
+def _around(chosen: Bool[np.ndarray, " f"], faces: Faces, count: int) -> Bool[np.ndarray, " f"]:
     """Returns the chosen triangles and those that share a corner with them."""
     corner = np.zeros(count, bool)
     corner[faces[chosen]] = True
     return _any_corner(corner, faces)
 
 
-def _any_corner(vertex: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+def _any_corner(vertex: Bool[np.ndarray, " v"], faces: Faces) -> Bool[np.ndarray, " f"]:
     return vertex[faces[:, 0]] | vertex[faces[:, 1]] | vertex[faces[:, 2]]  # a tenth of the time of ``any(axis=1)``
 
 
 def _with_rings(
-    times: Int[np.ndarray, " v"], spoilt: Bool[np.ndarray, " f"], faces: Int[np.ndarray, "f 3"], rings: tuple[int, ...]
+    times: Int[np.ndarray, " v"], spoilt: Bool[np.ndarray, " f"], faces: Faces, rings: tuple[int, ...]
 ) -> Bool[np.ndarray, " v"]:
     """Returns the vertices of all spots: the corners of the spoilt triangles and the ``rings`` about them, whose number
     grows with how often a corner was spoilt."""
@@ -257,16 +250,14 @@ def _with_rings(
     return reach > 0
 
 
-def _with_enclosed(spot: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " v"]:
+def _with_enclosed(spot: Bool[np.ndarray, " v"], faces: Faces) -> Bool[np.ndarray, " v"]:
     """Returns the spot together with the small pieces of the mesh that it cuts off from the rest."""
     piece = component_of(faces[~_any_corner(spot, faces)].astype(np.int32, copy=False), len(spot))
     size = np.bincount(piece[~spot], minlength=len(spot))
     return spot | (size[piece] < ENCLOSED_SHARE * len(spot))
 
 
-def _membrane(
-    vertices: Float[np.ndarray, "v 3"], rows: Int[np.ndarray, " r"], topology: Topology
-) -> Float[np.ndarray, "r 3"]:
+def _membrane(vertices: Vertices, rows: Int[np.ndarray, " r"], topology: Topology) -> Float[np.ndarray, "r 3"]:
     """Returns the positions of the vertices ``rows`` at which each is the mean of its neighbours while all other
     vertices stay."""
     beside, free = topology.beside[rows], np.zeros(len(vertices), bool)

@@ -62,6 +62,9 @@ MIXED_SINGLE = 0.2  # the same where a quarter of the coarse pixel is one pixel,
 STRAND_SHADES = 0.75, 1.0, 1.33  # of the subject's colour nearby, in which strands before the plate may be
 MAX_FAINT_CHI2 = 100.0  # chi-squared of a mean over nine pixels
 UNEXPLAINED, UNEXPLAINED_SHARE = 8.0, 0.15  # chi-squared that a mixture must leave, and that by the whole
+Picture = Float32[np.ndarray, "h w 3"]
+Plane = Float32[np.ndarray, "h w"]
+Mask = Bool[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,17 +72,17 @@ class Decision:
     """Holds the decision on a single image: what is subject and what is background. All arrays are at the coarse level;
     without a subject the mask is empty."""
 
-    coarse: Float32[np.ndarray, "h w 3"]  # the image
+    coarse: Picture  # the image
     background: Background
-    odds: Float32[np.ndarray, "h w"]  # of subject against plate, clipped
+    odds: Plane  # of subject against plate, clipped
     probability: Float[np.ndarray, "h w"]
-    mask: Bool[np.ndarray, "h w"]  # the subject's one piece, with what a person would fill
+    mask: Mask  # the subject's one piece, with what a person would fill
     detached_component_areas: tuple[float, ...]  # areas of the other pieces by its own
-    paint: Float32[np.ndarray, "h w 3"]  # the subject's own colour nearby
-    own_odds: Float32[np.ndarray, "h w"]  # of the subject's own colours, rather than any, against the plate
-    clear: Bool[np.ndarray, "h w"]  # that is nothing like the plate, in any shade
-    plain: Bool[np.ndarray, "h w"]  # and what is seen there is exactly the plate
-    mixed: Bool[np.ndarray, "h w"]  # hair before the plate, or an edge
+    paint: Picture  # the subject's own colour nearby
+    own_odds: Plane  # of the subject's own colours, rather than any, against the plate
+    clear: Mask  # that is nothing like the plate, in any shade
+    plain: Mask  # and what is seen there is exactly the plate
+    mixed: Mask  # hair before the plate, or an edge
 
     @property
     def reduction(self) -> float:
@@ -117,7 +120,7 @@ def decide(image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_
     )
 
 
-def doubtful(decision: Decision) -> Bool[np.ndarray, "h w"]:
+def doubtful(decision: Decision) -> Mask:
     """Tells which pixels outside the mask might still be the subject: those near it where the subject and the plate
     look alike. Other cameras are asked about them."""
     near = dilated(decision.mask, REACH) & ~decision.mask
@@ -137,13 +140,7 @@ def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"]) -> Decision:
     )
 
 
-def _subject_colour_odds(
-    image: Float32[np.ndarray, "h w 3"],
-    mask: Bool[np.ndarray, "h w"],
-    paint: Float32[np.ndarray, "h w 3"],
-    chi2: Float32[np.ndarray, "h w"],
-    variance: Float32[np.ndarray, "h w 3"],
-) -> Float32[np.ndarray, "h w"]:
+def _subject_colour_odds(image: Picture, mask: Mask, paint: Picture, chi2: Plane, variance: Picture) -> Plane:
     """Returns the log odds that a pixel has a colour of the subject rather than the plate: the subject's colour nearby,
     in the best shade, or any colour found in the mask."""
     nearby = 0.5 * (chi2 - colours_apart(paint, image, variance) ** 2) - PAINT_ODDS
@@ -158,9 +155,7 @@ def _subject_colour_odds(
     return np.maximum(nearby, 0.5 * chi2 - ANY_COLOUR_ODDS + gain)
 
 
-def find_mixtures(
-    image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], background: Background
-) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+def find_mixtures(image: UInt8[np.ndarray, "_ _ 3"], coarse: Picture, background: Background) -> tuple[Plane, Plane]:
     """Returns the squared difference of each coarse pixel from the plate (mean over the channels), and a measure of how
     much the pixel mixes subject and plate, as at strands of hair: the variance of its quarters relative to that
     difference. Quarters they are in pictures of any size, so that the measure does not depend on it."""
@@ -183,9 +178,7 @@ def _quarters(image: UInt8[np.ndarray, "_ _ 3"], size: tuple[int, int]) -> Float
     return cv2.resize(image, size, interpolation=method).astype(np.float32)
 
 
-def _against_plate(
-    image: Float32[np.ndarray, "h w 3"], background: Background, reduction: float
-) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w 3"]]:
+def _against_plate(image: Picture, background: Background, reduction: float) -> tuple[Plane, Picture]:
     """Returns the chi-squared of a coarse image against the plate, and the variance (levels squared) of their
     difference."""
     difference = image - background.coarse
@@ -196,9 +189,7 @@ def _against_plate(
     return (difference**2 / variance) @ CHANNEL_SUM, variance
 
 
-def colours_apart(
-    colour: Float32[np.ndarray, "h w 3"], other: Float32[np.ndarray, "h w 3"], variance: Float32[np.ndarray, "h w 3"]
-) -> Float32[np.ndarray, "h w"]:
+def colours_apart(colour: Picture, other: Picture, variance: Picture) -> Plane:
     """Returns the distance (standard deviations) between two colours, after ``colour`` is made as bright as brings it
     nearest to ``other``."""
     sigma = np.sqrt(variance)
@@ -207,12 +198,7 @@ def colours_apart(
     return np.sqrt(((shade[:, :, None] * f - b) ** 2) @ CHANNEL_SUM)
 
 
-def _other_colour(
-    difference: Float32[np.ndarray, "h w 3"],
-    paint: Float32[np.ndarray, "h w 3"],
-    plate: Float32[np.ndarray, "h w 3"],
-    variance: Float32[np.ndarray, "h w 3"],
-) -> tuple[Bool[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+def _other_colour(difference: Picture, paint: Picture, plate: Picture, variance: Picture) -> tuple[Mask, Plane]:
     """Finds faint differences to the plate that neither a shadow nor a mixture with the subject's colour nearby
     (``paint``) explains, so that the subject has another colour there. Also returns the chi-squared left unexplained,
     over the mean of nine pixels."""
@@ -229,16 +215,14 @@ def _other_colour(
     return (left > UNEXPLAINED + UNEXPLAINED_SHARE * square) & (faint > 0), left
 
 
-def _closed(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def _closed(mask: Mask) -> Mask:
     """Returns the mask with gaps of up to four coarse pixels closed. The matting opens real gaps, as between locks of
     hair, again; where the subject has the backdrop's colour it cannot, and the mask stays whole."""
     padded = np.pad(mask, CLOSING, mode="edge")
     return eroded(dilated(padded, CLOSING), CLOSING)[CLOSING:-CLOSING, CLOSING:-CLOSING]
 
 
-def whole_subject(
-    mask: Bool[np.ndarray, "h w"], plain: Bool[np.ndarray, "h w"]
-) -> tuple[Bool[np.ndarray, "h w"], tuple[float, ...]]:
+def whole_subject(mask: Mask, plain: Mask) -> tuple[Mask, tuple[float, ...]]:
     """Returns the largest component of the mask with its small gaps and holes filled, and the areas of the other
     components as shares of its area."""
     mask = mask | (_closed(mask) & ~plain)
@@ -263,9 +247,7 @@ def whole_subject(
     return subject | filled[holes], tuple(others)
 
 
-def smooth_odds(
-    odds: Float32[np.ndarray, "h w"], image: Float32[np.ndarray, "h w 3"], background: Background
-) -> Float[np.ndarray, "h w"]:
+def smooth_odds(odds: Plane, image: Picture, background: Background) -> Float[np.ndarray, "h w"]:
     """Returns the probability of the subject at each pixel after mean-field smoothing, in which neighbours with similar
     residuals influence each other."""
     residual = ((image - background.coarse) / np.maximum(background.noise, 1.0)).astype(np.float32)
@@ -273,13 +255,7 @@ def smooth_odds(
     return 1 / (1 + np.exp(-2 * field))
 
 
-def find_shadows(
-    image: Float32[np.ndarray, "h w 3"],
-    plate: Float32[np.ndarray, "h w 3"],
-    chi2: Float32[np.ndarray, "h w"],
-    variance: Float32[np.ndarray, "h w 3"],
-    odds: Float32[np.ndarray, "h w"],
-) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+def find_shadows(image: Picture, plate: Picture, chi2: Plane, variance: Picture, odds: Plane) -> tuple[Plane, Mask]:
     """Returns the chi-squared of each pixel against the plate in its best shade, and which pixels are soft shadows or
     reflected light: they differ from the plate, a darker or brighter shade explains them, and they begin gradually."""
     ratio = ((image * plate / variance) @ CHANNEL_SUM) / np.maximum((plate**2 / variance) @ CHANNEL_SUM, 1e-6)
@@ -294,9 +270,7 @@ def find_shadows(
     return best, soft
 
 
-def _soft_shadows(
-    candidate: Bool[np.ndarray, "h w"], depth: Float32[np.ndarray, "h w"], strength: Float32[np.ndarray, "h w"]
-) -> Bool[np.ndarray, "h w"]:
+def _soft_shadows(candidate: Mask, depth: Plane, strength: Plane) -> Mask:
     """Returns the candidates that begin softly, with plain background beside them that is already darker. A coat begins
     abruptly, also within a shadow, and is not included.
 
@@ -322,9 +296,7 @@ def _soft_shadows(
     return found | (fringe & dilated(found, 3))
 
 
-def _means(
-    values: Float32[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"], labels: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _means(values: Plane, where: Mask, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns the mean value of each component, over the pixels ``where``, and how many pixels that is."""
     sizes = np.bincount(labels[where], minlength=count)
     return np.bincount(labels[where], values[where], count) / np.maximum(sizes, 1), sizes

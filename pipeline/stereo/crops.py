@@ -62,12 +62,9 @@ def make_crops(
 ) -> list[Crop]:
     """Returns the crops of all cameras that have a photograph and a usable silhouette that is not empty.
 
-    Args:
-        images: RGB photographs, by camera name.
-        silhouettes: by camera name.
-        rig: the cameras.
-        pixel_mm: a photograph whose pixels are smaller than this (mm, at ``at_world``) is reduced to it.
-        at_world: about the middle of the subject, mm.
+    ``images``: RGB photographs, by camera name. ``silhouettes``: by camera name. ``rig``: the cameras. ``pixel_mm``: a
+    photograph whose pixels are smaller than this (mm, at ``at_world``) is reduced to it. ``at_world``: about the middle
+    of the subject, mm.
     """
     found = []
     for camera in rig:

@@ -84,11 +84,8 @@ def stated_deviation(
 ) -> Float32[np.ndarray, "h w"]:
     """Returns the standard deviation (mm) of the depth at each pixel, along the ray.
 
-    Args:
-        camera: of the view.
-        field: depths of the view.
-        agreeing: how many other views have the surface at the same point.
-        apart: mean squared distance to their surfaces, mm^2.
+    ``camera``: of the view. ``field``: depths of the view. ``agreeing``: how many other views have the surface at the
+    same point. ``apart``: mean squared distance to their surfaces, mm^2.
     """
     k = camera.intrinsics
     pixel_mm = np.maximum(field.depth, 1.0) / k.fx

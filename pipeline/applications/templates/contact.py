@@ -31,6 +31,8 @@ MAX_ZONES = 5  # that a change makes wider
 FEW = 0.35  # share of the triangles from which looking at all of them takes less time
 SOFT_RINGS = 3  # over which a change fades
 RELAXING = 4  # halvings of the search for the least change that is enough
+Vertices = Float[np.ndarray, "t 3"]
+Rows = Int[np.ndarray, " r"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,13 +40,13 @@ class RestSurface:
     """Holds a mesh at rest for contact: ``beside`` has 1 for every two vertices joined by an edge. Triangles that cross
     others at rest, and those next to them, are ``excluded``: no shape can part them."""
 
-    vertices: Float[np.ndarray, "t 3"]
+    vertices: Vertices
     faces: Int[np.ndarray, "f 3"]
     beside: sparse.csr_array
     excluded: Bool[np.ndarray, " f"]
 
 
-def rest_surface(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> RestSurface:
+def rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurface:
     """Prepares a mesh at rest (mm)."""
     count = len(vertices)
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -56,15 +58,13 @@ def rest_surface(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3
     return RestSurface(vertices, faces, beside, excluded)
 
 
-def crossings(
-    rest: RestSurface, displacement: Float[np.ndarray, "t 3"], weights: tuple[float, ...] = WEIGHTS
-) -> Int[np.ndarray, " w"]:
+def crossings(rest: RestSurface, displacement: Vertices, weights: tuple[float, ...] = WEIGHTS) -> Int[np.ndarray, " w"]:
     """Returns how many triangles cross others at each weight of a shape that do not at rest."""
     moved = _moved(rest, displacement)
     return np.array([np.count_nonzero(_crossing(rest, displacement, w, moved)) for w in weights])
 
 
-def kept_apart(rest: RestSurface, displacement: Float[np.ndarray, "t 3"], *, closing: bool) -> Float[np.ndarray, "t 3"]:
+def kept_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> Vertices:
     """Returns the displacement (mm, weight 1) changed so little that no triangles cross at ``WEIGHTS`` that do not at
     rest; where that cannot be, so that the fewest do. ``closing``: lids, which stop where they meet; everything else
     moves together."""
@@ -83,14 +83,12 @@ def kept_apart(rest: RestSurface, displacement: Float[np.ndarray, "t 3"], *, clo
     return best
 
 
-def _moved(rest: RestSurface, displacement: Float[np.ndarray, "t 3"]) -> Bool[np.ndarray, " f"]:
+def _moved(rest: RestSurface, displacement: Vertices) -> Bool[np.ndarray, " f"]:
     """Tells which triangles a shape moves. Triangles that stay cross none that stay."""
     return (np.abs(displacement).max(axis=1) > STILL_MM)[rest.faces].any(axis=1)
 
 
-def _stopped(
-    rest: RestSurface, displacement: Float[np.ndarray, "t 3"], zone: Int[np.ndarray, " r"]
-) -> Float[np.ndarray, "t 3"]:
+def _stopped(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
     """Returns the displacement scaled by the weight at which its triangles first meet."""
     scale = np.ones(len(displacement))
     for _ in range(MEETING_ROUNDS):
@@ -106,9 +104,7 @@ def _stopped(
     return scale[:, None] * displacement
 
 
-def _together(
-    rest: RestSurface, displacement: Float[np.ndarray, "t 3"], zone: Int[np.ndarray, " r"]
-) -> Float[np.ndarray, "t 3"]:
+def _together(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
     """Returns the displacement blended with its mean over space, ever wider, until no triangles of a zone cross."""
     out, rounds = displacement, 0
     best, fewest = displacement, np.inf
@@ -132,9 +128,7 @@ def _together(
     return best
 
 
-def _relaxed(
-    rest: RestSurface, wanted: Float[np.ndarray, "t 3"], clean: Float[np.ndarray, "t 3"], zone: Int[np.ndarray, " r"]
-) -> Float[np.ndarray, "t 3"]:
+def _relaxed(rest: RestSurface, wanted: Vertices, clean: Vertices, zone: Rows) -> Vertices:
     """Returns the displacement nearest to ``wanted``, on the way from ``clean``, that does not cross either."""
     if (wanted == clean).all() or _spot(rest, clean, WEIGHTS, zone).any():
         return clean
@@ -146,9 +140,7 @@ def _relaxed(
     return clean + low * (wanted - clean)
 
 
-def _mean_in_space(
-    vertices: Float[np.ndarray, "t 3"], rows: Int[np.ndarray, " r"], radius_mm: float
-) -> sparse.csr_array:
+def _mean_in_space(vertices: Vertices, rows: Rows, radius_mm: float) -> sparse.csr_array:
     """Returns the matrix of Gaussian means about some vertices over all vertices near them."""
     near = KDTree(vertices).query_ball_point(vertices[rows], 2.0 * radius_mm)
     counts = np.array([len(each) for each in near])
@@ -160,7 +152,7 @@ def _mean_in_space(
 
 
 def _crossing(
-    rest: RestSurface, displacement: Float[np.ndarray, "t 3"], weight: float, active: Bool[np.ndarray, " f"]
+    rest: RestSurface, displacement: Vertices, weight: float, active: Bool[np.ndarray, " f"]
 ) -> Bool[np.ndarray, " f"]:
     """Tells which triangles cross at a weight; only pairs with an active one are looked at."""
     if not active.any():
@@ -169,9 +161,7 @@ def _crossing(
     return crossing_faces(rest.vertices + weight * displacement, rest.faces, few) & ~rest.excluded
 
 
-def _crossing_within(
-    rest: RestSurface, displacement: Float[np.ndarray, "t 3"], weight: float, rows: Int[np.ndarray, " r"]
-) -> Bool[np.ndarray, " f"]:
+def _crossing_within(rest: RestSurface, displacement: Vertices, weight: float, rows: Rows) -> Bool[np.ndarray, " f"]:
     """Tells which triangles of some rows cross each other at a weight: a tenth of the time of looking at all."""
     out = np.zeros(len(rest.faces), bool)
     out[rows] = crossing_faces(rest.vertices + weight * displacement, rest.faces[rows])
@@ -179,10 +169,7 @@ def _crossing_within(
 
 
 def _spot(
-    rest: RestSurface,
-    displacement: Float[np.ndarray, "t 3"],
-    weights: tuple[float, ...],
-    zone: Int[np.ndarray, " r"] | None = None,
+    rest: RestSurface, displacement: Vertices, weights: tuple[float, ...], zone: Rows | None = None
 ) -> Bool[np.ndarray, " t"]:
     """Tells which vertices are corners of triangles that cross at some weight; of a zone's triangles alone, if any."""
     out, moved = np.zeros(len(rest.vertices), bool), _moved(rest, displacement)

@@ -50,11 +50,8 @@ def surface_by_openmvs(
 ) -> tuple[Mesh, float]:
     """Runs OpenMVS. Returns its refined surface (world frame, mm) and the processor seconds of its programs.
 
-    Args:
-        crops: of the photographs, with their masks.
-        hull_world: the visual hull.
-        programs: by name.
-        folder: empty; receives the input and all that the programs write.
+    ``crops``: of the photographs, with their masks. ``hull_world``: the visual hull. ``programs``: by name. ``folder``:
+    empty; receives the input and all that the programs write.
 
     Raises PeerFailed with the program's last words.
     """

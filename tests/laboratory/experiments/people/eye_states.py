@@ -42,12 +42,9 @@ def eyes(
 ) -> Outcome:
     """Runs this module's experiment. Returns ``eyes_wrong`` of ``eyes_heads``, and ``eyes_<state>_wrong``.
 
-    Args:
-        models: from which heads are drawn, by name.
-        job: runs a whole job.
-        renderer: for the studio.
-        key: names everything that the rows depend on, as in ``Records``.
-        heads: number for each model, each in all three states.
+    ``models``: from which heads are drawn, by name. ``job``: runs a whole job. ``renderer``: for the studio. ``key``:
+    names everything that the rows depend on, as in ``Records``. ``heads``: number for each model, each in all three
+    states.
     """
     records, rows = bench.records("people-eyes", key), []
     cases = [*product(range(heads), models.items(), STATES)]

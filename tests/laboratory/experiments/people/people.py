@@ -64,15 +64,11 @@ def people(
     ``<kind>_<evidence>_<quantity>`` and ``<quantity>`` over all rows, with ``eyes_wrong`` among them if eyes are
     requested.
 
-    Args:
-        model: fitted; heads are drawn from it, too.
-        others: another population to draw from, if there is one.
-        captures: folders with a truth beside them.
-        renderer: for the studio.
-        subjects: heads in the studio for every kind (1 by default); for eyes, heads of each model (10 by default).
-        only: kinds, subjects or evidence to run. A row must match one word of each sort that is given. ``eyes`` runs
-            the eyes alone.
-        detail: level of detail, None for the default.
+    ``model``: fitted; heads are drawn from it, too. ``others``: another population to draw from, if there is one.
+    ``captures``: folders with a truth beside them. ``renderer``: for the studio. ``subjects``: heads in the studio for
+    every kind (1 by default); for eyes, heads of each model (10 by default). ``only``: kinds, subjects or evidence to
+    run. A row must match one word of each sort that is given. ``eyes`` runs the eyes alone. ``detail``: level of
+    detail, None for the default.
     """
     settings = replace(Settings(), detail=detail, outputs=OutputSettings(surface="head"))
     key = key_of(model.sha256, settings, people_subjects, pose_error, view_subsets, eye_states)

@@ -81,13 +81,10 @@ def hidden(
     mean over the group: ``studio``, ``draws``, both as ``all``; the same with ``realism`` as ``studio-real``,
     ``draws-real`` and ``all-real``; or a capture by its name.
 
-    Args:
-        model: fitted; heads are drawn from it, too.
-        captures: folders with a truth beside them, by name.
-        renderer: for the studio.
-        others: another population, from which as many heads are drawn.
-        subjects: heads of each population.
-        realism: names of ``rig.studio.sensor.realism``, with which each head is photographed once more.
+    ``model``: fitted; heads are drawn from it, too. ``captures``: folders with a truth beside them, by name.
+    ``renderer``: for the studio. ``others``: another population, from which as many heads are drawn. ``subjects``:
+    heads of each population. ``realism``: names of ``rig.studio.sensor.realism``, with which each head is photographed
+    once more.
     """
     key = key_of(
         model.sha256, others.sha256 if others else "", Settings(), posterior, span_misfit, photo_refine, measurements
@@ -177,11 +174,8 @@ def skin_figures(
     """Returns the median distance (mm), the share within the stated interval, and the median stated deviation (mm) of
     the true skin, by whether it is seen and by region; the region ``all`` is all of them together.
 
-    Args:
-        known: the truth, with its visible points.
-        head_world: the delivered head, mm.
-        deviation_mm: stated at its vertices.
-        regions: of its vertices, by name.
+    ``known``: the truth, with its visible points. ``head_world``: the delivered head, mm. ``deviation_mm``: stated at
+    its vertices. ``regions``: of its vertices, by name.
     """
     hit = SurfaceIndex(head_world.vertices, head_world.faces, 1.0).closest(known.mesh.vertices)
     corner = head_world.faces[hit.triangles]

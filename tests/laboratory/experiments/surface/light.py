@@ -70,10 +70,7 @@ def light(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int =
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``: means over subjects and pairs of
     lights, and a row for each subject.
 
-    Args:
-        model: fitted; heads are drawn from it, too.
-        renderer: for the studio.
-        subjects: heads in the studio.
+    ``model``: fitted; heads are drawn from it, too. ``renderer``: for the studio. ``subjects``: heads in the studio.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head", albedo="file", texture_size=2048))
     code = (fitted_light, albedo, decision, chart_colours, colour_chart)

@@ -53,10 +53,7 @@ def pores(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int =
     """Runs this module's experiment: heads of smooth skin, and of skin with painted spots as large as its furrows. A
     figure is ``<skin>_<quantity>``, the mean over the heads.
 
-    Args:
-        model: fitted; heads are drawn from it, too.
-        renderer: for the studio.
-        subjects: heads of each skin.
+    ``model``: fitted; heads are drawn from it, too. ``renderer``: for the studio. ``subjects``: heads of each skin.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head"))
     records = bench.records("pores", key_of(model.sha256, settings))

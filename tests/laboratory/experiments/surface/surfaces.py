@@ -92,11 +92,8 @@ def surfaces(
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is
     ``<capture>_<peer>_<quantity>``.
 
-    Args:
-        model: fitted.
-        captures: folders with a truth beside them, by name.
-        renderer: for the fit.
-        openmvs: folder of the programs of OpenMVS; None leaves it out.
+    ``model``: fitted. ``captures``: folders with a truth beside them, by name. ``renderer``: for the fit. ``openmvs``:
+    folder of the programs of OpenMVS; None leaves it out.
 
     Raises InputError if ``openmvs`` lacks a program.
     """

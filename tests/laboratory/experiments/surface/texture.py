@@ -59,11 +59,8 @@ def texture(
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``,
     the mean over the group: ``studio``, or a capture by its name.
 
-    Args:
-        model: fitted; heads are drawn from it, too.
-        captures: folders with a truth beside them, by name.
-        renderer: for the studio.
-        subjects: heads in the studio.
+    ``model``: fitted; heads are drawn from it, too. ``captures``: folders with a truth beside them, by name.
+    ``renderer``: for the studio. ``subjects``: heads in the studio.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head"))
     records = bench.records("texture", key_of(model.sha256, settings))

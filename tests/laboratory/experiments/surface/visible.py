@@ -79,12 +79,9 @@ def visible(
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``,
     the mean over the group: ``studio``, ``real`` (the same heads with ``realism``), or a capture by its name.
 
-    Args:
-        model: fitted; heads are drawn from it, too.
-        captures: folders with a truth beside them, by name.
-        renderer: for the studio.
-        subjects: heads in the studio, with the hair styles of ``STYLES`` in turn.
-        realism: names of ``rig.studio.sensor.realism``, with which each head is photographed once more.
+    ``model``: fitted; heads are drawn from it, too. ``captures``: folders with a truth beside them, by name.
+    ``renderer``: for the studio. ``subjects``: heads in the studio, with the hair styles of ``STYLES`` in turn.
+    ``realism``: names of ``rig.studio.sensor.realism``, with which each head is photographed once more.
     """
     records = bench.records("visible", key_of(model.sha256, Settings()))
     jobs: list[tuple[str, str, Callable[[], Known]]] = []
