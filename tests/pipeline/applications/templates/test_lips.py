@@ -26,10 +26,9 @@ def test_lips_are_shut_where_they_nearly_are(weight: float, shuts: bool) -> None
     opened = opened_faces({name: model.levels[name].faces for name in ("cage", "full")})
     parted = model.vertices(np.zeros(0)) + model.levels["full"].operator @ model.expressions.moved({"jawOpen": weight})
     landmarks = {name: parted[row] for name, row in model.landmarks.items()}
-    made = shut_lips(parted, opened, landmarks)
-    before, after = (slit_mm2(each, opened, landmarks["stomion"]) for each in (parted, made))
+    made, middle = shut_lips(parted, opened, landmarks), landmarks["stomion"]
+    before, after = (slit_mm2(each, opened, middle) for each in (parted, made))
     assert before > 4.0
     assert after < 0.1 * before if shuts else after > 0.9 * before
     assert np.abs(made - parted).max() < 2.0 + PRESS_MM
-    away = np.linalg.norm(parted - landmarks["stomion"], axis=1) > 40.0
-    np.testing.assert_array_equal(made[away], parted[away])
+    assert np.linalg.norm(parted[(made != parted).any(axis=1)] - middle, axis=1).max() < 40.0
