@@ -13,20 +13,9 @@ SENTENCE = re.compile(r"(?=.*[a-z]{2})(.*[A-Za-z]{2,}[,.:;']? [a-z({\d']|[a-z]+ 
 COLLECTED = re.compile(r"(\w+\.)?_?(faults|warnings|remarks|reasons|severe|mild|fatal|notes|doubts)$")
 # Errors of Python and of libraries, which no operator reads, and of a page's or a command line's own.
 NOT_OURS = {
-    "ValueError",
-    "TypeError",
-    "KeyError",
-    "RuntimeError",
-    "NotImplementedError",
-    "AssertionError",
-    "OSError",
-    "FileExistsError",
-    "IsADirectoryError",
-    "NotADirectoryError",
-    "SystemExit",
-    "BadParameter",
-    "PydanticCustomError",
-    "AravisError",
+    *("ValueError", "TypeError", "KeyError", "RuntimeError", "NotImplementedError", "AssertionError", "OSError"),
+    *("FileExistsError", "IsADirectoryError", "NotADirectoryError", "SystemExit", "BadParameter"),
+    *("PydanticCustomError", "AravisError"),
 }
 
 
