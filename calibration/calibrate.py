@@ -65,14 +65,10 @@ def calibrate(
     """Calibrates the cameras of ``IMAGES/<camera>/<shot>.<ext>``. Pictures with the same name of a shot were taken at
     the same moment.
 
-    Args:
-        images: the folder IMAGES.
-        board: the calibration board.
-        front: the camera that the subject faces; None takes the middle one.
-        previous: the rig's last calibration, against which names, layout, scale and lenses are checked.
-        cache: folder that keeps detections by the pictures' content.
-        workers: processes that search the pictures.
-        report: progress.
+    ``images``: the folder IMAGES. ``board``: the calibration board. ``front``: the camera that the subject faces; None
+    takes the middle one. ``previous``: the rig's last calibration, against which names, layout, scale and lenses are
+    checked. ``cache``: folder that keeps detections by the pictures' content. ``workers``: processes that search the
+    pictures. ``report``: progress.
 
     Raises InputError for damaged pictures, and WrongBoard, PoseGraphError or CalibrationRefused, each with what to do.
     """

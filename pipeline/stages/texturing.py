@@ -56,6 +56,7 @@ def texture_head(
     capture = views.capture if chart is None else with_true_colours(views.capture, chart)
     around = None if layout is None else layout.around
     ears = pinnae(model)
+    scalp = head_regions(model)["cranium"] & ~ears
     vertices = texture(
         mesh,
         capture,
@@ -65,8 +66,7 @@ def texture_head(
         settings=settings.texture,
         around=around,
         dim_share=DIM_SHARE if settings.outputs.albedo != "none" else None,
-        skin=SkinShown(lambda camera: labels.skin_share(camera, mesh.vertices, ears, face)),
-        parts=(head_regions(model)["cranium"] & ~ears).astype(np.uint8),
+        skin=SkinShown(lambda camera: labels.skin_share(camera, mesh.vertices, ears, face), scalp.astype(np.uint8)),
     )
     close, pores_warnings = _read_pores(context, views, mesh, vertices, face, chart)
     atlas = paint_head(layout, mesh, vertices, face, settings, None if close is None else close.for_texels())

@@ -85,15 +85,30 @@ class Texture:
 @dataclass(frozen=True, slots=True, eq=False)
 class SkinShown:
     """Says where views show the skin of a head: ``share`` (0 to 1) gives for a camera how probably it does at each
-    vertex."""
+    vertex. Unseen vertices are filled from those of the same number in ``parts`` alone, where views see one."""
 
     share: Callable[[Camera], Float[np.ndarray, " v"]]
+    parts: Int[np.ndarray, " v"]
 
     def shown(self, weights: Float32[np.ndarray, "k v"], views: Rig) -> Bool[np.ndarray, "k v"]:
         """Tells which views may colour each vertex: not where they, or the mean of all, hardly show its skin."""
         shares = np.stack([self.share(camera) for camera in views])
         mean = (weights * shares).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-9)
         return (shares > MIN_SKIN) & (mean > MIN_MEAN_SKIN)
+
+    def filled(
+        self,
+        colours: Float[np.ndarray, "v 3"],
+        seen: Bool[np.ndarray, " v"],
+        faces: Int[np.ndarray, "f 3"],
+        whole: Float[np.ndarray, "v 3"],
+    ) -> Float[np.ndarray, "v 3"]:
+        """Returns the colours ``whole`` with those of each part filled from the part alone."""
+        for part in np.unique(self.parts[seen]):
+            within = self.parts == part
+            inside = faces[within[faces].all(axis=1)]
+            whole = np.where(within[:, None], fill_unknown(colours, seen & within, inside), whole)
+        return whole
 
 
 @traced
@@ -109,7 +124,6 @@ def texture(
     dim_share: float | None = None,
     outlier: float = OUTLIER,
     skin: SkinShown | None = None,
-    parts: Int[np.ndarray, " v"] | None = None,
 ) -> Texture:
     """Computes the colour of each vertex from the photographs of the usable views. ``depths`` are the mesh's depth maps
     in these views (mm).
@@ -117,8 +131,7 @@ def texture(
     If ``around``, the edges of the mesh, is not None, the result also has a ``decision``: a view for each vertex. If
     ``dim_share`` is not None, it also has each vertex's colour in a dim view: views with that share of the vertex's
     weight are no brighter. A view counts half where it differs from the views' median by ``outlier`` of its level.
-    With ``skin``, no view colours a vertex where it shows something before the mesh. Unseen vertices are filled from
-    those of the same number in ``parts`` alone, where views see one.
+    With ``skin``, no view colours a vertex where it shows something before the mesh.
     """
     views, normals = usable_views(capture, silhouettes, rig), mesh_world.normals()
     if settings.blend == "reference":
@@ -154,10 +167,7 @@ def texture(
         decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
         decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, hidden)
     whole = fill_unknown(agreed, seen > 0, mesh_world.faces)
-    for part in () if parts is None else np.unique(parts[seen > 0]):
-        within = parts == part
-        inside = mesh_world.faces[within[mesh_world.faces].all(axis=1)]
-        whole = np.where(within[:, None], fill_unknown(agreed, (seen > 0) & within, inside), whole)
+    whole = whole if skin is None else skin.filled(agreed, seen > 0, mesh_world.faces, whole)
     shown, by_camera = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8), _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
     dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)

@@ -96,10 +96,7 @@ def masks_off_edges(
     """Returns a warning if most given masks are too large, or most too small, compared with the edges in the
     photographs.
 
-    Args:
-        images: RGB, by camera.
-        silhouettes: by camera.
-        ready: cameras whose mask was given.
+    ``images``: RGB, by camera. ``silhouettes``: by camera. ``ready``: cameras whose mask was given.
     """
     judged = [name for name in ready if name in images and name in silhouettes and silhouettes[name].quality.usable]
     edges = [edge for name in judged if (edge := edge_beside(images[name], silhouettes[name])) is not None]
@@ -137,10 +134,7 @@ def turned_masks(
     """Returns the fault of ready masks that follow the photographs only once all are flipped or turned by 180 degrees,
     as programs write them that count rows from the bottom; None if there is none.
 
-    Args:
-        images: by camera.
-        silhouettes: by camera.
-        ready: cameras whose mask was given.
+    ``images``: by camera. ``silhouettes``: by camera. ``ready``: cameras whose mask was given.
     """
     judged = [name for name in ready if name in images and name in silhouettes]
 

@@ -92,7 +92,7 @@ def test_firmware_speaks_the_protocol(simulator: Simulator) -> None:
         box.set_lights(0b0101)
         with pytest.raises(TriggerRefused, match="NOT-ARMED"):
             box.fire(1, 100)
-        for body in "DELAY 12 0,DELAY 0 500001,DELAY 0,ARM 60001,ARM x,LIGHTS 10,FIRE 1000 5,ARM".split(","):
+        for body in ("DELAY 12 0", "DELAY 0 500001", "DELAY 0", "ARM 60001", "ARM x", "LIGHTS 10", "FIRE 1000", "ARM"):
             with pytest.raises(TriggerRefused, match="ARGUMENT"):
                 box._command(body)
         with pytest.raises(TriggerRefused, match="UNKNOWN"):

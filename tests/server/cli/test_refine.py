@@ -55,7 +55,7 @@ def test_captures_of_two_rigs_are_refused(tmp_path: Path) -> None:
     masks = {camera.name: np.zeros((camera.intrinsics.height, camera.intrinsics.width), bool) for camera in small}
     for mask in masks.values():
         mask[10:30, 15:35] = True
-    blank = {name: np.zeros((*mask.shape, 3), np.uint8) for name, mask in masks.items()}
+    blank = {name: np.full((*mask.shape, 3), 128, np.uint8) for name, mask in masks.items()}
     other = disturbed(small, 0.5, np.random.default_rng(0))
     write_capture(tmp_path / "one", Capture(blank, masks=masks), small)
     write_capture(tmp_path / "two", Capture(blank, masks=masks), other)
