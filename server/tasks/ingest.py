@@ -273,7 +273,7 @@ def check_capture(
         digests[FEATURES] = sha256_of(features)
     losses = judge_lost(lost, rig, faults)
     kept = rig.subset([name for name in rig.names if name not in lost])
-    if len(empty) == len(kept):
+    if empty and len(empty) == len(kept):
         faults.append(compose("every-picture-its-plate"))
     if faults:
         raise InputError("capture", say_once(faults, rig.names))

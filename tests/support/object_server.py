@@ -83,17 +83,21 @@ def _await(port: int, process: "subprocess.Popen[bytes]", log: Path) -> None:
     raise AssertionError(f"the S3 server did not start:\n{log.read_text()[-3000:]}")
 
 
-def client_of(url: str) -> Any:
-    """A plain client of the server, as a studio's own programs are."""
+def client_of(url: str, bucket: str = "") -> Any:
+    """A plain client of the server, as a studio's own programs are, with a new bucket. A slow server that had made it
+    refuses the second request."""
     from botocore.session import Session
 
-    return Session().create_client(
+    client = Session().create_client(
         "s3",
         endpoint_url=url,
         region_name=KEYS["AWS_REGION"],
         aws_access_key_id=KEYS["AWS_ACCESS_KEY_ID"],
         aws_secret_access_key=KEYS["AWS_SECRET_ACCESS_KEY"],
     )
+    with suppress(client.exceptions.BucketAlreadyOwnedByYou):
+        _ = bucket and client.create_bucket(Bucket=bucket)
+    return client
 
 
 @dataclass

@@ -120,7 +120,7 @@ def test_stores_that_answer_and_those_that_do_not_are_named(
     examine: Callable[..., dict], tmp_path: Path, network: Network, object_server: str
 ) -> None:
     assert examine(data=tmp_path)["stores"]["ok"]
-    client_of(object_server).create_bucket(Bucket="examined")
+    client_of(object_server, "examined")
     there = {"store_endpoint": network.url, "store_timeout_s": 0.3, "import_prefixes": ("s3://examined/in/",)}
     assert examine(data=tmp_path, **there)["stores"] == {"ok": True, "detail": "s3://examined/in/: answer"}
     found = examine(data=tmp_path, **there, deliver_prefixes=("s3://nobody/", f"file://{tmp_path}/nas/"))["stores"]

@@ -15,8 +15,7 @@ from tests.support.services import RunningService, packed_capture, running_servi
 @pytest.fixture(scope="module")
 def studio(object_server: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A client of the studio's own: its bucket holds one capture as an archive, and as a folder."""
-    client, folder = client_of(object_server), tmp_path_factory.mktemp("studio")
-    client.create_bucket(Bucket="studio-in")
+    client, folder = client_of(object_server, "studio-in"), tmp_path_factory.mktemp("studio")
     archive = packed_capture(folder)
     client.put_object(Bucket="studio-in", Key="in/anna.tar", Body=archive.read_bytes())
     client.put_object(Bucket="studio-in", Key="secret/anna.tar", Body=archive.read_bytes())

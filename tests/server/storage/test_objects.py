@@ -23,8 +23,7 @@ from tests.support.services import ROOT
 @pytest.fixture(scope="module")
 def bucket(object_server: str) -> Any:
     """A client that goes past the network, and a bucket with versions."""
-    client = client_of(object_server)
-    client.create_bucket(Bucket="studio")
+    client = client_of(object_server, "studio")
     client.put_bucket_versioning(Bucket="studio", VersioningConfiguration={"Status": "Enabled"})
     client.put_object(Bucket="studio", Key="first", Body=b"makes the server take up its disk")
     return client

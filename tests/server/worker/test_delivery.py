@@ -22,8 +22,7 @@ NAMES = {"head.glb", "head.ply", "overlays/cam00.png"}
 
 @pytest.fixture(scope="module")
 def bucket(object_server: str) -> Any:
-    client = client_of(object_server)
-    client.create_bucket(Bucket="studio-out")
+    client = client_of(object_server, "studio-out")
     client.put_object(Bucket="studio-out", Key="first", Body=b"makes the server take up its disk")
     return client
 

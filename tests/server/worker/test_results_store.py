@@ -29,8 +29,7 @@ NAMES = {"head.glb", "head.ply", "overlays/cam00.png"}
 
 @pytest.fixture(scope="module")
 def bucket(object_server: str) -> Any:
-    client = client_of(object_server)
-    client.create_bucket(Bucket="results")
+    client = client_of(object_server, "results")
     client.put_bucket_versioning(Bucket="results", VersioningConfiguration={"Status": "Enabled"})
     client.put_object(Bucket="results", Key="first", Body=b"makes the server take up its disk")
     return client
