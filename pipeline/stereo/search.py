@@ -55,11 +55,9 @@ def first_fields(matching: Matching, depth_ranges: Sequence[DepthRange]) -> list
     def work(view: int) -> Field:
         room, matcher = depth_ranges[view], matching.matcher(view)
         strides = label_strides(room)
-        cost, wide = matcher.sweep(room, strides, LABELS), room.far - room.near > WIDE_MM
-        room = slanted(room, _cheapest(cost, room, strides), float(matching.stack.lens[view, 0]))
-        again = DepthRange(room.near, np.where(wide, room.far, np.float32(0.0)), room.slopes)
-        cost[wide] = matcher.sweep(again, strides, LABELS)[wide]
-        return _cheapest(cost, room, strides)
+        field = _cheapest(matcher.sweep(room, strides, LABELS), room, strides)
+        room = slanted(room, field, float(matching.stack.lens[view, 0]))
+        return _cheapest(matcher.sweep(room, strides, LABELS), room, strides)
 
     return map_in_threads(work, len(matching.stack))
 
