@@ -87,16 +87,15 @@ def load_window(sight, width, height, column, row, window):
     falloff = np.float32(1.0 / (sight.contrast * sight.contrast))
     total, mean = np.float32(0.0), np.float32(0.0)
     for i in range(pattern.shape[1]):
-        x = min(max(np.int32(column) + np.int32(pattern[0, i]), np.int32(0)), np.int32(width - 1))
-        y = min(max(np.int32(row) + np.int32(pattern[1, i]), np.int32(0)), np.int32(height - 1))
-        at = np.uint64(start) + np.uint64(np.uint32(y * np.int32(width) + x))
-        window[0, i] = np.float32(np.int32(pairs[at] & LOW))
-        window[1, i] = sight.distance_px[at]
-    for i in range(pattern.shape[1]):  # apart from the loads, eight at once
-        value = window[0, i]
-        off = value - centre
-        w = np.float32(1.0) / (np.float32(1.0) + off * off * falloff)
-        w = w if window[1, i] < np.float32(WINDOW_PX) else np.float32(0.0)
+        x = min(max(column + int(pattern[0, i]), 0), width - 1)
+        y = min(max(row + int(pattern[1, i]), 0), height - 1)
+        at = start + y * width + x
+        value = np.float32(np.int32(pairs[at] & LOW))
+        w = np.float32(0.0)
+        if sight.distance_px[at] < WINDOW_PX:
+            off = value - centre
+            w = np.float32(1.0) / (np.float32(1.0) + off * off * falloff)
+        window[0, i] = value
         window[1, i] = w
         total += w
         mean += w * value
@@ -219,8 +218,7 @@ def correlate_and_slide(way, place, sight, loaded, found):
         s_jj += wj * slope
         s_kr += wk * window[0, i]
         s_jr += wj * window[0, i]
-    noise, theirs = np.float32(noise), np.float32(way[NOISE])
-    theirs = total * theirs * theirs
+    theirs = total * way[NOISE] * way[NOISE]
     kk = max(s_kk - s_k * s_k / total, zero) + theirs
     kj = s_kj - s_k * s_j / total
     jj = max(s_jj - s_j * s_j / total, zero)
