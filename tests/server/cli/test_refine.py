@@ -32,7 +32,7 @@ def test_cameras_come_back_and_the_page_says_so(renderer, tmp_path: Path) -> Non
     folders = [tmp_path / f"subject{i}" for i in range(3)]
     for folder, seen in zip(folders, captures_of(renderer, TRUE, 3, np.random.default_rng(5)), strict=True):
         masks = {name: silhouette.mask for name, silhouette in seen.items()}
-        blank = np.zeros((768, 1024, 3), np.uint8)
+        blank = np.full((768, 1024, 3), 128, np.uint8)
         write_capture(folder, Capture(dict.fromkeys(off.names, blank), masks=masks), off)
     out = tmp_path / "refined.json"
     done = run("refine", *map(str, folders), "--out", str(out), "--json")
