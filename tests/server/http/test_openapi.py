@@ -38,8 +38,10 @@ def test_schemathesis_finds_nothing(tmp_path: Path, scope: str) -> None:
         ]
         # An If-Match of another state is answered before the body is read.
         expected = [400, 401, 403, 404, 405, 406, 409, 412, 415, 422, 428, 429, "5xx"]
-        told = "[checks]\nnegative_data_rejection.expected-statuses = " + json.dumps([str(each) for each in expected])
-        (tmp_path / "schemathesis.toml").write_text(told)
+        configured = "[checks]\nnegative_data_rejection.expected-statuses = " + json.dumps(
+            [str(each) for each in expected]
+        )
+        (tmp_path / "schemathesis.toml").write_text(configured)
         hooks = {"SCHEMATHESIS_HOOKS": "tests.support.schemathesis_hooks", "PYTHONPATH": str(ROOT)}
         done = subprocess.run(
             command, env=os.environ | hooks, cwd=tmp_path, capture_output=True, text=True, check=False
