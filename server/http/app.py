@@ -158,7 +158,7 @@ class Conditions:
             start, content, tag = await self._state(scope, receive)
             await send({**start, "headers": [*start["headers"], *([(b"etag", tag.encode())] if tag else [])]})
             await send({"type": "http.response.body", "body": content})
-        elif method in CHANGES and "GET" in kinds and wanted is not None:
+        elif wanted and method in CHANGES & kinds and "GET" in kinds:
             async with self._locks.setdefault(scope["path"], asyncio.Lock()):
                 *_, held = await self._state({**scope, "method": "GET"}, _no_content)
                 if held and not {"*", held} & {tag.strip() for tag in wanted.split(",")}:
