@@ -64,6 +64,12 @@ def pinnae(model: HeadModel) -> Bool[np.ndarray, " v"]:
     return cached_arrays("pinnae", inputs, lambda: {"pinnae": _standing(vertices, ears)}, made_by=())["pinnae"]
 
 
+def scalp(model: HeadModel) -> Bool[np.ndarray, " v"]:
+    """Returns which vertices of the full level can bear the hair of a head: cranium and temples, without the pinnae."""
+    regions = head_regions(model)
+    return (regions["cranium"] | regions["ears"]) & ~pinnae(model)
+
+
 def _standing(vertices: Float[np.ndarray, "v 3"], ears: Bool[np.ndarray, " v"]) -> Bool[np.ndarray, " v"]:
     found = np.zeros(len(vertices), bool)
     for side in (-1.0, 1.0):

@@ -12,6 +12,9 @@ from pipeline.fusion.signed_distance import NoSurface
 from pipeline.fusion.skin import HeadSkin
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.raster import depth_maps
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.regions import scalp
+from pipeline.part_labels.codes import Part
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
 from pipeline.stages.part_labels import PartLabels
@@ -20,13 +23,14 @@ from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.paint import find_layout, paint_head
-from pipeline.texturing.vertex_colours import texture
+from pipeline.texturing.vertex_colours import Shown, texture
 from rig.capture import Capture
 from rig.mesh import Mesh
 from rig.messages.message import compose
 
 # Of the face: the message is for an operator who takes the bust for a measurement.
 MAX_GUESSED_SHARE = 0.1
+OFF_HEAD_MM = 8.0  # long hair before a neck; skin's own surface lies within its deviation of the head
 FACE_REACH_MM = 10.0  # from the head's face: what lies farther in front of it is hair, a hand or a garment
 
 
@@ -120,15 +124,37 @@ def _share(chosen: Bool[np.ndarray, " n"]) -> float:
 
 
 def colour_bust(
-    context: ReconstructionContext, views: Views, shaped: ShapedBust | None, coloured: Capture
+    context: ReconstructionContext,
+    views: Views,
+    labels: PartLabels,
+    refined: RefinedHead,
+    shaped: ShapedBust | None,
+    *,
+    coloured: Capture,
 ) -> Staged[Bust | None]:
     """Colours the bust from the photographs of ``coloured``. Returns None without a surface."""
     if shaped is None:
         return Staged(None)
     settings, rig, mesh = context.settings, context.rig, shaped.surface.mesh_world
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
-    colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture)
+    shown = Shown(
+        _likely_parts(shaped.surface, refined.mesh_world, context.model),
+        lambda camera: labels.shares(camera, mesh.vertices),
+        measured=shaped.surface.seen,
+    )
+    colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture, shown=shown)
     return Staged(Bust(shaped, normals, colours.colours, colours.views, settings.bust.spacing_mm))
+
+
+def _likely_parts(surface: BustSurface, head_world: Mesh, model: HeadModel) -> UInt8[np.ndarray, " v"]:
+    """Returns what each vertex most likely shows, so that what is unseen gets the colour of its like: ``HAIR`` is the
+    whole scalp, bald or not, and what lies far off the head; ``CLOTHES`` lie beyond its open border."""
+    far, near = nearest(PointTree.of(head_world.vertices), surface.mesh_world.vertices)
+    part, unseen = surface.part.copy(), surface.part == Part.UNSEEN
+    part[unseen] = Part.SKIN
+    part[scalp(model)[near] | (unseen & (far > OFF_HEAD_MM))] = Part.HAIR
+    part[unseen & model.levels["full"].boundary[near]] = Part.CLOTHES
+    return part
 
 
 @dataclass(frozen=True, slots=True, eq=False)

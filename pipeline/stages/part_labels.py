@@ -36,21 +36,12 @@ class PartLabels:
         """Returns, for each camera, the probability at every pixel that hair, or the cap, hides the skin."""
         return OnePart(self.maps, Part.HAIR, {} if self.cap is None else self.cap.masks)
 
-    def skin_share(
-        self,
-        camera: Camera,
-        points: Float[np.ndarray, "v 3"],
-        hairless: Bool[np.ndarray, " v"],
-        face: Bool[np.ndarray, " v"],
-    ) -> Float[np.ndarray, " v"]:
-        """Returns how probably (0 to 1) a view shows the head at its points (world, mm), and not clothes or a backdrop
-        before them, nor hair before ``hairless`` ones. In the ``face``, what is of no part is a mouth or a nostril. 1
+    def shares(self, camera: Camera, points: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
+        """Returns how probably (0 to 1) a view shows skin, hair and clothes at points (world, mm). It shows skin
         without a part map."""
         if camera.name not in self.maps:
-            return np.ones(len(points))
-        shown = parts_shown(points, self.maps[camera.name], camera)
-        of_head = shown[:, Part.SKIN.channel] + ~hairless * shown[:, Part.HAIR.channel]
-        return of_head + face * (1.0 - shown.sum(axis=1))
+            return np.tile([1.0, 0.0, 0.0], (len(points), 1))
+        return parts_shown(points, self.maps[camera.name], camera)
 
     def skin_probability(self) -> "OnePart":
         """Returns, for each camera, the probability of skin at every pixel."""

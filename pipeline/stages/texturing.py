@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from pipeline.geometry.raster import depth_maps
-from pipeline.head_model.regions import head_regions, pinnae
+from pipeline.head_model.regions import pinnae, scalp
+from pipeline.part_labels.codes import Part
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
@@ -22,7 +23,7 @@ from pipeline.texturing.paint import find_layout, paint_head
 from pipeline.texturing.pores.close_views import CloseViews, read_close_views
 from pipeline.texturing.pores.skin_maps import SkinMaps, skin_maps, skin_share
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
-from pipeline.texturing.vertex_colours import SkinShown, Texture, texture
+from pipeline.texturing.vertex_colours import Shown, Texture, texture
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture
 from rig.mesh import Mesh
@@ -55,8 +56,6 @@ def texture_head(
     chart, chart_warnings = chart_colours(views.capture, rig) if settings.texture.chart else (None, [])
     capture = views.capture if chart is None else with_true_colours(views.capture, chart)
     around = None if layout is None else layout.around
-    ears = pinnae(model)
-    scalp = head_regions(model)["cranium"] & ~ears
     vertices = texture(
         mesh,
         capture,
@@ -66,7 +65,12 @@ def texture_head(
         settings=settings.texture,
         around=around,
         dim_share=DIM_SHARE if settings.outputs.albedo != "none" else None,
-        skin=SkinShown(lambda camera: labels.skin_share(camera, mesh.vertices, ears, face), scalp.astype(np.uint8)),
+        shown=Shown(
+            np.where(scalp(model), Part.HAIR, Part.SKIN).astype(np.uint8),
+            lambda camera: labels.shares(camera, mesh.vertices),
+            hairless=pinnae(model),
+            face=face,
+        ),
     )
     close, pores_warnings = _read_pores(context, views, mesh, vertices, face, chart)
     atlas = paint_head(layout, mesh, vertices, face, settings, None if close is None else close.for_texels())

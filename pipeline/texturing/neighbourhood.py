@@ -43,6 +43,7 @@ class Neighbourhood:
         return values
 
 
+SEAM_RINGS = 6  # of vertices, a millimetre or two apart: a hairline that nobody saw is no straight cut
 RELAXATIONS = ((60, 1.7), (10, 1.0))  # sweeps and factor: over-relaxed, then plain, which calms what overshot
 
 
@@ -56,10 +57,31 @@ def neighbours(faces: Int[np.ndarray, "f 3"], count: int) -> tuple[Int32[np.ndar
 
 
 def fill_unknown(
+    values: Float[np.ndarray, "v c"],
+    known: Bool[np.ndarray, " v"],
+    faces: Int[np.ndarray, "f 3"],
+    parts: Int[np.ndarray, " v"] | None = None,
+) -> Float[np.ndarray, "v c"]:
+    """Fills in the values (at most four channels) of unknown vertices smoothly from their neighbours. A piece of the
+    mesh without any known vertex gets the mean of all known ones. With ``parts``, a vertex is filled from those of its
+    own part, where any is known; where two parts meet unknown, one becomes the other over some ``SEAM_RINGS``."""
+    if parts is None:
+        return _fill(values, known, faces)
+    out, sure = values.astype(float), known.copy()
+    for part in np.unique(parts[known]):
+        within = parts == part
+        out[within] = _fill(values, known & within, faces[within[faces].all(axis=1)])[within]
+        sure |= within
+    seam = np.zeros(len(parts), bool)
+    seam[faces[np.ptp(parts[faces], axis=1) > 0]] = True
+    for _ in range(SEAM_RINGS):
+        seam[faces[seam[faces].any(axis=1)]] = True
+    return _fill(out, sure & (known | ~seam), faces)
+
+
+def _fill(
     values: Float[np.ndarray, "v c"], known: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "v c"]:
-    """Fills in the values (at most four channels) of unknown vertices smoothly from their neighbours. A part of the
-    mesh without any known vertex gets the mean of all known ones."""
     out = values.astype(float)
     if known.all() or not known.any():
         return out

@@ -30,6 +30,7 @@ from pipeline.compute.trace import traced
 from pipeline.geometry.raster import camera_depths
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import Silhouette
+from pipeline.part_labels.codes import Part
 from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision, pack_pictures
 from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown
@@ -57,6 +58,7 @@ BARELY = np.float32(1e-9)  # weight of a view at a corner that it does not see
 REFERENCE_HIDDEN_MM = 1.5  # a vertex this far behind the nearest surface is hidden: a pixel's slope on a steep cheek
 SURE_SHARE = 0.1  # of the median weight of what is seen: with less, blurred edges and background are in the colour
 DOUBTFUL_MM2 = 1000.0  # of connected surface that no view shows surely; a nostril, which is dark, has a tenth
+GUESS_SHARE = 0.35  # of the median weight: curls before a white wall made a guessed back of hair grey below it
 GREY = 0.22  # linear: what a head gets that no camera saw
 STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
 
@@ -83,32 +85,47 @@ class Texture:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SkinShown:
-    """Says where views show the skin of a head: ``share`` (0 to 1) gives for a camera how probably it does at each
-    vertex. Unseen vertices are filled from those of the same number in ``parts`` alone, where views see one."""
+class Shown:
+    """Says what the views show of a surface.
 
-    share: Callable[[Camera], Float[np.ndarray, " v"]]
-    parts: Int[np.ndarray, " v"]
+    Attributes:
+        likely: the part (a code of ``Part``) of each vertex if nobody sees it; ``HAIR`` is the scalp, bald or not.
+        shares: gives for a camera the probabilities (0 to 1) of skin, hair and clothes at each vertex.
+        hairless: where hair hides the surface, which is a bare head's; None: hair belongs to the surface.
+        face: where what is of no part is a mouth or a nostril, and not a backdrop.
+        measured: where depth agrees with the surface; None: everywhere.
+    """
 
-    def shown(self, weights: Float32[np.ndarray, "k v"], views: Rig) -> Bool[np.ndarray, "k v"]:
-        """Tells which views may colour each vertex: not where they, or the mean of all, hardly show its skin."""
-        shares = np.stack([self.share(camera) for camera in views])
-        mean = (weights * shares).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-9)
-        return (shares > MIN_SKIN) & (mean > MIN_MEAN_SKIN)
+    likely: UInt8[np.ndarray, " v"]
+    shares: Callable[[Camera], Float[np.ndarray, "v 3"]]
+    hairless: Bool[np.ndarray, " v"] | None = None
+    face: Bool[np.ndarray, " v"] | None = None
+    measured: Bool[np.ndarray, " v"] | None = None
 
-    def filled(
-        self,
-        colours: Float[np.ndarray, "v 3"],
-        seen: Bool[np.ndarray, " v"],
-        faces: Int[np.ndarray, "f 3"],
-        whole: Float[np.ndarray, "v 3"],
-    ) -> Float[np.ndarray, "v 3"]:
-        """Returns the colours ``whole`` with those of each part filled from the part alone."""
-        for part in np.unique(self.parts[seen]):
-            within = self.parts == part
-            inside = faces[within[faces].all(axis=1)]
-            whole = np.where(within[:, None], fill_unknown(colours, seen & within, inside), whole)
-        return whole
+    def weigh(
+        self, weights: Float32[np.ndarray, "k v"], views: Rig
+    ) -> tuple[Float32[np.ndarray, "k v"], UInt8[np.ndarray, " v"]]:
+        """Returns the views' weights, 0 where one of them, or the mean of all, hardly shows the surface; and the parts
+        from which unseen vertices are filled: hair from the hair of the scalp, where most of the scalp has hair."""
+        shares = np.stack([self.shares(camera) for camera in views]).astype(np.float32)
+        total = np.maximum(weights.sum(axis=0), 1e-9)
+        scalp = self.likely == Part.HAIR
+        hair = (weights * shares[..., Part.HAIR.channel]).sum(axis=0) / total
+        seen = scalp & (weights > 0).any(axis=0)
+        bare = seen & (hair < 0.5) if seen.any() and hair[seen].mean() > 0.5 else np.zeros(len(seen), bool)
+        if self.hairless is not None:
+            surface = shares[..., Part.SKIN.channel] + ~self.hairless * shares[..., Part.HAIR.channel]
+            if self.face is not None:
+                surface += self.face * (1.0 - shares.sum(axis=2))
+            mean = (weights * surface).sum(axis=0) / total
+            weights = weights * ((surface > MIN_SKIN) & (mean > MIN_MEAN_SKIN))
+        return weights, np.where(bare, Part.SKIN, self.likely).astype(np.uint8)
+
+    def find_guessed(self, weights: Float32[np.ndarray, "k v"]) -> Bool[np.ndarray, " v"]:
+        """Tells where the surface is a guess that views show only along their rims: their colour is half another's."""
+        total = weights.sum(axis=0)
+        guessed = np.zeros(len(total), bool) if self.measured is None else ~self.measured
+        return guessed & (total < GUESS_SHARE * np.median(total[total > 0]))
 
 
 @traced
@@ -123,7 +140,7 @@ def texture(
     around: Neighbourhood | None = None,
     dim_share: float | None = None,
     outlier: float = OUTLIER,
-    skin: SkinShown | None = None,
+    shown: Shown | None = None,
 ) -> Texture:
     """Computes the colour of each vertex from the photographs of the usable views. ``depths`` are the mesh's depth maps
     in these views (mm).
@@ -131,7 +148,7 @@ def texture(
     If ``around``, the edges of the mesh, is not None, the result also has a ``decision``: a view for each vertex. If
     ``dim_share`` is not None, it also has each vertex's colour in a dim view: views with that share of the vertex's
     weight are no brighter. A view counts half where it differs from the views' median by ``outlier`` of its level.
-    With ``skin``, no view colours a vertex where it shows something before the mesh.
+    With ``shown``, no view colours a vertex where it shows something before the mesh, or a guess along its rim.
     """
     views, normals = usable_views(capture, silhouettes, rig), mesh_world.normals()
     if settings.blend == "reference":
@@ -147,8 +164,9 @@ def texture(
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
     hidden = np.asarray((weights > 0).any(axis=0))
-    if skin is not None:
-        weights *= skin.shown(weights, views)
+    parts = None
+    if shown is not None:
+        weights, parts = shown.weigh(weights, views)
     hidden &= ~(weights > 0).any(axis=0)
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:
@@ -159,6 +177,8 @@ def texture(
     if not seen.any():
         return _untextured(len(seen))
     doubtful = wide_doubtful_surface(weights, mesh_world)
+    if shown is not None:
+        doubtful |= shown.find_guessed(weights)
     weights[:, doubtful], seen[doubtful], hidden = 0.0, 0, hidden | doubtful
     decision = None
     if around is not None:
@@ -166,12 +186,11 @@ def texture(
         pictures = pack_pictures(views, [image for _, image in found], masks, gains, offsets, mesh_world=mesh_world)
         decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
         decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, hidden)
-    whole = fill_unknown(agreed, seen > 0, mesh_world.faces)
-    whole = whole if skin is None else skin.filled(agreed, seen > 0, mesh_world.faces, whole)
-    shown, by_camera = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8), _by_name(views, gains)
+    whole = fill_unknown(agreed, seen > 0, mesh_world.faces, parts)
+    codes, by_camera = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8), _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
     dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
-    return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, dim, _gain_warnings(by_camera))
+    return Texture(codes, seen, by_camera, _by_name(views, offsets), filled, decision, dim, _gain_warnings(by_camera))
 
 
 def wide_doubtful_surface(weights: Float32[np.ndarray, "k v"], mesh_world: Mesh) -> Bool[np.ndarray, " v"]:
