@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float, Float32
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion.grid import Grid
+from pipeline.fusion.prior import near_rim
 from pipeline.fusion.refinement import EDGE_MM, guessed_deviation_mm, neighbours
 from pipeline.fusion.refinement_kernels import blurred_over_mesh
 from pipeline.fusion.skin import mean_around, skin_share
@@ -77,6 +78,7 @@ SHELL_VIEWS, MAX_PLACES = 3, 25_000  # views that agree on a depth, for it to te
 DEEPEST_MM = 30.0  # inside the hull; farther in a place belongs to something else
 SHELL_AROUND = 36  # places, whose median is the depth of the hair about them
 FACING = (-0.1, 0.2)  # cosine to a camera from which on the shell's outside counts as shown, and wholly
+BESIDE_MM = (8.0, 16.0)  # from the hair, up to which there is a shell, and from which on none: a chest has none
 SHELL_STEPS, DEPTH_STEPS = 1.0, 2.5  # of the grid: standard deviations of the blur of the shell, and of its depth
 FAR_MM = 1000.0  # a length along the crop's rays, any
 
@@ -113,7 +115,7 @@ def find_silent_hair(
         clothes = share[:, Part.CLOTHES.channel]
         about = local_share(depth_map, parts, rig)[known]
         silent = share[:, Part.HAIR.channel] | (about < np.where(clothes, DENSE_CLOTHES, DENSE_SKIN))
-        agreed = silent & ~clothes & (depth_map.views[known] >= SHELL_VIEWS)
+        agreed = share[:, Part.HAIR.channel] & ~clothes & (depth_map.views[known] >= SHELL_VIEWS)
         kept = known.copy()
         kept[known] = ~silent
         return points[agreed], only_where(kept, depth_map)
@@ -193,7 +195,8 @@ def distance_to_shell(
     hull, (known, deep) = distance_to_hull(places, views), depth_inside(hair, views)
     band = np.flatnonzero(np.abs(hull) < DEEPEST_MM + 2.0 * box.step_mm)
     inset = np.full(len(hull), np.median(deep))
-    inset[band] = np.median(deep[nearest(known, places[band], count=min(SHELL_AROUND, len(deep)))[1]], axis=1)
+    off_mm, about = nearest(known, places[band], count=min(SHELL_AROUND, len(deep)))
+    inset[band] = np.median(deep[about], axis=1)
     even = gaussian_filter(inset.reshape(box.shape), DEPTH_STEPS)
     field = np.clip(hull.reshape(box.shape) + even, -2.0 * DEEPEST_MM, 2.0 * DEEPEST_MM)
     normal = np.array(np.gradient(gaussian_filter(field, DEPTH_STEPS))).reshape(3, -1).T
@@ -203,6 +206,7 @@ def distance_to_shell(
         towards = centre - places
         facing = np.maximum(facing, (normal * towards).sum(axis=1) / np.linalg.norm(towards, axis=1))
     shown = np.clip((facing - FACING[0]) / (FACING[1] - FACING[0]), 0.0, 1.0)
+    shown[band] *= np.interp(off_mm[:, 0], BESIDE_MM, (1.0, 0.0))
     return gaussian_filter(field, SHELL_STEPS).ravel(), shown
 
 
@@ -236,7 +240,8 @@ def parts_over_head(votes: PartVotes, head_world: Mesh, stubble: bool = True) ->
     weight = out[alike, hair] + 1e-9
     mean_mm = (weight * height[alike]).sum(axis=1) / weight.sum(axis=1)
     over = np.interp(mean_mm, STUBBLE_MM, (0.0, 1.0)) if stubble else 1.0
-    out[:, hair] = np.where(far > OFF_HEAD_MM, both, over * out[:, hair])
+    off = (far > OFF_HEAD_MM) & ~near_rim(head_world, head_world.vertices)[near]  # below its end is a chest
+    out[:, hair] = np.where(off, both, over * out[:, hair])
     out[:, skin] = both - out[:, hair]
     return replace(votes, probability=out)
 
