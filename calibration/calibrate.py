@@ -176,7 +176,7 @@ def _finish(
     dropped: tuple[Dropped, ...],
     report: Progress,
 ) -> _Fit:
-    """Single corners out, Huber's cost, time offsets where they explain something."""
+    """Leaves out single corners, fits with Huber's cost, and adds time offsets where they reduce the residuals."""
     names = graph.names
     contradicting = _contradicting_cameras(names, views, dropped)
     if contradicting:
@@ -229,9 +229,9 @@ def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped:
 def _prior(
     weak: LensPrior, names: Sequence[str], lenses: dict[str, Lens], noise: Float[np.ndarray, " c"], sigma: np.ndarray
 ) -> LensPrior:
-    """Where views err as a whole (moments that differ), the joint fit must take their corners for noisier than they are
-    to each other, and would bend the lenses to explain the rest. What each lens was found to be by itself then counts
-    as knowledge, by the share of the noise that is not the corners' own."""
+    """Returns a prior of each lens from its own calibration. Where views err as a whole (their moments differ), the
+    joint fit overestimates the noise of corners, and would bend the lenses to explain the rest. The prior's weight is
+    the share of the noise that corners of one view have in common."""
     share = 1.0 - noise**2 / sigma**2
     mean = np.stack([lenses[name].intrinsics.values() for name in names])
     information = np.stack([np.linalg.inv(lenses[name].covariance) for name in names])
@@ -314,9 +314,9 @@ def _judged(
 def _covariances(
     fit: _Fit, rig: Rig
 ) -> tuple[Float[np.ndarray, "p p"], dict[str, Float[np.ndarray, " 9"]], Float[np.ndarray, " c"]]:
-    """Poses' joint covariance in the subject's gauge, standard deviations of the intrinsics, and what both amount to in
-    pixels at the subject. The uncertainty of the
-    lenses is contained in that of the poses (``effective_pose``), for a fit takes the intrinsics as they are.
+    """Returns the poses' joint covariance in the subject's gauge, standard deviations of the intrinsics, and what both
+    amount to in pixels at the subject. The uncertainty of the lenses is contained in that of the poses
+    (``effective_pose``), for a fit takes the intrinsics as they are.
 
     Corners of one view err together where moments differ or the board bends; the covariance of independent corners is
     raised by how much more the views' means scatter than their corners would let them."""
@@ -333,7 +333,7 @@ def _covariances(
 
 
 def _design_effect(fit: _Fit) -> float:
-    """Variance of the views' mean residuals over what independent corners would give, at least 1."""
+    """Returns the variance of the views' mean residuals over that of independent corners, at least 1."""
     misses = residuals(fit.solution.state, fit.seen)
     counts = np.bincount(fit.seen.view_of, minlength=len(fit.seen.camera))
     filled = counts > 0
@@ -344,7 +344,7 @@ def _design_effect(fit: _Fit) -> float:
 
 
 def _misses(fit: _Fit) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Per view: numbers, pixels and misses of its used corners."""
+    """Returns of each view the numbers, pixels and residuals of its used corners."""
     every = residuals(fit.solution.state, fit.seen)
     table, first = {}, 0
     for index, view in enumerate(fit.views):

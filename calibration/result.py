@@ -166,7 +166,7 @@ class Calibration:
         }
 
     def _covered(self, camera: Camera) -> float:
-        """Share of the picture's cells that hold a corner."""
+        """Returns the share of the picture's cells that hold a corner."""
         size = (camera.intrinsics.width, camera.intrinsics.height)
         pixels = np.concatenate(
             [observed for (name, _), (_, observed, _) in self.misses.items() if name == camera.name]

@@ -172,9 +172,8 @@ def local_misfit_mm(
     one.
 
     The vertices ``lost`` are seen by several cameras but have no match within the search; there the distance is taken
-    as ``LOST_MM``. An example are eyes that are open in the model and closed in the photographs. They count only around
-    themselves. Away from the patches the misfit fades to 0.
-    """
+    as ``LOST_MM``. An example are eyes that are open in the model and closed in the photographs. They affect only the
+    surface around them. Away from the patches the misfit fades to 0."""
     skin = ~seen.bound
     off = surface_residual(seen, state.coefficients, state.world_from_head, state.camera_shift)[0][skin]
     full, cage = model.vertices(np.zeros(0)), model.mean.astype(float)

@@ -60,7 +60,7 @@ def paint_texture(
 
 
 def _coarse(layout: Layout, colours: UInt8[np.ndarray, "v 3"]) -> UInt8[np.ndarray, "s s 3"]:
-    """The vertices' colours, small, blue first; texels beside the layout have the nearest one's."""
+    """Paints the vertices' colours in a small image, blue first; texels beside the layout get the nearest colour."""
     texels, ones = COARSE * layout.uv - 0.5, np.ones(len(layout.uv))
     _, shown = rasterise(texels, ones, layout.faces, COARSE, COARSE)
     values = np.ascontiguousarray(colours[layout.source, ::-1]).astype(np.float32)

@@ -25,7 +25,7 @@ UPPER_LIP, LOWER_LIP = [0, 37, 267, 13, 82, 312, 81, 311], [17, 84, 314, 14, 87,
 
 
 class _Offset(NamedTuple):
-    """How far a view's face, or its lower lip from the upper one, lies from where the other views see it."""
+    """Holds how far a view's face, or its lower lip from the upper one, lies from where the other views see it."""
 
     sigmas: float
     distance_mm: float

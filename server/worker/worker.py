@@ -353,7 +353,7 @@ class Worker:
         return error
 
     def _keep_alive(self) -> None:
-        """Heartbeat and reaper; its own thread, so that no job can hold it up."""
+        """Writes heartbeats and finds dead workers, in its own thread, so that no job can delay it."""
         while not self._stop.wait(self.settings.heartbeat_s):
             try:
                 self._beat()
@@ -394,7 +394,7 @@ class Worker:
 
 
 class _StateWatch:
-    """Whether a job is still to run, asked of the database a few times a second."""
+    """Tells whether a job is still to run, by the database, which is asked a few times a second."""
 
     def __init__(self, every_s: float) -> None:
         self._every_s = every_s

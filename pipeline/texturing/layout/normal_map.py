@@ -140,7 +140,7 @@ def vertex_tangents(
 
 
 def _laid(directions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Unit vectors in the planes of the normals."""
+    """Returns unit vectors in the planes of the normals."""
     return _unit(directions - np.einsum("nx,nx->n", directions, normals)[:, None] * normals)
 
 
@@ -163,8 +163,8 @@ def _in_frame(
     normal: Float32[np.ndarray, "h w 3"],
     sign: np.float32,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """The unit vectors whose shares of tangent, bitangent and normal give the wanted ones: interpolated, the frame is
-    no longer at right angles."""
+    """Returns the wanted unit vectors as shares of tangent, bitangent and normal, which are no longer at right angles
+    once interpolated."""
     lean = np.einsum("yxc,yxc->yx", tangent, normal)
     bitangent = _unit(sign * np.cross(normal, tangent))
     x, z = (np.einsum("yxc,yxc->yx", wanted, axis) for axis in (tangent, normal))

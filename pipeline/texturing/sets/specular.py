@@ -156,8 +156,8 @@ def specular_light(
 
 
 def _lamp_colour(light: Float32[np.ndarray, "s s 3"]) -> Float32[np.ndarray, "s s 3"]:
-    """The colour of mirrored light around each texel, of mean 1: it is the lamps', so that what differs from texel to
-    texel is noise."""
+    """Returns the colour of mirrored light around each texel, with mean 1: it is that of the lamps, so differences
+    between texels are noise."""
     size = len(light)
     coarse = cv2.resize(light, (COLOUR_SIDE, COLOUR_SIDE), interpolation=cv2.INTER_AREA)
     coarse = cv2.GaussianBlur(coarse, (0, 0), 1.0)

@@ -65,7 +65,7 @@ def template_textures(
 
 
 def _places(layout: Layout, surface_binding: SurfaceBinding) -> Float[np.ndarray, "t 2"]:
-    """Where each vertex of the skin lies in the model's layout; the others at its corner."""
+    """Returns the position of each skin vertex in the model's layout; the other vertices lie at its corner."""
     attached = surface_binding.attachment
     out = np.zeros((len(surface_binding.rest), 2))
     out[surface_binding.skin] = np.einsum("nk,nkx->nx", attached.weights, layout.uv[layout.faces[attached.triangles]])
