@@ -1,5 +1,4 @@
-"""Calibrates a rig from pictures of a board: detection, lenses, pose graph, bundle adjustment and checks in one
-function."""
+"""Calibrates a rig from pictures of a board: detection, lenses, pose graph, bundle adjustment and checks."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -99,7 +98,7 @@ def calibrate_detections(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Fit:
     solution: BundleSolution
     seen: Observations
@@ -212,7 +211,19 @@ def _finish(
     assert solution is not None
     observed = everything.subset(retained)
     _, sync = corner_sigma(state, observed, noise)
-    return _Fit(solution, observed, views, retained, names, prior, sigma, sync, offsets, free, dropped)
+    return _Fit(
+        solution=solution,
+        seen=observed,
+        views=views,
+        kept=retained,
+        names=names,
+        prior=prior,
+        sigma=sigma,
+        sync_px=sync,
+        offsets=offsets,
+        free=free,
+        dropped=dropped,
+    )
 
 
 def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped: Sequence[Dropped]) -> list[Message]:
@@ -287,21 +298,21 @@ def _judged(
     report("checks", 1.0)
     offsets = fit.offsets if np.isfinite(fit.offsets.sigma).all() else None
     calibration = Calibration(
-        rig,
-        detections.board,
-        front or rig.front_camera(),
-        covariance,
-        intrinsics_sigma,
-        dict(zip(rig.names, pose_sigma.tolist(), strict=True)),
-        _misses(fit),
-        detected,
-        lenses,
-        fit.sync_px,
-        offsets,
-        fit.free.offsets,
-        tuple(dropped),
-        tuple(checks),
-        (*detections.remarks, *_warnings(fit, lenses, dropped)),
+        rig=rig,
+        board=detections.board,
+        front=front or rig.front_camera(),
+        pose_covariance=covariance,
+        intrinsics_sigma=intrinsics_sigma,
+        pose_sigma_px=dict(zip(rig.names, pose_sigma.tolist(), strict=True)),
+        misses=_misses(fit),
+        detected=detected,
+        lenses=lenses,
+        sync_px=fit.sync_px,
+        offsets=offsets,
+        offsets_used=fit.free.offsets,
+        dropped=tuple(dropped),
+        checks=tuple(checks),
+        warnings=(*detections.remarks, *_warnings(fit, lenses, dropped)),
     )
     bad = failed(checks)
     if bad:

@@ -92,8 +92,7 @@ class LinearisedCornerTerm:
         return rows
 
     def jacobian(self, size: int) -> Float[np.ndarray, "n 2 q"]:
-        """Returns the derivatives of each corner by all ``size`` parameters, mostly zeros; for tests and other
-        solvers."""
+        """Returns each corner's derivatives by all ``size`` parameters, mostly zeros; for tests and other solvers."""
         observed, rows = self.term.seen, self.by_view()
         whole = np.zeros((*rows.shape[:2], size))
         for view, at in enumerate(places(observed, len(self.state.intrinsics), size)):

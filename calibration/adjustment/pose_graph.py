@@ -82,8 +82,7 @@ class Graph:
     edges: tuple[Edge, ...]
 
     def state(self, lenses: dict[str, Lens]) -> BundleState:
-        """Returns the graph as the start of a bundle adjustment, with the intrinsics of ``lenses`` and no time
-        offsets."""
+        """Returns the graph as a bundle adjustment's start, with the intrinsics of ``lenses`` and no time offsets."""
         return BundleState(
             np.stack([lenses[name].intrinsics.values() for name in self.names]),
             np.stack([self.cameras[name].rotation for name in self.names]),

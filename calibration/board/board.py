@@ -197,8 +197,7 @@ def _side(board: Board, key: str) -> int:
 
 
 def write_board_pdf(board: Board, path: Path) -> None:
-    """Writes the board as a PDF at true scale, on the smallest paper that can hold it, with a ruler to check the
-    print."""
+    """Writes the board as a PDF at true scale, on the smallest paper that holds it, with a ruler for the print."""
     width, height = board.columns * board.square_mm, board.rows * board.square_mm
     page = _paper(width, height)
     pdf = FPDF(unit="mm", format=page)

@@ -120,8 +120,7 @@ Tags = Mapping[tuple[str, int], Mapping[str, Float[np.ndarray, "4 2"]]]
 
 
 def find_tags(photographs: Photographs, known: TagSize) -> Tags:
-    """Finds the tags of a dictionary in all photographs. Returns their corners (px) by (shot, number of the tag), then
-    by camera."""
+    """Finds a dictionary's tags in all photographs. Returns their corners (px) by (shot, number), then by camera."""
     files = ((camera, shot, path) for camera, shots in photographs.files.items() for shot, path in shots.items())
     decoded = ((camera, shot, decode_image_file(path, path.name, "grey")[0]) for camera, shot, path in files)
     return _tags_of(((camera, shot, grey) for camera, shot, grey in decoded if grey is not None), known)

@@ -197,8 +197,7 @@ def decode_jpeg(camera: CameraConfig, data: bytes) -> ImageRgb:
 
 
 def _is_taken(prop: int, wanted: float, actual: float) -> bool:
-    """Tells whether a value was set: within a twentieth, as cameras have steps, but exactly for a pixel format's
-    code."""
+    """Tells whether a value was set: within a twentieth, as cameras have steps; exactly for a pixel format."""
     return abs(actual - wanted) <= (0.0 if prop == cv2.CAP_PROP_FOURCC else _NEAR * abs(wanted))
 
 

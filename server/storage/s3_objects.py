@@ -200,8 +200,8 @@ class S3Objects:
         return digest.hexdigest()
 
     def _fetch(self, key: str, path: Path, sha256: str | None, admit: Admission) -> str:
-        """Reads an object once. The client itself compares with a checksum that the store sends; where our metadata say
-        nothing, an ETag of 32 digits is the MD5 of the bytes, unless they are encrypted with a key of one's own."""
+        """Reads an object once. The client itself compares with a checksum that the store sends; if an object lacks our
+        metadata, an ETag of 32 digits is the MD5 of the bytes, unless they are encrypted with a key of one's own."""
         with self._asking(key):
             answer = self._client.get_object(**self._at(key))
             md5 = hashlib.md5(usedforsecurity=False)

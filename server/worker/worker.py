@@ -94,8 +94,7 @@ class Worker:
         self._deliverer = Deliverer(settings, self.store, self._webhooks, self.results, self._stop)
 
     def start(self) -> None:
-        """Writes the first heartbeat, starts the job engine and begins to take jobs. Returns at once; the jobs run in
-        threads."""
+        """Writes the first heartbeat, starts the job engine and takes jobs. Returns at once; jobs run in threads."""
         DBOS.migrate(system_database_url=self.settings.url)
         DBOS(config=engine_config(self.settings, self.id))
         self._register()

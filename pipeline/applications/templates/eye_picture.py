@@ -94,8 +94,7 @@ def _front(
 def _photographed(
     eyeball: Eyeball, directions: Float[np.ndarray, "n 3"], photographed: PhotographedEyes
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Returns the head's colours (sRGB) where an eyeball lies in these directions, and which of them lids do not
-    hide."""
+    """Returns the head's colours (sRGB) in these directions of an eyeball, and which of them no lid hides."""
     head, atlas = photographed.head, photographed.atlas
     if atlas is None or not len(photographed.between):
         return np.zeros_like(directions), np.zeros(len(directions), bool)

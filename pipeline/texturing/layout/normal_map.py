@@ -91,8 +91,7 @@ def normal_mapped(
     reduced: ReducedLayout,
     size: int = SIZE_PX,
 ) -> NormalMapped:
-    """Reduces the full mesh of a head (mm, unit normals), and returns the reduced mesh with a normal map of the lost
-    detail."""
+    """Reduces the full mesh of a head (mm, unit normals). Returns it with a normal map of the lost detail."""
     rows = layout.source[reduced.rows]
     places, reduced_normals, uv = vertices[rows], normals[rows], layout.uv[reduced.rows]
     tangents = vertex_tangents(places, reduced_normals, uv, reduced.faces)

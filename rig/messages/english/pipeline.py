@@ -93,7 +93,7 @@ TEMPLATES = {
     "neither-plate-nor-mask": "{camera} has neither a clean plate nor a mask: record one of them",
     "outline-guessed": "found without a clean plate, and {share:.0%} of its outline is a guess: give its clean plate or mask",
     "head-cut-off-at-top": "the head is cut off at the {side:word} of the image: move the camera back or tilt it up",
-    "subject-area-absurd": "the subject covers {share:.1%} of the image, which no head does",
+    "subject-area-absurd": "the subject covers {share:.1%} of the image; expected 1 % to 95 %",
     "light-changed": "the light differs from the plate's by a factor {factor:.2f}: record a new plate",
     "mask-alone": "{share:.1%} of the mask is where the other cameras see nothing: did something move since the plate?",
     "mask-incomplete": "the mask lacks {share:.1%} of what the other cameras show: hair or clothes in the backdrop's colour?",

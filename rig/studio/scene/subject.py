@@ -205,8 +205,7 @@ def random_look(rng: np.random.Generator) -> Look:
 def random_pose(
     centre_world: Float[np.ndarray, " 3"], spread_deg: float, spread_mm: float, rng: np.random.Generator
 ) -> Similarity:
-    """Draws the pose (world_from_head) of a subject at the point that the cameras see, slightly turned and
-    displaced."""
+    """Draws the pose (world_from_head) of a subject about the cameras' common point, slightly turned and displaced."""
     rotation = rotation_from_vector(np.radians(rng.normal(0, spread_deg, 3)))
     return Similarity(1.0, rotation, centre_world + rng.normal(0, spread_mm, 3))
 
