@@ -3,7 +3,7 @@
 Each view gives camera_from_board with two ambiguities: the image of a plane allows two poses (IPPE), and a checkerboard
 may be turned (``Board.turns``). Two cameras that share shots resolve both, since their relative pose must be the same
 in every shot: each shot's candidates are tested on all other shots, and the one with the most support wins. Pairs are
-joined by a maximum spanning tree. What remains ambiguous is refused: a tie between turns, cameras that share no shot,
+joined by a maximum spanning tree. Ambiguities that remain are refused: a tie between turns, cameras that share no shot,
 and a camera whose views agree with no other's (its pictures are mirrored, or its shots are named wrongly)."""
 
 from collections.abc import Iterable, Sequence

@@ -194,7 +194,8 @@ def _matched_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> 
 def _search_missing(
     scene: _Scene, face: TriangulatedFace, found: Mapping[str, tuple[FaceDetection, ...]]
 ) -> dict[str, tuple[FaceDetection, ...]]:
-    """Looks for a face in the views in which it must be and was not found; what was found there comes after it."""
+    """Looks for a face in the views in which it must be and was not found; other detections of these views follow
+    it."""
     added = {}
     points = face.world_from_face.apply(point_table().shape_mm)
     for name in _expected(face.world_from_face, scene.rig, scene.effort.min_facing):

@@ -44,7 +44,7 @@ class PartLabels:
         face: Bool[np.ndarray, " v"],
     ) -> Float[np.ndarray, " v"]:
         """Returns how probably (0 to 1) a view shows the head at its points (world, mm), and not clothes or a backdrop
-        before them, nor hair before ``hairless`` ones. In the ``face``, what is of no part is a mouth or a nostril. 1
+        before them, nor hair before ``hairless`` ones. In the ``face``, pixels of no part show a mouth or a nostril. 1
         without a part map."""
         if camera.name not in self.maps:
             return np.ones(len(points))

@@ -3,8 +3,7 @@
 A texel is a point of the fitted surface. Its pixel in a photograph is interpolated from those of the triangle's corners
 (which include lens distortion; edges are a few pixels long). The photograph is read there with a sub-pixel window, and
 the corners' correction is added (``pipeline.texturing.seam_levelling``). If the corners chose different photographs,
-these are blended across the triangle. What no camera sees gets the vertices' colours.
-"""
+these are blended across the triangle. Texels that no camera sees get the vertices' colours."""
 
 import cv2
 import numpy as np

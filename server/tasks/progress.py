@@ -103,8 +103,8 @@ class JobProgress:
 
 class ProgressMeter:
     """Writes the progress and remaining time of a job to its events: when a stage begins, and then at most every
-    ``every_s`` seconds. What tells of a stage's beginning stays; anything else supersedes what was written before it,
-    so that the events of a long job are as few as those of a short one."""
+    ``every_s`` seconds. The event of a stage's beginning stays; any other supersedes the one before it, so that a long
+    job has as few events as a short one."""
 
     def __init__(self, log: "EventLog", job_id: str, progress: JobProgress, every_s: float = EVERY_S) -> None:
         self._log, self._job_id, self._progress, self._every_s = log, job_id, progress, every_s

@@ -1,8 +1,7 @@
 """Paints an eyeball as the photographs show it: an image about the iris, equidistant in angle.
 
-What lies between the lids has the head's texture; what they hide has the median colour of its ring of the iris, or of
-the white.
-"""
+The part between the lids has the head's texture; hidden parts have the median colour of their ring of the iris, or of
+the white."""
 
 from dataclasses import dataclass
 

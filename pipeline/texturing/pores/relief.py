@@ -7,8 +7,8 @@ inverted there. Waves along whose direction the light does not change stay unkno
 
 Pictures have noise and highlights, and geometry and cameras are off by a pixel. Per patch and octave of wavelength only
 that share of the power is kept that repeats between two sets of views without a common view, after the shift between
-the two is taken out. What repeats and is colour rather than relief cannot be told apart by that; it counts as
-``COLOUR`` of a slope's shading.
+the two is taken out. Repeating colour cannot be distinguished from relief in this way; it counts as ``COLOUR`` of a
+slope's shading.
 
 The texture gains in the same way what repeats of the difference between full size and work size.
 """

@@ -96,7 +96,7 @@ def _tile(
 
 def filled(image: UInt8[np.ndarray, "s s 3"], known: Bool[np.ndarray, "s s"]) -> UInt8[np.ndarray, "s s 3"]:
     """Returns the image with the nearest known texel where none is, a margin for blurred reading and the cut; farther
-    off, shoulders say, the mean colour. What fills is coarse; known texels stay."""
+    off, shoulders say, the mean colour. The fill is coarse; known texels stay."""
     step = max(1, len(image) // COARSE)
     if not known[::step, ::step].any():
         return image
