@@ -180,14 +180,7 @@ def _finish(
     contradicting = _contradicting_cameras(names, views, dropped)
     if contradicting:
         raise CalibrationRefused([*contradicting, *(drop.message() for drop in dropped[:5])])
-    shots = tuple(shot for shot in graph.shots if any(view.shot == shot for view in views))
-    at = [graph.shots.index(shot) for shot in shots]
-    state = replace(
-        state,
-        board_rotations=state.board_rotations[at],
-        board_translations=state.board_translations[at],
-        velocities=state.velocities[at],
-    )
+    state, shots = _take_shots(state, graph.shots, {view.shot for view in views})
     everything = observations(views, names, shots, detections.board)
     sigma, _ = corner_sigma(state, everything, noise)
     prior = _prior(weak, names, lenses, noise, sigma)
@@ -224,6 +217,14 @@ def _finish(
         free=free,
         dropped=dropped,
     )
+
+
+def _take_shots(state: BundleState, shots: Sequence[str], used: set[str]) -> tuple[BundleState, tuple[str, ...]]:
+    """Returns the state of the ``used`` shots alone, and their names in order."""
+    at = [index for index, shot in enumerate(shots) if shot in used]
+    boards = state.board_rotations[at], state.board_translations[at]
+    state = replace(state, board_rotations=boards[0], board_translations=boards[1], velocities=state.velocities[at])
+    return state, tuple(shots[index] for index in at)
 
 
 def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped: Sequence[Dropped]) -> list[Message]:
