@@ -1,5 +1,4 @@
-"""Calibrates a rig from pictures of a board: detection, lenses, pose graph, bundle adjustment and checks in one
-function."""
+"""Calibrates a rig from pictures of a board: detection, lenses, pose graph, bundle adjustment and checks."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -99,7 +98,7 @@ def calibrate_detections(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Fit:
     solution: BundleSolution
     seen: Observations
@@ -176,19 +175,12 @@ def _finish(
     dropped: tuple[Dropped, ...],
     report: Progress,
 ) -> _Fit:
-    """Single corners out, Huber's cost, time offsets where they explain something."""
+    """Leaves out single corners, fits with Huber's cost, and adds time offsets where they reduce the residuals."""
     names = graph.names
     contradicting = _contradicting_cameras(names, views, dropped)
     if contradicting:
         raise CalibrationRefused([*contradicting, *(drop.message() for drop in dropped[:5])])
-    shots = tuple(shot for shot in graph.shots if any(view.shot == shot for view in views))
-    at = [graph.shots.index(shot) for shot in shots]
-    state = replace(
-        state,
-        board_rotations=state.board_rotations[at],
-        board_translations=state.board_translations[at],
-        velocities=state.velocities[at],
-    )
+    state, shots = _take_shots(state, graph.shots, {view.shot for view in views})
     everything = observations(views, names, shots, detections.board)
     sigma, _ = corner_sigma(state, everything, noise)
     prior = _prior(weak, names, lenses, noise, sigma)
@@ -212,7 +204,27 @@ def _finish(
     assert solution is not None
     observed = everything.subset(retained)
     _, sync = corner_sigma(state, observed, noise)
-    return _Fit(solution, observed, views, retained, names, prior, sigma, sync, offsets, free, dropped)
+    return _Fit(
+        solution=solution,
+        seen=observed,
+        views=views,
+        kept=retained,
+        names=names,
+        prior=prior,
+        sigma=sigma,
+        sync_px=sync,
+        offsets=offsets,
+        free=free,
+        dropped=dropped,
+    )
+
+
+def _take_shots(state: BundleState, shots: Sequence[str], used: set[str]) -> tuple[BundleState, tuple[str, ...]]:
+    """Returns the state of the ``used`` shots alone, and their names in order."""
+    at = [index for index, shot in enumerate(shots) if shot in used]
+    boards = state.board_rotations[at], state.board_translations[at]
+    state = replace(state, board_rotations=boards[0], board_translations=boards[1], velocities=state.velocities[at])
+    return state, tuple(shots[index] for index in at)
 
 
 def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped: Sequence[Dropped]) -> list[Message]:
@@ -229,9 +241,9 @@ def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped:
 def _prior(
     weak: LensPrior, names: Sequence[str], lenses: dict[str, Lens], noise: Float[np.ndarray, " c"], sigma: np.ndarray
 ) -> LensPrior:
-    """Where views err as a whole (moments that differ), the joint fit must take their corners for noisier than they are
-    to each other, and would bend the lenses to explain the rest. What each lens was found to be by itself then counts
-    as knowledge, by the share of the noise that is not the corners' own."""
+    """Returns a prior of each lens from its own calibration. Where views err as a whole (their moments differ), the
+    joint fit overestimates the noise of corners, and would bend the lenses to explain the rest. The prior's weight is
+    the share of the noise that corners of one view have in common."""
     share = 1.0 - noise**2 / sigma**2
     mean = np.stack([lenses[name].intrinsics.values() for name in names])
     information = np.stack([np.linalg.inv(lenses[name].covariance) for name in names])
@@ -287,21 +299,21 @@ def _judged(
     report("checks", 1.0)
     offsets = fit.offsets if np.isfinite(fit.offsets.sigma).all() else None
     calibration = Calibration(
-        rig,
-        detections.board,
-        front or rig.front_camera(),
-        covariance,
-        intrinsics_sigma,
-        dict(zip(rig.names, pose_sigma.tolist(), strict=True)),
-        _misses(fit),
-        detected,
-        lenses,
-        fit.sync_px,
-        offsets,
-        fit.free.offsets,
-        tuple(dropped),
-        tuple(checks),
-        (*detections.remarks, *_warnings(fit, lenses, dropped)),
+        rig=rig,
+        board=detections.board,
+        front=front or rig.front_camera(),
+        pose_covariance=covariance,
+        intrinsics_sigma=intrinsics_sigma,
+        pose_sigma_px=dict(zip(rig.names, pose_sigma.tolist(), strict=True)),
+        misses=_misses(fit),
+        detected=detected,
+        lenses=lenses,
+        sync_px=fit.sync_px,
+        offsets=offsets,
+        offsets_used=fit.free.offsets,
+        dropped=tuple(dropped),
+        checks=tuple(checks),
+        warnings=(*detections.remarks, *_warnings(fit, lenses, dropped)),
     )
     bad = failed(checks)
     if bad:
@@ -314,9 +326,9 @@ def _judged(
 def _covariances(
     fit: _Fit, rig: Rig
 ) -> tuple[Float[np.ndarray, "p p"], dict[str, Float[np.ndarray, " 9"]], Float[np.ndarray, " c"]]:
-    """Poses' joint covariance in the subject's gauge, standard deviations of the intrinsics, and what both amount to in
-    pixels at the subject. The uncertainty of the
-    lenses is contained in that of the poses (``effective_pose``), for a fit takes the intrinsics as they are.
+    """Returns the poses' joint covariance in the subject's gauge, standard deviations of the intrinsics, and what both
+    amount to in pixels at the subject. The uncertainty of the lenses is contained in that of the poses
+    (``effective_pose``), for a fit takes the intrinsics as they are.
 
     Corners of one view err together where moments differ or the board bends; the covariance of independent corners is
     raised by how much more the views' means scatter than their corners would let them."""
@@ -333,7 +345,7 @@ def _covariances(
 
 
 def _design_effect(fit: _Fit) -> float:
-    """Variance of the views' mean residuals over what independent corners would give, at least 1."""
+    """Returns the variance of the views' mean residuals over that of independent corners, at least 1."""
     misses = residuals(fit.solution.state, fit.seen)
     counts = np.bincount(fit.seen.view_of, minlength=len(fit.seen.camera))
     filled = counts > 0
@@ -344,7 +356,7 @@ def _design_effect(fit: _Fit) -> float:
 
 
 def _misses(fit: _Fit) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Per view: numbers, pixels and misses of its used corners."""
+    """Returns of each view the numbers, pixels and residuals of its used corners."""
     every = residuals(fit.solution.state, fit.seen)
     table, first = {}, 0
     for index, view in enumerate(fit.views):

@@ -110,7 +110,7 @@ def _offsets(calibration: Calibration) -> str:
 
 
 def _parameter_table(calibration: Calibration) -> str:
-    """Every parameter with its standard deviation: lens, then pose (left perturbation) in the subject's gauge."""
+    """Tabulates parameters and standard deviations: lens, then pose (left perturbation; subject's gauge)."""
     head = ("camera", *INTRINSICS, "turn x y z, mrad", "shift x y z, mm")
     rows = []
     for camera in calibration.rig:

@@ -63,8 +63,7 @@ class Figures(TypedDict):
 
 
 class CheckDocument(TypedDict):
-    """Describes the result of one check, and what to do if it failed. ``passed`` is null if there was nothing to check
-    against."""
+    """Describes the result of one check, and a remedy. ``passed`` is null if there was nothing to check against."""
 
     name: str
     passed: bool | None
@@ -112,7 +111,7 @@ class CalibrationDocument(TypedDict):
     rig: CamerasDocument
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Calibration:
     """Holds a calibrated rig with its evidence. Covariances are in the gauge of ``calibration.adjustment.gauge``.
 
@@ -166,7 +165,7 @@ class Calibration:
         }
 
     def _covered(self, camera: Camera) -> float:
-        """Share of the picture's cells that hold a corner."""
+        """Returns the share of the picture's cells that hold a corner."""
         size = (camera.intrinsics.width, camera.intrinsics.height)
         pixels = np.concatenate(
             [observed for (name, _), (_, observed, _) in self.misses.items() if name == camera.name]

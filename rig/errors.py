@@ -1,5 +1,4 @@
-"""Defines the base classes of all exceptions. Every message says what is wrong and what to do; no code raises a bare
-Exception."""
+"""Defines the base classes of all exceptions. Every message says what is wrong and what to do."""
 
 from collections.abc import Iterable
 

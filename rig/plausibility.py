@@ -91,8 +91,8 @@ def _through_lens(camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.nd
     """Returns ``X / Z, Y / Z`` without and with the lens, for a grid over the middle of the picture; NaN where no ray
     meets a pixel.
 
-    For a recorded lens the grid covers the pinhole's picture. What a fisheye recorded outside of it is never used, so
-    that its model need not be right there."""
+    For a recorded lens the grid covers the pinhole's picture. Pixels of a fisheye outside of it are never used, so its
+    model need not be right there."""
     k = camera.intrinsics
     edge = 0.5 * (1.0 - MIDDLE)
     sides = zip((k.width, k.height), GRID, strict=True)

@@ -2,7 +2,7 @@
 
 A camera with such a lens is a pinhole everywhere in the program (``Camera.intrinsics`` has no distortion), and its
 ``recorded`` is the lens with which the files were taken. Both share focal lengths, principal point and size, so that
-the middle of the picture keeps its resolution. What a fisheye recorded outside the pinhole's frame is dropped.
+the middle of the picture keeps its resolution. Pixels of a fisheye outside the pinhole's frame are dropped.
 
 Kannala-Brandt: ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`` with ``theta`` the angle to
 the axis (https://docs.opencv.org/4.x/db/d58/group__calib3d__fisheye.html). Rational: OpenCV's eight coefficients k1 k2

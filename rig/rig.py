@@ -26,7 +26,7 @@ class UnknownCamera(EigenheadError, KeyError):
 @dataclass(frozen=True, slots=True, eq=False)
 class Rig:
     """Holds the cameras, in the order of their file. ``scale_sigma`` is the relative standard deviation of all lengths,
-    where they were estimated from photographs: what it moves, it moves in all cameras together."""
+    if they were estimated from photographs: such an error is common to all cameras."""
 
     cameras: tuple[Camera, ...]
     scale_sigma: float = 0.0

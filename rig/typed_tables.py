@@ -80,7 +80,7 @@ def _value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:
 
 
 def _number(value: Any) -> float | None:
-    """None for what is no finite number; a whole number of JSON may be larger than any float."""
+    """Returns a finite number, else None; a whole number of JSON may be larger than any float."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         return None
     try:
@@ -100,7 +100,7 @@ def _item(where: str, value: Any, index: int) -> str:
 
 
 def _shown(value: Any) -> Message | str:
-    """A wrong value in a fault. Python writes down no number of thousands of digits, and nothing nested deeply."""
+    """Returns the text of a wrong value. Python prints no number of thousands of digits and no deeply nested value."""
     try:
         return f"{value!r:.80}"
     except (ValueError, RecursionError):

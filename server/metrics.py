@@ -1,5 +1,4 @@
-"""Collects metrics for Prometheus: requests are counted as they end, everything else is measured when the metrics are
-read."""
+"""Collects metrics for Prometheus: requests are counted as they end, all else is measured when metrics are read."""
 
 import resource
 import time

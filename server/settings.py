@@ -128,7 +128,7 @@ class ServiceSettings(BaseSettings):
     @field_validator("work")
     @classmethod
     def _present_place(cls, address: str) -> str:
-        """Where what a variable of an older version names lies now."""
+        """Returns the present place of a folder that a variable of an older version names."""
         return MOVED.get(address, address)
 
     @field_validator("database_url")

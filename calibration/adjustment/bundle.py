@@ -92,8 +92,7 @@ class LinearisedCornerTerm:
         return rows
 
     def jacobian(self, size: int) -> Float[np.ndarray, "n 2 q"]:
-        """Returns the derivatives of each corner by all ``size`` parameters, mostly zeros; for tests and other
-        solvers."""
+        """Returns each corner's derivatives by all ``size`` parameters, mostly zeros; for tests and other solvers."""
         observed, rows = self.term.seen, self.by_view()
         whole = np.zeros((*rows.shape[:2], size))
         for view, at in enumerate(places(observed, len(self.state.intrinsics), size)):
@@ -163,7 +162,7 @@ def corner_sigma(
     """Estimates the noise (px) of each camera's corners in the joint solution, and the part of it that all cameras
     share.
 
-    The noise of each camera alone is known from ``lens_noise``. What the joint solution has beyond it comes from
+    The noise of each camera alone is known from ``lens_noise``. Larger residuals of the joint solution come from
     cameras that were not exactly simultaneous, or from a board that bends. That part is one variance for all cameras:
     with one for each, the fit could call one camera noisy and follow the others exactly."""
     squares = (residuals(state, observed) ** 2).sum(axis=1)

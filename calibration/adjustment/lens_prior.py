@@ -56,8 +56,7 @@ class LinearisedLensPrior:
 
 
 class AspectTerm:
-    """Computes the residual ``2 (fx - fy) / (fx + fy) / ASPECT_PRIOR`` of each camera, since pixels are nearly
-    square."""
+    """Computes the residual ``2 (fx - fy) / (fx + fy) / ASPECT_PRIOR`` of each camera: pixels are nearly square."""
 
     def at(self, state: BundleState) -> "LinearisedAspectPrior":
         """Returns the term at a state."""

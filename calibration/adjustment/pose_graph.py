@@ -3,7 +3,7 @@
 Each view gives camera_from_board with two ambiguities: the image of a plane allows two poses (IPPE), and a checkerboard
 may be turned (``Board.turns``). Two cameras that share shots resolve both, since their relative pose must be the same
 in every shot: each shot's candidates are tested on all other shots, and the one with the most support wins. Pairs are
-joined by a maximum spanning tree. What remains ambiguous is refused: a tie between turns, cameras that share no shot,
+joined by a maximum spanning tree. Ambiguities that remain are refused: a tie between turns, cameras that share no shot,
 and a camera whose views agree with no other's (its pictures are mirrored, or its shots are named wrongly)."""
 
 from collections.abc import Iterable, Sequence
@@ -82,8 +82,7 @@ class Graph:
     edges: tuple[Edge, ...]
 
     def state(self, lenses: dict[str, Lens]) -> BundleState:
-        """Returns the graph as the start of a bundle adjustment, with the intrinsics of ``lenses`` and no time
-        offsets."""
+        """Returns the graph as a bundle adjustment's start, with the intrinsics of ``lenses`` and no time offsets."""
         return BundleState(
             np.stack([lenses[name].intrinsics.values() for name in self.names]),
             np.stack([self.cameras[name].rotation for name in self.names]),

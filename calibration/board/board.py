@@ -197,8 +197,7 @@ def _side(board: Board, key: str) -> int:
 
 
 def write_board_pdf(board: Board, path: Path) -> None:
-    """Writes the board as a PDF at true scale, on the smallest paper that can hold it, with a ruler to check the
-    print."""
+    """Writes the board as a PDF at true scale, on the smallest paper that holds it, with a ruler for the print."""
     width, height = board.columns * board.square_mm, board.rows * board.square_mm
     page = _paper(width, height)
     pdf = FPDF(unit="mm", format=page)
@@ -228,7 +227,7 @@ def _paper(width: float, height: float) -> tuple[float, float]:
 
 
 def _rectangles(board: Board) -> list[tuple[float, float, float, float, bool]]:
-    """x, y, width, height in mm, and whether white; in the order of drawing."""
+    """Returns x, y, width, height (mm) of each rectangle and whether it is white, in the order of drawing."""
     side = board.square_mm
     paint = board.inverted  # white squares on black paper, or black on white
     squares = [
@@ -256,7 +255,7 @@ def _marker(board: Board, number: int, x: float, y: float) -> list[tuple[float, 
 
 
 def _runs(cells: Bool[np.ndarray, "n n"]) -> list[tuple[int, int, int]]:
-    """(line, first, behind the last) of every run of True."""
+    """Returns (line, first, one past the last) of every run of True."""
     padded = np.pad(cells, ((0, 0), (1, 1))).astype(np.int8)
     steps = np.diff(padded, axis=1)
     starts, ends = np.argwhere(steps == 1), np.argwhere(steps == -1)

@@ -76,7 +76,7 @@ def rise(grey: UInt8[np.ndarray, "h w"], board: Board, found: Corners) -> float:
 
 
 def _edge_width(grey: np.ndarray, homography: np.ndarray, middles: np.ndarray, reach: np.ndarray) -> float:
-    """Median over the edges through ``middles`` (board, in squares), sampled ``reach`` to both sides."""
+    """Returns the median width of edges through ``middles`` (board, in squares), sampled ``reach`` either way."""
     steps, along = np.linspace(-1.0, 1.0, 61), 0.1 * (reach[::-1] > 0)
     # Three lines beside each other, averaged: noise must not pass for blur.
     points = middles[:, None, None] + np.array([-1, 0, 1])[:, None, None] * along + steps[:, None] * reach
@@ -126,7 +126,7 @@ def in_board_order(grey: np.ndarray, corners: np.ndarray, board: Board) -> Float
 
 
 def _contrast(grey: np.ndarray, grid: Float[np.ndarray, "rows columns 2"]) -> float:
-    """Mean grey of the squares that the board has white, less that of the black ones."""
+    """Returns the mean grey of the board's white squares less that of the black ones."""
     middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     row, column = np.indices(middles.shape[:2])
     black = (row + column) % 2 == 0  # the square between the first four inner corners is (1, 1): black
@@ -180,7 +180,7 @@ def classic_corners(grey: np.ndarray, board: Board) -> np.ndarray | None:
 
 
 def _refine(grey: np.ndarray, corners: np.ndarray, share: float, board: Board) -> np.ndarray:
-    """``cornerSubPix`` with a window of ``share`` of a square's side in the image."""
+    """Calls ``cornerSubPix`` with a window of ``share`` of a square's side in the image."""
     spread = np.sqrt(abs(np.linalg.det(np.cov(corners.T))))  # of a uniform grid: (n sides)^2 / 12 in each direction
     side = np.sqrt(12.0 * spread / board.corner_count)
     window = int(np.clip(share * side, 2, 15))

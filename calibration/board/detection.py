@@ -153,8 +153,8 @@ def _with_measured_pattern(
     workers: int,
     report: Progress,
 ) -> Detections:
-    """The board again with the pattern that its markers have, where it is not found as it was described. Raises
-    WrongBoard where its markers are not as wide as described: their edges then pass for blur."""
+    """Returns the board with the pattern that its markers have, if it is not found as described. Raises WrongBoard
+    where its markers are not as wide as described: their edges then pass for blur."""
     board = detections.board
     paths = [path for shots in pictures.values() for path in shots.values()]
     found_share = len(detections.views) / len(paths)
@@ -194,7 +194,7 @@ def _refuse_markers(pictures: dict[str, dict[str, Path]]) -> None:
 def _detect_pictures(
     folder: Path, pictures: dict[str, dict[str, Path]], board: Board, cache: Path | None, workers: int, report: Progress
 ) -> Detections:
-    """One pass over all pictures for one board. Raises InputError on damaged input."""
+    """Detects one board in all pictures. Raises InputError on damaged input."""
     tasks = [(camera, shot, path) for camera, shots in pictures.items() for shot, path in shots.items()]
     results: list[tuple[tuple[int, int], Found | None] | Message] = []
     with ThreadPoolExecutor(workers) as pool:
@@ -238,7 +238,7 @@ def _detect_pictures(
 
 
 def _detect_file(path: Path, board: Board, cache: Path | None) -> tuple[tuple[int, int], Found | None] | Message:
-    """(size, find), or what is wrong with the file."""
+    """Returns the picture's size and its detection, or the file's fault."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -280,7 +280,7 @@ def _from_cache(path: Path) -> Found | None:
 def _explain_missing(
     pictures: dict[str, dict[str, Path]], sizes: dict[str, tuple[int, int]], views: list[View], board: Board
 ) -> list[PictureNote]:
-    """For each camera that never sees the board: what its pictures show instead, where that can be told."""
+    """Returns what the pictures of cameras that never see the board show instead, if that is recognised."""
     notes = []
     cameras_with_board = {view.camera for view in views}
     for camera in (camera for camera in sizes if camera not in cameras_with_board):
@@ -334,7 +334,7 @@ def _explain_checkerboard(grey: np.ndarray, board: Board) -> Message | None:
 
 
 def _explain_charuco(grey: np.ndarray, board: Board) -> Message | None:
-    """What the markers in a picture say of the board, once it was not found by them."""
+    """Explains by a picture's markers why the board was not found."""
     markers = find_markers(grey, board.dictionary)
     mirrored = find_markers(np.ascontiguousarray(grey[:, ::-1]), board.dictionary)
     if len(mirrored) > len(markers) + 2:

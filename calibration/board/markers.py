@@ -67,8 +67,8 @@ def find_layout(pictures: Sequence[Markers], board: Board) -> Layout | None:
 
 
 def _first_markers(shown: Sequence[Markers], board: Board | None) -> list[int]:
-    """Numbers that the first marker may have: 0 or the board's own where that is possible, else the least that was
-    seen, or a lower one where the board has more markers than were seen."""
+    """Returns possible numbers of the first marker: 0 or the board's own if possible, else the least observed one, or a
+    lower one if the board has more markers than were observed."""
     least, most = min(min(markers) for markers in shown), max(max(markers) for markers in shown)
     if board is None:
         return [0] if least == 0 else [0, least]
@@ -95,7 +95,7 @@ def _explaining(shown: Sequence[Markers], columns: int, first: int, *, legacy: b
 
 
 def _layout_corners(columns: int, *, legacy: bool) -> Float[np.ndarray, "m 4 2"]:
-    """Corners of the markers in squares, as if their sides were a square's, for as many rows as any board has."""
+    """Returns the markers' corners in squares, as if as wide as a square, for as many rows as any board has."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
     rows = min(60, 2 * (len(dictionary.bytesList) // columns))
     board = cv2.aruco.CharucoBoard((columns, rows), 1.0, 0.999, dictionary)
@@ -104,7 +104,7 @@ def _layout_corners(columns: int, *, legacy: bool) -> Float[np.ndarray, "m 4 2"]
 
 
 def _fit(flat: Float[np.ndarray, "m 4 2"], observed: Float[np.ndarray, "m 4 2"]) -> tuple[float, float]:
-    """How far (squares, RMS) the centres of markers miss their layout, and the measured side of a marker (squares)."""
+    """Returns how far (squares, RMS) centres of markers miss their layout, and a marker's measured side (squares)."""
     homography, _ = cv2.findHomography(observed.mean(axis=1), flat.mean(axis=1), 0)
     if homography is None or np.linalg.det(homography) <= 0:
         return np.inf, 0.0

@@ -61,8 +61,7 @@ def check_held_out(
     free: Free,
     tick: Callable[[], None] = lambda: None,
 ) -> Check:
-    """Checks that cameras estimated without every fifth shot fit the boards of those shots as well as they fit the
-    others."""
+    """Checks that cameras estimated without every fifth shot fit the boards of those shots as well as others."""
     several = np.flatnonzero(np.bincount(observed.shot, minlength=len(state.board_rotations)) >= 2)
     held = several[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
     if len(held) < 2 or len(several) - len(held) < 4:

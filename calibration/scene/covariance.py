@@ -128,7 +128,7 @@ def lens_misfit(structure: Structure, noise_px: float) -> float:
 
 
 def _reduced(structure: Structure, noise_px: float) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-    """The reduced system, and half the gradient of chi-squared by the same unknowns."""
+    """Returns the reduced system, and half the gradient of chi-squared by the same unknowns."""
     places = camera_places(structure)
     size, count = int(places.max()) + 1, len(structure.points)
     u, v = np.zeros((size, size)), np.zeros((count, 3, 3))
@@ -161,7 +161,7 @@ def _reduced(structure: Structure, noise_px: float) -> tuple[Float[np.ndarray, "
 
 
 def _inverse(matrix: Float[np.ndarray, "p p"], motions: Float[np.ndarray, "p 7"]) -> Float[np.ndarray, "p p"]:
-    """Inverse of the reduced system where ``motions``, its null space, are held."""
+    """Returns the inverse of the reduced system where ``motions``, its null space, are held."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     held = np.linalg.qr(motions / scale[:, None])[0]
     inverse = np.linalg.inv(matrix * np.outer(scale, scale) + held @ held.T) - held @ held.T
@@ -171,7 +171,7 @@ def _inverse(matrix: Float[np.ndarray, "p p"], motions: Float[np.ndarray, "p 7"]
 def _per_camera(
     covariance: Float[np.ndarray, "p p"], places: Int[np.ndarray, "c 11"]
 ) -> Float[np.ndarray, "c 15 c 15"]:
-    """The same of each camera's nine lens values and pose."""
+    """Returns the same by each camera's nine lens values and pose."""
     count = len(places)
     expand = np.zeros((count, 15, len(covariance)))
     for index in range(count):

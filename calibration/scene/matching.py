@@ -93,7 +93,7 @@ def quiet() -> Iterator[None]:
 
 
 def _write_grey(photographs: Photographs, folder: Path) -> dict[str, tuple[int, int]]:
-    """Pictures as this project reads them, whatever COLMAP would make of their files; returns width and height."""
+    """Writes pictures as this project reads them, not as COLMAP would; returns width and height."""
 
     def one(job: tuple[str, str, Path]) -> tuple[tuple[int, int], Message | None]:
         camera, shot, path = job
@@ -170,12 +170,12 @@ def _pairs_file(path: Path, pairs: Iterator[tuple[str, str]]) -> Path:
 
 
 def _first(photographs: Photographs) -> list[str]:
-    """The picture under whose name a camera stands among images."""
+    """Returns the picture that stands for each camera among COLMAP's images."""
     return [f"{camera}/{next(iter(shots))}.png" for camera, shots in photographs.files.items()]
 
 
 def _merge(photographs: Photographs, scratch: Path, name: str, *, one_lens: bool) -> Path:
-    """All shots of a camera in one image: keypoints one after the other, matches numbered accordingly, and verified."""
+    """Merges all shots of a camera to one image: keypoints in sequence, matches renumbered and verified."""
     import pycolmap
 
     options = pycolmap.ImageReaderOptions()

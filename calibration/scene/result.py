@@ -1,5 +1,4 @@
-"""Defines the result of a calibration from a scene: the rig with its covariances, its scale, and the views that were
-left out."""
+"""Defines the result of a calibration from a scene: the rig with its covariances, its scale, and excluded views."""
 
 from dataclasses import dataclass
 from typing import TypedDict

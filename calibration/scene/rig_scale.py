@@ -73,6 +73,6 @@ def _scale(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> Scale:
 
 
 def _undistorted(full: Rig, name: str, pixel: np.ndarray) -> np.ndarray:
-    """Where a pixel of the file lies in the picture as it is read."""
+    """Returns the position of a file's pixel in the picture as it is read."""
     lens = full[name].recorded
     return pixel if lens is None else lens.undistorted(pixel[None], full[name].intrinsics.matrix())[0]

@@ -120,8 +120,7 @@ Tags = Mapping[tuple[str, int], Mapping[str, Float[np.ndarray, "4 2"]]]
 
 
 def find_tags(photographs: Photographs, known: TagSize) -> Tags:
-    """Finds the tags of a dictionary in all photographs. Returns their corners (px) by (shot, number of the tag), then
-    by camera."""
+    """Finds a dictionary's tags in all photographs. Returns their corners (px) by (shot, number), then by camera."""
     files = ((camera, shot, path) for camera, shots in photographs.files.items() for shot, path in shots.items())
     decoded = ((camera, shot, decode_image_file(path, path.name, "grey")[0]) for camera, shot, path in files)
     return _tags_of(((camera, shot, grey) for camera, shot, grey in decoded if grey is not None), known)
@@ -147,7 +146,7 @@ def _tags_of(pictures: Iterable[tuple[str, str, UInt8[np.ndarray, "h w"]]], know
 
 
 def _tags_in(grey: UInt8[np.ndarray, "h w"], detector: cv2.aruco.ArucoDetector) -> dict[int, Float[np.ndarray, "4 2"]]:
-    """Corners by number; a number that is there twice cannot be told apart."""
+    """Returns the corners of each tag by its number, without numbers that occur twice."""
     corners, ids, _ = detector.detectMarkers(grey)
     numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]
     return {
@@ -213,7 +212,7 @@ def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Sca
 
 
 def _looked_at(structure: Structure) -> Float[np.ndarray, "p 3"]:
-    """Points inside the largest sphere about the common point that all but a few cameras have whole in the picture."""
+    """Returns points in the largest sphere about the common point that all but a few cameras have whole in view."""
     centre, radii = structure.rig.centre_world(), []
     for camera in structure.rig:
         k = camera.intrinsics

@@ -90,7 +90,7 @@ def solve_structure(matches: Matches, scratch: Path, *, report: Progress) -> Str
 
 
 def _start_lenses(path: Path, lens: Float[np.ndarray, " 5"] | None) -> None:
-    """The lens from which every camera of a database starts, its principal point aside; None: COLMAP's guess."""
+    """Returns the initial lens of every camera of a database without its principal point; None: COLMAP's guess."""
     import pycolmap
 
     if lens is None:
@@ -105,7 +105,7 @@ def _start_lenses(path: Path, lens: Float[np.ndarray, " 5"] | None) -> None:
 
 
 def _pipeline_options() -> "pycolmap.IncrementalPipelineOptions":
-    """Lenses stay undistorted while views join: three views bend k1 and k2 to their matches, and no fourth fits."""
+    """Keeps lenses undistorted while views join: three views bend k1 and k2 to their matches, and no fourth fits."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -121,7 +121,7 @@ def _pipeline_options() -> "pycolmap.IncrementalPipelineOptions":
 
 
 def _adjust(model: "pycolmap.Reconstruction", *, one_lens: bool, principal_point: bool) -> None:
-    """The last bundle adjustment, with a loss that forgives: a wrong match may be within COLMAP's four pixels."""
+    """Does the last bundle adjustment with a robust loss, since a wrong match may be within COLMAP's four pixels."""
     import pycolmap
 
     options = pycolmap.BundleAdjustmentOptions()

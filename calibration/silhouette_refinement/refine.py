@@ -189,8 +189,7 @@ def noise_of(misses: Float[np.ndarray, " n"]) -> float:
 
 
 def gain_of(before: np.ndarray, after: np.ndarray, noise: float) -> tuple[float, float]:
-    """Returns by how much the mean robust cost falls from ``before`` to ``after``, and the standard deviation of
-    that."""
+    """Returns the fall of the mean robust cost from ``before`` to ``after``, and its standard deviation."""
     one, two = _forgiven(before, noise), _forgiven(after, noise)
     if len(one) != len(two):  # a tangency at the image's border appeared or disappeared
         spread = np.hypot(one.std() / np.sqrt(max(1, len(one))), two.std() / np.sqrt(max(1, len(two))))
@@ -262,8 +261,7 @@ class _Refining:
         return minimise(Problem((*terms, self.prior), len(correction), np.add), correction, ONE_STEP)
 
     def tangency_term(self, correction: Float[np.ndarray, " p"], *, outer: bool) -> TangencyTerm:
-        """Returns the cost of the tangencies that the corrected cameras find in all captures, with their robust
-        noise."""
+        """Returns the cost of all captures' tangencies in the corrected cameras, with their robust noise."""
         rig = self.rig(correction)
         tangencies = [t for capture in self.captures for t in _tangencies(capture, rig, self.pairs, outer=outer)]
         packed = PackedTangencies.of(tangencies, rig)

@@ -72,7 +72,6 @@ def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement 
 
 
 def _pairs(names: list[str], fold: int, *, inside: bool) -> Pairs:
-    """Returns a test of whether a pair of cameras is in a fold (``inside``), or outside. Every camera has pairs in each
-    fold."""
+    """Returns a test whether a pair of cameras is in a fold (``inside``) or not. All cameras have pairs in each."""
     index_of = {name: index for index, name in enumerate(names)}
     return lambda pair: (sum(index_of[name] for name in pair) % FOLDS == fold) == inside

@@ -65,8 +65,7 @@ def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> 
 
 
 def spread_points(places: LandmarkMap) -> Int[np.ndarray, " n"]:
-    """Returns the indices of at most ``POINTS`` landmarks that do not slide, spread as evenly as possible over the
-    face."""
+    """Returns the indices of at most ``POINTS`` landmarks that do not slide, spread evenly over the face."""
     rest = np.flatnonzero(~places.slides)
     deviation = np.sqrt((places.deviation_mm**2).sum(axis=1))
     position = point_table().shape_mm

@@ -219,8 +219,7 @@ def head_origin(
 
 
 def turned(start: Similarity, yaw_deg: float, pitch_deg: float) -> Similarity:
-    """Returns the pose after the head is turned in its own frame: by the yaw about its vertical axis, and by the pitch
-    (nodding)."""
+    """Returns the pose of the head turned in its own frame: by the yaw about its vertical axis, and by the pitch."""
     turn = rotation_from_vector(np.radians([0.0, yaw_deg, 0.0])) @ rotation_from_vector(
         np.radians([pitch_deg, 0.0, 0.0])
     )

@@ -1,10 +1,9 @@
 """What runs on which thread when, for Chrome's trace viewer and Perfetto, and for the laboratory's ``scaling``.
 
 Nothing is recorded, and nothing but one test is paid, unless a trace is active. Stages, parts of stages, shared loops
-and their slices are spans of one thread each; those of one thread nest. A stage that runs beside others lies in a
-``background``, the others in the ``foreground`` of the same name. Wall clock and processor seconds stand side by side:
-on a busy machine only the latter say what work there was.
-"""
+and their slices are spans of one thread each; those of one thread nest. A stage in a thread of its own has a
+``background`` span, and the stages that run meanwhile a ``foreground`` span of the same name. Wall clock and processor
+seconds stand side by side: on a busy machine only the latter say what work there was."""
 
 import functools
 import json

@@ -66,11 +66,11 @@ class Round:
 COARSE = (Round(5.0, 10.0, 0.5, 3.0), Round(4.0, 7.0, 0.6, 2.0), Round(3.0, 5.0, 0.7, 1.0))
 FINE = Round(2.0, 2.5, 0.7, 0.5)
 LOOKS_MM = (1.0, 0.5)  # robust scale of each look at the photographs, on the head that the last one left
-PATCH_REACH_MM = 4.0  # about a patch no dense point is asked: a window reaches as far
+PATCH_REACH_MM = 4.0  # no dense point counts so near to a patch, whose window reaches as far
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shown:
+class PointObservations:
     """Holds the observations of the head that surface points give; for the n points of skin among them, also the
     triangles that they show (corners and barycentric coordinates) and their deviations."""
 
@@ -129,7 +129,7 @@ def refine_to_surface(
     shape = plain_shape(fit, model, eigenheads)
     base = with_plain_lids(fitted, shape, model)
     lids, unexplained = estimate_eyelid_closure(fit, model, base, surface, eyes or {})
-    closed = frozenset(side for side, shown in (eyes or {}).items() if shown.closed and lids.get(side, 1.0) == 1.0)
+    closed = frozenset(side for side, eye in (eyes or {}).items() if eye.closed and lids.get(side, 1.0) == 1.0)
     blink = blink_shift(fit, model, lids)
     base = unfolded(shape + blink, base + blink, faces)
     base = bridge_eyelids(base, model, closed.difference(lids) | unexplained)
@@ -185,30 +185,30 @@ def deform_to_points(
     """
     amplitude = np.maximum(deviation_mm, MIN_AMPLITUDE_MM)
     informative = surface.chosen((surface.part != Part.UNSEEN) & np.isfinite(surface.deviation_mm))
-    many = thinned(informative, CELL_MM)
-    few = thinned(many, COARSE_CELL_MM)
-    now = _coarsely_deformed(
-        vertices, amplitude, faces, nodes.coarse, few, loose=loose, outlines=outlines, report=report
+    fine_points = thinned(informative, CELL_MM)
+    coarse_points = thinned(fine_points, COARSE_CELL_MM)
+    current = _coarsely_deformed(
+        vertices, amplitude, faces, nodes.coarse, coarse_points, loose=loose, outlines=outlines, report=report
     )
-    base = now = unfolded(vertices, now, faces)
+    base = current = unfolded(vertices, current, faces)
     normals = vertex_normals(base, faces)
     field = _laid_out(nodes.fine, base, LENGTH_MM)
     directions = normal_directions(nodes.fine, nodes.fine.shape @ amplitude, normals)
     report("fine", len(COARSE) / (len(COARSE) + 1))
-    shown = observe(base, now, faces, many, loose, each=FINE, floor_mm=FLOOR_MM)
-    posterior = solve_field(field, directions, with_outlines(shown.observed, outlines, base, now, FINE.robust_mm))
-    now = base + directions.moved(posterior.mean)
+    dense = observe(base, current, faces, fine_points, loose, limits=FINE, floor_mm=FLOOR_MM)
+    posterior = solve_field(field, directions, with_outlines(dense.observed, outlines, base, current, FINE.robust_mm))
+    current = base + directions.moved(posterior.mean)
     for robust_mm in LOOKS_MM:
         if look is None:
             break
-        both = with_patches(shown.observed, look(now), base, now, faces, robust_mm)
-        posterior = solve_field(field, directions, with_outlines(both, outlines, base, now, robust_mm))
-        now = base + directions.moved(posterior.mean)
+        combined = with_patches(dense.observed, look(current), base, current, faces, robust_mm)
+        posterior = solve_field(field, directions, with_outlines(combined, outlines, base, current, robust_mm))
+        current = base + directions.moved(posterior.mean)
     seen = np.zeros(len(vertices), bool)
-    seen[shown.corner] = True
-    common_mm = np.hypot(COMMON_MM, shared_error * typical_deviation(shown, faces, len(vertices)))
+    seen[dense.corner] = True
+    common_mm = np.hypot(COMMON_MM, shared_error * typical_deviation(dense, faces, len(vertices)))
     deviation = field_deviation(posterior, base, normals, amplitude, seen, common_mm=common_mm)
-    return DeformedSurface(unfolded(base, now, faces), deviation, seen)
+    return DeformedSurface(unfolded(base, current, faces), deviation, seen)
 
 
 def _coarsely_deformed(
@@ -216,33 +216,33 @@ def _coarsely_deformed(
     amplitude: Float[np.ndarray, " v"],
     faces: Int[np.ndarray, "f 3"],
     nodes: NodeMesh,
-    few: SurfacePoints,
+    coarse_points: SurfacePoints,
     *,
     loose: Bool[np.ndarray, " v"],
     outlines: Outlines | None,
     report: Progress,
 ) -> Float[np.ndarray, "v 3"]:
     """Returns the vertices after the coarse rounds, which move them freely in space."""
-    now = vertices
+    current = vertices
     field = _laid_out(nodes, vertices, COARSE_LENGTH_MM)
     directions = free_directions(nodes, nodes.shape @ amplitude)
-    for i, each in enumerate(COARSE):
+    for i, limits in enumerate(COARSE):
         report("fine", i / (len(COARSE) + 1))
-        shown = observe(vertices, now, faces, few, loose, each=each, floor_mm=COARSE_FLOOR_MM)
-        both = with_outlines(shown.observed, outlines, vertices, now, each.robust_mm)
-        now = vertices + directions.moved(solve_field(field, directions, both).mean)
-    return now
+        dense = observe(vertices, current, faces, coarse_points, loose, limits=limits, floor_mm=COARSE_FLOOR_MM)
+        combined = with_outlines(dense.observed, outlines, vertices, current, limits.robust_mm)
+        current = vertices + directions.moved(solve_field(field, directions, combined).mean)
+    return current
 
 
 def with_outlines(
     observed: Observed,
     outlines: Outlines | None,
     base: Float[np.ndarray, "v 3"],
-    now: Float[np.ndarray, "v 3"],
+    current: Float[np.ndarray, "v 3"],
     robust_mm: float,
 ) -> Observed:
     """Returns the observations and those of the outlines, if there are any."""
-    return observed if outlines is None else observed.joined(outlines(base, now, robust_mm))
+    return observed if outlines is None else observed.joined(outlines(base, current, robust_mm))
 
 
 def _laid_out(mesh: NodeMesh, vertices: Float[np.ndarray, "v 3"], length_mm: float) -> SmoothField:
@@ -251,46 +251,46 @@ def _laid_out(mesh: NodeMesh, vertices: Float[np.ndarray, "v 3"], length_mm: flo
 
 def observe(
     base: Float[np.ndarray, "v 3"],
-    now: Float[np.ndarray, "v 3"],
+    current: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
     surface: SurfacePoints,
     loose: Bool[np.ndarray, " v"],
     *,
-    each: Round,
+    limits: Round,
     floor_mm: float,
-) -> Shown:
-    """Returns the observations that the points give of the head at ``now``: their offsets (mm) from ``base``. Points of
+) -> PointObservations:
+    """Returns the observations that points give of the head at ``current``: their offsets (mm) from ``base``. Points of
     hair count only where the head reaches beyond them.
 
     The normal of an observation is half the point's and half the head's (Rusinkiewicz 2019, *A symmetric objective
     function for ICP*), which is exact to second order where both are curved.
     """
-    normals = vertex_normals(now, faces)
+    normals = vertex_normals(current, faces)
     found = associate(
         surface.points,
         surface.normals,
-        now,
+        current,
         normals,
         faces,
-        reach_mm=each.loose_reach_mm,
-        least_agreement=each.agreement,
+        reach_mm=limits.loose_reach_mm,
+        least_agreement=limits.agreement,
     )
     corner = faces[found.triangle]
-    reach = np.where(loose[corner].any(axis=1), each.loose_reach_mm, each.reach_mm)
+    reach = np.where(loose[corner].any(axis=1), limits.loose_reach_mm, limits.reach_mm)
     between = interpolated(normals[corner], found.blend) + surface.normals[found.row]
     between /= np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-9)
     point = surface.points[found.row]
-    off = ((point - interpolated(now[corner], found.blend)) * between).sum(axis=1)
+    off = ((point - interpolated(current[corner], found.blend)) * between).sum(axis=1)
     skin = surface.part[found.row] == Part.SKIN
-    speaks = np.where(skin, found.distance_mm <= reach, off < 0.0)  # hair speaks where skin stands out of it
+    informative = np.where(skin, found.distance_mm <= reach, off < 0.0)  # hair counts where the head reaches beyond it
     variance = surface.deviation_mm[found.row] ** 2 + floor_mm**2
-    robust = np.where(skin, 1.0 / (1.0 + (off / each.robust_mm) ** 2) ** 2, 1.0)
-    shared = _local_density(found, corner, now, faces, CORRELATION_MM)
+    robust = np.where(skin, 1.0 / (1.0 + (off / limits.robust_mm) ** 2) ** 2, 1.0)
+    shared = _local_density(found, corner, current, faces, CORRELATION_MM)
     offset = ((point - interpolated(base[corner], found.blend)) * between).sum(axis=1)
-    kept, of_skin = np.flatnonzero(speaks), np.flatnonzero(speaks & skin)
+    retained, of_skin = np.flatnonzero(informative), np.flatnonzero(informative & skin)
     information = robust / (variance * shared)
-    return Shown(
-        Observed(corner[kept], found.blend[kept], between[kept], offset[kept], information[kept]),
+    return PointObservations(
+        Observed(corner[retained], found.blend[retained], between[retained], offset[retained], information[retained]),
         corner[of_skin],
         found.blend[of_skin],
         surface.deviation_mm[found.row[of_skin]],
@@ -301,16 +301,16 @@ def with_patches(
     observed: Observed,
     found: PatchPlaces,
     base: Float[np.ndarray, "v 3"],
-    now: Float[np.ndarray, "v 3"],
+    current: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
     robust_mm: float,
 ) -> Observed:
-    """Replaces observations by those of the patches near them: adds the patches' measurements on the head at ``now``,
+    """Replaces observations by those of patches near them: adds the patches' measurements on the head at ``current``,
     and drops the dense observations within ``PATCH_REACH_MM`` of a patch."""
-    vertex, normals = found.vertex, vertex_normals(now, faces)[found.vertex]
+    vertex, normals = found.vertex, vertex_normals(current, faces)[found.vertex]
     if not len(vertex):
         return observed
-    place = now[vertex] + found.place_mm[:, None] * normals
+    place = current[vertex] + found.place_mm[:, None] * normals
     offset = ((place - base[vertex]) * normals).sum(axis=1)
     information = found.information / (1.0 + (found.place_mm / robust_mm) ** 2) ** 2
     at = interpolated(base[observed.corner], observed.blend)
@@ -319,13 +319,13 @@ def with_patches(
     return observed.chosen(alone).joined(Observed(corner, blend, normals, offset, information))
 
 
-def typical_deviation(shown: Shown, faces: Int[np.ndarray, "f 3"], count: int) -> Float[np.ndarray, " v"]:
+def typical_deviation(dense: PointObservations, faces: Int[np.ndarray, "f 3"], count: int) -> Float[np.ndarray, " v"]:
     """Returns the mean standard deviation (mm) of the points of skin around each of ``count`` vertices; 0 where there
     are none."""
-    if not len(shown.corner):
+    if not len(dense.corner):
         return np.zeros(count)
-    known = np.bincount(shown.corner.ravel(), shown.blend.ravel(), count)
-    total = np.bincount(shown.corner.ravel(), (shown.blend * shown.deviation_mm[:, None]).ravel(), count)
+    known = np.bincount(dense.corner.ravel(), dense.blend.ravel(), count)
+    total = np.bincount(dense.corner.ravel(), (dense.blend * dense.deviation_mm[:, None]).ravel(), count)
     return _pooled(total, faces) / np.maximum(_pooled(known, faces), 1e-9)
 
 

@@ -115,12 +115,12 @@ def _place(
 
 
 def _whole(pyramid: Pyramid) -> list[Crop]:
-    """The picture as one square."""
+    """Returns the picture as one square."""
     return [Crop((pyramid.size_px - 1) / 2, float(pyramid.size_px.max()), 0.0)]
 
 
 def _parts(pyramid: Pyramid) -> list[Crop]:
-    """Squares of half the picture's longer side that overlap by half, where it has pixels to show in them."""
+    """Returns squares of half the picture's longer side that overlap by half; none if the picture is too small."""
     side = float(pyramid.size_px.max()) / 2
     if side < FINDER_SIZE:
         return []
@@ -130,8 +130,8 @@ def _parts(pyramid: Pyramid) -> list[Crop]:
 
 
 def _find(pyramid: Pyramid, frames: Sequence[Crop], networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """The faces in parts of a picture, best first: the upright ones where one of them is beyond doubt, else whichever
-    way up."""
+    """Returns the faces in parts of a picture, best first: the upright ones if one is beyond doubt, else those of any
+    orientation."""
     seen: list[tuple[float, Crop]] = []
     found: tuple[FaceDetection, ...] = ()
     for turns in ((0.0,), (90.0, 180.0, 270.0)):
@@ -148,7 +148,7 @@ def _find(pyramid: Pyramid, frames: Sequence[Crop], networks: FaceNetworks) -> t
 
 
 def _proposals(seen: Sequence[tuple[float, Crop]]) -> list[Crop]:
-    """What the finder sees, best first; of one face a crop for each way up."""
+    """Returns crops of the detector's faces, best first; one for each orientation of a face."""
     chosen: list[Crop] = []
     for _, crop in sorted(seen, key=lambda proposal: -proposal[0]):
         if not any(_is_same(crop, other) and _angle_deg(crop, other) < SAME_WAY_UP_DEG for other in chosen):
@@ -157,7 +157,7 @@ def _proposals(seen: Sequence[tuple[float, Crop]]) -> list[Crop]:
 
 
 def _seen(pyramid: Pyramid, frame: Crop, networks: FaceNetworks) -> Iterator[tuple[float, Crop]]:
-    """Score and crop of what the finder sees in one square: of each face its best cell."""
+    """Returns score and crop of each face that the detector finds in one square, from its best cell."""
     faces, scores = networks.find(pyramid.sample(frame, FINDER_SIZE))
     picture_from_crop = frame.picture_from_crop(FINDER_SIZE)
     centres: list[Float[np.ndarray, " 2"]] = []
@@ -175,7 +175,7 @@ def _seen(pyramid: Pyramid, frame: Crop, networks: FaceNetworks) -> Iterator[tup
 
 
 def _verified(pyramid: Pyramid, proposals: Sequence[Crop], networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """The proposals that are faces, best first, each face once: by the score of a first look, the most likely first."""
+    """Returns the proposals that are faces, best first and each face once; the most likely are tried first."""
     candidates = [_place(pyramid, crop, networks) for crop in proposals]
     chosen: list[FaceDetection] = []
     for points, _, _ in sorted(candidates, key=lambda candidate: -candidate[2]):
@@ -191,16 +191,16 @@ def _verified(pyramid: Pyramid, proposals: Sequence[Crop], networks: FaceNetwork
 
 
 def _is_same(a: Crop, b: Crop) -> bool:
-    """Whether two crops are of one face, however they are turned."""
+    """Tells whether two crops show one face, however they are turned."""
     return bool(np.linalg.norm(a.centre_px - b.centre_px) < SAME_FACE / CROP_OF_FACE * max(a.side_px, b.side_px))
 
 
 def _is_settled(before: Crop, after: Crop) -> bool:
-    """Whether a crop has found its place."""
+    """Tells whether a crop no longer moves."""
     step = max(float(np.linalg.norm(after.centre_px - before.centre_px)), abs(after.side_px - before.side_px))
     return step < SETTLED * after.side_px and _angle_deg(before, after) < SETTLED_DEG
 
 
 def _angle_deg(a: Crop, b: Crop) -> float:
-    """The angle between what is upright in two crops, 0 to 180."""
+    """Returns the angle between the upward directions of two crops, 0 to 180."""
     return abs((a.roll_deg - b.roll_deg + 180.0) % 360.0 - 180.0)

@@ -71,7 +71,7 @@ def eye_warnings(closed: Collection[str]) -> list[Message]:
 
 
 def _opening(lids_px: Float[np.ndarray, "16 2"], direction: Float[np.ndarray, " 3"]) -> float:
-    """Height of the gap by the length between the corners, as if seen from the front."""
+    """Returns the gap's height over the length between the eye's corners, as if seen from the front."""
     across = lids_px[INNER] - lids_px[0]
     length = float(np.linalg.norm(across))
     normal = np.array([-across[1], across[0]]) / length
@@ -83,7 +83,7 @@ def _opening(lids_px: Float[np.ndarray, "16 2"], direction: Float[np.ndarray, " 
 def _place(
     pyramid: Pyramid, corners_px: Float[np.ndarray, "2 2"], networks: FaceNetworks, *, mirrored: bool
 ) -> tuple[Float[np.ndarray, "16 2"], Float[np.ndarray, "5 2"]]:
-    """Lids and iris of the eye between two corners, outer and inner. The network knows right eyes only."""
+    """Returns lids and iris of the eye between its outer and inner corner. The network knows right eyes only."""
     across = (corners_px[1] - corners_px[0]) * (-1.0 if mirrored else 1.0)
     roll = float(np.rad2deg(np.arctan2(across[1], across[0])))
     crop = Crop(corners_px.mean(axis=0), CROP_OF_WIDTH * float(np.linalg.norm(across)), roll, mirrored)

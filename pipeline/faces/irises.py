@@ -163,7 +163,7 @@ def _moved(iris: Iris, step: Float[np.ndarray, " 7"], covariance: Float[np.ndarr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Eye:
-    """Holds the views of an eye, where its eyeball may lie, and what is up in its face."""
+    """Holds the views of an eye, where its eyeball may lie, and the face's upward direction."""
 
     seen: Sequence[EyeSight]
     eyeball: Float[np.ndarray, " 3"]
@@ -238,7 +238,7 @@ def _iris(fit: LimbusFit, seen: Sequence[EyeSight]) -> Iris | UnseenEye:
 
 
 def _towards(gaze: Float[np.ndarray, " 3"], ahead: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-    """The direction from the eyeball to the iris, drawn towards straight ahead: the head says its eyeballs roughly."""
+    """Returns the direction from eyeball to iris, drawn towards straight ahead, since eyeballs are known roughly."""
     mixed = gaze / BEHIND_MM + ahead
     return mixed / np.linalg.norm(mixed)
 

@@ -114,7 +114,7 @@ def _map(rows: np.ndarray, weights: np.ndarray, offset_mm: np.ndarray, carried_m
 
 
 def _carried(model: HeadModel) -> Mapping[str, np.ndarray]:
-    """Rows and weights of the default model's points on another model's mean head."""
+    """Returns rows and weights of the default model's points on another model's mean head."""
     marks = model.levels["full"].landmarks
     default = load_model()
     names = sorted(set(marks) & set(default.levels["full"].landmarks))

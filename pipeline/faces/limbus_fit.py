@@ -5,9 +5,8 @@ its covariance, and what it rests on. Edges of the limbus and pupils are looked 
 fitted to them, and so on, nearer and nearer. The pupil lies on the circle's axis; how far before the circle is found,
 too: an iris lies behind the cornea, which lifts it, and a model's may be painted on the cornea.
 
-The pupil is the darkest disc in the iris, of the same size in all views. What mirrors a lamp is left out. Brightness is
-taken by its square root, so that noise is alike in bright and dark.
-"""
+The pupil is the darkest disc in the iris, of the same size in all views. Pixels that mirror a lamp are left out.
+Brightness is taken by its square root, so that noise is alike in bright and dark."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -110,7 +110,7 @@ def complete_match(
 def _consistent(
     candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
 ) -> Iterator[TriangulatedFace]:
-    """Faces that two views or more agree on, each grown to all views that do."""
+    """Returns the faces that two views or more agree on, each with all views that do."""
     detections = [(name, face) for name, faces in candidates.items() for face in faces]
     pairs = [(a, b) for k, a in enumerate(detections) for b in detections[k + 1 :] if a[0] != b[0]]
     pairs.sort(key=lambda pair: -min(pair[0][1].score, pair[1][1].score))
@@ -139,7 +139,7 @@ def _consistent(
 def _may_be_one(
     pair: Sequence[tuple[str, FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
 ) -> bool:
-    """Whether the rays of two detections meet, points of a face's size: a first look that takes 0.3 ms."""
+    """Tells whether the rays of two detections meet in points of a face's size: a quick test of 0.3 ms."""
     (centre, ray), (other, other_ray) = (
         (rig[name].centre_world, rig[name].rays_world(face.landmarks_px[FEW_POINTS])) for name, face in pair
     )
@@ -166,7 +166,7 @@ def _may_be_one(
 def _grown(
     face: TriangulatedFace | None, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
 ) -> TriangulatedFace | None:
-    """The face of a pair, with the detections of all views in which its points project to what was found there."""
+    """Returns the face of a pair, with the detections of all views in which its points project to a detection."""
     for _ in range(GROWING_ROUNDS):
         if face is None:
             return None
@@ -181,8 +181,8 @@ def _grown(
 def _nearest(
     face: TriangulatedFace, detections: Sequence[FaceDetection], camera: Camera
 ) -> tuple[FaceDetection, float]:
-    """Of a view's detections the one nearest to where the face's points project, and its misfit: the RMS of residuals
-    by what the points' noise there and their uncertainty lead to expect; infinite behind the camera."""
+    """Returns a view's detection nearest to the projected points of the face, and its misfit: the RMS of residuals over
+    their expected deviation (the points' noise and uncertainty); infinite behind the camera."""
     points, placed = face.points.positions_world, face.world_from_face
     pixels, slopes = camera.project_with_jacobian(points)
     if not np.isfinite(pixels).all():
@@ -201,7 +201,7 @@ def _nearest(
 
 
 def _is_face(face: TriangulatedFace, rig: Rig, eye_distance_mm: tuple[float, float] | None) -> bool:
-    """Whether the points are a face's: of its size and relief, and turned towards its cameras."""
+    """Tells whether the points are a face's: of its size and relief, and turned towards its cameras."""
     low, high = eye_distance_mm or (0.0, np.inf)
     scaled_mm = face.world_from_face.scale * mean_eye_distance_mm()
     middle, facing = face.world_from_face.translation, face.world_from_face.rotation[:, 2]
@@ -216,7 +216,7 @@ def _is_face(face: TriangulatedFace, rig: Rig, eye_distance_mm: tuple[float, flo
 
 
 def _dissenting(face: TriangulatedFace, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig) -> int:
-    """How many views that should show the face show faces, but not this one."""
+    """Counts the views that should show this face and show other faces only."""
     middle, facing = face.world_from_face.translation, face.world_from_face.rotation[:, 2]
     count = 0
     for name, faces in candidates.items():
@@ -242,7 +242,7 @@ def _eye_distance_mm(points: Float[np.ndarray, "468 3"]) -> float:
 
 
 def _prominence(face: TriangulatedFace, rig: Rig) -> float:
-    """Over the views, how large the face is in the picture and how near to its middle."""
+    """Scores over all views how large the face is in the picture and how near to its middle."""
 
     def of_view(name: str, detection: FaceDetection) -> float:
         k = rig[name].intrinsics
@@ -257,7 +257,7 @@ def _prominence(face: TriangulatedFace, rig: Rig) -> float:
 def _outliers(
     face: TriangulatedFace, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
 ) -> dict[str, FaceDetection]:
-    """Of views that are left out, the detections that lie where the face is but do not fit it."""
+    """Returns detections of excluded views that lie where the face is but do not fit it."""
     found = {}
     for name, faces in candidates.items():
         if name not in face.detections and faces:
@@ -269,7 +269,7 @@ def _outliers(
 
 
 def _matched(face: TriangulatedFace, rig: Rig, outliers: Mapping[str, FaceDetection]) -> MatchedFaces:
-    """The face as it is handed on."""
+    """Builds the face that the stage hands on."""
     names = list(face.detections)
     return MatchedFaces(
         detections=face.detections,

@@ -107,5 +107,5 @@ def _load(path: Path) -> cv2.dnn.Net:
 
 
 def _blob(crop: UInt8[np.ndarray, "s s 3"]) -> Float32[np.ndarray, "1 3 s s"]:
-    """A crop as the networks take it: planes, 0 to 1."""
+    """Converts a crop to the networks' input: planes, 0 to 1."""
     return np.ascontiguousarray(crop.transpose(2, 0, 1)[None], np.float32) / np.float32(255.0)

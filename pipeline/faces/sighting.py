@@ -61,8 +61,8 @@ def sight_face(subject: SubjectFaces, rig: Rig, *, front: str) -> FaceSighting:
 
 
 def _turned(from_front_deg: float, from_middle_deg: float) -> float:
-    """The angle from the front camera, 0 unless the face is turned that way from the middle of the cameras, too: of
-    cameras in rows the front one stands above or below it, and who looks between the rows is turned from neither."""
+    """Returns the angle from the front camera; 0 unless the face is turned that way from the middle of the cameras,
+    too. The front one of cameras in rows stands above or below that middle; a face between rows counts as straight."""
     agreed = from_front_deg * from_middle_deg > 0.0 and abs(from_middle_deg) >= MIN_OFF_MIDDLE_DEG
     return from_front_deg if agreed else 0.0
 
@@ -73,7 +73,7 @@ def has_front(rig: Rig) -> bool:
 
 
 def _fan(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """The mean of the unit vectors from the subject to the cameras: of length 1 in one spot, 0 in a full ring."""
+    """Returns the mean unit vector from the subject to the cameras: of length 1 in one spot, 0 in a full ring."""
     directions = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return directions.mean(axis=0)
@@ -87,7 +87,7 @@ def gaze_from(face: MatchedFaces, axis_world: Float[np.ndarray, " 3"]) -> tuple[
 
 
 def _missing(subject: SubjectFaces, face: MatchedFaces) -> tuple[str, ...]:
-    """The cameras that must see the face, in which none was found, where others bear witness of it."""
+    """Returns the cameras that must see the face by other cameras' detections, but in which none was found."""
     if len(face.detections) < MIN_WITNESSES:
         return ()
     return tuple(name for name in subject.expected if name not in face.detections and not subject.found.get(name))

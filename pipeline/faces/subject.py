@@ -125,7 +125,7 @@ def find_subject(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scene:
-    """What a search goes through."""
+    """Holds the views, cameras and networks of one search."""
 
     rig: Rig
     pyramids: Mapping[str, Pyramid]
@@ -144,7 +144,7 @@ def _search(
     find: Callable[[Pyramid, FaceNetworks], tuple[FaceDetection, ...]],
     report: Callable[[float], None],
 ) -> tuple[dict[str, tuple[FaceDetection, ...]], TriangulatedFace | None]:
-    """Searches view after view until one face is confirmed: the faces of each that was searched or looked at, and the
+    """Searches view after view until one face is confirmed. Returns the faces of the searched views, and the
     subject's."""
     found: dict[str, tuple[FaceDetection, ...]] = {}
     face = None
@@ -167,8 +167,8 @@ def _search(
 
 
 def _next_view(left: Sequence[str], found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> str:
-    """The view to search next: the first that is left until a face is found, then the one that looks from about
-    ``APART_DEG`` beside the view that shows the best one."""
+    """Returns the view to search next: the first one left until a face is found, then one about ``APART_DEG`` from the
+    view of the best face."""
     seen = [name for name in found if found[name]]
     if not seen:
         return left[0]
@@ -183,7 +183,7 @@ def _next_view(left: Sequence[str], found: Mapping[str, tuple[FaceDetection, ...
 
 
 def _matched_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> MatchedFaces | None:
-    """The face that is beyond doubt and the only one that any view shows."""
+    """Returns the face that is beyond doubt and the only one that any view shows."""
     seen = [(name, faces) for name, faces in found.items() if faces]
     if len(seen) != 1 or len(seen[0][1]) != 1 or seen[0][1][0].score < CERTAIN_SCORE:
         return None
@@ -194,7 +194,8 @@ def _matched_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> 
 def _search_missing(
     scene: _Scene, face: TriangulatedFace, found: Mapping[str, tuple[FaceDetection, ...]]
 ) -> dict[str, tuple[FaceDetection, ...]]:
-    """Looks for a face in the views in which it must be and was not found; what was found there comes after it."""
+    """Looks for a face in the views in which it must be and was not found; other detections of these views follow
+    it."""
     added = {}
     points = face.world_from_face.apply(point_table().shape_mm)
     for name in _expected(face.world_from_face, scene.rig, scene.effort.min_facing):
@@ -208,7 +209,7 @@ def _search_missing(
 
 
 def _expected(world_from_face: Similarity, rig: Rig, min_facing: float) -> Iterator[str]:
-    """The views towards which a face looks and whose pictures hold it."""
+    """Returns the views that a face is turned to and whose pictures hold it."""
     points = world_from_face.apply(point_table().shape_mm)
     for camera in rig:
         pixels = camera.project(points)
@@ -272,7 +273,7 @@ def match_alone(name: str, face: FaceDetection, camera: Camera) -> MatchedFaces 
 
 
 def _pose(points: Float[np.ndarray, "n 3"], normalised: Float[np.ndarray, "n 2"]) -> RigidTransform | None:
-    """camera_from_face of points and where they are seen (X / Z, Y / Z), by the least sum of squares."""
+    """Returns the least-squares camera_from_face of points and their positions in the image (X / Z, Y / Z)."""
     if len(points) < 6 or not np.isfinite(normalised).all():
         return None
     found, turn, shift = cv2.solvePnP(points, normalised, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_SQPNP)

@@ -121,6 +121,6 @@ def _noise_px(
     cameras: Sequence[Camera],
     which: slice,
 ) -> Float[np.ndarray, "v n"]:
-    """``point_noise_px`` of all views."""
+    """Returns ``point_noise_px`` of all views."""
     views = zip(sizes_px.tolist(), cameras, strict=True)
     return np.stack([point_noise_px(size, points_world, world_from_face, c, which) for size, c in views])

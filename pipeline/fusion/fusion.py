@@ -3,8 +3,7 @@
 Enters: depth maps, silhouettes and the fitted head. Leaves: a two-manifold mesh with a standard deviation and a part
 for each vertex. A signed distance is computed on a grid (``signed_distance``); its zero becomes a mesh
 (``pipeline.geometry.surface_nets``); the vertices are moved to the depth maps (``refinement``) and to the fitted head
-(``skin``); what is then turned, folded or crossing is mended (``untangling``).
-"""
+(``skin``); triangles that are then turned, folded or crossing are mended (``untangling``)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

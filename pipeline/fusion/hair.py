@@ -188,7 +188,7 @@ def distance_to_shell(
     hair: Places, views: ViewStack, box: Grid
 ) -> tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]:
     """Returns, at the nodes of a whole box, the signed distance (mm, positive outside) to the shell, and how far a
-    photograph shows its outside there, 0 to 1: what all cameras see from behind, no silhouette bounds."""
+    photograph shows its outside there, 0 to 1: no silhouette bounds a surface that all cameras see from behind."""
     from scipy.ndimage import gaussian_filter  # only such hair needs it
 
     places = box.places()

@@ -133,7 +133,7 @@ def solve(
     hair: Places | None = None,
 ) -> tuple[Level, Cut]:
     """Computes the signed distance near the surface, on a sparse grid with a step of ``spacing_mm``, from coarse to
-    fine. ``hair`` is what the depth maps do not show."""
+    fine. ``hair`` is the hair that depth maps miss."""
     halvings = 1
     while spacing_mm * 2**halvings < COARSEST_MM:
         halvings += 1

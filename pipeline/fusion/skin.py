@@ -82,21 +82,17 @@ def combine_with_head(
     count, row = len(seen), field.row
     beside = neighbours(mesh_world.faces, count)
     share = skin_share(beside, mesh_world.vertices, skin, seen)
-    around_mm = mean_around(beside, deviation_mm, seen.astype(float))
-    noise_mm = np.where(seen, np.maximum(deviation_mm, around_mm), guessed_deviation_mm(mesh_world.vertices, seen))
-    noise_mm = np.hypot(noise_mm, MIN_DEVIATION_MM)
+    noise_mm = depth_deviation_mm(beside, mesh_world.vertices, deviation_mm, seen)
     height, stated_mm, within = np.zeros(count), np.zeros(count), np.zeros(count)
     height[row], stated_mm[row], within[row] = field.height_mm, np.hypot(field.deviation_mm, MIN_DEVIATION_MM), 1.0
     most = 4.0 * np.hypot(noise_mm, stated_mm)
     shown = within * seen * skin
     offset = within * mean_around(beside, np.clip(height, -most, most), shown)
     head_mm = np.sqrt(stated_mm**2 + mean_around(beside, offset**2, shown))
-    unsure = np.maximum(head_mm / SURE_MM, 1.0)
-    stiffness = within * STIFFNESS / (np.maximum(head_mm, MIN_DEVIATION_MM) * unsure) ** 2
+    stiffness = within * head_stiffness(head_mm)
     area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / count
     pull = share * stiffness * area_mm2 / LENGTH_MM**2
-    alike = np.pi * np.where(seen, CORRELATED_MM, GUESSES_CORRELATED_MM) ** 2 / area_mm2
-    information = within / (noise_mm**2 * np.maximum(alike, 1.0))
+    information = within * depth_information(noise_mm, seen, area_mm2)
     both_mm, root = np.hypot(noise_mm, head_mm), np.sqrt(stiffness)
     estimate = offset
     for narrowing in NARROWING:
@@ -108,6 +104,35 @@ def combine_with_head(
     vertices = mesh_world.vertices.copy()
     vertices[row] += (share * (estimate - height))[row, None] * field.normal
     return Mesh(vertices, mesh_world.faces)
+
+
+def depth_deviation_mm(
+    beside: Adjacency,
+    vertices: Float[np.ndarray, "v 3"],
+    stated_mm: Float[np.ndarray, " v"],
+    seen: Bool[np.ndarray, " v"],
+) -> Float[np.ndarray, " v"]:
+    """Returns s, at least ``MIN_DEVIATION_MM``: the larger of a vertex' deviation and its surroundings' mean; where no
+    view sees the vertex, that of a guess."""
+    around_mm = mean_around(beside, stated_mm, seen.astype(float))
+    noise_mm = np.where(seen, np.maximum(stated_mm, around_mm), guessed_deviation_mm(vertices, seen))
+    return np.hypot(noise_mm, MIN_DEVIATION_MM)
+
+
+def head_stiffness(head_mm: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+    """Returns k (1/mm2) by the head's deviation, 0 to ``STIFFNESS / MIN_DEVIATION_MM**2``; above ``SURE_MM`` it falls
+    with the fourth power."""
+    unsure = np.maximum(head_mm / SURE_MM, 1.0)
+    return STIFFNESS / (np.maximum(head_mm, MIN_DEVIATION_MM) * unsure) ** 2
+
+
+def depth_information(
+    noise_mm: Float[np.ndarray, " v"], seen: Bool[np.ndarray, " v"], area_mm2: float
+) -> Float[np.ndarray, " v"]:
+    """Returns 1 / (n s^2) (1/mm2), 0 to ``1 / MIN_DEVIATION_MM**2``. n, at least 1, counts the vertices, of
+    ``area_mm2`` each, whose depths err alike."""
+    alike = np.pi * np.where(seen, CORRELATED_MM, GUESSES_CORRELATED_MM) ** 2 / area_mm2
+    return 1.0 / (noise_mm**2 * np.maximum(alike, 1.0))
 
 
 def heights_over(head: HeadSkin, mesh_world: Mesh) -> HeightField:

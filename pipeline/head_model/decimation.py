@@ -12,7 +12,7 @@ from rig.mesh import face_normals
 
 
 class _Collapser:
-    """State of one decimation: triangles by vertex, quadrics, and a lazy heap of half-edge collapses."""
+    """Holds the state of one decimation: triangles by vertex, quadrics, and a lazy heap of half-edge collapses."""
 
     # Lists of floats, not arrays: on vectors of three numpy's overhead is ten times the arithmetic.
     def __init__(
@@ -66,7 +66,7 @@ class _Collapser:
         return all(self._survives(k, v, u) for k in self.at[v] - shared)
 
     def _survives(self, k: int, v: int, u: int) -> bool:
-        """The triangle neither folds over, in the chart too, nor becomes a sliver when its corner v moves to u."""
+        """Tells whether the triangle stays unfolded (in the chart, too) and no sliver if its corner v moves to u."""
         corners, moved = self.faces[k], [u if w == v else w for w in self.faces[k]]
         if self.chart is not None and _turn(self.chart, corners) * _turn(self.chart, moved) <= 0:
             return False
@@ -107,13 +107,13 @@ def _squared(a: list[float], b: list[float]) -> float:
 
 
 def _turn(chart: list[list[float]], corners: Sequence[int]) -> float:
-    """Twice the triangle's area in the chart, with its sign."""
+    """Returns twice the triangle's signed area in the chart."""
     (ax, ay), (bx, by), (cx, cy) = (chart[w] for w in corners)
     return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
 
 
 def _quadrics(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 10"]:
-    """Sum of squared plane distances per vertex, weighted by area: xx xy xz yy yz zz xd yd zd dd."""
+    """Returns each vertex's sum of squared plane distances, weighted by area: xx xy xz yy yz zz xd yd zd dd."""
     normals = face_normals(vertices, faces)
     area = np.linalg.norm(normals, axis=1)
     x, y, z = (normals / np.maximum(area, 1e-12)[:, None]).T

@@ -102,7 +102,7 @@ def _within(
 
 
 def _ears(vertices: Float[np.ndarray, "v 3"], at: dict[str, Float[np.ndarray, " 3"]]) -> Bool[np.ndarray, " v"]:
-    """What stands off the side of the head about the opening of the ear."""
+    """Returns the vertices that stand off the side of the head about the opening of the ear."""
     found = np.zeros(len(vertices), bool)
     for side in ("right", "left"):
         notch = at[f"tragion_{side}"]

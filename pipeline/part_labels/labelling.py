@@ -1,13 +1,12 @@
 """Labels every pixel of the subject as skin, hair or clothes, by what it learns from the capture itself.
 
-The middle of the fitted face is skin. What lies beside the head above the chin is hair unless it looks like that skin,
-as a bald crown does; what lies below is clothes unless it looks like skin. From this start, expectation maximisation
+The middle of the fitted face is skin. Pixels beside the head above the chin are hair unless they look like that skin,
+as a bald crown does; pixels below are clothes unless they look like skin. From this start, expectation maximisation
 (Dempster, Laird and Rubin 1977) learns how the parts of this capture look, as histograms of colour and fine structure
 over all views, with the cameras' gains removed. The position on the head is the prior. A filter that keeps the edges of
 the photograph makes neighbours agree (He, Sun and Tang 2010, guided image filtering,
 https://doi.org/10.1007/978-3-642-15549-9_1). A cap is distinguished from hair only if it looks like the clothes below;
-both hide skin.
-"""
+both hide skin."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

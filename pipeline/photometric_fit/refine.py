@@ -115,9 +115,8 @@ def rounds_of_rig(factor: float) -> tuple[Round, ...]:
 
     Each round has as many steps as usual, over a range ``factor`` times as wide. For each doubling of the factor, the
     last round is repeated once, and once more over half its range: with three cameras in front, outlines leave the
-    middle of a face open by 8 mm, and what is far off takes long to converge. Shading is then removed in the last
-    rounds, too, since gloss looks like depth.
-    """
+    middle of a face undetermined by 8 mm, and large errors converge slowly. Shading is then removed in the last rounds,
+    too, since gloss looks like depth."""
     more = round(math.log2(factor))
     wider = [replace(each, reach_mm=factor * each.reach_mm) for each in ROUNDS]
     wider[-1] = replace(wider[-1], with_shading=not more)
@@ -172,9 +171,8 @@ def local_misfit_mm(
     one.
 
     The vertices ``lost`` are seen by several cameras but have no match within the search; there the distance is taken
-    as ``LOST_MM``. An example are eyes that are open in the model and closed in the photographs. They count only around
-    themselves. Away from the patches the misfit fades to 0.
-    """
+    as ``LOST_MM``. An example are eyes that are open in the model and closed in the photographs. They affect only the
+    surface around them. Away from the patches the misfit fades to 0."""
     skin = ~seen.bound
     off = surface_residual(seen, state.coefficients, state.world_from_head, state.camera_shift)[0][skin]
     full, cage = model.vertices(np.zeros(0)), model.mean.astype(float)

@@ -190,7 +190,7 @@ def _against_plate(image: Picture, background: Background, reduction: float) -> 
 
 
 def colours_apart(colour: Picture, other: Picture, variance: Picture) -> Plane:
-    """Returns the distance (standard deviations) between two colours, after ``colour`` is made as bright as brings it
+    """Returns the distance (standard deviations) between two colours, after ``colour`` is scaled to the brightness
     nearest to ``other``."""
     sigma = np.sqrt(variance)
     f, b = colour / sigma, other / sigma

@@ -51,10 +51,8 @@ class SilhouetteObjective:
         speaking: Literal["face", "all"] = "face",
         weighted: bool = True,
     ) -> None:
-        """``level`` of the model, ``scale`` of the images (0.5: half the width); ``start`` fixes what may speak.
-
-        ``weighted``: eq. (5); otherwise eq. (4), where every pixel that may speak counts alike.
-        """
+        """Takes a ``level`` of the model and a ``scale`` of the images (0.5: half the width); ``start`` fixes which
+        pixels count. ``weighted``: eq. (5); otherwise eq. (4), in which all these pixels count alike."""
         self._turn = world_from_head.scale * world_from_head.rotation
         mean = model.levels[level].operator @ model.mean
         self._mean_world = world_from_head.apply(mean.astype(np.float64))

@@ -102,7 +102,7 @@ def shape_bust(
     context: ReconstructionContext, views: Views, depth: Depth, refined: RefinedHead, fused: DepthSurface | None
 ) -> Staged[ShapedBust | None]:
     """Combines the fused surface with the delivered head, extends hair to its outlines, and mends the triangles.
-    Returns None for None. Warns ``bust-guessed`` where much of the face was measured by nothing."""
+    Returns None for None. Warns ``bust-guessed`` if neither depth nor the head measured much of the face."""
     if fused is None:
         return Staged(None)
     head = HeadSkin(refined.mesh_world, refined.deviation_mm)

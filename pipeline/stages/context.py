@@ -1,8 +1,8 @@
 """Defines what every stage of one reconstruction may read."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Protocol, runtime_checkable
 
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
@@ -15,7 +15,14 @@ from rig.render.compute import ComputeDevice
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
-Segment = Callable[..., dict[str, Silhouette]]
+
+@runtime_checkable
+class Segment(Protocol):
+    """Declares what computes the silhouettes of a capture: ``segment``, or one that keeps them in a cache."""
+
+    def __call__(self, capture: Capture, rig: Rig, /, *, report: Progress) -> dict[str, Silhouette]:
+        """Returns the silhouette of every camera."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

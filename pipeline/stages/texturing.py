@@ -106,7 +106,7 @@ def _read_pores(
     face: Bool[np.ndarray, " v"],
     chart: ChartColours | None,
 ) -> tuple[CloseViews | None, list[ReportWarning]]:
-    """The full-size pictures, if the settings ask for pores. None and a warning if there is no file or no texture."""
+    """Reads the full-size pictures for pores. Returns None, with a warning if there is no file or no texture."""
     if context.settings.detail != "pores":
         return None, []
     if context.read_original is None or coloured.decision is None:

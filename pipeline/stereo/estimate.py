@@ -6,7 +6,7 @@ stereo*, 2011, https://doi.org/10.5244/C.25.14, have planes and their propagatio
 nothing is random: silhouettes and head bound the search (``depth_range``), depths at even steps joined by paths of
 least cost give the first estimate (``search``), and from there least squares moves the windows to a fraction of a pixel
 and computes their information (``refinement``; Goesele et al., *Multi-view stereo for community photo collections*,
-2007, https://doi.org/10.1109/ICCV.2007.4408933). What no other view confirms is discarded (``agreement``).
+2007, https://doi.org/10.1109/ICCV.2007.4408933). Depths that no other view confirms are discarded (``agreement``).
 
 The result does not depend on the order of work: each view is refined by itself, and all are compared at the end.
 """

@@ -25,8 +25,7 @@ GROUP = 8  # invocations across and down of one group, as in shaders/matching.gl
 
 
 class Planes(NamedTuple):
-    """Holds the plane that each pixel of a view currently has, and the plane's matching cost. The arrays are changed in
-    place."""
+    """Holds the present plane of each pixel of a view, and its matching cost. The arrays are changed in place."""
 
     depth: Float32[np.ndarray, "h w"]  # mm; 0 where there is none
     slopes: Float32[np.ndarray, "h w 2"]  # by x and y, mm a pixel

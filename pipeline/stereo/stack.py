@@ -61,8 +61,7 @@ class Stack:
 
 
 def stack_crops(crops: Sequence[Crop], level: int) -> Stack:
-    """Packs the crops at one ``level`` into flat arrays; level 0 is full size, and each further level has half the
-    size."""
+    """Packs the crops at one ``level`` into flat arrays; level 0 is full size, each further level half of it."""
     levels = [crop.levels[level] for crop in crops]
     cameras = [each.camera for each in levels]
     count = len(levels)

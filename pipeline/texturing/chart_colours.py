@@ -53,8 +53,7 @@ def chart_colours(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list
 
 
 def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
-    """Computes the colour correction of each camera from the charts that it saw. Returns None and a warning if no chart
-    gives one."""
+    """Computes the colour correction of each camera from its charts. Returns None and a warning if there is none."""
     found = {name: chart_correction(visible) for name, visible in charts.items() if visible}
     cameras = {name: correction for name, correction in found.items() if correction is not None}
     if not cameras:

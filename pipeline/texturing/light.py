@@ -124,8 +124,8 @@ def _lamp_camera(mesh: Mesh, towards: Float[np.ndarray, " 3"]) -> Camera:
 def _hidden(
     camera: Camera, mesh: Mesh, rows: Int[np.ndarray, " n"], cosine: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Share of the four nearest pixels of the lamp's depth map that each vertex is behind, by more than its own slope
-    makes of a pixel."""
+    """Returns the share of the four nearest pixels of the lamp's depth map that hide each vertex, by more depth than
+    its own slope has in a pixel."""
     depth, _ = depth_map(camera, mesh.vertices, mesh.faces)
     points = mesh.vertices[rows]
     x, y = np.clip(project_points(camera, points), 0, MAP_PX - 1.001).T
@@ -176,6 +176,6 @@ def fit_light(
 
 
 def _bounds(coefficients: Float[np.ndarray, "9 3"]) -> Float[np.ndarray, "n 9"]:
-    """The normals that would be darker than any studio leaves them: what no part of the face is turned to."""
+    """Returns the harmonics of directions that the fit makes darker than any studio leaves them."""
     dark = (SURROUND @ coefficients).mean(axis=1) < MIN_UNHIDDEN
     return SURROUND[dark] if coefficients.any() else SURROUND[:0]

@@ -3,8 +3,7 @@
 A texel is a point of the fitted surface. Its pixel in a photograph is interpolated from those of the triangle's corners
 (which include lens distortion; edges are a few pixels long). The photograph is read there with a sub-pixel window, and
 the corners' correction is added (``pipeline.texturing.seam_levelling``). If the corners chose different photographs,
-these are blended across the triangle. What no camera sees gets the vertices' colours.
-"""
+these are blended across the triangle. Texels that no camera sees get the vertices' colours."""
 
 import cv2
 import numpy as np
@@ -60,7 +59,7 @@ def paint_texture(
 
 
 def _coarse(layout: Layout, colours: UInt8[np.ndarray, "v 3"]) -> UInt8[np.ndarray, "s s 3"]:
-    """The vertices' colours, small, blue first; texels beside the layout have the nearest one's."""
+    """Paints the vertices' colours in a small image, blue first; texels beside the layout get the nearest colour."""
     texels, ones = COARSE * layout.uv - 0.5, np.ones(len(layout.uv))
     _, shown = rasterise(texels, ones, layout.faces, COARSE, COARSE)
     values = np.ascontiguousarray(colours[layout.source, ::-1]).astype(np.float32)

@@ -285,7 +285,7 @@ def _reference(
     rig: Rig,
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
 ) -> Texture:
-    """Section 4.5 to the letter, in the images' own codes; vertices that no camera sees are filled."""
+    """Colours vertices exactly by section 4.5, in the images' own codes; fills those that no camera sees."""
     colours, weights, views = reference_colours(mesh.vertices, normals, capture, silhouettes, rig, depths)
     known = weights > 0
     if not known.any():
@@ -325,7 +325,7 @@ def _visible(
     depth: Float32[np.ndarray, "h w"],
     silhouette: Silhouette,
 ) -> Bool[np.ndarray, " v"]:
-    """Inside the silhouette, and nothing before the vertex."""
+    """Tells which vertices lie inside the silhouette and are not occluded."""
     height, width = depth.shape
     framed = np.logical_and(pixels >= 0, pixels <= (width - 1, height - 1)).all(axis=1)  # NaN is not
     columns, rows = np.rint(np.where(framed.reshape(-1, 1), pixels, 0.0)).astype(int).T
@@ -334,7 +334,7 @@ def _visible(
 
 
 def _sampled(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "v 2"]) -> Float[np.ndarray, "v 3"]:
-    """Bilinear samples; the nearest border pixel outside the image."""
+    """Returns bilinear samples; outside the image those of the nearest border pixel."""
     height, width = image.shape[:2]
     safe = np.clip(np.nan_to_num(pixels), 0, (width - 1.001, height - 1.001))
     low = safe.astype(int)
@@ -421,7 +421,7 @@ def _blind(weights: Float32[np.ndarray, "k v"], faces: Int[np.ndarray, "f 3"]) -
 
 
 def _patches(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " f"]:
-    """The patch of each triangle: they hang together by edges."""
+    """Returns the patch of each triangle: the triangles of a patch are connected by edges."""
     count = len(faces)
     ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     _, edge = np.unique(ends, axis=0, return_inverse=True)

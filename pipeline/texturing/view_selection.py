@@ -75,7 +75,7 @@ def select_views(
 def _disagreement(
     codes: Float32[np.ndarray, "k v 3"], agreed: Float32[np.ndarray, "v 3"]
 ) -> Float32[np.ndarray, "v k"]:
-    """How far each view is from the others, by what is ordinary."""
+    """Returns how far each view is from the others, relative to the usual difference."""
     off = (codes - agreed) / (DISAGREEMENT * agreed + NOISE_CODES)
     return np.sqrt(np.einsum("kvc,kvc->vk", off, off) / 3.0)
 

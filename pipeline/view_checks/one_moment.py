@@ -1,8 +1,8 @@
 """Finds views that show another moment or another person than the rest: a face, or lips, that lie elsewhere.
 
 The landmarks of each view are compared with those triangulated from the other views. Two distances are judged: of all
-points (the head has moved, or is another's), and of the lower lip from the upper one (the mouth has opened). What a
-view's landmarks have in common by chance, and what the other views do not know, is the noise of both.
+points (the head has moved, or is another's), and of the lower lip from the upper one (the mouth has opened). The noise
+has two parts: chance errors common to a view's landmarks, and the uncertainty of the other views.
 
 Enters: the faces found in the photographs. Leaves: the views that differ, each with a warning. A head that has moved
 towards a camera or away from it looks the same there, and a mouth seen from the side hardly opens: neither is found.
@@ -25,7 +25,7 @@ UPPER_LIP, LOWER_LIP = [0, 37, 267, 13, 82, 312, 81, 311], [17, 84, 314, 14, 87,
 
 
 class _Offset(NamedTuple):
-    """How far a view's face, or its lower lip from the upper one, lies from where the other views see it."""
+    """Holds how far a view's face, or its lower lip from the upper one, lies from where the other views see it."""
 
     sigmas: float
     distance_mm: float

@@ -164,8 +164,7 @@ def _versions(folder: Path) -> Path:
 
 
 def link_plates(plates: Plates, background: Path) -> None:
-    """Links the files of clean plates into the background/ of a capture, or copies them where the file system has no
-    links."""
+    """Links the files of clean plates into background/ of a capture, or copies them where links are impossible."""
     for name, files in plates.files.items():
         for i, file in enumerate(files):
             target = (

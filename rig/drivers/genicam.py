@@ -190,7 +190,7 @@ class GenicamDriver:
         self._aravis.call("arv_camera_start_acquisition", self._device)
 
     def _stamp_s(self, buffer: int) -> float:
-        """The host's stamp of the buffer, taken in Aravis's own thread, on the clock of time.monotonic."""
+        """Returns the host's stamp of the buffer, taken in Aravis's own thread, on the clock of time.monotonic."""
         now_s = time.monotonic()
         age_s = (time.time_ns() - self._aravis.call("arv_buffer_get_system_timestamp", buffer)) * 1e-9
         return now_s - age_s if 0 <= age_s < 1.0 else now_s

@@ -176,12 +176,12 @@ class GphotoDriver:
 
 
 def _serial_of(camera: CameraConfig) -> str:
-    """As ports are kept by: cameras write leading zeros, labels on their bodies do not."""
+    """Returns the serial number without leading zeros: cameras write them, the labels on their bodies do not."""
     return camera.identity.lstrip("0")
 
 
 def _nearest_choice(value: Any, choices: list[str]) -> str | None:
-    """The choice that is ``value``, or for a number the one within a third of a stop of it."""
+    """Returns the choice that is ``value``, or for a number the one within a third of a stop of it."""
     if isinstance(value, str):
         return value if value in choices else None
     numbers = [(abs(number / value - 1), choice) for choice in choices if (number := _number(choice)) is not None]
@@ -190,7 +190,7 @@ def _nearest_choice(value: Any, choices: list[str]) -> str | None:
 
 
 def _number(text: str) -> float | None:
-    """A shutter speed or temperature as cameras write it: "1/125", "0.5", "5200"; None for "bulb" and the like."""
+    """Returns a camera's shutter speed or temperature: "1/125", "0.5", "5200"; None for "bulb" and the like."""
     numerator, _, denominator = text.strip().rstrip("s").partition("/")
     try:
         return float(numerator) / float(denominator or 1)

@@ -118,7 +118,7 @@ class MjpegStream:
 
 
 def _stamp_s(notes: list[tuple[int, int, bytes]]) -> float:
-    """The kernel's time of arrival on the clock of time.monotonic; now, where it gives none."""
+    """Returns the kernel's time of arrival on the clock of time.monotonic, or the present time if it gives none."""
     now_s = time.monotonic()
     for level, kind, data in notes:
         if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS) and len(data) == _TIMESPEC.size:

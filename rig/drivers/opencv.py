@@ -197,7 +197,7 @@ def decode_jpeg(camera: CameraConfig, data: bytes) -> ImageRgb:
 
 
 def _is_taken(prop: int, wanted: float, actual: float) -> bool:
-    """Numbers within a twentieth, since cameras have steps; a pixel format is a code, which nothing comes near to."""
+    """Tells whether a value was set: within a twentieth, as cameras have steps; exactly for a pixel format."""
     return abs(actual - wanted) <= (0.0 if prop == cv2.CAP_PROP_FOURCC else _NEAR * abs(wanted))
 
 

@@ -38,7 +38,7 @@ def render(template: str, parameters: Mapping[str, Any]) -> str:
 
 
 def _written(value: object, specification: str) -> str:
-    """Lists have commas between names, and semicolons between sentences."""
+    """Formats a value; lists get commas between names and semicolons between sentences."""
     if isinstance(value, tuple):
         between = ", " if all(isinstance(item, str | int | float) for item in value) else "; "
         return between.join(_written(item, specification) for item in value)

@@ -37,7 +37,7 @@ from rig.rig import Rig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Surface:
-    """The GPU's share of one page: the mask to draw into, the weights, and the block sums."""
+    """Holds what the GPU has of one page: the mask to draw into, the weights, and the block sums."""
 
     page: Page
     mask: moderngl.Framebuffer
@@ -156,7 +156,7 @@ class SilhouetteSet:
         return boxes
 
     def _reach(self, vertices: Float[np.ndarray, "v 3"]) -> tuple[Int[np.ndarray, "k 4"], bool]:
-        """Per camera, the blocks (left, top, right, bottom) that the model may touch; and: is all of it in front?"""
+        """Returns the blocks (left, top, right, bottom) that the model may touch, by camera, and if all is in front."""
         box = box_points(vertices)
         boxes, all_in_front = [], True
         for camera, limit in zip(self.rig, self._limits, strict=True):

@@ -1,5 +1,4 @@
-"""Packs the images of all cameras into as few textures as OpenGL allows, and prepares what a shader must know of a
-camera."""
+"""Packs the images of all cameras into as few textures as OpenGL allows, and the cameras' values for shaders."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -230,7 +230,7 @@ class BatchFolder:
 
 
 def _locked(path: Path, *, wait: bool) -> IO[bytes] | None:
-    """Opens and locks a file that whoever has locked it may remove. Returns None if another process has the lock."""
+    """Opens and locks a file, which the owner of the lock may remove. Returns None if another process has the lock."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):  # another process has just removed the empty folder, or the file

@@ -45,7 +45,7 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """A line of a card. ``lead``: its first so many characters are bold, in ``ink``."""
+    """Holds a line of a card. ``lead``: its first so many characters are bold, in ``ink``."""
 
     text: str
     size_pt: float
@@ -72,7 +72,7 @@ def sheet_pdf(title: str, cards: Sequence[Card]) -> bytes:
 
 
 class _Page(FPDF):
-    """A4 pages with numbers at their feet, and what a card is drawn of."""
+    """Draws A4 pages with numbers at their feet, and the parts of a card."""
 
     def __init__(self, title: str) -> None:
         super().__init__(unit="mm", format="A4")

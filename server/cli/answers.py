@@ -92,8 +92,8 @@ Overwrite = Annotated[bool, switch("--overwrite", "Replace what is there.")]
 
 
 def service_settings(**overrides: Any) -> Any:
-    """Returns the service's ``ServiceSettings``. An option that is not None overrides the environment variable, and
-    that the default.
+    """Returns the service's ``ServiceSettings``. An option that is not None overrides the environment variable, which
+    overrides the default.
 
     Raises typer.BadParameter (exit status 2) naming every option or variable with a wrong value.
     """

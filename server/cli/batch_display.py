@@ -17,8 +17,8 @@ Clock = Callable[[], float]
 
 
 class BatchProgress:
-    """Counts the captures that are done, of ``workers`` at once, and estimates the remaining time from their mean
-    duration: before the first is done from ``expected_s``. ``clock`` returns seconds and never goes back."""
+    """Counts finished captures, of which ``workers`` run at once. Estimates the remaining time from their mean
+    duration, and from ``expected_s`` until the first is done. ``clock`` returns seconds and never goes back."""
 
     def __init__(self, captures: int, workers: int, expected_s: float, clock: Clock = time.monotonic) -> None:
         self._captures, self._workers, self._expected_s, self._clock = captures, workers, expected_s, clock

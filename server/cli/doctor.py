@@ -279,7 +279,7 @@ def _rig(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _stores(settings: ServiceSettings) -> tuple[bool, str]:
-    """Lists the first object of each place; what may be written there only a delivery shows."""
+    """Lists the first object of each place; only a delivery shows whether the service may write there."""
     stores = [place for place in (settings.captures_store, settings.results_store) if place is not None]
     places = dict.fromkeys([*settings.import_prefixes, *settings.deliver_prefixes, *stores])
     if not places:

@@ -183,7 +183,7 @@ def mean_landmarks(context: WorkerContext, report: Progress, *, model: str, name
 
 
 def _seen(rig: Rig, points: Mapping[str, Float[np.ndarray, " 3"]]) -> dict[str, dict[str, list[float]]]:
-    """Where the cameras see each point; a camera outside whose picture it lies is left out."""
+    """Returns the pixel of each point by camera; cameras whose pictures do not hold it are left out."""
     places = np.array(list(points.values()))
     clicks: dict[str, dict[str, list[float]]] = {name: {} for name in points}
     for camera in rig:
@@ -202,5 +202,5 @@ def _near_image(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> np.ndarray:
 
 
 def _together(remarks: tuple[Message, ...]) -> Message | None:
-    """All remarks as one; None where there are none."""
+    """Joins all remarks to one; returns None without any."""
     return compose("several", messages=remarks) if len(remarks) > 1 else next(iter(remarks), None)

@@ -98,7 +98,7 @@ class Cache:
                 self._values.pop(key, None)
 
     def _drop_old(self) -> None:
-        """What no page has asked for anew: reports of jobs, mostly."""
+        """Drops values that no page has requested lately, mostly reports of jobs."""
         with self._lock:
             before = time.monotonic() - KEEP_S
             for key in [key for key, (made_s, _, _) in self._values.items() if made_s < before]:

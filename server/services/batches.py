@@ -274,7 +274,7 @@ class Batches:
         return len(jobs)
 
     def _job_within(self, connection: sa.Connection, row: BatchRow, item: BatchItem) -> str | None:
-        """The id of a new job, None where the capture was removed since the batch began."""
+        """Returns the id of a new job, None if the capture was removed since the batch began."""
         capture = self._store.found("captures", item.capture_id or "")
         if not isinstance(capture, CaptureRecord):
             return None

@@ -71,8 +71,8 @@ def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: 
 
 
 def _await_workers(store: Store, jobs: Collection[str]) -> None:
-    """Until no worker writes to the jobs any more, each of which then lacks its attempt's folder: it would put back
-    what is erased here. One that was killed will not write either, but leaves its folder."""
+    """Waits until no worker writes to the jobs: then none has the folder of an attempt. A worker that still wrote would
+    restore erased files. One that was killed will not write either, but leaves its folder."""
     deadline = time.monotonic() + CANCEL_S
     folders = [store.folder("jobs", job) for job in jobs]
     while any([*folder.glob("attempt-*")] for folder in folders) and time.monotonic() < deadline:

@@ -78,8 +78,7 @@ def _workers(service: Service) -> Check:
 
 
 def _queues(service: Service) -> Check:
-    """Queues whose jobs wait for a worker that nobody has started. The service can take other work, so that this is no
-    reason to send it none."""
+    """Names queues whose jobs wait for a worker that nobody has started. The service is still ready for other work."""
     try:
         queued = service.jobs.index.queued()
         idle = {queue: found.jobs for queue, found in queued.items() if service.jobs.queue_notice(queue)}

@@ -37,7 +37,7 @@ def fetch_stored_capture(url: str, folder: Path, store: Store, settings: Service
 
 
 def _listed(url: str, objects: ObjectStore, prefix: str, settings: ServiceSettings) -> dict[str, StoredObject]:
-    """The objects below a prefix, by their names there."""
+    """Lists the objects below a prefix, by their names there."""
     found, total = dict[str, StoredObject](), 0
     for entry in objects.entries(prefix):
         found[entry.key.removeprefix(prefix)] = entry

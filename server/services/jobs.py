@@ -158,7 +158,7 @@ class Jobs:
         return job_id
 
     def _asks_the_same(self, first: JobRequest | None, request: JobRequest) -> bool:
-        """Whether both ask the same of the same pictures: an upload that is sent again is a capture of its own."""
+        """Tells whether both requests want the same of the same pictures; an upload sent again is another capture."""
         if first is None or {**json.loads(json.dumps(request)), "capture_id": first["capture_id"]} != first:
             return False
         captures = [self._store.found("captures", each["capture_id"]) for each in (first, request)]
@@ -342,7 +342,7 @@ class Jobs:
             raise TooMany("too-many-jobs", detail, retry_after_s=10)
 
     def _lost(self, job_id: str, state: str) -> Message | None:
-        """That the files of a job that succeeded are gone."""
+        """Returns the message that the files of a job that succeeded are gone."""
         lost = state == "succeeded" and not self.results.elsewhere and not self._result(job_id).is_dir()
         return compose("result-missing") if lost else None
 

@@ -197,7 +197,7 @@ def _captures(service: Service) -> int:
 
 
 def _caches(service: Service) -> int:
-    """Caches without a capture, and those used longest ago where all together are too large or the disk is full."""
+    """Removes caches without a capture, and the least recently used ones if all are too large or the disk is full."""
     store, s = service.store, service.settings
     known, removed = set(store.ids("captures")), 0
     kept: list[tuple[float, int, Path]] = []
@@ -220,7 +220,7 @@ def _caches(service: Service) -> int:
 
 
 def _orphans(service: Service) -> int:
-    """Attempts that a killed worker left in a job that ended, and folders of jobs that are not known any more."""
+    """Removes attempts that a killed worker left in ended jobs, and folders of jobs that are not known any more."""
     removed = 0
     for job_id in service.store.ids("jobs"):
         folder = service.store.folder("jobs", job_id)
@@ -244,7 +244,7 @@ def _ended(service: Service, job_id: str) -> bool:
 
 
 def _deliveries(service: Service) -> int:
-    """Messages to webhooks that were delivered, or given up, a day ago."""
+    """Removes messages to webhooks that were delivered, or given up, a day ago."""
     before = datetime.fromtimestamp(time.time() - DAY_S, UTC).isoformat()
     client = service.jobs.client
     rows = client.list_workflows(name=DELIVERY, completed_before=before, load_input=False, load_output=False)
@@ -254,7 +254,7 @@ def _deliveries(service: Service) -> int:
 
 
 def _find_missing(service: Service) -> None:
-    """What readiness says of results that somebody else removed or changed, or that a backup lacks. One job's files are
+    """Finds results that somebody else removed or changed, or that a backup lacks, for readiness. One job's files are
     compared at each sweep, in turn."""
     missing, done = service.jobs.without_result(), service.jobs.index.newest_first(STATUSES["succeeded"])
     damaged = service.jobs.results.damaged

@@ -71,7 +71,7 @@ class Sessions:
         return [capture for some in self._library.captures_of(sessions).values() for capture in some]
 
     def _record(self, identity: str) -> SessionRecord | None:
-        """None where it was removed since the index was asked."""
+        """Returns the record, None if it was removed since the index was read."""
         with suppress(NotFound):
             return self._store.session(identity)
         return None

@@ -117,7 +117,7 @@ def _bytes(path: Path) -> int:
 
 
 def _sizes(folder: Path) -> Iterator[int]:
-    """Of all files below a folder, of what is removed meanwhile none; links are not followed."""
+    """Yields the sizes of all files below a folder but those removed meanwhile; links are not followed."""
     try:
         entries = os.scandir(folder)
     except (FileNotFoundError, NotADirectoryError):

@@ -49,7 +49,7 @@ def surface_distance(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> Float[np.n
 def _to_triangles(
     p: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Distance of point i to triangle i: to the plane where the foot lies inside, else to the nearest edge."""
+    """Returns the distance of point i to triangle i: to its plane if the foot lies inside, else to the nearest edge."""
     corners = vertices[triangles]
     edges = np.roll(corners, -1, axis=1) - corners
     normal = np.cross(edges[:, 0], -edges[:, 2])

@@ -53,7 +53,7 @@ def collect(
 
 
 def _owns(objects: ObjectStore, owner: str, scratch: Path) -> bool:
-    """Whether the store's results are of this database; the first that looks says that they are its."""
+    """Tells whether the store's results are this database's; the first database that looks becomes their owner."""
     with TemporaryDirectory(dir=scratch) as folder:
         path = Path(folder) / OWNER
         try:

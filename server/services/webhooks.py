@@ -126,7 +126,7 @@ class Webhooks:
         return httpx.post(hook.url, content=body, headers=headers, timeout=TIMEOUT_S).raise_for_status().status_code
 
     def _post_own(self, message: WebhookMessage, hook: JobWebhook) -> int:
-        """To an address that a caller named: judged now, whatever it was when the job was made."""
+        """Posts to an address that a caller named, and checks it now, as it may have changed since the job was made."""
         aim = target(hook["url"], self._origins)
         body, headers = _signed(message, hook["secret"])
         with httpx.Client(trust_env=False, timeout=TIMEOUT_S) as client:
@@ -153,7 +153,7 @@ def _delivery(identity: str) -> EnqueueOptions:
 
 
 def _signed(message: WebhookMessage, secret: str | None) -> tuple[bytes, dict[str, str]]:
-    """The body and headers of a message; without a secret it is not signed."""
+    """Returns the body and headers of a message; without a secret it is not signed."""
     data = {name: value for name, value in message.items() if name in ("job_id", "batch_id", "delivered_to")}
     body = json.dumps({"type": message["type"], "data": data}).encode()
     signed = {} if secret is None else signed_headers(message["id"], int(time.time()), body, secret)

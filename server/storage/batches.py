@@ -271,7 +271,7 @@ class BatchIndex:
 
 
 def _has_waiting() -> sa.ColumnElement[bool]:
-    """Two conditions, each with an index of its own."""
+    """Tells whether items wait: two conditions, each with an index of its own."""
     item = batch_items.c
     those = item.batch_id == batches.c.id
     return sa.or_(sa.exists().where(those, item.job_id.is_(None)), sa.exists().where(those, RECALLED))

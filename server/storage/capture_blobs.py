@@ -251,7 +251,7 @@ def open_capture_blobs(settings: ServiceSettings, engine: sa.Engine) -> CaptureB
 
 
 def _is_there(path: Path, sha256: str) -> bool:
-    """Whether a file is there. Small ones may be replaced while their capture stays: they are compared."""
+    """Tells whether a file is there. Small ones may be replaced while their capture stays: they are compared."""
     with suppress(FileNotFoundError, NotADirectoryError):
         return path.stat().st_size > SMALL_BYTES or sha256_of(path) == sha256
     return False

@@ -197,7 +197,7 @@ identities = sa.Table(  # one row: what a store of results knows the database by
 
 @event.listens_for(sa.Engine, "connect")
 def _delete_securely(connection: Any, record: Any) -> None:
-    """What is erased stands in no free page of SQLite: rows of the job engine, which connects by itself, included."""
+    """Makes SQLite overwrite deleted rows, those of the job engine's own connections included."""
     if isinstance(connection, sqlite3.Connection):
         connection.execute("PRAGMA secure_delete=ON")
 

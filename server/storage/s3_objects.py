@@ -49,7 +49,7 @@ def open_bucket(prefix: str, settings: ServiceSettings) -> "S3Objects":
 
 @lru_cache
 def _client(endpoint: str | None, region: str | None, timeout_s: float) -> Any:
-    """A client, which threads may share; it takes a second to make."""
+    """Makes a client, which threads may share, in about a second."""
     from botocore.config import Config
     from botocore.session import Session
 
@@ -166,7 +166,7 @@ class S3Objects:
             self._check(key, self._read_back(key), sha256)
 
     def _is(self, key: str, size: int, sha256: str) -> bool:
-        """Whether an equal object is there, by what the store says of it, and by its bytes."""
+        """Tells whether an equal object is there, by the store's checksum of it or by its bytes."""
         try:
             with self._asking(key):
                 said = self._client.head_object(**self._at(key))
@@ -200,8 +200,8 @@ class S3Objects:
         return digest.hexdigest()
 
     def _fetch(self, key: str, path: Path, sha256: str | None, admit: Admission) -> str:
-        """Reads an object once. The client itself compares with a checksum that the store sends; where our metadata say
-        nothing, an ETag of 32 digits is the MD5 of the bytes, unless they are encrypted with a key of one's own."""
+        """Reads an object once. The client itself compares with a checksum that the store sends; if an object lacks our
+        metadata, an ETag of 32 digits is the MD5 of the bytes, unless they are encrypted with a key of one's own."""
         with self._asking(key):
             answer = self._client.get_object(**self._at(key))
             md5 = hashlib.md5(usedforsecurity=False)

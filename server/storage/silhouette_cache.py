@@ -97,8 +97,8 @@ def _decoded(data: bytes) -> dict[str, Silhouette]:
 
 
 def _steps(values: Float32[np.ndarray, "h w"]) -> bytes:
-    """Differences along rows of the numbers' bit patterns, first bytes first: distances rise evenly, so that they
-    become long runs."""
+    """Returns differences of bit patterns along rows, first bytes first: distances rise evenly, which gives long
+    runs."""
     bits = np.ascontiguousarray(values).view(np.int32)
     return np.diff(bits, axis=1, prepend=np.int32(0)).view(np.uint8).reshape(-1, 4).T.tobytes()
 

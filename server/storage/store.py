@@ -278,7 +278,7 @@ class Store:
 
     @contextmanager
     def _change(self, what: Message, identity: str) -> Iterator[None]:
-        """One change or removal at a time, so that none is lost and nothing comes back that was removed. Raises
+        """Allows one change or removal at a time, so that no change is lost and no removed thing comes back. Raises
         NotFound, also for what another process removed meanwhile."""
         with self._changing:
             try:

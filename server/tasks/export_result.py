@@ -63,7 +63,8 @@ def export_result(folder: Path, out: Path, outputs: OutputSettings) -> list[str]
 
 
 def _read_reconstruction(folder: Path, model: HeadModel, outputs: OutputSettings) -> Reconstruction:
-    """Returns what a result folder says of its head. What only its photographs say is empty. Raises InputError."""
+    """Returns what a result folder says of its head. Fields that only its photographs could fill are empty. Raises
+    InputError."""
     visit, report = read_visit(folder, model.name), read_report(folder)
     mesh, head_from_world = visit.measured.mesh_world, visit.measured.head_from_world
     try:

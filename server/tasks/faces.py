@@ -88,7 +88,7 @@ def _face_of(face: "FaceDetection", camera: Camera, recorded: Camera, best: "Fac
 
 
 def _suggested(context: WorkerContext, face: "MatchedFaces", rig: Rig, recorded: Rig) -> PixelsOfPoints:
-    """The seven points by the default model's landmarks; none where nobody knows the finder's points on it."""
+    """Returns the seven points by landmarks of the default model; none without their places among the face's points."""
     from pipeline.alignment.suggested_points import suggest_points
     from pipeline.faces.landmark_map import NoLandmarkMap, landmark_map
     from pipeline.head_model.landmarks import SEVEN_POINTS
@@ -113,5 +113,5 @@ def _file_pixels(pixels: Float[np.ndarray, "n 2"], camera: Camera, recorded: Cam
 
 
 def _plain(values: Float[np.ndarray, " n"]) -> list[float]:
-    """To a tenth of a pixel."""
+    """Rounds to a tenth of a pixel."""
     return [round(float(value), 1) for value in values]

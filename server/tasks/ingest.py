@@ -102,7 +102,7 @@ def ingest_archive(
 
 
 def _beside(face: FaceSighting | None, findings: tuple[ReportWarning, ...]) -> FaceSighting | None:
-    """Leaves out of what small pictures told of the face what the whole check tells, too."""
+    """Drops remarks on the face in small pictures that the whole check makes, too."""
     said = {finding.code for finding in findings}
     return face and replace(face, remarks=tuple(remark for remark in face.remarks if remark.code not in said))
 
@@ -200,7 +200,7 @@ def _leave_out(root: Path, rig: Rig) -> None:
 
 
 def _with_calibration(found: CaptureContent, root: Path, warnings: tuple[ReportWarning, ...]) -> CaptureContent:
-    """With the figures of the calibration, of which a job reads what was said."""
+    """Adds the figures of the calibration, from which a job reads the calibration's remarks."""
     inputs = dict(sorted({**found.inputs, FIGURES: sha256_of(root / FIGURES)}.items()))
     return replace(found, inputs=inputs, bytes=found.bytes + (root / FIGURES).stat().st_size, warnings=warnings)
 
@@ -214,7 +214,7 @@ def ingest_folder(
 
 
 def _face_networks(context: WorkerContext) -> FaceNetworks | None:
-    """The networks of this process; None where their files are damaged, which jobs tell."""
+    """Returns the networks of this process; None if their files are damaged, which jobs report."""
     try:
         return context.keep("face networks", load_networks)
     except DamagedNetwork:
@@ -305,7 +305,7 @@ def _camera_digests(root: Path, rig_file: Path, rig: Rig) -> dict[str, str]:
 def _face_of(
     small: Mapping[str, tuple[ImageRgb, Camera]], rig: Rig, networks: FaceNetworks, *, is_metric: bool
 ) -> FaceSighting:
-    """The subject's face in small pictures. ``is_metric``: the cameras are in millimetres."""
+    """Finds the subject's face in small pictures. ``is_metric``: the cameras are in millimetres."""
     images = {name: image for name, (image, _) in small.items()}
     reduced = Rig(tuple(camera for _, camera in small.values()))
     limits = EYE_DISTANCE_MM if is_metric else None
@@ -315,7 +315,7 @@ def _face_of(
 
 
 def _view_of(shot: Capture, name: str, measured: bool) -> dict[str, ViewCheck]:
-    """The camera's picture, judged; nothing where it cannot be read."""
+    """Judges the camera's picture; returns nothing if it cannot be read."""
     image = shot.images.get(name)
     if image is None:
         return {}

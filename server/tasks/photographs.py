@@ -192,13 +192,13 @@ def keep_masks(kept: Path, capture: Capture, rig: Rig, *, report: Progress) -> d
 
 
 def _of_file(mask: Bool[np.ndarray, "h w"], k: Intrinsics) -> UInt8[np.ndarray, "y x"]:
-    """A mask of the size of its picture's file, which was perhaps read smaller."""
+    """Returns a mask in the size of its picture's file, which may have been read smaller."""
     large = cv2.resize(mask.astype(np.uint8) * np.uint8(255), (k.width, k.height), interpolation=cv2.INTER_LINEAR)
     return (large > 127).astype(np.uint8) * np.uint8(255)
 
 
 def _made_of(root: Path, front: str | None) -> dict[str, str]:
-    """The sha256 of all that a calibration follows from."""
+    """Returns the SHA-256 of everything that a calibration depends on."""
     from importlib.metadata import version
 
     files = [path for path in sorted(picture_folder(root).rglob("*")) if is_picture(path)]

@@ -73,7 +73,7 @@ def prepare_kernels(report: Progress, settings: "Settings | None" = None) -> Pre
 
 
 class _Work:
-    """Groups of kernels that several threads, each with a child, take one after another."""
+    """Hands groups of kernels to several threads, each of which has a child process."""
 
     def __init__(self, groups: "list[list[Kernel]]", total: int, report: Progress) -> None:
         self._groups, self._total, self._report = deque(groups), total, report
@@ -104,7 +104,7 @@ class _Work:
 
 
 def _can_keep() -> bool:
-    """Whether the cache folder can be written; where not, a line in the log says so."""
+    """Tells whether the cache folder can be written; if not, a line in the log says so."""
     from rig.jit import say_not_kept
 
     try:

@@ -68,7 +68,7 @@ class JobProgress:
         return self._progress
 
     def _rest_of_stage(self) -> float:
-        """Expected seconds: what is left of the usual ones, or what the stage's own fraction says, if that is more."""
+        """Returns the expected seconds: the rest of the usual ones or, if more, those by the stage's own fraction."""
         spent, usual = self._spent_s() / self._pace(), self._expected.get(self._visit, 0.0)
         rest = max(usual - spent, OVERTIME * usual)
         if FRACTION_LEAST < self._fraction < 1:
@@ -76,11 +76,11 @@ class JobProgress:
         return rest
 
     def _to_come(self) -> float:
-        """Expected seconds of the stages that have not begun."""
+        """Returns the expected seconds of the stages that have not begun."""
         return sum(took for stage, took in self._expected.items() if stage not in self.seconds and stage != self._visit)
 
     def _pace(self) -> float:
-        """Seconds that a second of the expectation takes here, by the stages that are done."""
+        """Returns measured over expected seconds of the stages that are done."""
         done = [stage for stage in self.seconds if stage != self._visit]
         took = sum(self.seconds[stage] for stage in done)
         return (took + PACE_S) / (sum(self._expected.get(stage, 0.0) for stage in done) + PACE_S)
@@ -103,8 +103,8 @@ class JobProgress:
 
 class ProgressMeter:
     """Writes the progress and remaining time of a job to its events: when a stage begins, and then at most every
-    ``every_s`` seconds. What tells of a stage's beginning stays; anything else supersedes what was written before it,
-    so that the events of a long job are as few as those of a short one."""
+    ``every_s`` seconds. The event of a stage's beginning stays; any other supersedes the one before it, so that a long
+    job has as few events as a short one."""
 
     def __init__(self, log: "EventLog", job_id: str, progress: JobProgress, every_s: float = EVERY_S) -> None:
         self._log, self._job_id, self._progress, self._every_s = log, job_id, progress, every_s

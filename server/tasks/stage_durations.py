@@ -104,7 +104,7 @@ class StageDurations:
             write_atomically(self._file, json.dumps(learnt, indent=1).encode())
 
     def _read(self) -> dict[str, dict[str, float]]:
-        """What the file says, and where there is none, what this process has learnt."""
+        """Returns the durations of the file or, without one, those that this process has measured."""
         try:
             document = json.loads(self._file.read_bytes())
             return {

@@ -74,7 +74,7 @@ class CaptureSource:
 
     @property
     def _is_own(self) -> bool:
-        """Whether a capture without a record means that the data folder is not the service's."""
+        """Tells whether a capture without a record means that the data folder is not the service's."""
         return self._store.blobs is not None and self._settings.results_store is not None
 
     def _is_busy(self, capture: str) -> bool:

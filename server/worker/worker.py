@@ -94,8 +94,7 @@ class Worker:
         self._deliverer = Deliverer(settings, self.store, self._webhooks, self.results, self._stop)
 
     def start(self) -> None:
-        """Writes the first heartbeat, starts the job engine and begins to take jobs. Returns at once; the jobs run in
-        threads."""
+        """Writes the first heartbeat, starts the job engine and takes jobs. Returns at once; jobs run in threads."""
         DBOS.migrate(system_database_url=self.settings.url)
         DBOS(config=engine_config(self.settings, self.id))
         self._register()
@@ -353,7 +352,7 @@ class Worker:
         return error
 
     def _keep_alive(self) -> None:
-        """Heartbeat and reaper; its own thread, so that no job can hold it up."""
+        """Writes heartbeats and finds dead workers, in its own thread, so that no job can delay it."""
         while not self._stop.wait(self.settings.heartbeat_s):
             try:
                 self._beat()
@@ -394,7 +393,7 @@ class Worker:
 
 
 class _StateWatch:
-    """Whether a job is still to run, asked of the database a few times a second."""
+    """Tells whether a job is still to run, by the database, which is asked a few times a second."""
 
     def __init__(self, every_s: float) -> None:
         self._every_s = every_s

@@ -1,8 +1,8 @@
 """docs/dependencies.md from uv.lock, docs/dependencies.toml and the installed packages: `make dependencies`."""
 
+import textwrap
 import tomllib
 from importlib.metadata import PackageNotFoundError, metadata
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE, REASONS = ROOT / "docs" / "dependencies.md", ROOT / "docs" / "dependencies.toml"
 LICENCE_MOST = 60  # characters; some packages give the whole text
 ABSENT = "not installed where this was written"
+FILL: Any = {"width": 128, "subsequent_indent": "  ", "break_on_hyphens": False}
 HEAD = """# Dependencies
 
 `make dependencies` writes this page from `uv.lock`, `docs/dependencies.toml` and the licences that the installed
@@ -17,6 +18,12 @@ packages state.
 
 | package | licence | why |
 |---|---|---|
+"""
+NEEDED = """
+## What these need
+
+`uv tree --invert --package NAME` prints what needs a package.
+
 """
 
 
@@ -43,18 +50,13 @@ def licence(name: str) -> str:
 
 
 def page() -> str:
-    packages, why = locked(), reasons()
-    needed_by: dict[str, list[str]] = {}
-    for package in packages:
-        extras = package.get("optional-dependencies", {}).values()
-        for needed in chain(package.get("dependencies", []), *extras):
-            needed_by.setdefault(needed["name"], []).append(package["name"])
-    rows = []
-    for name in sorted({package["name"] for package in packages}):
-        others = sorted(set(needed_by.get(name, [])))
-        reason = why.get(name) or "for " + ", ".join(others[:4]) + (" and others" if len(others) > 4 else "")
-        rows.append(f"| {name} | {licence(name)} | {reason} |\n")
-    return HEAD + "".join(rows)
+    """The packages that we ask for with the reason for each; those that they need by licence."""
+    names, why = sorted({package["name"] for package in locked()}), reasons()
+    rows = [f"| {name} | {licence(name)} | {why[name]} |\n" for name in names if name in why]
+    needed = {name: licence(name) for name in names if name not in why}
+    lists = [(stated, [name for name in needed if needed[name] == stated]) for stated in sorted({*needed.values()})]
+    fills = (textwrap.fill(f"- {stated}: {', '.join(names)}", **FILL) + "\n" for stated, names in lists)
+    return HEAD + "".join(rows) + NEEDED + "".join(fills)
 
 
 if __name__ == "__main__":

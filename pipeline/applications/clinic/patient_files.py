@@ -113,8 +113,7 @@ COLOUR_END_MM = 2.0  # distance at which a colour of residual.ply is full
 
 
 def write_registration(folder: Path, found: Registration) -> dict[str, Any]:
-    """Writes head.ply, residual.ply, landmarks.mrk.json and registration.json, and returns what the last says. Raises
-    OSError."""
+    """Writes head.ply, residual.ply, landmarks.mrk.json and registration.json; returns the last. Raises OSError."""
     motion, axes = found.fit.motion, found.surface.axes
     write_patient_mesh(folder / HEAD_FILE, found.visit, motion, axes)
     write_patient_mesh(

@@ -1,8 +1,7 @@
 """Paints an eyeball as the photographs show it: an image about the iris, equidistant in angle.
 
-What lies between the lids has the head's texture; what they hide has the median colour of its ring of the iris, or of
-the white.
-"""
+The part between the lids has the head's texture; hidden parts have the median colour of their ring of the iris, or of
+the white."""
 
 from dataclasses import dataclass
 
@@ -94,8 +93,7 @@ def _front(
 def _photographed(
     eyeball: Eyeball, directions: Float[np.ndarray, "n 3"], photographed: PhotographedEyes
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Returns the head's colours (sRGB) where an eyeball lies in these directions, and which of them lids do not
-    hide."""
+    """Returns the head's colours (sRGB) in these directions of an eyeball, and which of them no lid hides."""
     head, atlas = photographed.head, photographed.atlas
     if atlas is None or not len(photographed.between):
         return np.zeros_like(directions), np.zeros(len(directions), bool)

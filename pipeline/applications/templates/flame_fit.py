@@ -1,9 +1,7 @@
 """Fits the parameters of a FLAME model to a mesh in its vertex order: shape, expression, turned joints, translation.
 
 Levenberg-Marquardt on the distances of the vertices, with Gaussian priors. The distances' own deviation is estimated,
-too, in rounds: where the model can be the mesh, the priors fade; where it cannot, they decide what the mesh does not
-tell.
-"""
+too, in rounds: if the model can equal the mesh, the priors fade; if not, they decide what the mesh leaves open."""
 
 from dataclasses import dataclass, replace
 

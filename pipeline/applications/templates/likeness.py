@@ -140,8 +140,7 @@ def _modes_on(model: HeadModel, marks: SurfaceMarks) -> Float[np.ndarray, "p 3 m
 
 
 class MetSurface:
-    """Holds the mesh that the model is fitted to, with search trees of its surface and of its points by position and
-    normal."""
+    """Holds the mesh that the model is fitted to, with search trees of its surface and of its oriented points."""
 
     def __init__(self, mesh: Surface) -> None:
         self._mesh, self._surface = mesh, SurfaceIndex(mesh.vertices, mesh.faces)

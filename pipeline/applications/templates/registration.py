@@ -208,8 +208,8 @@ def parting(
     faces: Int[np.ndarray, "f 3"],
     model: HeadModel,
 ) -> Bool[np.ndarray, " t"]:
-    """Tells which vertices move away from their neighbours on some random head. They were attached to another layer of
-    the surface, such as the inside of a lid or the eyeball."""
+    """Tells which vertices move away from their neighbours on some random head. Such vertices were attached to another
+    layer of the surface, such as the inside of a lid or the eyeball."""
     graph = _graph(faces[skin[faces].all(axis=1)], len(rest))
     graph = sparse.csr_array(((graph + graph.T) > 0).astype(float))
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)[:, None]

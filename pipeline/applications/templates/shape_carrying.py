@@ -2,8 +2,8 @@
 
 The skin moves as its attachment says (``carrying``). What lies deeper is attached, too, where the mesh leads to it over
 vertices that move alike: an expression parts lips that touch, so that the smooth map in space that carries a person's
-shape would tear the inside of one lip along with the other. What cannot be attached moves by its neighbours on the
-mesh. Parts of their own, not joined to the skin, are
+shape would tear the inside of one lip along with the other. Vertices that cannot be attached move with their neighbours
+on the mesh. Parts of their own, not joined to the skin, are
 
 - round and closed: eyeballs, which no shape moves (turn them about their pivots);
 - at the skin: lashes and brows, which stand on the triangle of the skin at their roots and turn with it;

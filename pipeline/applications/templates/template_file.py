@@ -117,8 +117,7 @@ def _template(meta: dict, arrays: Mapping[str, np.ndarray], flame: FlameModel | 
 
 
 def _check(path: Path, template: Template) -> None:
-    """Raises BadTemplate if rows or numbers of the file are invalid, which would otherwise fail a job only at its
-    end."""
+    """Raises BadTemplate if rows or numbers of the file are invalid, which would fail a job only at its end."""
     mesh, surface_binding = template.mesh, template.surface_binding
     count = len(surface_binding.rest)
     rows = (mesh.corners, surface_binding.skin, surface_binding.anchors, surface_binding.whole_anchors)

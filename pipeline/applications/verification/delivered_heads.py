@@ -35,8 +35,7 @@ def build_from_results(folder: Path, out: Path, *, name: str, report: Progress |
 
 
 def find_results(folder: Path) -> tuple[Path, ...]:
-    """Returns the folders of all results below ``folder``, itself included, in order. Raises InputError if there is
-    none."""
+    """Returns the folders of all results in or below ``folder``, in order. Raises InputError if there is none."""
     reports = sorted(folder.rglob("report.json"))
     found = tuple(path.parent for path in reports if is_result(path.parent))
     if not found:

@@ -140,8 +140,7 @@ class Judgement:
 
 
 def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) -> Judgement:
-    """Judges heads of one model and one subject against the reference. Raises InputError if the reference is not of
-    this head."""
+    """Judges heads of one model and subject against the reference. Raises InputError if it is not of this head."""
     captures = tuple(judge_one(one, reference) for one in measured)
     first = measured[0]
     deviations = np.stack([one.deviation_mm for one in captures])

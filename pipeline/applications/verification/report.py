@@ -16,8 +16,7 @@ FORMAT = "eigenhead-verification/1"
 
 
 class RegionReport(TypedDict):
-    """Describes the errors of a region of the head (mm); ``covered`` is the share of its area that the reference
-    shows."""
+    """Describes the errors of a region of the head (mm); ``covered`` is its area's share in the reference."""
 
     covered: float
     mean_mm: float

@@ -43,8 +43,7 @@ NOTES = (
 def write_verification(
     folder: Path, first: Measured, reference: Reference, judgement: Judgement, occasion: Occasion
 ) -> VerificationReport:
-    """Writes the files of a verification, report.json last, and returns the report. ``first`` is the head of the first
-    capture."""
+    """Writes a verification's files, report.json last, and returns that. ``first`` is the first capture's head."""
     document, pictures = report_document(judgement, reference, occasion), draw(first, reference, judgement)
     rows = [np.hstack(row) for row in (pictures.reference, pictures.result, pictures.error)]
     write_image(folder / "error.png", np.vstack(rows))

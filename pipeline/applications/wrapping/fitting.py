@@ -109,7 +109,7 @@ def surface_of(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]
 
 
 def _near_face(points: Float[np.ndarray, "n 3"], model: HeadModel) -> Bool[np.ndarray, " n"]:
-    """Tells which points of a registered template lie near the face of the mean head: what is no skin there lies in
-    the mouth, in the nose or in sockets."""
+    """Tells which points of a registered template lie near the face of the mean head: points there that are no skin lie
+    in the mouth, the nose or the sockets."""
     mean = model.vertices(np.zeros(0))
     return KDTree(mean[model.levels["full"].face_region]).query(points)[0] < FACE_MM

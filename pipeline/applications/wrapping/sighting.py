@@ -203,8 +203,7 @@ def nearest_axis(direction: Float[np.ndarray, " 3"]) -> str:
 
 
 def _lids(face: MatchedFaces, rig: Rig) -> Float[np.ndarray, "32 3"] | None:
-    """Triangulates the edges of the lids, which the eyes' network places where they are seen, also those of closed
-    eyes."""
+    """Triangulates the edges of the lids as the eyes' network sees them, also those of closed eyes."""
     seen = {name: found.lids_px for name, found in face.detections.items() if found.lids_px is not None}
     if len(seen) < 2:
         return None

@@ -107,8 +107,7 @@ def _write_residuals(folder: Path, wrapped: Wrapped) -> None:
 
 
 def wrap_picture(wrapped: Wrapped) -> ImageRgb:
-    """Draws, from the front and the side, the scan in clay, the template on it, and the residuals; below, the face from
-    nearer."""
+    """Draws, from front and side, the scan in clay, the template on it, and the residuals; below, the face."""
     scan, template = surface_in_head(wrapped)
     colours = residual_colours(wrapped.distance_mm, wrapped.covered)
     box = (template.vertices.min(axis=0), template.vertices.max(axis=0))

@@ -91,8 +91,7 @@ def normal_mapped(
     reduced: ReducedLayout,
     size: int = SIZE_PX,
 ) -> NormalMapped:
-    """Reduces the full mesh of a head (mm, unit normals), and returns the reduced mesh with a normal map of the lost
-    detail."""
+    """Reduces the full mesh of a head (mm, unit normals). Returns it with a normal map of the lost detail."""
     rows = layout.source[reduced.rows]
     places, reduced_normals, uv = vertices[rows], normals[rows], layout.uv[reduced.rows]
     tangents = vertex_tangents(places, reduced_normals, uv, reduced.faces)
@@ -140,7 +139,7 @@ def vertex_tangents(
 
 
 def _laid(directions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Unit vectors in the planes of the normals."""
+    """Returns unit vectors in the planes of the normals."""
     return _unit(directions - np.einsum("nx,nx->n", directions, normals)[:, None] * normals)
 
 
@@ -163,8 +162,8 @@ def _in_frame(
     normal: Float32[np.ndarray, "h w 3"],
     sign: np.float32,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """The unit vectors whose shares of tangent, bitangent and normal give the wanted ones: interpolated, the frame is
-    no longer at right angles."""
+    """Returns the wanted unit vectors as shares of tangent, bitangent and normal, which are no longer at right angles
+    once interpolated."""
     lean = np.einsum("yxc,yxc->yx", tangent, normal)
     bitangent = _unit(sign * np.cross(normal, tangent))
     x, z = (np.einsum("yxc,yxc->yx", wanted, axis) for axis in (tangent, normal))

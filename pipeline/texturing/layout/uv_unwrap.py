@@ -81,12 +81,12 @@ def unwrap(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
 
 
 def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    """Directed edges: corner 0 to 1 of all faces, then 1 to 2, then 2 to 0."""
+    """Returns directed edges: corner 0 to 1 of all faces, then 1 to 2, then 2 to 0."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def _border(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " b"]:
-    """The vertices of the one open border, in the order of its directed edges."""
+    """Returns the vertices of the one open border, in the order of its directed edges."""
     edges, base = _edges(faces).astype(np.int64), int(faces.max()) + 1
     known = np.unique(edges @ [base, 1])
     open_edges = known[~np.isin(known, edges @ [1, base])]
@@ -103,7 +103,7 @@ def _border(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " b"]:
 def _path(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], start: int, end: int
 ) -> Int[np.ndarray, " p"]:
-    """The shortest way along edges, drawn to the plane of symmetry, and touching the border at its start alone."""
+    """Returns the shortest path on edges that prefers the symmetry plane and meets the border at its start only."""
     edges = _edges(faces)
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     length *= 1 + np.abs(vertices[edges].mean(axis=1)[:, 0])
@@ -119,7 +119,7 @@ def _path(
 def _cut_open(
     faces: Int[np.ndarray, "f 3"], count: int, path: Int[np.ndarray, " p"]
 ) -> tuple[Int[np.ndarray, "f 3"], Int[np.ndarray, " n"]]:
-    """Faces with the path's vertices doubled, but for its end; and the vertex that each vertex was."""
+    """Returns faces with the path's vertices doubled except its end, and the original of each vertex."""
     edges = _edges(faces)
     beside = np.flatnonzero(np.isin(edges, path).any(axis=1))
     face_of = dict(zip(map(tuple, edges[beside].tolist()), (beside % len(faces)).tolist(), strict=True))
@@ -141,7 +141,7 @@ def _cut_open(
 
 
 def _frame(loop: Float[np.ndarray, "b 3"], corner: int, top: int) -> Float[np.ndarray, "b 2"]:
-    """Where the border lies: the neck from the lower left to the lower right, then up the cut and over the top."""
+    """Places the border: the neck from the lower left to the lower right, then up the cut and over the top."""
     ends = np.concatenate([loop, loop[:1]])
     walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ends, axis=0), axis=1))])
     neck, crown, whole = walked[corner], walked[top], walked[-1]
@@ -160,7 +160,7 @@ def _frame(loop: Float[np.ndarray, "b 3"], corner: int, top: int) -> Float[np.nd
 def _mean_value_weights(
     points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], count: int
 ) -> scipy.sparse.csr_array:
-    """Row i: the weights of vertex i's neighbours, ``(tan(a / 2) + tan(b / 2)) / |ij|``."""
+    """Returns in row i the weights of vertex i's neighbours, ``(tan(a / 2) + tan(b / 2)) / |ij|``."""
     rows, columns, values = [], [], []
     for k in range(3):
         i, j, other = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
@@ -180,7 +180,7 @@ def _mean_value_weights(
 def _settled(
     weights: scipy.sparse.csr_array, count: int, loop: Int[np.ndarray, " b"], frame: Float[np.ndarray, "b 2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Every inner vertex at the weighted mean of its neighbours."""
+    """Puts every inner vertex at the weighted mean of its neighbours."""
     uv = np.zeros((count, 2))
     uv[loop] = frame
     inner = np.setdiff1d(np.arange(len(uv)), loop)
@@ -194,7 +194,7 @@ def _settled(
 def _stretch(
     points: Float[np.ndarray, "n 3"], uv: Float[np.ndarray, "n 2"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Root mean square by which the surface around each vertex is longer than its picture, relative to the whole."""
+    """Returns how much longer (RMS) the surface around each vertex is than its picture, relative to the whole."""
     a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
     (s, t), (p, q) = (uv[faces[:, 1]] - uv[faces[:, 0]]).T, (uv[faces[:, 2]] - uv[faces[:, 0]]).T
     determinant = s * q - t * p

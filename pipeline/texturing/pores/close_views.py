@@ -84,7 +84,7 @@ def read_close_views(
 
 
 def _head_of(camera: Camera, image: ImageRgb, mesh: Mesh) -> tuple[Camera, UInt8[np.ndarray, "_ _ 3"]]:
-    """The rectangle around the head, copied so that the rest can be freed, and the camera that takes it alone."""
+    """Returns the camera of the rectangle around the head and a copy of that, so that the rest can be freed."""
     k = camera.intrinsics.at_size(image.shape[1], image.shape[0])
     pixels = project_points(replace(camera, intrinsics=k), mesh.vertices)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]

@@ -7,8 +7,8 @@ inverted there. Waves along whose direction the light does not change stay unkno
 
 Pictures have noise and highlights, and geometry and cameras are off by a pixel. Per patch and octave of wavelength only
 that share of the power is kept that repeats between two sets of views without a common view, after the shift between
-the two is taken out. What repeats and is colour rather than relief cannot be told apart by that; it counts as
-``COLOUR`` of a slope's shading.
+the two is taken out. Repeating colour cannot be distinguished from relief in this way; it counts as ``COLOUR`` of a
+slope's shading.
 
 The texture gains in the same way what repeats of the difference between full size and work size.
 """
@@ -131,8 +131,8 @@ def patch_side(size: int, frames: TexelFrames) -> int:
 
 
 def _painted(strips: Strips, halves: HalfPictures) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The logarithm of the light in both sets of full-size pictures, and by how much it differs from that in the
-    pictures of work size (float16: of the size of noise in the pictures' codes)."""
+    """Returns the logarithm of the light in both sets of full-size pictures, and by how much it differs from that in
+    the pictures of work size (float16: of the size of noise in the pictures' codes)."""
     size = strips.size
     full, added = (list(np.zeros((2, size, size), np.float16)) for _ in range(2))
 
@@ -174,8 +174,8 @@ def _row_of_patches(
     frames: TexelFrames,
     figures: Float[np.ndarray, "o 2"],
 ) -> tuple[Float32[np.ndarray, "r s"], Float32[np.ndarray, "r s"]] | None:
-    """Heights and brightness of one row of patches, windowed so that rows add up; None without skin. Powers are added
-    to ``figures``."""
+    """Returns heights and brightness of one row of patches, windowed so that rows add up; None without skin. Powers are
+    added to ``figures``."""
     side = len(full[0])
     hop = side // 2
     columns = np.arange(-hop, size, hop)
@@ -304,6 +304,6 @@ def waves_by_texel(side: int) -> tuple[Float32[np.ndarray, "p q"], Float32[np.nd
 
 
 def _vertex(three: Float32[np.ndarray, " 3"]) -> float:
-    """Where a parabola through three neighbouring values has its peak, from the middle one."""
+    """Returns the peak's distance from the middle one of three neighbouring values, on their parabola."""
     bend = float(three[0] - 2 * three[1] + three[2])
     return 0.0 if bend >= 0 else float(np.clip(0.5 * (three[0] - three[2]) / bend, -0.5, 0.5))

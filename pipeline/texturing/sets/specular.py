@@ -1,9 +1,9 @@
 """Separates what skin mirrors from what it scatters, by two sets in polarised light.
 
-Lamps behind a filter send polarised light. What the surface mirrors stays polarised; what comes out of the skin does
-not. A filter before the lens that is crossed with the lamps' passes scattered light alone, a parallel one both in equal
-exposure (Ma et al., *Rapid Acquisition of Specular and Diffuse Normal Maps*, EGSR 2007). So, in linear light, ``cross``
-is the diffuse part and ``parallel / exposure - cross`` the specular one.
+Lamps behind a filter send polarised light. Light that the surface mirrors stays polarised; light that leaves the skin
+from within does not. A filter before the lens that is crossed with the lamps' passes scattered light alone, a parallel
+one both in equal exposure (Ma et al., *Rapid Acquisition of Specular and Diffuse Normal Maps*, EGSR 2007). So, in
+linear light, ``cross`` is the diffuse part and ``parallel / exposure - cross`` the specular one.
 
 The exposure of the parallel picture by that of the crossed one is measured for each camera from colour alone: mirrored
 light has the lamps' colour, near grey in a balanced picture, so that differences between channels come from scattered
@@ -156,8 +156,8 @@ def specular_light(
 
 
 def _lamp_colour(light: Float32[np.ndarray, "s s 3"]) -> Float32[np.ndarray, "s s 3"]:
-    """The colour of mirrored light around each texel, of mean 1: it is the lamps', so that what differs from texel to
-    texel is noise."""
+    """Returns the colour of mirrored light around each texel, with mean 1: it is that of the lamps, so differences
+    between texels are noise."""
     size = len(light)
     coarse = cv2.resize(light, (COLOUR_SIDE, COLOUR_SIDE), interpolation=cv2.INTER_AREA)
     coarse = cv2.GaussianBlur(coarse, (0, 0), 1.0)

@@ -94,7 +94,7 @@ class _Type(_StandIn):
         self.order = ">" if state[1] == ">" else "<"
 
     def decoded(self) -> np.dtype | None:
-        """Returns the type, or None of what is no plain number."""
+        """Returns the type, or None if it is not one of plain numbers."""
         kind = self.kind.lstrip("<>=|")
         return np.dtype(self.order + kind) if kind in KINDS else None
 
@@ -178,7 +178,7 @@ class _Reader(pickle.Unpickler):
 
 
 def _array(value: Any) -> np.ndarray | None:
-    """Returns the numbers of an entry as an array; None of what is none."""
+    """Returns the numbers of an entry as an array, None if it has none."""
     if isinstance(value, _Array):
         return value.value
     if not isinstance(value, _Inert) or not isinstance(value.state, dict):

@@ -56,8 +56,8 @@ def _header(width: int, height: int) -> bytes:
 
 
 def _block(samples: Float[np.ndarray, "r 3 w"]) -> bytes:
-    """Compresses some rows: low bytes before high ones, differences of neighbours, then zlib; or the samples as they
-    are where that is not shorter."""
+    """Compresses some rows: low bytes before high ones, differences of neighbours, then zlib; or returns the samples as
+    they are if that is not longer."""
     raw = np.frombuffer(np.ascontiguousarray(samples).tobytes(), np.uint8)
     parted = np.concatenate([raw[::2], raw[1::2]])
     differences = np.concatenate([parted[:1], parted[1:] - parted[:-1] + np.uint8(128)])

@@ -153,8 +153,7 @@ def _levels(plane: Plane, span: tuple[float, float]) -> list[float]:
 
 
 def _is_area(pixels: Bool[np.ndarray, "h w"]) -> bool:
-    """Tells whether most of the pixels have only such pixels around them; the pixels of one level of a soft edge do
-    not."""
+    """Tells whether most of these pixels have only each other as neighbours, unlike one grey level of a soft edge."""
     within = cv2.erode(pixels.astype(np.uint8), np.ones((3, 3), np.uint8))
     return bool(np.count_nonzero(within) > AREA_WITHIN * np.count_nonzero(pixels))
 

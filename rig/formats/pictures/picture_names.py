@@ -127,8 +127,8 @@ def _equal(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
 
 
 def _alike_about(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Matches files that have the same words before and after the words of each camera. Of all such pairs of words that
-    which fits most cameras counts."""
+    """Matches files that have the same words before and after the words of each camera. The pair of words that fits
+    most cameras counts."""
     fitting: dict[tuple[Words, Words], dict[str, list[str]]] = {}
     for name, words in strays.items():
         for camera, known in cameras.items():

@@ -1,7 +1,7 @@
 """Fills the empty rims of pictures whose clean plates have none, and of plates whose pictures have none.
 
 Undistortion leaves a rim without light, transparent or black, and sometimes white. Compared with a plate that was not
-treated so it is a subject all around the picture. What lies in it is unknown, and taken for backdrop.
+treated so it is a subject all around the picture. The scene behind the rim is unknown and taken for backdrop.
 
 Enters: pictures and clean plates by camera. Leaves: the same without such rims, and a remark.
 """

@@ -225,7 +225,7 @@ TEMPLATES = {
     "nothing-due": "nothing was due",
     "no-such-key": "No such key. Make one with: eigenhead keys add NAME",
     "no-board-toml": "holds no board.toml beside IMAGES/",
-    "photographs-do-not-tell": "{no_rig}, and its photographs alone do not tell the cameras",
+    "photographs-do-not-tell": "{no_rig}, and its photographs alone do not determine the cameras",
     "every-picture-its-plate": "every picture is its own clean plate: nobody was there, or the plates were copied; shoot again",
     "picture-too-large": "{file} is {width} x {height} pixels; at most {most:,} pixels are accepted",
     "views-many": "{joined} views joined, of which {most} that stand well apart are used",

@@ -78,7 +78,7 @@ def device_fault_from_text(text: str) -> DeviceFault:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """Everything that a camera's picture depends on."""
+    """Holds everything that a camera's picture depends on."""
 
     camera: str
     seated: bool
@@ -197,7 +197,7 @@ class StudioDevices:
         self.box = SimulatedTriggerBox(self.port_link, BoxLogic(self._on_release, self._on_lights, self.streams.arm))
 
     def _apply(self) -> None:
-        """Brings every device into the state that the list of faults says."""
+        """Sets every device to the faults of the list."""
         kinds = {(fault.kind, fault.camera) for fault in self.faults}
         views = {name: name for name in self.names}
         for kind, camera in kinds:
@@ -255,7 +255,7 @@ class StudioDevices:
             self.streams.show(name, self._films[self._look(name)])
 
     def _films_of(self, camera: str) -> dict[_Look, Film]:
-        """The films of one camera with the lamps off and on."""
+        """Returns the films of one camera with the lamps off and on."""
         lightings = [self._look(camera, lamps) for lamps in (0, (1 << LIGHTS) - 1)]
         if all(lighting in self._films for lighting in lightings):
             return {lighting: self._films[lighting] for lighting in lightings}
@@ -270,7 +270,7 @@ class StudioDevices:
         return films
 
     def _answer(self, method: str, path: str, query: Mapping[str, str]) -> tuple[int, str]:
-        """The studio's own page and controls: GET /, POST /subject?present=1, POST and DELETE /faults."""
+        """Answers the studio's page and controls: GET /, POST /subject?present=1, POST and DELETE /faults."""
         try:
             if (method, path) == ("GET", "/"):
                 return 200, self._page()
@@ -322,7 +322,7 @@ def serve_scene(
 
 
 def _develop(image: ImageRgb, lighting: _Look, rng: np.random.Generator) -> bytes:
-    """A JPEG file of ``image`` with less light and a bump."""
+    """Encodes ``image`` as JPEG, with less light and a bump."""
     if lighting.bump_px:
         image = _bumped(image, lighting.bump_px)
     if lighting.light < 1:
@@ -335,7 +335,7 @@ def _develop(image: ImageRgb, lighting: _Look, rng: np.random.Generator) -> byte
 
 
 def _bumped(image: ImageRgb, amount_px: float) -> ImageRgb:
-    """The picture of a knocked camera: shifted along (0.8, 0.6), and turned by a third of ``amount_px`` at its edge."""
+    """Shifts a knocked camera's picture along (0.8, 0.6), and turns it by a third of ``amount_px`` at its edge."""
     height, width = image.shape[:2]
     turn_deg = float(np.degrees(2 * amount_px / (3 * width)))
     warp = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn_deg, 1.0)

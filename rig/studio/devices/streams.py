@@ -243,7 +243,7 @@ class StreamServer:
             left.cancel()
 
     async def _wait(self, camera: _Camera, left: asyncio.Future[bytes]) -> None:
-        """Until the camera shows a frame or the client leaves. Cables may be swapped meanwhile, so not for ever."""
+        """Waits until the camera shows a frame, the client leaves or some time is over, as cables may be swapped."""
         shown = asyncio.ensure_future(camera.shown_event.wait())
         try:
             await asyncio.wait({left, shown}, timeout=self._period_s, return_when=asyncio.FIRST_COMPLETED)

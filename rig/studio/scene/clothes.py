@@ -54,7 +54,7 @@ def shirt(
 def _rings(
     vertices: Float[np.ndarray, "v 3"], collar_y: float, axis: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "r c 3"]:
-    """Outlines from the collar down; each encloses the neck at its height and the ring above."""
+    """Returns outlines from the collar down; each encloses the neck at its height and the ring above."""
     angle = np.arange(COLUMNS) * 2 * np.pi / COLUMNS
     across, ahead = np.sin(angle), np.cos(angle)
     rings, reach = [], np.zeros(COLUMNS)
@@ -69,7 +69,7 @@ def _rings(
 
 
 def _neck(vertices: Float[np.ndarray, "v 3"], y: float, axis: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " c"]:
-    """Radius around the axis by angle, with room for the cloth; 0 below the mesh."""
+    """Returns the radius around the axis by angle, with room for the cloth; 0 below the mesh."""
     near = vertices[np.abs(vertices[:, 1] - y) < 9.0] - axis
     radius = np.zeros(COLUMNS, np.float32)
     if len(near) < 20:

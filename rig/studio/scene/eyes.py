@@ -120,7 +120,7 @@ def _paint(off_axis: Float[np.ndarray, "r s"], iris: Colour, rng: np.random.Gene
 
 
 def _step(x: Float[np.ndarray, "r s"], middle: float, width: float) -> Float[np.ndarray, "r s"]:
-    """1 below ``middle``, 0 above, half at it."""
+    """Returns 1 below ``middle``, 0 above and 1/2 at it."""
     t = np.clip((middle + 0.5 * width - x) / width, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 

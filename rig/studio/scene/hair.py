@@ -126,7 +126,7 @@ def outer_radius(points: Float[np.ndarray, "v 3"], *, open_ears: bool) -> Float[
 def _inside_hairline(
     surface: Float[np.ndarray, "r c 3"], body: Anatomy, style: HairStyle, rng: np.random.Generator
 ) -> Float[np.ndarray, "r c"]:
-    """Height above the hairline, mm; positive under hair."""
+    """Returns the height above the hairline, mm; positive under hair."""
     line = HAIRLINE_OVER_EARS if style.over_ears else HAIRLINE
     relative = (surface - body.ears) / body.unit
     front = np.clip((relative[:, :, 2] - 35.0) / 40.0, 0.0, 1.0)

@@ -51,7 +51,7 @@ def cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, b
 
 
 def _visor(rim: Float[np.ndarray, "c 3"], azimuth: Float[np.ndarray, " c"], body: Anatomy) -> Surface:
-    """Two sheets that bend down to both sides, closed along the front edge."""
+    """Makes two sheets that bend down to both sides, closed along the front edge."""
     turn = (azimuth + np.pi) % (2 * np.pi) - np.pi
     front = np.flatnonzero(np.abs(turn) < np.radians(VISOR_DEG))
     front = front[np.argsort(turn[front])]
@@ -98,7 +98,7 @@ def glasses(head: Float[np.ndarray, "v 3"], body: Anatomy) -> AnySurface:
 def _temple(
     head: Float[np.ndarray, "v 3"], body: Anatomy, start: Float[np.ndarray, " 3"], sign: float
 ) -> Float[np.ndarray, "n 3"]:
-    """From the rim back beside the temple, over the ear and down behind it."""
+    """Makes the path of an arm of glasses: from the rim back beside the temple, over the ear and down behind it."""
     over = body.ears + np.array([0.0, 14.0, -4.0]) * body.unit
     between = np.abs(head[:, 1] - over[1]) < 6.0
     between &= (head[:, 2] > over[2] + 10.0) & (head[:, 2] < start[2] - 15.0)
@@ -115,7 +115,7 @@ def _temple(
 def _tube(
     path: Float[np.ndarray, "n 3"], radius_mm: float, reference: Float[np.ndarray, " 3"], *, closed: bool
 ) -> Surface:
-    """A round tube about a path; ``reference`` is never along it."""
+    """Makes a round tube about a path; ``reference`` is never along it."""
     tangent = np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0) if closed else np.gradient(path, axis=0)
     across = np.cross(tangent, reference)
     across /= np.linalg.norm(across, axis=1, keepdims=True)

@@ -40,8 +40,7 @@ ARRANGEMENTS_DEG = {
 
 
 def default_layout() -> Rig:
-    """Returns the default rig: eleven cameras in front of and beside the head, 1.2 m away. cam00 sees the face from the
-    front."""
+    """Returns the default rig: eleven cameras in front of and beside the head, 1.2 m away; cam00 is the front one."""
     return rig_from_directions(DEFAULT_DIRECTIONS_DEG)
 
 

@@ -68,7 +68,7 @@ def _fall(
     unit: float,
     length_mm: float,
 ) -> Float[np.ndarray, "r c"]:
-    """Radius (float32) about the axis by drop and angle: the shell's, then straight down but for what pushes out."""
+    """Returns the radius (float32) by drop and angle: the shell's, then straight down except over what pushes out."""
     hair = _envelope(shell.shell[np.unique(shell.shell_faces)] - axis, unit, length_mm)
     solid = _envelope(below, unit, length_mm)
     step = length_mm / (ROWS - 1)
@@ -84,7 +84,7 @@ def _fall(
 
 
 def _envelope(points: Float[np.ndarray, "n 3"], unit: float, length_mm: float) -> Float[np.ndarray, "r c"]:
-    """Outermost radius about the vertical axis by drop and angle (float32), 0 where there is nothing."""
+    """Returns the outermost radius about the vertical axis by drop and angle (float32), 0 where there is nothing."""
     limit = np.radians(FRONT_EDGE_DEG)
     angle = np.arctan2(-points[:, 0], -points[:, 2])
     row = np.rint((TOP_MM * unit - points[:, 1]) / length_mm * (ROWS - 1)).astype(int)

@@ -265,8 +265,8 @@ def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) 
 def _polarised(
     scene: Scene, source: Mapping[str, str], rng: np.random.Generator
 ) -> dict[str, dict[str, UInt8[np.ndarray, "_ _ 3"]]]:
-    """The texture sets of polarised light, of the same moment and exposed alike: a filter that is crossed with those
-    of the lamps takes away what the surface mirrors."""
+    """Returns texture sets of polarised light, of one moment and one exposure. A filter that is crossed with those of
+    the lamps removes reflections of the surface."""
     sets: dict[str, dict[str, np.ndarray]] = {"cross": {}, "parallel": {}}
     for name, camera_rng in zip(scene.rig.names, rng.spawn(len(scene.rig)), strict=True):
         view = scene.views[source[name]]
@@ -319,7 +319,7 @@ def _knocked(camera: Camera, faults: Sequence[Fault], rng: np.random.Generator) 
 
 
 def _sway(preset: Preset, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
-    """How far the subject moves (mm) while a rolling shutter reads all rows."""
+    """Returns how far the subject moves (mm) while a rolling shutter reads all rows."""
     direction = rng.standard_normal(3)
     return direction / np.linalg.norm(direction) * preset.sway_mm_s * preset.rolling_ms / 1000
 
@@ -330,8 +330,8 @@ def _rolling(
     at_world: Float[np.ndarray, " 3"],
     sway_mm: Float[np.ndarray, " 3"],
 ) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
-    """The subject sways while the rows are read, and each camera sees that from its own side. The truth is its place
-    at the middle row. Motion across the image is that of the head's origin; nearer parts move by a tenth more."""
+    """Distorts pictures as a rolling shutter does if the subject sways while rows are read. The true position is that
+    at the middle row. The whole image moves as the head's origin does; nearer parts would move by a tenth more."""
     shifts = {camera.name: camera.project_with_jacobian(at_world[None])[1][0] @ sway_mm for camera in rig}
     return {name: rolled(light[name], shifts[name]) for name in light}
 
@@ -370,7 +370,7 @@ def _views(
 def _picture(
     view: View, preset: Preset, faults: Sequence[Fault], rng: np.random.Generator
 ) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[UInt8[np.ndarray, "_ _ 3"], ...]]:
-    """The shot and the clean plates of one camera."""
+    """Returns the shot and the clean plates of one camera."""
     kinds = {fault.kind: fault for fault in faults}
     plate_view = shot_view = view
     if "chair" in kinds:
@@ -413,7 +413,7 @@ def _shadowed(view: View, amount: float) -> Float[np.ndarray, "h w 3"]:
 
 
 def _wrong_masks(scene: Scene, faults: Sequence[Fault]) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """What an operator's slip leaves: the mirrored mask, a fifth of the image off."""
+    """Returns masks as after an operator's mistake: mirrored, and shifted by a fifth of the image."""
     wrong = [fault.camera for fault in faults if fault.kind == "wrong-mask" and fault.camera]
     masks = {name: scene.views[name].mask[:, ::-1] for name in wrong}
     return {name: np.roll(mask, mask.shape[1] // 5, axis=1) for name, mask in masks.items()}
@@ -425,7 +425,7 @@ def _photographed(
     vertices: Float[np.ndarray, "v 3"],
     normals: Float[np.ndarray, "v 3"],
 ) -> Bool[np.ndarray, " v"]:
-    """Vertices that at least one camera sees, not at a grazing angle and not behind hair."""
+    """Returns the vertices that at least one camera sees, not at a grazing angle and not behind hair."""
     seen = np.zeros(len(vertices), bool)
     for camera in rig:
         towards = camera.centre_world - vertices
@@ -448,7 +448,7 @@ def _unhidden(
 def _seen_landmarks(
     coarse: Rig, rig: Rig, depth: Mapping[str, Float[np.ndarray, "h w"]], marks: Mapping[str, Float[np.ndarray, " 3"]]
 ) -> dict[str, dict[str, Float[np.ndarray, " 2"]]]:
-    """True pixels of each landmark in the cameras that see it, those nearest to the front first."""
+    """Returns the true pixels of each landmark in the cameras that see it, those nearest to the front first."""
     front = rig[rig.front_camera()].centre_world - rig.centre_world()
     by_angle = sorted(rig, key=lambda c: -float(np.dot(c.centre_world - rig.centre_world(), front)))
     found: dict[str, dict[str, np.ndarray]] = {}

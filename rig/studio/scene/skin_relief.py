@@ -65,8 +65,8 @@ class RelievedSkin:
 
 
 def relieved(head: Mesh, relief: SkinRelief, values: Mapping[str, Float[np.ndarray, "v _"]]) -> RelievedSkin:
-    """Divides the triangles of a head where it has a relief, and moves their corners to it. ``values`` are of its
-    vertices."""
+    """Divides the triangles of a head where it has a relief, and moves their corners to it. ``values`` are those of the
+    head's vertices."""
     normals = vertex_normals(head.vertices, head.faces)
     table = np.concatenate([head.vertices, normals, *values.values()], axis=1)
     near = (relief.share(head.vertices) > 0)[head.faces].any(axis=1)

@@ -56,7 +56,7 @@ def oily_zones(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.nd
 
 
 def _blotches(vertices: Float[np.ndarray, "v 3"], rng: np.random.Generator) -> Float[np.ndarray, "v 1"]:
-    """A sum of waves in random directions, 15 to 60 mm long, standard deviation about 0.06."""
+    """Returns a sum of waves in random directions, 15 to 60 mm long, standard deviation about 0.06."""
     waves = rng.normal(0, 1, (24, 3))
     waves *= (2 * np.pi / rng.uniform(15, 60, (24, 1))) / np.linalg.norm(waves, axis=1, keepdims=True)
     return 0.06 * np.sin(vertices @ waves.T + rng.uniform(0, 2 * np.pi, 24)).sum(axis=1, keepdims=True) / np.sqrt(12)
@@ -115,7 +115,7 @@ def _eye(
     *,
     eyeballs: bool,
 ) -> None:
-    """Brow, and eye or lashes."""
+    """Paints a brow, and an eye or lashes."""
     x, y, z = vertices.T
     outer, inner = marks[f"exocanthion_{side}"], marks[f"endocanthion_{side}"]
     span = outer[0] - inner[0]
@@ -167,7 +167,7 @@ def _open_eye(
     outer: Float[np.ndarray, " 3"],
     closed: float,
 ) -> None:
-    """White, iris and pupil between the lids, and the upper lashes."""
+    """Paints white, iris and pupil between the lids, and the upper lashes."""
     x, y, _ = vertices.T
     gap = eye_gap(vertices, inner, outer, closed)
     opening = gap.here * _smoothstep(0.6, -0.6, np.abs(gap.off) - gap.height) * (closed < 1.0)

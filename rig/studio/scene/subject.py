@@ -55,7 +55,7 @@ def scattered(
 def _laplacian(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[sparse.csr_array, Float[np.ndarray, " v"]]:
-    """Cotangent stiffness (positive semidefinite) and a third of the triangles' area at each vertex (mm2)."""
+    """Returns the cotangent stiffness (positive semidefinite) and a third of the area about each vertex (mm2)."""
     double = np.maximum(np.linalg.norm(face_normals(vertices, faces), axis=1), 1e-6)
     rows, columns, values = [], [], []
     for corner in range(3):
@@ -205,8 +205,7 @@ def random_look(rng: np.random.Generator) -> Look:
 def random_pose(
     centre_world: Float[np.ndarray, " 3"], spread_deg: float, spread_mm: float, rng: np.random.Generator
 ) -> Similarity:
-    """Draws the pose (world_from_head) of a subject at the point that the cameras see, slightly turned and
-    displaced."""
+    """Draws the pose (world_from_head) of a subject about the cameras' common point, slightly turned and displaced."""
     rotation = rotation_from_vector(np.radians(rng.normal(0, spread_deg, 3)))
     return Similarity(1.0, rotation, centre_world + rng.normal(0, spread_mm, 3))
 
@@ -270,7 +269,7 @@ def dress(
 
 
 def _uncut(skin: Part, head: Mesh) -> Part:
-    """The head's own vertices and triangles of skin that is cut between the lids, which begins with them."""
+    """Returns the head's own vertices and triangles, the first ones of skin that is cut between the lids."""
     rows = slice(len(head.vertices))
     vertices = skin.vertices[rows]
     return replace(
@@ -307,7 +306,7 @@ def _skin(subject: Subject, body: Anatomy, appearance: Look, one_sided: bool, rn
 
 
 def _relieved(piece: Piece, head: Mesh, relief: SkinRelief, world_from_head: Similarity) -> Part:
-    """The skin with its relief in the world frame, not lit yet."""
+    """Returns the skin with its relief in the world frame, not lit yet."""
     oil = np.zeros((len(piece.vertices), 1)) if piece.oil is None else piece.oil[:, None]
     fine = relieved(head, relief, {"paint": piece.paint, "oil": oil})
     return Part(
@@ -330,7 +329,7 @@ def _hairs(
     worn: tuple[Float[np.ndarray, "_ 3"], np.ndarray] | None,
     rng: np.random.Generator,
 ) -> list[tuple[Hair, HairStyle]]:
-    """All surfaces of hair, that of the scalp first."""
+    """Returns all surfaces of hair, that of the scalp first."""
     styles: list[tuple[Hair, HairStyle]] = []
     if appearance.hair:
         scalp = grow(head.vertices, body, appearance.hair, rng)

@@ -467,7 +467,7 @@ export default {
   "neither-plate-nor-mask": "{camera} hat weder Leerbild noch Maske: eines davon aufnehmen",
   "outline-guessed": "ohne Leerbild gefunden, und {share:.0%} des Umrisses ist geraten: Leerbild oder Maske geben",
   "head-cut-off-at-top": "der Kopf ist abgeschnitten ({side:word}): Kamera zurückstellen oder nach oben neigen",
-  "subject-area-absurd": "die Person füllt {share:.1%} des Bildes, was kein Kopf tut",
+  "subject-area-absurd": "die Person füllt {share:.1%} des Bildes; erwartet sind 1 % bis 95 %",
   "light-changed": "das Licht weicht um den Faktor {factor:.2f} von dem des Leerbilds ab: neues Leerbild aufnehmen",
   "mask-alone": "{share:.1%} der Maske liegt, wo die anderen Kameras nichts sehen: Hat sich seit dem Leerbild etwas bewegt?",
   "mask-incomplete": "der Maske fehlt {share:.1%} von dem, was die anderen Kameras zeigen: Haar oder Kleidung in der Farbe des Hintergrunds?",

@@ -148,7 +148,7 @@ class RealRig:
             return self.lights()
 
     def _adjustment(self) -> RigAdjustment:
-        """What was changed over HTTP; a file that cannot be read is as none."""
+        """Reads the settings that were changed over HTTP; a file that cannot be read counts as none."""
         with suppress(OSError, ValueError):
             return RIG_ADJUSTMENT.read(json.loads(self._adjusted.read_bytes()))
         return RigAdjustment({})

@@ -21,7 +21,7 @@ def test_noise_is_refused_with_every_view_and_what_to_add(http: httpx.Client, tm
     refused = upload(http, packed(tmp_path / "noise"))
     assert refused.status_code == 422
     errors = refused.json()["errors"]
-    assert any("photographs alone do not tell the cameras" in error for error in errors)
+    assert any("photographs alone do not determine the cameras" in error for error in errors)
     for index in range(3):
         assert any(error.startswith(f"view{index}: only") and "light and focus it" in error for error in errors)
 

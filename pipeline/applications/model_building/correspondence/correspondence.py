@@ -123,8 +123,7 @@ def _averaging(faces: Int[np.ndarray, "F 3"], count: int) -> sparse.csr_array:
 
 
 def nearest_mean(shapes: Float[np.ndarray, "N L 3"]) -> int:
-    """Returns the index of the shape closest to the mean of all, which becomes the reference (step 1 of section
-    3.2)."""
+    """Returns the index of the shape closest to the mean of all: the reference (step 1 of section 3.2)."""
     return int(((shapes - shapes.mean(0)) ** 2).sum((1, 2)).argmin())
 
 

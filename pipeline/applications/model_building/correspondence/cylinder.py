@@ -47,8 +47,7 @@ class CylinderIndex:
         heights: Float[np.ndarray, " N"],
         near: Float[np.ndarray, " N"] | None = None,
     ) -> Cast:
-        """Returns for each ray the hit whose radius is nearest to ``near`` (mm), or without ``near`` the outermost
-        hit."""
+        """Returns each ray's hit whose radius is nearest to ``near`` (mm), or without ``near`` the outermost hit."""
         wanted = np.full(len(angles), np.inf) if near is None else np.asarray(near, float)
         found, triangles = cast_rays(
             self._vertices, self._faces, self._low, self._rows, self._start, self._members, angles, heights, wanted

@@ -40,8 +40,7 @@ class Prior:
 def registration_prior(
     mean: Float[np.ndarray, "V 3"], modes: Float[np.ndarray, "M V 3"], faces: Int[np.ndarray, "F 3"], *, seed: int = 0
 ) -> Prior:
-    """Returns the mixture for a model's mean and modes (mm per standard deviation), mirrored if the mesh is
-    symmetric."""
+    """Returns the mixture for a model's mean and modes (mm per sigma), mirrored if the mesh is symmetric."""
     opposite = mirror_images(mean, faces)
     if opposite is not None:
         mean = (mean + mean[opposite] * _MIRROR) / 2

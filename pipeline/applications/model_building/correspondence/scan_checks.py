@@ -120,8 +120,7 @@ def _landmark_faults(scan: Scan, template: HeadModel) -> list[str]:
 
 
 def _surface_faults(scan: Scan) -> list[str]:
-    """Returns a fault if neighbouring faces are oriented against each other: both use their common edge in one
-    direction."""
+    """Returns a fault if neighbouring faces are oriented differently: both use their edge in one direction."""
     directed = np.concatenate([scan.faces[:, [0, 1]], scan.faces[:, [1, 2]], scan.faces[:, [2, 0]]]).astype(np.int64)
     keys = directed[:, 0] * len(scan.vertices) + directed[:, 1]
     doubled = len(keys) - len(np.unique(keys))

@@ -337,8 +337,7 @@ def largest_miss(
 def close_openings(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], largest_mm: float = 90.0
 ) -> Int[np.ndarray, "G 3"]:
-    """Returns the faces with strips that close every opening up to ``largest_mm`` wide, except the widest one, the
-    neck."""
+    """Returns the faces with strips that close every opening up to ``largest_mm`` wide except the neck."""
     loops = boundary_loops(faces)
     if not loops:
         return faces

@@ -77,8 +77,7 @@ def build_model(
 def read_checked(
     folder: Path, template: HeadModel, *, report: Progress | None = None
 ) -> tuple[list[Checked], dict[str, str]]:
-    """Returns the sound scans of a folder, and the faults of the others by name. Raises InputError for an empty
-    folder."""
+    """Returns the sound scans of a folder, and the others' faults by name. Raises InputError for an empty folder."""
     paths = find_scans(folder)
     with workers(2, len(paths)) as crew:
         found = crew.over(partial(_read_and_check, template), paths, "checking scans", report)

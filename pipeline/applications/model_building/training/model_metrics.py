@@ -52,8 +52,7 @@ def specificity(
     draws: int = 200,
     seed: int = 0,
 ) -> float:
-    """Computes the mean distance (mm over vertices of ``region``) of random draws of a model to the nearest of
-    ``heads``."""
+    """Computes the mean distance (mm, in ``region``) of random draws of a model to the nearest of ``heads``."""
     rng = np.random.default_rng(seed)
     known = heads[:, region].astype(np.float32)
     total = 0.0

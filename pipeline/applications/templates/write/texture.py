@@ -65,7 +65,7 @@ def template_textures(
 
 
 def _places(layout: Layout, surface_binding: SurfaceBinding) -> Float[np.ndarray, "t 2"]:
-    """Where each vertex of the skin lies in the model's layout; the others at its corner."""
+    """Returns the position of each skin vertex in the model's layout; the other vertices lie at its corner."""
     attached = surface_binding.attachment
     out = np.zeros((len(surface_binding.rest), 2))
     out[surface_binding.skin] = np.einsum("nk,nkx->nx", attached.weights, layout.uv[layout.faces[attached.triangles]])
@@ -96,7 +96,7 @@ def _tile(
 
 def filled(image: UInt8[np.ndarray, "s s 3"], known: Bool[np.ndarray, "s s"]) -> UInt8[np.ndarray, "s s 3"]:
     """Returns the image with the nearest known texel where none is, a margin for blurred reading and the cut; farther
-    off, shoulders say, the mean colour. What fills is coarse; known texels stay."""
+    off, shoulders say, the mean colour. The fill is coarse; known texels stay."""
     step = max(1, len(image) // COARSE)
     if not known[::step, ::step].any():
         return image

@@ -125,7 +125,7 @@ def test_a_kept_name_in_an_unknown_encoding_is_not_shown_garbled(kind: str, tmp_
                 archive.addfile(tarfile.TarInfo(name.decode("utf-8", "surrogateescape")))
         data = buffer.getvalue()
     assert refused(data, tmp_path) == (
-        "'images/??Cam00.png' has letters in an encoding that the archive does not tell: pack it with names in UTF-8, "
+        "'images/??Cam00.png' has letters in an encoding that the archive does not state: pack it with names in UTF-8, "
         "or rename it",
     )
 
