@@ -19,6 +19,8 @@ from pipeline.contour_fit.problem import ContourProblem, State
 from pipeline.contour_fit.rim_term import observed_rim
 from pipeline.geometry.nearest import PointTree, nearest
 
+Plane = Float32[np.ndarray, "h w"]
+
 DEPTH_MM = 4.0  # inside the outline, where the pixel shows what makes it: blur and matting end before
 MIN_SKIN = 0.4  # probability there, in the median of views: of a bald, oily crown 0.55 to 0.9, of hair 0 to 0.08
 SMOOTH_MM = 3.0  # an outline is compared with itself, smoothed over this
@@ -29,7 +31,7 @@ REACH_MM = 30.0  # from the outline to a rim that belongs to it
 MISSED_PX = 1.0  # a crown whose outline is farther off is fitted once more
 
 
-def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Float32[np.ndarray, "h w"]]) -> ContourSolution:
+def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Plane]) -> ContourSolution:
     """Marks the outline of the crown if it turns out to be hairless, and fits the head once more with it counted in
     full.
 
@@ -76,9 +78,7 @@ def _shown_crown(
     return crown, crown & within(cells, rim)
 
 
-def find_bare(
-    problem: ContourProblem, state: State, skin: Mapping[str, Float32[np.ndarray, "h w"]]
-) -> tuple[Bool[np.ndarray, "_ _"], ...]:
+def find_bare(problem: ContourProblem, state: State, skin: Mapping[str, Plane]) -> tuple[Bool[np.ndarray, "_ _"], ...]:
     """Marks, in every view, the square cells (``CELL_PX`` pixels wide) near an outline that is a hairless head's."""
     views, maps = problem.views, []
     for k, camera in enumerate(problem.rig):
@@ -92,9 +92,7 @@ def find_bare(
     return tuple(maps)
 
 
-def bare_cells(
-    distance: Float32[np.ndarray, "h w"], skin: Float32[np.ndarray, "h w"], px_per_mm: float
-) -> Bool[np.ndarray, "_ _"]:
+def bare_cells(distance: Plane, skin: Plane, px_per_mm: float) -> Bool[np.ndarray, "_ _"]:
     """Marks the square cells (``CELL_PX`` pixels wide) within ``REACH_MM`` of a hairless head's outline in one view: of
     an outline that is smooth, with skin up to it.
 
@@ -114,7 +112,7 @@ def bare_cells(
     return cells_along(outline, (rough < ROUGH_MM) & (shown > MIN_SKIN), distance.shape, REACH_MM * px_per_mm)
 
 
-def largest_outline(distance: Float32[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"] | None:
+def largest_outline(distance: Plane) -> Float[np.ndarray, "n 2"] | None:
     """Returns the pixels (column, row) along the longest outline of a signed distance; None without a subject."""
     outlines = cv2.findContours((distance < 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
     return max(outlines, key=len)[:, 0].astype(float) if outlines else None
@@ -137,9 +135,7 @@ def cells_along(
     return cells
 
 
-def roughness(
-    distance: Float32[np.ndarray, "h w"], smooth: Float[np.ndarray, "n 2"], px_per_mm: float
-) -> Float[np.ndarray, " n"]:
+def roughness(distance: Plane, smooth: Float[np.ndarray, "n 2"], px_per_mm: float) -> Float[np.ndarray, " n"]:
     """Returns the roughness (px, RMS) of an outline at each point of the ``smooth`` curve along it: how far the outline
     strays from the curve within some millimetres, without their mean offset.
 
@@ -158,10 +154,7 @@ def _pooled(values: Float[np.ndarray, " n"], px_per_mm: float) -> Float[np.ndarr
 
 
 def share_inside(
-    distance: Float32[np.ndarray, "h w"],
-    skin: Float32[np.ndarray, "h w"],
-    outline: Float[np.ndarray, "n 2"],
-    px_per_mm: float,
+    distance: Plane, skin: Plane, outline: Float[np.ndarray, "n 2"], px_per_mm: float
 ) -> Float[np.ndarray, " n"]:
     """Returns the probability of skin, or of what else is given for it, ``DEPTH_MM`` inside each point of an outline,
     its mean across it."""

@@ -22,6 +22,8 @@ from pipeline.head_model.model import HeadModel
 from rig.mesh import vertex_normals
 from rig.rig import Rig
 
+Vertices = Float[np.ndarray, "v 3"]
+
 SIDES = ("right", "left")
 MARGIN_MM = 2.0  # beyond the corners of the eye
 BRIDGE_HEIGHT, BRIDGE_RAISED = 0.36, 0.05  # half height and middle of the bridge, by the fissure's length: up to the
@@ -94,7 +96,7 @@ def eye_fissure(model: HeadModel, side: str) -> Fissure:
 @traced
 def measure_eye_appearance(
     model: HeadModel,
-    vertices: Float[np.ndarray, "v 3"],
+    vertices: Vertices,
     images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
     rig: Rig,
     openings: Mapping[str, float],
@@ -174,9 +176,7 @@ def _lids(slit: Fissure) -> Int[np.ndarray, " r"]:
     return np.flatnonzero(slit.ellipse(half_length, half_height, -BRIDGE_RAISED * slit.length_mm))
 
 
-def with_plain_lids(
-    vertices: Float[np.ndarray, "v 3"], shape: Float[np.ndarray, "v 3"], model: HeadModel
-) -> Float[np.ndarray, "v 3"]:
+def with_plain_lids(vertices: Vertices, shape: Vertices, model: HeadModel) -> Vertices:
     """Returns the head with the lids of ``shape``, displaced as smoothly as the skin around them is displaced.
 
     Displacements along the normals tear lids apart: their margins' normals point at each other.
@@ -193,9 +193,7 @@ def with_plain_lids(
     return shape + moved
 
 
-def bridge_eyelids(
-    vertices: Float[np.ndarray, "v 3"], model: HeadModel, closed: frozenset[str]
-) -> Float[np.ndarray, "v 3"]:
+def bridge_eyelids(vertices: Vertices, model: HeadModel, closed: frozenset[str]) -> Vertices:
     """Returns the head with the lids of the eyes ``closed`` (``right``, ``left``) bridged. ``vertices`` are the full
     level, in any frame, mm."""
     out, faces = vertices.copy(), model.levels["full"].faces
@@ -206,10 +204,7 @@ def bridge_eyelids(
 
 
 def _smoothest(
-    values: Float[np.ndarray, "v 3"],
-    vertices: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
-    rows: Int[np.ndarray, " r"],
+    values: Vertices, vertices: Vertices, faces: Int[np.ndarray, "f 3"], rows: Int[np.ndarray, " r"]
 ) -> Float[np.ndarray, "r 3"]:
     """Returns the values at the vertices ``rows`` that minimise the squared Laplacian while all other vertices keep
     theirs."""

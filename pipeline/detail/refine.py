@@ -38,6 +38,10 @@ from pipeline.part_labels.codes import Part
 from rig.mesh import vertex_normals
 from rig.progress import Progress
 
+Vertices = Float[np.ndarray, "v 3"]
+PerVertex = Float[np.ndarray, " v"]
+Faces = Int[np.ndarray, "f 3"]
+
 COARSE_LENGTH_MM = 12.0  # over which a displacement of the nodes fades where nothing is seen
 LENGTH_MM = 5.0  # the same of the displacement along the normals that follows it
 MIN_AMPLITUDE_MM = 0.7  # standard deviation of a displacement where the fit claims to be better
@@ -85,12 +89,12 @@ class DeformedSurface:
     """Holds the deformed head (world frame, mm), the standard deviation of each vertex, whether a point of skin shows
     it, and how far the eyes are closed."""
 
-    vertices: Float[np.ndarray, "v 3"]
-    deviation_mm: Float[np.ndarray, " v"]  # along the normal
+    vertices: Vertices
+    deviation_mm: PerVertex  # along the normal
     observed: Bool[np.ndarray, " v"]  # at a triangle that a point of skin showed
     closed_eyes: frozenset[str] = frozenset()  # of ``right`` and ``left``
     lids: Mapping[str, float] = field(default_factory=dict)  # how far each eye is closed, where the model blinks
-    outlined: Float[np.ndarray, " v"] | None = None  # how far silhouettes hold each vertex, 0 to 1; None: not compared
+    outlined: PerVertex | None = None  # how far silhouettes hold each vertex, 0 to 1; None: not compared
 
 
 @traced
@@ -100,7 +104,7 @@ def refine_to_surface(
     surface: SurfacePoints,
     *,
     eigenheads: int,
-    deviation_mm: Float[np.ndarray, " v"],
+    deviation_mm: PerVertex,
     eyes: Mapping[str, EyeEvidence] | None = None,
     patches: PatchSearch | None = None,
     outlines: OutlineSearch | None = None,
@@ -154,14 +158,14 @@ def refine_to_surface(
 
 
 def deform_to_points(
-    vertices: Float[np.ndarray, "v 3"],
-    deviation_mm: Float[np.ndarray, " v"],
-    faces: Int[np.ndarray, "f 3"],
+    vertices: Vertices,
+    deviation_mm: PerVertex,
+    faces: Faces,
     nodes: Nodes,
     surface: SurfacePoints,
     *,
     loose: Bool[np.ndarray, " v"],
-    look: Callable[[Float[np.ndarray, "v 3"]], PatchPlaces] | None = None,
+    look: Callable[[Vertices], PatchPlaces] | None = None,
     outlines: Outlines | None = None,
     shared_error: float = SHARED_ERROR,
     report: Progress = lambda stage, fraction: None,
@@ -212,16 +216,16 @@ def deform_to_points(
 
 
 def _coarsely_deformed(
-    vertices: Float[np.ndarray, "v 3"],
-    amplitude: Float[np.ndarray, " v"],
-    faces: Int[np.ndarray, "f 3"],
+    vertices: Vertices,
+    amplitude: PerVertex,
+    faces: Faces,
     nodes: NodeMesh,
     coarse_points: SurfacePoints,
     *,
     loose: Bool[np.ndarray, " v"],
     outlines: Outlines | None,
     report: Progress,
-) -> Float[np.ndarray, "v 3"]:
+) -> Vertices:
     """Returns the vertices after the coarse rounds, which move them freely in space."""
     current = vertices
     field = _laid_out(nodes, vertices, COARSE_LENGTH_MM)
@@ -235,24 +239,20 @@ def _coarsely_deformed(
 
 
 def with_outlines(
-    observed: Observed,
-    outlines: Outlines | None,
-    base: Float[np.ndarray, "v 3"],
-    current: Float[np.ndarray, "v 3"],
-    robust_mm: float,
+    observed: Observed, outlines: Outlines | None, base: Vertices, current: Vertices, robust_mm: float
 ) -> Observed:
     """Returns the observations and those of the outlines, if there are any."""
     return observed if outlines is None else observed.joined(outlines(base, current, robust_mm))
 
 
-def _laid_out(mesh: NodeMesh, vertices: Float[np.ndarray, "v 3"], length_mm: float) -> SmoothField:
+def _laid_out(mesh: NodeMesh, vertices: Vertices, length_mm: float) -> SmoothField:
     return smooth_field(mesh.shape @ vertices, mesh.faces, length_mm)
 
 
 def observe(
-    base: Float[np.ndarray, "v 3"],
-    current: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
+    base: Vertices,
+    current: Vertices,
+    faces: Faces,
     surface: SurfacePoints,
     loose: Bool[np.ndarray, " v"],
     *,
@@ -298,12 +298,7 @@ def observe(
 
 
 def with_patches(
-    observed: Observed,
-    found: PatchPlaces,
-    base: Float[np.ndarray, "v 3"],
-    current: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
-    robust_mm: float,
+    observed: Observed, found: PatchPlaces, base: Vertices, current: Vertices, faces: Faces, robust_mm: float
 ) -> Observed:
     """Replaces observations by those of patches near them: adds the patches' measurements on the head at ``current``,
     and drops the dense observations within ``PATCH_REACH_MM`` of a patch."""
@@ -319,7 +314,7 @@ def with_patches(
     return observed.chosen(alone).joined(Observed(corner, blend, normals, offset, information))
 
 
-def typical_deviation(dense: PointObservations, faces: Int[np.ndarray, "f 3"], count: int) -> Float[np.ndarray, " v"]:
+def typical_deviation(dense: PointObservations, faces: Faces, count: int) -> PerVertex:
     """Returns the mean standard deviation (mm) of the points of skin around each of ``count`` vertices; 0 where there
     are none."""
     if not len(dense.corner):
@@ -329,7 +324,7 @@ def typical_deviation(dense: PointObservations, faces: Int[np.ndarray, "f 3"], c
     return _pooled(total, faces) / np.maximum(_pooled(known, faces), 1e-9)
 
 
-def _pooled(values: Float[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " v"]:
+def _pooled(values: PerVertex, faces: Faces) -> PerVertex:
     """Returns the sum of the values over the triangles about each vertex, twice."""
     for _ in range(2):
         values = np.bincount(faces.ravel(), np.repeat(values[faces].sum(axis=1), 3), len(values))
@@ -337,11 +332,7 @@ def _pooled(values: Float[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -> F
 
 
 def _local_density(
-    found: Associated,
-    corner: Int[np.ndarray, "n 3"],
-    vertices: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
-    correlation_mm: float,
+    found: Associated, corner: Int[np.ndarray, "n 3"], vertices: Vertices, faces: Faces, correlation_mm: float
 ) -> Float[np.ndarray, " n"]:
     """Returns, for each point, how many points share its error, itself included: those within ``correlation_mm`` of it,
     by the density of points there."""
@@ -355,13 +346,13 @@ def _local_density(
 
 def field_deviation(
     posterior: Posterior,
-    base: Float[np.ndarray, "v 3"],
-    normals: Float[np.ndarray, "v 3"],
-    deviation_mm: Float[np.ndarray, " v"],
+    base: Vertices,
+    normals: Vertices,
+    deviation_mm: PerVertex,
     observed: Bool[np.ndarray, " v"],
     *,
-    common_mm: Float[np.ndarray, " v"],
-) -> Float[np.ndarray, " v"]:
+    common_mm: PerVertex,
+) -> PerVertex:
     """Returns the standard deviation (mm) of every vertex along its normal. Near observed vertices it comes from random
     draws of the posterior and from the error ``common_mm`` that all points share; far from them it is at least
     ``deviation_mm``."""

@@ -29,6 +29,8 @@ from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.surface_index import SurfaceIndex
 from rig.mesh import Mesh, face_normals
 
+PerVertex = Float[np.ndarray, " v"]
+
 Adjacency = tuple[Int64[np.ndarray, " s"], Int32[np.ndarray, " e"]]
 
 REACH_MM = 15.0  # height over the head above which the surface is something else (hair, a collar, a hand)
@@ -50,7 +52,7 @@ class HeadSkin:
     """Holds the delivered head as the prior of skin."""
 
     mesh_world: Mesh  # mm
-    deviation_mm: Float[np.ndarray, " v"]  # standard deviation of each vertex along its normal
+    deviation_mm: PerVertex  # standard deviation of each vertex along its normal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,9 +66,7 @@ class HeightField:
 
 
 @traced
-def combine_with_head(
-    mesh_world: Mesh, skin: Float[np.ndarray, " v"], head: HeadSkin, deviation_mm: Float[np.ndarray, " v"]
-) -> Mesh:
+def combine_with_head(mesh_world: Mesh, skin: PerVertex, head: HeadSkin, deviation_mm: PerVertex) -> Mesh:
     """Moves the vertices of skin along the head's normals to the estimate from depth and head.
 
     Args:
@@ -107,11 +107,8 @@ def combine_with_head(
 
 
 def depth_deviation_mm(
-    beside: Adjacency,
-    vertices: Float[np.ndarray, "v 3"],
-    stated_mm: Float[np.ndarray, " v"],
-    seen: Bool[np.ndarray, " v"],
-) -> Float[np.ndarray, " v"]:
+    beside: Adjacency, vertices: Float[np.ndarray, "v 3"], stated_mm: PerVertex, seen: Bool[np.ndarray, " v"]
+) -> PerVertex:
     """Returns s, at least ``MIN_DEVIATION_MM``: the larger of a vertex' deviation and its surroundings' mean; where no
     view sees the vertex, that of a guess."""
     around_mm = mean_around(beside, stated_mm, seen.astype(float))
@@ -119,16 +116,14 @@ def depth_deviation_mm(
     return np.hypot(noise_mm, MIN_DEVIATION_MM)
 
 
-def head_stiffness(head_mm: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+def head_stiffness(head_mm: PerVertex) -> PerVertex:
     """Returns k (1/mm2) by the head's deviation, 0 to ``STIFFNESS / MIN_DEVIATION_MM**2``; above ``SURE_MM`` it falls
     with the fourth power."""
     unsure = np.maximum(head_mm / SURE_MM, 1.0)
     return STIFFNESS / (np.maximum(head_mm, MIN_DEVIATION_MM) * unsure) ** 2
 
 
-def depth_information(
-    noise_mm: Float[np.ndarray, " v"], seen: Bool[np.ndarray, " v"], area_mm2: float
-) -> Float[np.ndarray, " v"]:
+def depth_information(noise_mm: PerVertex, seen: Bool[np.ndarray, " v"], area_mm2: float) -> PerVertex:
     """Returns 1 / (n s^2) (1/mm2), 0 to ``1 / MIN_DEVIATION_MM**2``. n, at least 1, counts the vertices, of
     ``area_mm2`` each, whose depths err alike."""
     alike = np.pi * np.where(seen, CORRELATED_MM, GUESSES_CORRELATED_MM) ** 2 / area_mm2
@@ -153,8 +148,8 @@ def heights_over(head: HeadSkin, mesh_world: Mesh) -> HeightField:
 
 
 def skin_share(
-    beside: Adjacency, vertices: Float[np.ndarray, "v 3"], skin: Float[np.ndarray, " v"], seen: Bool[np.ndarray, " v"]
-) -> Float[np.ndarray, " v"]:
+    beside: Adjacency, vertices: Float[np.ndarray, "v 3"], skin: PerVertex, seen: Bool[np.ndarray, " v"]
+) -> PerVertex:
     """Returns the probability that each vertex shows skin; where no view sees it, that of what is seen nearest."""
     rim = np.flatnonzero(seen)
     nearest_seen = nearest(PointTree.of(vertices[rim]), vertices[~seen])[1]
@@ -163,9 +158,7 @@ def skin_share(
     return np.where(seen, share, mean_around(beside, share, np.ones(len(seen))))
 
 
-def mean_around(
-    beside: Adjacency, values: Float[np.ndarray, " v"], weight: Float[np.ndarray, " v"]
-) -> Float[np.ndarray, " v"]:
+def mean_around(beside: Adjacency, values: PerVertex, weight: PerVertex) -> PerVertex:
     """Returns, for each vertex of a closed mesh, the weighted mean of the values over its surroundings
     (``SURROUNDINGS`` steps); about 0 where no weight is near. ``beside`` are its ``neighbours``."""
     both = blurred_over_mesh(np.stack([weight * values, weight], axis=1).astype(float), *beside, SURROUNDINGS)

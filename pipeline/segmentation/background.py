@@ -13,6 +13,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+CoarsePicture = Float32[np.ndarray, "hc wc 3"]
+Picture = Float32[np.ndarray, "h w 3"]
+
 COARSE_COLUMNS = 256  # columns of the coarse level: 16 pixels a decision quarter the noise, and edges stay sharp
 FIELD_SHARE = 0.12  # sigma of the gain field by the image's width: the drift of lamps is smoother than that
 TOLERANCE_LEVELS = 0.8  # error of a plate where nothing happened: 8-bit rounding, reflected light ...
@@ -32,9 +35,9 @@ class Background:
     which pixels show the background."""
 
     plates: UInt8[np.ndarray, "p h w 3"]
-    field: Float32[np.ndarray, "hc wc 3"]  # what their mean is multiplied by
-    coarse: Float32[np.ndarray, "hc wc 3"]  # the product (levels), averaged to the coarse level
-    noise: Float32[np.ndarray, "hc wc 3"]  # standard deviation (levels) of image minus expected, one full-size pixel
+    field: CoarsePicture  # what their mean is multiplied by
+    coarse: CoarsePicture  # the product (levels), averaged to the coarse level
+    noise: CoarsePicture  # standard deviation (levels) of image minus expected, one full-size pixel
     inliers: Bool[np.ndarray, "hc wc"]  # coarse pixels that look like the plate
     gain: Float32[np.ndarray, " 3"]  # median of the field, RGB
 
@@ -46,15 +49,13 @@ def coarse_size(shape: tuple[int, ...], width: int) -> tuple[int, int]:
     return max(1, shape[1] // factor), max(1, shape[0] // factor)
 
 
-def plate_tolerance(levels: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+def plate_tolerance(levels: Picture) -> Picture:
     """Returns by how many levels a plate of these levels may be off where nothing happened."""
     return TOLERANCE_LEVELS + TOLERANCE_SHARE * levels
 
 
 def estimate_background(
-    image: UInt8[np.ndarray, "h w 3"],
-    image_coarse: Float32[np.ndarray, "hc wc 3"],
-    plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...],
+    image: UInt8[np.ndarray, "h w 3"], image_coarse: CoarsePicture, plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...]
 ) -> Background:
     """Estimates the background of an image with the subject in it, by fitting a smooth gain field to the clean
     plates."""
@@ -94,18 +95,13 @@ def _mode_of_ratio(image: Float32[np.ndarray, "h w"], plate: Float32[np.ndarray,
     return float(np.exp(np.median(near))) if len(near) else 1.0
 
 
-def _tukey(square: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+def _tukey(square: Picture) -> Float32[np.ndarray, "h w"]:
     """Returns Tukey's biweight of each pixel, for the channel with the largest squared residual."""
     worst = np.maximum(np.maximum(square[:, :, 0], square[:, :, 1]), square[:, :, 2]) / TUKEY**2
     return np.where(worst < 1, (1 - worst) ** 2, 0).astype(np.float32)
 
 
-def _gain_field(
-    image: Float32[np.ndarray, "h w 3"],
-    plate: Float32[np.ndarray, "h w 3"],
-    weight: Float32[np.ndarray, "h w"],
-    sigma: float,
-) -> Float32[np.ndarray, "h w 3"]:
+def _gain_field(image: Picture, plate: Picture, weight: Float32[np.ndarray, "h w"], sigma: float) -> Picture:
     """Estimates the gain of the image over the plate at each pixel, by least squares in a Gaussian window. With no
     background nearby it tends to the gain of the whole image."""
     weighted = plate * cv2.merge([weight] * 3)
@@ -132,10 +128,10 @@ def _image_noise(image: UInt8[np.ndarray, "h w 3"], plates: UInt8[np.ndarray, "p
 def _noise_by_level(
     image: UInt8[np.ndarray, "h w 3"],
     plates: UInt8[np.ndarray, "p h w 3"],
-    field: Float32[np.ndarray, "hc wc 3"],
-    plate_coarse: Float32[np.ndarray, "hc wc 3"],
+    field: CoarsePicture,
+    plate_coarse: CoarsePicture,
     inliers: Bool[np.ndarray, "hc wc"],
-) -> Float32[np.ndarray, "hc wc 3"]:
+) -> CoarsePicture:
     """Estimates the noise (levels) of every coarse pixel from its brightness, by a curve measured on the background
     pixels."""
     rows, columns = np.arange(3, image.shape[0], 6), np.arange(3, image.shape[1], 6)  # 20,000 samples are enough
@@ -157,9 +153,7 @@ def _noise_by_level(
     return np.maximum(np.stack(channels, axis=2), np.sqrt(2 / 12)).astype(np.float32)
 
 
-def _with_temporal_noise(
-    noise: Float32[np.ndarray, "hc wc 3"], plates: Float32[np.ndarray, "p hc wc 3"]
-) -> Float32[np.ndarray, "hc wc 3"]:
+def _with_temporal_noise(noise: CoarsePicture, plates: Float32[np.ndarray, "p hc wc 3"]) -> CoarsePicture:
     """Adds to the noise the variation between the plates, if there are three or more: a flickering lamp, a moving
     curtain."""
     if len(plates) < 3:

@@ -24,6 +24,8 @@ from pipeline.segmentation.foreground import Decision
 from pipeline.segmentation.matting_kernels import MAX_ALPHA_INFORMATION, solve_alpha
 from rig.colour_space import linear_from_srgb
 
+Plane = Float32[np.ndarray, "h w"]
+
 BAND_PX = 6.0  # half width of the band in which alpha is solved, beyond the coarse level's 4 px
 ALPHA_BLUR_PX = 0.7  # blur that optics and pixel give an edge anyway; it halves the noise of the contour
 WEAK_CONTRAST = 4.0  # standard deviations between subject and background below which a contour piece is weak
@@ -99,9 +101,7 @@ def _pixels(cells: tuple[slice, slice], coarse: tuple[int, ...], fine: tuple[int
     return rows, columns
 
 
-def _smooth(
-    alpha: Float32[np.ndarray, "h w"], trust: Float32[np.ndarray, "h w"], sigma: float
-) -> Float32[np.ndarray, "h w"]:
+def _smooth(alpha: Plane, trust: Plane, sigma: float) -> Plane:
     """Returns alpha averaged with weights ``trust`` (1 / variance), in a window that is wider where trust is low."""
     near = cv2.GaussianBlur(alpha, (0, 0), sigma)
     if not (trust < MAX_ALPHA_INFORMATION).any():
@@ -124,10 +124,7 @@ def _light_outside(
 
 
 def _subject_inside(
-    image: UInt8[np.ndarray, "h w 3"],
-    alpha: Float32[np.ndarray, "h w"],
-    coarse: Float32[np.ndarray, "hc wc 3"],
-    reduction: float,
+    image: UInt8[np.ndarray, "h w 3"], alpha: Plane, coarse: Float32[np.ndarray, "hc wc 3"], reduction: float
 ) -> Float32[np.ndarray, "h2 w2 3"]:
     """Returns the subject's colour near its contour, at half resolution, spread from solid pixels inside. Of a picture
     with less than ``FULL_REDUCTION`` pixels to a coarse one all distances shrink as the head does, and no pixel is
@@ -144,15 +141,13 @@ def _subject_inside(
     return found / cv2.cvtColor(total[:, :, 3] / 255 + np.float32(0.02), cv2.COLOR_GRAY2RGB)
 
 
-def _share_of_edge(there: Bool[np.ndarray, "h w"], alpha: Float32[np.ndarray, "h w"]) -> float:
+def _share_of_edge(there: Bool[np.ndarray, "h w"], alpha: Plane) -> float:
     """Returns the share of the pixels that the contour halves where something is ``there``; 0 without a contour."""
     edge = np.abs(alpha - 0.5) < 0.25
     return float(there[edge].mean()) if edge.any() else 0.0
 
 
-def _along_contour(
-    contrast: Float32[np.ndarray, "h w"], alpha: Float32[np.ndarray, "h w"]
-) -> Float32[np.ndarray, " c"]:
+def _along_contour(contrast: Plane, alpha: Plane) -> Float32[np.ndarray, " c"]:
     """Returns the contrast at every pixel of the contour: the pixel's own or, beside the band, its neighbours'; 0 where
     they were not solved either."""
     mask = alpha > 0.5

@@ -66,6 +66,10 @@ STRONG_GAIN = 1.5  # a camera that differs so much from the others has another e
 MIN_SKIN, MIN_MEAN_SKIN = 0.5, 0.7  # of a view, and of all: at a collar's soft edge single views are sure of skin
 GAIN_HALVED = 1.0  # of the light, in powers of two: a camera that differs so much counts half
 
+Weights = Float32[np.ndarray, "k v"]
+Colours = Float32[np.ndarray, "k v 3"]
+Points = Float[np.ndarray, "v 3"]
+Faces = Int[np.ndarray, "f 3"]
 Rgb = tuple[float, float, float]
 
 
@@ -97,14 +101,12 @@ class Shown:
     """
 
     likely: UInt8[np.ndarray, " v"]
-    shares: Callable[[Camera], Float[np.ndarray, "v 3"]]
+    shares: Callable[[Camera], Points]
     hairless: Bool[np.ndarray, " v"] | None = None
     face: Bool[np.ndarray, " v"] | None = None
     measured: Bool[np.ndarray, " v"] | None = None
 
-    def weigh(
-        self, weights: Float32[np.ndarray, "k v"], views: Rig
-    ) -> tuple[Float32[np.ndarray, "k v"], UInt8[np.ndarray, " v"]]:
+    def weigh(self, weights: Weights, views: Rig) -> tuple[Weights, UInt8[np.ndarray, " v"]]:
         """Returns the views' weights, 0 where one of them, or the mean of all, hardly shows the surface; and the parts
         from which unseen vertices are filled: hair from the hair of the scalp, where most of the scalp has hair."""
         shares = np.stack([self.shares(camera) for camera in views]).astype(np.float32)
@@ -121,7 +123,7 @@ class Shown:
             weights = weights * ((surface > MIN_SKIN) & (mean > MIN_MEAN_SKIN))
         return weights, np.where(bare, Part.SKIN, self.likely).astype(np.uint8)
 
-    def find_guessed(self, weights: Float32[np.ndarray, "k v"]) -> Bool[np.ndarray, " v"]:
+    def find_guessed(self, weights: Weights) -> Bool[np.ndarray, " v"]:
         """Tells where the surface is a guess that views show only along their rims: their colour is half another's."""
         total = weights.sum(axis=0)
         guessed = np.zeros(len(total), bool) if self.measured is None else ~self.measured
@@ -193,7 +195,7 @@ def texture(
     return Texture(codes, seen, by_camera, _by_name(views, offsets), filled, decision, dim, _gain_warnings(by_camera))
 
 
-def wide_doubtful_surface(weights: Float32[np.ndarray, "k v"], mesh_world: Mesh) -> Bool[np.ndarray, " v"]:
+def wide_doubtful_surface(weights: Weights, mesh_world: Mesh) -> Bool[np.ndarray, " v"]:
     """Tells which vertices lie on a wide part of the surface that no view shows surely, as the back of a head before
     frontal cameras with the edge of what they show. Its colour is filled from what is seen surely."""
     total = weights.sum(axis=0)
@@ -207,9 +209,7 @@ def wide_doubtful_surface(weights: Float32[np.ndarray, "k v"], mesh_world: Mesh)
     return np.asarray(unsure & (area_mm2[part] > DOUBTFUL_MM2))
 
 
-def underexposed_views(
-    weights: Float32[np.ndarray, "k v"], colours: Float32[np.ndarray, "k v 3"], share: float
-) -> Float32[np.ndarray, "v 3"]:
+def underexposed_views(weights: Weights, colours: Colours, share: float) -> Float32[np.ndarray, "v 3"]:
     """Returns the linear colour of each vertex in a dim view: the one for which views that are no brighter have
     ``share`` of the vertex's weight. Black where no view sees the vertex."""
     order = np.argsort(np.where(weights > 0, colours.sum(axis=2), np.inf), axis=0)
@@ -228,9 +228,9 @@ def gain_confidence(gains: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
 
 def decide(
     views: Rig,
-    weights: Float32[np.ndarray, "k v"],
-    balanced: Float32[np.ndarray, "k v 3"],
-    agreed: Float[np.ndarray, "v 3"],
+    weights: Weights,
+    balanced: Colours,
+    agreed: Points,
     gains: Float[np.ndarray, "k 3"],
     pictures: Pictures,
     *,
@@ -252,7 +252,7 @@ def usable_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: R
     return rig.subset(name for name in rig.names if name in capture.images and silhouettes[name].quality.usable)
 
 
-def _stacked(sights: Sequence[Sight]) -> tuple[Float32[np.ndarray, "k v"], Float32[np.ndarray, "k v 3"]]:
+def _stacked(sights: Sequence[Sight]) -> tuple[Weights, Colours]:
     return np.stack([sight.weights for sight in sights]), np.stack([sight.colours for sight in sights])
 
 
@@ -279,7 +279,7 @@ def _untextured(count: int) -> Texture:
 
 def _reference(
     mesh: Mesh,
-    normals: Float[np.ndarray, "v 3"],
+    normals: Points,
     capture: Capture,
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
@@ -295,13 +295,13 @@ def _reference(
 
 
 def reference_colours(
-    points: Float[np.ndarray, "v 3"],
-    normals: Float[np.ndarray, "v 3"],
+    points: Points,
+    normals: Points,
     capture: Capture,
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
-) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, " v"], UInt8[np.ndarray, " v"]]:
+) -> tuple[Points, Float[np.ndarray, " v"], UInt8[np.ndarray, " v"]]:
     """Computes the colours of surface points by the paper's method (section 4.5). Returns their sRGB codes, the sum of
     weights of each (0: no camera sees the point), and the number of images."""
     total, weights = np.zeros((len(normals), 3)), np.zeros(len(normals))
@@ -320,7 +320,7 @@ def reference_colours(
 
 def _visible(
     camera: Camera,
-    vertices: Float[np.ndarray, "v 3"],
+    vertices: Points,
     pixels: Float[np.ndarray, "v 2"],
     depth: Float32[np.ndarray, "h w"],
     silhouette: Silhouette,
@@ -333,7 +333,7 @@ def _visible(
     return framed & silhouette.mask[rows, columns] & free
 
 
-def _sampled(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "v 2"]) -> Float[np.ndarray, "v 3"]:
+def _sampled(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "v 2"]) -> Points:
     """Returns bilinear samples; outside the image those of the nearest border pixel."""
     height, width = image.shape[:2]
     safe = np.clip(np.nan_to_num(pixels), 0, (width - 1.001, height - 1.001))
@@ -371,9 +371,7 @@ def fill_unobserved_patches(
     return _taken(decision, faces[wide], area[wide], _patches(faces[wide]), seen[:, wide])
 
 
-def _parts(
-    mesh: Mesh, rows: Int[np.ndarray, " f"]
-) -> tuple[Int[np.ndarray, "f 3"], Float[np.ndarray, "f 3"], Float[np.ndarray, " f"]]:
+def _parts(mesh: Mesh, rows: Int[np.ndarray, " f"]) -> tuple[Faces, Float[np.ndarray, "f 3"], Float[np.ndarray, " f"]]:
     """Triangles, their unit normals and areas (mm2)."""
     faces = mesh.faces[rows]
     normals = face_normals(mesh.vertices, faces)
@@ -381,7 +379,7 @@ def _parts(
     return faces, normals / doubled[:, None], 0.5 * doubled
 
 
-def _wide(faces: Int[np.ndarray, "f 3"], area: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+def _wide(faces: Faces, area: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
     """Triangles of patches that are large enough."""
     patch = _patches(faces)
     return np.bincount(patch, area)[patch] >= MIN_MM2 if len(faces) else np.zeros(0, bool)
@@ -389,7 +387,7 @@ def _wide(faces: Int[np.ndarray, "f 3"], area: Float[np.ndarray, " f"]) -> Bool[
 
 def _taken(
     decision: Decision,
-    faces: Int[np.ndarray, "f 3"],
+    faces: Faces,
     area: Float[np.ndarray, " f"],
     patch: Int[np.ndarray, " f"],
     seen: Float32[np.ndarray, "k f p"],
@@ -412,7 +410,7 @@ def _taken(
     return replace(decision, slots=slots, shares=shares, weights=weights)
 
 
-def _blind(weights: Float32[np.ndarray, "k v"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+def _blind(weights: Weights, faces: Faces) -> Bool[np.ndarray, " f"]:
     """Triangles of which no view sees all corners."""
     out = np.ones(len(faces), bool)
     for view in weights:
@@ -420,7 +418,7 @@ def _blind(weights: Float32[np.ndarray, "k v"], faces: Int[np.ndarray, "f 3"]) -
     return out
 
 
-def _patches(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " f"]:
+def _patches(faces: Faces) -> Int[np.ndarray, " f"]:
     """Returns the patch of each triangle: the triangles of a patch are connected by edges."""
     count = len(faces)
     ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)

@@ -29,6 +29,9 @@ from rig.mesh import boundary_edges, vertex_normals
 from rig.messages.message import compose
 from rig.progress import Progress
 
+Flags = Bool[np.ndarray, " t"]
+Vertices = Float[np.ndarray, "t 3"]
+
 DRAWN = Search(steps=0, reach_mm=5.0, normal_mm=2.0, plane_mm=0.0)
 MARK_WEIGHT = 30.0  # of a landmark, beside 1 of a vertex that meets the head: it must move its neighbours along
 STIFFNESS = (10.0, 3.0, 1.0, 0.5, 0.2, 0.05, 0.05)
@@ -55,7 +58,7 @@ class Registration:
 
     surface_binding: SurfaceBinding
     place: Similarity  # head_from_template, from the start
-    placed: Float[np.ndarray, "t 3"]  # the mesh there, in its own shape, mm
+    placed: Vertices  # the mesh there, in its own shape, mm
     head: Float[np.ndarray, "v 3"]  # the model as like it as it can be, full level, mm
     off_mm: Float[np.ndarray, " n"]  # skin to that head, after the mesh was drawn to it
     unlike_mm: Float[np.ndarray, " n"]  # and before
@@ -195,19 +198,15 @@ def _head(model: HeadModel, vertices: Float[np.ndarray, "v 3"]) -> Surface:
     return Surface(vertices, faces, vertex_normals(vertices, faces))
 
 
-def _used(mesh: Surface) -> Bool[np.ndarray, " t"]:
+def _used(mesh: Surface) -> Flags:
     used = np.zeros(len(mesh.vertices), bool)
     used[mesh.faces] = True
     return used
 
 
 def parting(
-    attachment: Attachment,
-    rest: Float[np.ndarray, "t 3"],
-    skin: Bool[np.ndarray, " t"],
-    faces: Int[np.ndarray, "f 3"],
-    model: HeadModel,
-) -> Bool[np.ndarray, " t"]:
+    attachment: Attachment, rest: Vertices, skin: Flags, faces: Int[np.ndarray, "f 3"], model: HeadModel
+) -> Flags:
     """Tells which vertices move away from their neighbours on some random head. Such vertices were attached to another
     layer of the surface, such as the inside of a lid or the eyeball."""
     graph = _graph(faces[skin[faces].all(axis=1)], len(rest))
@@ -221,7 +220,7 @@ def parting(
     return skin & (apart > PARTING_MM + reach)
 
 
-def without_edge(skin: Bool[np.ndarray, " t"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " t"]:
+def without_edge(skin: Flags, faces: Int[np.ndarray, "f 3"]) -> Flags:
     """Returns the skin without its vertices next to deeper parts. Where a lid turns inwards it is chance which of them
     still meet the model's lid; without all of them the deeper parts follow evenly."""
     out = skin.copy()
@@ -230,7 +229,7 @@ def without_edge(skin: Bool[np.ndarray, " t"], faces: Int[np.ndarray, "f 3"]) ->
     return out
 
 
-def without_specks(mask: Bool[np.ndarray, " t"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " t"]:
+def without_specks(mask: Flags, faces: Int[np.ndarray, "f 3"]) -> Flags:
     """Returns the mask without its small connected patches."""
     inside = faces[mask[faces].all(axis=1)]
     _, patch = connected_components(_graph(inside, len(mask)), directed=False)
@@ -238,9 +237,7 @@ def without_specks(mask: Bool[np.ndarray, " t"], faces: Int[np.ndarray, "f 3"]) 
     return mask & (size[patch] > PATCH_SHARE * mask.sum())
 
 
-def _drawn(
-    mesh: Surface, skin: Bool[np.ndarray, " t"], head: Surface, marks: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> Float[np.ndarray, "t 3"]:
+def _drawn(mesh: Surface, skin: Flags, head: Surface, marks: Sequence[tuple[np.ndarray, np.ndarray]]) -> Vertices:
     """Returns the mesh's vertices with the skin drawn onto the head, and its landmarks onto the head's; other parts
     stay."""
     rows = np.flatnonzero(skin)
@@ -258,9 +255,7 @@ def _drawn(
     return out
 
 
-def _followed(
-    before: Float[np.ndarray, "t 3"], after: Float[np.ndarray, "t 3"], skin: Bool[np.ndarray, " t"]
-) -> Float[np.ndarray, "t 3"]:
+def _followed(before: Vertices, after: Vertices, skin: Flags) -> Vertices:
     """Returns ``after`` for the skin; all other vertices move from ``before`` smoothly with the skin around them."""
     rows = np.flatnonzero(skin)
     rows = rows[spread_nodes(before[rows], min(400, len(rows)))]

@@ -23,6 +23,9 @@ from pipeline.segmentation.without_plates.mask_search import CoarseMask, search_
 from pipeline.segmentation.without_plates.viewing_volume import ViewingVolume, viewing_ball, viewing_volume
 from rig.rig import Rig
 
+Plane = Float[np.ndarray, " 4"]
+Vector = Float[np.ndarray, " 3"]
+
 POINTS_SHARE, MASKS_SHARE = 0.3, 0.6  # of the time, when they are there
 POINT_PX = 2  # of the reduced image: what is around a point is the same thing
 MIN_LEVEL = 0.8  # cosine between a table's normal and the face's up: a nod of 35 degrees
@@ -81,12 +84,7 @@ def decide_without_plates(
 
 
 def background_seen(
-    points: ScenePoints,
-    name: str,
-    width: int,
-    size: tuple[int, int],
-    volume: ViewingVolume,
-    plane: Float[np.ndarray, " 4"] | None,
+    points: ScenePoints, name: str, width: int, size: tuple[int, int], volume: ViewingVolume, plane: Plane | None
 ) -> Bool[np.ndarray, "h w"]:
     """Returns the pixels of a reduced image (``size``: height, width) around scene points that are background: far from
     the subject, or on the plane that it stands on."""
@@ -195,9 +193,7 @@ OUTLYING, ROOM = 0.01, 1.2  # share of points that are wrong; of their distance,
 MIN_OFF_CENTRE = 0.08  # of the radius: the place that all cameras look at is not on it
 
 
-def standing_plane(
-    points_world: Float[np.ndarray, "n 3"], centre_world: Float[np.ndarray, " 3"], radius_mm: float
-) -> Float[np.ndarray, " 4"] | None:
+def standing_plane(points_world: Float[np.ndarray, "n 3"], centre_world: Vector, radius_mm: float) -> Plane | None:
     """Finds a plane that many scene points lie on and hardly any lie beyond. ``plane . (x, 1)`` is the distance (mm),
     positive on the subject's side; None if there is no such plane."""
     near = points_world[np.linalg.norm(points_world - centre_world, axis=1) < 2 * radius_mm]
@@ -221,11 +217,8 @@ def standing_plane(
 
 
 def ball_above(
-    plane_world: Float[np.ndarray, " 4"],
-    points_world: Float[np.ndarray, "n 3"],
-    centre_world: Float[np.ndarray, " 3"],
-    radius_mm: float,
-) -> tuple[Float[np.ndarray, " 3"], float]:
+    plane_world: Plane, points_world: Float[np.ndarray, "n 3"], centre_world: Vector, radius_mm: float
+) -> tuple[Vector, float]:
     """Returns the centre (world) and radius (mm) of a ball around the scene points above the plane, with some margin
     for parts without points."""
     height = points_world @ plane_world[:3] + plane_world[3]
@@ -239,9 +232,7 @@ def ball_above(
     return middle, min(radius_mm, ROOM * float(np.quantile(away, 1 - OUTLYING)))
 
 
-def _holds(
-    plane: Float[np.ndarray, " 4"], points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, " 3"], radius: float
-) -> bool:
+def _holds(plane: Plane, points: Float[np.ndarray, "n 3"], centre: Vector, radius: float) -> bool:
     height = points @ plane[:3] + plane[3]
     on = points[np.abs(height) < NEAR * radius]
     inside = np.linalg.norm(points - centre, axis=1) < radius
@@ -252,7 +243,7 @@ def _holds(
     return bool(spread > MIN_WIDTH * radius and beyond < MAX_BEYOND)
 
 
-def _through(three: Float[np.ndarray, "3 3"], centre: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 4"] | None:
+def _through(three: Float[np.ndarray, "3 3"], centre: Vector) -> Plane | None:
     normal = np.cross(three[1] - three[0], three[2] - three[0])
     length = float(np.linalg.norm(normal))
     if length < 1e-9:
@@ -261,9 +252,7 @@ def _through(three: Float[np.ndarray, "3 3"], centre: Float[np.ndarray, " 3"]) -
     return plane if plane[:3] @ centre + plane[3] > 0 else -plane
 
 
-def _refined(
-    plane: Float[np.ndarray, " 4"], points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, " 3"], radius: float
-) -> Float[np.ndarray, " 4"]:
+def _refined(plane: Plane, points: Float[np.ndarray, "n 3"], centre: Vector, radius: float) -> Plane:
     """Returns the plane fitted by least squares to the points near it."""
     for _ in range(3):
         on = points[np.abs(points @ plane[:3] + plane[3]) < NEAR * radius]

@@ -26,6 +26,8 @@ from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 
+Faces = Int[np.ndarray, "f 3"]
+
 ROUNDS = 4  # of reweighting
 BULGE = 0.02  # of the square's side
 MARGIN = 0.01  # left free around the square
@@ -45,7 +47,7 @@ class Layout:
     ``uv`` is its position in the unit square, v downwards as in glTF."""
 
     uv: Float[np.ndarray, "n 2"]
-    faces: Int[np.ndarray, "f 3"]
+    faces: Faces
     source: Int[np.ndarray, " n"]
 
 
@@ -57,7 +59,7 @@ class Atlas:
     image: UInt8[np.ndarray, "s s 3"]
 
 
-def unwrap(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Layout:
+def unwrap(vertices: Float[np.ndarray, "v 3"], faces: Faces) -> Layout:
     """Cuts a head open from the nape to the crown, and lays it flat in the unit square. Raises NoLayout unless the mesh
     is one piece with one open border, at the neck."""
     border = _border(faces)
@@ -80,12 +82,12 @@ def unwrap(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
     return Layout(MARGIN + (1 - 2 * MARGIN) * uv, cut, source)
 
 
-def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+def _edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
     """Returns directed edges: corner 0 to 1 of all faces, then 1 to 2, then 2 to 0."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
-def _border(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " b"]:
+def _border(faces: Faces) -> Int[np.ndarray, " b"]:
     """Returns the vertices of the one open border, in the order of its directed edges."""
     edges, base = _edges(faces).astype(np.int64), int(faces.max()) + 1
     known = np.unique(edges @ [base, 1])
@@ -100,9 +102,7 @@ def _border(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " b"]:
     return np.array(loop)
 
 
-def _path(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], start: int, end: int
-) -> Int[np.ndarray, " p"]:
+def _path(vertices: Float[np.ndarray, "v 3"], faces: Faces, start: int, end: int) -> Int[np.ndarray, " p"]:
     """Returns the shortest path on edges that prefers the symmetry plane and meets the border at its start only."""
     edges = _edges(faces)
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
@@ -116,9 +116,7 @@ def _path(
     return np.array(path[::-1])
 
 
-def _cut_open(
-    faces: Int[np.ndarray, "f 3"], count: int, path: Int[np.ndarray, " p"]
-) -> tuple[Int[np.ndarray, "f 3"], Int[np.ndarray, " n"]]:
+def _cut_open(faces: Faces, count: int, path: Int[np.ndarray, " p"]) -> tuple[Faces, Int[np.ndarray, " n"]]:
     """Returns faces with the path's vertices doubled except its end, and the original of each vertex."""
     edges = _edges(faces)
     beside = np.flatnonzero(np.isin(edges, path).any(axis=1))
@@ -157,9 +155,7 @@ def _frame(loop: Float[np.ndarray, "b 3"], corner: int, top: int) -> Float[np.nd
     return np.stack([x, y], axis=1)
 
 
-def _mean_value_weights(
-    points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], count: int
-) -> scipy.sparse.csr_array:
+def _mean_value_weights(points: Float[np.ndarray, "n 3"], faces: Faces, count: int) -> scipy.sparse.csr_array:
     """Returns in row i the weights of vertex i's neighbours, ``(tan(a / 2) + tan(b / 2)) / |ij|``."""
     rows, columns, values = [], [], []
     for k in range(3):
@@ -191,9 +187,7 @@ def _settled(
     return uv
 
 
-def _stretch(
-    points: Float[np.ndarray, "n 3"], uv: Float[np.ndarray, "n 2"], faces: Int[np.ndarray, "f 3"]
-) -> Float[np.ndarray, " n"]:
+def _stretch(points: Float[np.ndarray, "n 3"], uv: Float[np.ndarray, "n 2"], faces: Faces) -> Float[np.ndarray, " n"]:
     """Returns how much longer (RMS) the surface around each vertex is than its picture, relative to the whole."""
     a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
     (s, t), (p, q) = (uv[faces[:, 1]] - uv[faces[:, 0]]).T, (uv[faces[:, 2]] - uv[faces[:, 0]]).T

@@ -10,12 +10,14 @@ from jaxtyping import Float, Int
 
 from pipeline.applications.model_building.correspondence.cylinder_kernels import CELL_MM, bin_triangles, cast_rays
 
+PerVertex = Float[np.ndarray, " N"]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cast:
     """Holds where rays meet a surface: radius (mm) and triangle, NaN and -1 where they do not."""
 
-    radii: Float[np.ndarray, " N"]
+    radii: PerVertex
     triangles: Int[np.ndarray, " N"]
 
 
@@ -24,9 +26,7 @@ def coordinates(points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, " _
     return np.arctan2(points[:, 0], points[:, 2]), points[:, 1], np.hypot(points[:, 0], points[:, 2])
 
 
-def points_at(
-    angles: Float[np.ndarray, " N"], heights: Float[np.ndarray, " N"], radii: Float[np.ndarray, " N"]
-) -> Float[np.ndarray, "N 3"]:
+def points_at(angles: PerVertex, heights: PerVertex, radii: PerVertex) -> Float[np.ndarray, "N 3"]:
     """Returns points from angle, height and radius: the inverse of ``coordinates``."""
     return np.stack([radii * np.sin(angles), heights, radii * np.cos(angles)], 1)
 
@@ -41,12 +41,7 @@ class CylinderIndex:
         self._rows = int((vertices[:, 1].max() - self._low) / CELL_MM) + 1
         self._start, self._members = bin_triangles(self._vertices, self._faces, self._low, self._rows)
 
-    def cast(
-        self,
-        angles: Float[np.ndarray, " N"],
-        heights: Float[np.ndarray, " N"],
-        near: Float[np.ndarray, " N"] | None = None,
-    ) -> Cast:
+    def cast(self, angles: PerVertex, heights: PerVertex, near: PerVertex | None = None) -> Cast:
         """Returns each ray's hit whose radius is nearest to ``near`` (mm), or without ``near`` the outermost hit."""
         wanted = np.full(len(angles), np.inf) if near is None else np.asarray(near, float)
         found, triangles = cast_rays(

@@ -33,6 +33,8 @@ from rig.mesh import vertex_normals
 from rig.messages.message import compose
 from rig.progress import Progress
 
+Vertices = Float[np.ndarray, "V 3"]
+
 
 class CannotImport(EigenheadError):
     """Reports a file or folder that contains no readable head model."""
@@ -53,7 +55,7 @@ class Foreign:
     licence: str
     source: str
     notice: str
-    mean: Float[np.ndarray, "V 3"]
+    mean: Vertices
     modes: Float[np.ndarray, "M V 3"]  # mm per standard deviation; need not be orthogonal
     faces: Int[np.ndarray, "F 3"]
     landmarks: Mapping[str, int]  # those that are known
@@ -61,7 +63,7 @@ class Foreign:
     expressions: Expressions | None = None  # displacements in mm
 
 
-def read_obj(path: Path, *, polygons: bool = True) -> tuple[Float[np.ndarray, "V 3"], list[list[int]]]:
+def read_obj(path: Path, *, polygons: bool = True) -> tuple[Vertices, list[list[int]]]:
     """Returns vertices and polygons in the order of the file. trimesh would merge and reorder the vertices to which
     published indices refer."""
     vertices, faces = [], []
@@ -177,9 +179,7 @@ def read_ict_repository(folder: Path, *, report: Progress | None = None) -> Fore
     return replace(found, expressions=_repository_expressions(inside, neutral, report))
 
 
-def _repository_expressions(
-    folder: Path, neutral: Float[np.ndarray, "V 3"], report: Progress | None
-) -> Expressions | None:
+def _repository_expressions(folder: Path, neutral: Vertices, report: Progress | None) -> Expressions | None:
     """Returns the expressions from meshes named after them: browDown_L.obj and so on. Raises CannotImport."""
     paths = [path for path in sorted(folder.glob("*.obj")) if ICT_EXPRESSION.fullmatch(path.stem)]
     shapes = []
@@ -244,7 +244,7 @@ def read_statismo(path: Path) -> Foreign:
     )
 
 
-def _basel_landmarks(listed: list[dict], mean: Float[np.ndarray, "V 3"]) -> dict[str, int]:
+def _basel_landmarks(listed: list[dict], mean: Vertices) -> dict[str, int]:
     named = {_BASEL_NAMES.get(entry["id"], entry["id"]): np.asarray(entry["coordinates"], float) for entry in listed}
     return {n: int(np.linalg.norm(mean - p, axis=1).argmin()) for n, p in named.items() if n in NAMES}
 
@@ -335,7 +335,7 @@ def largest_miss(
 
 
 def close_openings(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], largest_mm: float = 90.0
+    vertices: Vertices, faces: Int[np.ndarray, "F 3"], largest_mm: float = 90.0
 ) -> Int[np.ndarray, "G 3"]:
     """Returns the faces with strips that close every opening up to ``largest_mm`` wide except the neck."""
     loops = boundary_loops(faces)
@@ -350,9 +350,7 @@ def close_openings(
     return np.concatenate([faces, *strips]).astype(np.int32)
 
 
-def complete_landmarks(
-    mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], known: Mapping[str, int]
-) -> dict[str, int]:
+def complete_landmarks(mean: Vertices, faces: Int[np.ndarray, "F 3"], known: Mapping[str, int]) -> dict[str, int]:
     """Returns all 26 landmarks as vertices: the known ones, and the others from the default model, fitted and warped to
     this mean head."""
     if set(known) >= set(NAMES):
@@ -375,9 +373,7 @@ def complete_landmarks(
     return placed | {name: int(known[name]) for name in shared}
 
 
-def _symmetric(
-    at: Float[np.ndarray, "26 3"], mean: Float[np.ndarray, "V 3"], surface: SurfaceIndex
-) -> Float[np.ndarray, "26 3"]:
+def _symmetric(at: Float[np.ndarray, "26 3"], mean: Vertices, surface: SurfaceIndex) -> Float[np.ndarray, "26 3"]:
     """Returns landmarks averaged with their mirror images if the mean head is symmetric (to 0.5 mm).
 
     The default population is not exactly symmetric: on a perfectly symmetric head the fit alone puts an ear's landmark
@@ -389,7 +385,7 @@ def _symmetric(
     return (at + at[[NAMES.index(mirrored(name)) for name in NAMES]] * flip + middle) / 2
 
 
-def _start(default: HeadModel, mean: Float[np.ndarray, "V 3"], known: Mapping[str, int]) -> RigidTransform:
+def _start(default: HeadModel, mean: Vertices, known: Mapping[str, int]) -> RigidTransform:
     """Returns the start of the fit of the default model to a mean head: by shared landmarks, otherwise by the tip of
     the nose."""
     ours = default.vertices(np.zeros(0))
@@ -400,9 +396,7 @@ def _start(default: HeadModel, mean: Float[np.ndarray, "V 3"], known: Mapping[st
     return RigidTransform(np.eye(3), nose - ours[default.landmarks["pronasale"]])
 
 
-def _likeness(
-    default: HeadModel, mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], start: RigidTransform
-) -> Float[np.ndarray, "V 3"]:
+def _likeness(default: HeadModel, mean: Vertices, faces: Int[np.ndarray, "F 3"], start: RigidTransform) -> Vertices:
     """Returns the default model's head that fits the mean head best, its neck left out."""
     areas = vertex_areas(mean, faces)
     placed = start.apply(default.vertices(np.zeros(0)))
@@ -426,7 +420,7 @@ class SurfaceFit:
     distances: Float[np.ndarray, " N"]  # mm, of each point to the fitted surface
     iterations: int
 
-    def vertices(self, model: HeadModel, level: str = "full") -> Float[np.ndarray, "V 3"]:
+    def vertices(self, model: HeadModel, level: str = "full") -> Vertices:
         """Returns the fitted head in the target's frame."""
         return self.target_from_head.apply(model.vertices(self.coefficients, level))
 
