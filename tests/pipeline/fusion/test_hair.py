@@ -97,6 +97,15 @@ def test_height_over_the_head_decides_between_skin_and_hair(height_mm: float, sh
     assert (shares[:, part.channel] > 0.99).all()
 
 
+def test_a_chest_below_the_end_of_the_head_is_no_hair() -> None:
+    head, chest = ball(OUTLINE_MM), np.array([[0.0, -OUTLINE_MM - 20.0, 30.0], [0.0, OUTLINE_MM + 20.0, 30.0]])
+    kept = head.faces[head.vertices[head.faces][:, :, 1].min(axis=1) > -0.8 * OUTLINE_MM]
+    used, joined = np.unique(kept, return_inverse=True)
+    neck = Mesh(head.vertices[used], joined.reshape(-1, 3).astype(np.int32))
+    votes = PartVotes(chest.min(axis=0), np.array([9, 99, 9]), np.arange(2), chest, np.tile([1.0, 0.0, 0.0], (2, 1)))
+    assert parts_over_head(votes, neck).probability[:, Part.SKIN.channel].tolist() == [1.0, 0.0]
+
+
 def test_scatter_of_strands_is_smoothed_and_skin_stays() -> None:
     rng, mesh = np.random.default_rng(0), ball(OUTLINE_MM)
     noisy = Mesh(mesh.vertices * (1.0 + rng.normal(0.0, 1.0 / OUTLINE_MM, (len(mesh.vertices), 1))), mesh.faces)
