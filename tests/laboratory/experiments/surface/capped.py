@@ -148,7 +148,7 @@ def skulls(
     populations = [(model, IN_SPAN_MODES, IN_SPAN_SPREAD)]
     if others is not None:
         populations.append((others, len(others.modes), 1.0))
-    for number, style in product(range(subjects), STYLES):
+    for style, number in product(STYLES, range(subjects)):
         bench.report(style, number / subjects)
         drawn, name = populations[number % len(populations)], f"{style}-{number:02}"
         made = partial(_skull, model, *drawn, number, style, renderer=renderer)
