@@ -36,14 +36,7 @@ from tests.laboratory.experiments.people.pose_error import PoseError, pose_error
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 EYES = "eyes"
-SPEAKING = (
-    "contour-implausible",
-    "face-elsewhere",
-    "no-face",
-    "pose-doubtful",
-    "scale-implausible",
-    "shape-implausible",
-)
+SPEAKING = ("contour-implausible", "face-elsewhere", "no-face", "pose-doubtful", "scale-implausible")
 """Warnings that say of a result, not of its input, that it may be wrong."""
 MAX_TURN_DEG, MAX_SHIFT_MM, MAX_DEVIATIONS = 3.0, 5.0, 3.0  # of a result that needs no warning
 REFUSAL_LETTERS = 120  # of a refusal's sentence, in a row

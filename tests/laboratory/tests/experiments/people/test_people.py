@@ -102,7 +102,7 @@ def test_the_summary_counts_what_is_silently_wrong() -> None:
         row(),
         row(turn_deg=2.0),
         row(turn_deg=170.0, shift_mm=150.0, warnings=["camera-gain"]),
-        row(turn_deg=90.0, warnings=["shape-implausible"]),
+        row(turn_deg=90.0, warnings=["pose-doubtful"]),
         row("circle-8", "masks", deviations_off=5.0),
         {"name": "n", "subject": "s", "kind": "front-3", "evidence": "neither", "refused": "no view", "seconds": 1.0},
         {"name": "n", "subject": "s", "kind": "front-3", "evidence": "masks", "crashed": "KeyError: 3", "seconds": 1.0},
@@ -126,7 +126,7 @@ def test_the_table_marks_what_is_silently_wrong_and_says_how_others_ended() -> N
         row("circle-16"),
         row("circle-8", turn_deg=9.0),
         row(refused="no view shows a head"),
-        row("circle-8", turn_deg=9.0, warnings=["shape-implausible"]),
+        row("circle-8", turn_deg=9.0, warnings=["pose-doubtful"]),
     ]
     lines = table(rows).splitlines()[2:]
     assert [line.split(" | ")[0] for line in lines] == ["| front-3", "| circle-8", "| circle-8", "| circle-16"]
