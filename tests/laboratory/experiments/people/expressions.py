@@ -25,7 +25,6 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
-from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.paper.detail import Known, surface_error
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.drawn_expressions import drawn_weights
@@ -52,7 +51,7 @@ def expressions(models: Mapping[str, HeadModel], *, renderer: Renderer, bench: B
         bench.report(f"{label} {i} {kind}", (len(rows) + 1) / (2 * subjects * len(models)))
         row = kept[label].row(f"{label}-{i:02} {kind}", partial(_subject, model, i, kind == "posed", renderer))
         rows.append({"model": label, "kind": kind, "subject": i} | row)
-    return {"figures": _figures(rows, tuple(models)), "rows": rows, "markdown": _table(rows, tuple(models))}
+    return {"figures": _figures(rows, tuple(models)), "rows": rows}
 
 
 def _subject(model: HeadModel, number: int, posed: bool, renderer: Renderer) -> Row:
@@ -112,14 +111,3 @@ def _weights(rows: list[Row], label: str) -> dict[str, float]:
         "weights_told_of_none": float(estimated[~there].sum() / len(posed)),
         **{f"off_{name}": float(value) for name, value in each.items()},
     }
-
-
-def _table(rows: list[Row], labels: tuple[str, ...]) -> str:
-    header = ("heads", "subjects", "median, mm", "vertices, mm", "fit, s", "weights")
-    figures, lines = _figures(rows, labels), []
-    for label, kind in product(labels, ("posed", "neutral")):
-        count = sum((row["model"], row["kind"]) == (label, kind) for row in rows)
-        means = [figures[f"{label}_{kind}_{quantity}"] for quantity in ("median_mm", "vertex_mm", "fit_s")]
-        correlation = f"r = {figures.get(f'{label}_weights_correlation_true', np.nan):.2f}" if kind == "posed" else "-"
-        lines.append([f"{label}, {kind}", count, *means, correlation])
-    return markdown.table(header, lines)

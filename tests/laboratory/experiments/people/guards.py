@@ -65,11 +65,6 @@ class Shot:
     masks: Mapping[str, Bool[np.ndarray, "_ _"]]
     face: FaceEvidence | None
 
-    @property
-    def masked(self) -> Capture:
-        """Returns the capture with these masks as given ones."""
-        return Capture(self.capture.images, masks=self.masks)
-
     def draw(self, rng: np.random.Generator) -> "Shot":
         """Returns some of the cameras."""
         faces = [] if self.face is None else rng.permutation(self.face.views)[:FACES_DRAWN].tolist()

@@ -24,7 +24,6 @@ from tests.laboratory.experiments.people.people import (
     is_wrong,
     people,
     select_cases,
-    summary_table,
     table,
 )
 from tests.laboratory.experiments.people.people_subjects import (
@@ -132,15 +131,6 @@ def test_the_table_marks_what_is_silently_wrong_and_says_how_others_ended() -> N
     assert [line.split(" | ")[0] for line in lines] == ["| front-3", "| circle-8", "| circle-8", "| circle-16"]
     assert ["! s" in line for line in lines] == [False, True, False, False]
     assert "refused: no view shows a head" in lines[0]
-
-
-def test_a_line_a_kind_says_the_worst_that_nobody_is_told_of() -> None:
-    refusal = {"name": "n", "subject": "s", "kind": "circle-8", "evidence": "plates", "refused": "no", "seconds": 1.0}
-    lines = summary_table([row(), row(turn_deg=9.0), refusal]).splitlines()[2:]
-    assert lines == [
-        "| front-3 | plates | 2 | 0 | 0 | 1 | 9 | 0.4 | 1 |",
-        "| circle-8 | plates | 1 | 1 | 0 | - | - | - | 0 |",
-    ]
 
 
 def cases() -> list[Case]:
