@@ -110,19 +110,12 @@ def guards(
         figures |= {f"{fault}_named": float(sum(not codes.isdisjoint(one["codes"]) for one in those))}
         figures |= {f"{fault}_planted": float(len(those))}
     header = ("guard", "kind", "captures", "false_alarms", "good", "hits", "faulty", "evidence", "prevents")
+    text = markdown.table(header, [[row[name] for name in header] for row in rows])
     return {
         "figures": figures,
         "rows": rows,
-        "markdown": markdown.table(header, [[row[name] for name in header] for row in rows]),
-        "lines": [
-            f"{row['guard']} ({row['captures']}): {row['false_alarms']} false alarms in {row['good']} good captures, "
-            f"{row['hits']} hits in {row['faulty']} faulty ones"
-            for row in rows
-            if row["false_alarms"] or row["hits"]
-        ]
-        + [
-            f"{fault}: {figures[f'{fault}_named']:.0f} of {figures[f'{fault}_planted']:.0f} named" for fault in NAMED_BY
-        ],
+        "markdown": text,
+        "lines": [*text.splitlines(), *map(str, figures.items())],
     }
 
 
