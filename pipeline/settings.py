@@ -33,6 +33,7 @@ FIXED = {
     ),
     "texture": ("contour_margin_px", "footprint_px", "hidden_mm", "least_facing", "outlier", "selection", "sharpness"),
 }  # settings before 0.4.0 whose numbers are constants now: by table, () for all of a table
+RETIRED_CODE = "shape-implausible"  # of a warning of 0.4.0
 RENAMED = {
     "outputs": {"skin": ("albedo", {"albedo": "glb"}), "delight": ("albedo", {"True": "file"})}
 }  # settings before 0.4.0: by table and name, the new name and the new value by the old one
@@ -187,6 +188,10 @@ def _with_present_keys(document: Mapping[str, Any]) -> tuple[dict[str, Any], tup
                 if (value := meanings.get(str(values.pop(old)))) is not None:
                     values.setdefault(new, value)
                 present[table] = values
+    codes = present.get("fail_on")
+    if isinstance(codes, list) and RETIRED_CODE in codes:
+        present["fail_on"] = [code for code in codes if code != RETIRED_CODE]
+        fixed.append(f"fail_on: {RETIRED_CODE}")
     if fixed:
         warnings.append(compose("old-setting", setting=", ".join(fixed)))
     return present, tuple(warnings)

@@ -55,7 +55,6 @@ WARNING_CODES = (
     "scale-assumed",
     "scale-implausible",
     "setting-renamed",
-    "shape-implausible",
     "size-unusual",
     "texture-sets-exchanged",
     "texture-sets-unused",

@@ -2,8 +2,7 @@
 
 Enters: a fit and the figures of its cameras. Leaves: warnings. Nothing here changes a result; ``settings.fail_on``
 turns codes into failures. Thresholds are given together with what good captures had at the deepest level of detail: a
-real scan with closed eyes and hair (largest coefficient 3.5 standard deviations, scale 1.024), and a random head of
-another population (4.3, 1.053).
+real scan with closed eyes and hair (scale 1.024), and a random head of another population (1.053).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -11,7 +10,6 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.special import chdtrc
 
 from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.camera_metrics import CameraFigures
@@ -20,10 +18,6 @@ from pipeline.warnings import ReportWarning
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 
-MAX_COEFFICIENT = (
-    6.0  # standard deviations of the largest: at most 5.3 in thirteen good heads; a rig scaled by 1.12: 6.8
-)
-MIN_CHANCE = 1e-16  # of a sum of squares this large: at least 7e-14 in thirteen good heads, some of another population
 MAX_SIZE = 2.9  # standard deviations of the heads' own size, which good heads exceed once in 268
 MAX_SCALE_OFF = 0.07  # of size; 0.053 of a head from another population, more of a rig whose unit is wrong
 MAX_UNSEEN = 0.12  # share of the face's vertices: 0.14 to 0.24 where three or four cameras stand on one side, 0.10 at
@@ -50,7 +44,7 @@ class ImplausibleResult(EigenheadError):
 def plausibility_warnings(
     fit: Fit, model: HeadModel, cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]
 ) -> list[ReportWarning]:
-    """Returns the warnings about a result: an unlikely shape, scale or size, or a poor contour.
+    """Returns the warnings about a result: an unlikely scale or size, or a poor contour.
 
     Args:
         fit: coefficients in standard deviations; scale relative to the model's own size.
@@ -58,11 +52,7 @@ def plausibility_warnings(
         cameras: contour residuals of every camera.
         widths_px: of the pictures, by camera.
     """
-    return [
-        *_shape(np.delete(fit.coefficients, [row for row in model.posed if row < len(fit.coefficients)])),
-        *(_scale(fit.world_from_head.scale) or _size(*size_of(fit, model))),
-        *_contours(cameras, widths_px),
-    ]
+    return [*(_scale(fit.world_from_head.scale) or _size(*size_of(fit, model))), *_contours(cameras, widths_px)]
 
 
 def unexplained_outlines(cameras: Mapping[str, CameraFigures], pixels_mm: Mapping[str, float]) -> ReportWarning | None:
@@ -100,19 +90,6 @@ def refuse(warnings: Iterable[ReportWarning], fail_on: Sequence[str]) -> None:
     fatal = [warning for warning in warnings if warning.code in fail_on]
     if fatal:
         raise ImplausibleResult(fatal)
-
-
-def _shape(coefficients: Float[np.ndarray, " m"]) -> list[ReportWarning]:
-    """Returns a warning if the largest coefficient, or the sum of all squares, is unlikely under the prior z ~ N(0,
-    1)."""
-    if not len(coefficients):
-        return []
-    largest = float(np.abs(coefficients).max())
-    total = float(coefficients @ coefficients)
-    if largest <= MAX_COEFFICIENT and float(chdtrc(len(coefficients), total)) >= MIN_CHANCE:
-        return []
-    warning = compose("shape-implausible", largest=largest, rms=np.sqrt(total / len(coefficients)))
-    return [warning]
 
 
 def _scale(scale: float) -> list[ReportWarning]:

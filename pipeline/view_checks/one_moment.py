@@ -1,8 +1,9 @@
 """Finds views that show another moment or another person than the rest: a face, or lips, that lie elsewhere.
 
-The landmarks of each view are compared with those triangulated from the other views. Two distances are judged: of all
-points (the head has moved, or is another's), and of the lower lip from the upper one (the mouth has opened). The noise
-has two parts: chance errors common to a view's landmarks, and the uncertainty of the other views.
+The landmarks of each view are compared with those triangulated from the other views. Two distances are judged: of the
+points that no jaw moves (the head has moved, or is another's), and of the lower lip from the upper one (the mouth has
+opened). The noise of both has two parts: chance errors common to a view's landmarks, and the uncertainty of the other
+views. A mouth that is open in this view and in the others tells nothing: its landmarks differ by half of the opening.
 
 Enters: the faces found in the photographs. Leaves: the views that differ, each with a warning. A head that has moved
 towards a camera or away from it looks the same there, and a mouth seen from the side hardly opens: neither is found.
@@ -12,8 +13,10 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.faces.detection import FaceDetection
+from pipeline.faces.points import direction_from_face, point_table
 from pipeline.faces.subject import SubjectFaces
 from pipeline.faces.triangulated_face import shared_modes, triangulate_face, unbiased_px, view_noise_px
 from pipeline.warnings import ReportWarning
@@ -21,6 +24,9 @@ from rig.messages.message import compose
 from rig.rig import Rig
 
 MAX_SIGMAS = 4.5  # 4.2 in clean captures; `python -m tests.laboratory guards` counts both errors
+OPEN_MM = 3.0  # between lips: 0.4 to 2.3 of eight shut mouths, 4.3 to 11 of six jaws opened by half and fully
+OPENING_NOISE = 0.15  # of the opening that the other views see, by which lips seen from above or below differ
+MIN_FACING = 0.5  # cosine, of a view whose lips are judged: seen from the side, all mouths look shut
 UPPER_LIP, LOWER_LIP = [0, 37, 267, 13, 82, 312, 81, 311], [17, 84, 314, 14, 87, 317, 178, 402]  # of the 468 points
 
 
@@ -61,7 +67,19 @@ def _offset(name: str, seen: FaceDetection, agreeing: Mapping[str, FaceDetection
     missed = unbiased_px(seen, face.world_from_face, camera) - pixels
     unknown = np.einsum("nij,mnj->mni", slopes, shared_modes(face, rig)).mean(axis=1)
     noise_px = np.hypot(view_noise_px(seen.size_px, face.world_from_face, camera), np.sqrt((unknown**2).sum() / 2.0))
-    whole, upper, lower = (np.median(missed[rows], axis=0) for rows in (slice(None), UPPER_LIP, LOWER_LIP))
-    off_px = max(float(np.linalg.norm(whole)), float(np.linalg.norm(lower - upper)))
     mm_per_px = float(camera.camera_from_world.apply(points)[:, 2].mean()) / camera.intrinsics.fx
-    return _Offset(off_px / float(noise_px), off_px * mm_per_px, name)
+    high = point_table().shape_mm[:, 1]
+    head_px = float(np.linalg.norm(np.median(missed[high > np.median(high)], axis=0)))
+    there, seen_there, world = (_lips_apart(each) for each in (pixels, pixels + missed, points))
+    lips_px, open_px = float(np.linalg.norm(seen_there - there)), float(np.linalg.norm(there))
+    is_open = min(float(np.linalg.norm(world)), float(np.linalg.norm(seen_there)) * mm_per_px) > OPEN_MM
+    if is_open or direction_from_face(face.world_from_face, camera)[2] < MIN_FACING:
+        lips_px = 0.0
+    by_head = _Offset(head_px / float(noise_px), head_px * mm_per_px, name)
+    by_lips = _Offset(lips_px / float(np.hypot(noise_px, OPENING_NOISE * open_px)), lips_px * mm_per_px, name)
+    return max(by_head, by_lips)
+
+
+def _lips_apart(points: Float[np.ndarray, "468 d"]) -> Float[np.ndarray, " d"]:
+    """Returns how far the lower lip lies from the upper one, in pixels or mm."""
+    return np.median(points[LOWER_LIP], axis=0) - np.median(points[UPPER_LIP], axis=0)

@@ -23,7 +23,7 @@ SEVERE = frozenset(
     {
         "camera-moved", "cameras-exchanged", "contour-implausible", "face-elsewhere", "mask-contradicted",
         "masks-exchanged", "masks-off-edges",
-        "outlines-unexplained", "plates-exchanged", "pose-doubtful", "scale-implausible", "shape-implausible",
+        "outlines-unexplained", "plates-exchanged", "pose-doubtful", "scale-implausible",
         "size-unusual",
     }
 )  # fmt: skip

@@ -19,7 +19,7 @@ from rig.mesh import Mesh
 from rig.messages.message import compose
 
 # Codes of warnings that doubt the head.
-DOUBTFUL = ("face-elsewhere", "no-face", "pose-doubtful", "scale-assumed", "scale-implausible", "shape-implausible")
+DOUBTFUL = ("face-elsewhere", "no-face", "pose-doubtful", "scale-assumed", "scale-implausible")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,7 +25,6 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
-from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.paper.detail import Known, surface_error
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.drawn_expressions import drawn_weights
@@ -39,7 +38,7 @@ def expressions(models: Mapping[str, HeadModel], *, renderer: Renderer, bench: B
 
     Of the expression weights there are the correlation with the true ones (``<model>_weights_correlation_true`` over
     those that are not 0; ``..._all`` over all that are not 0 or reported for any head), the mean error of the true ones
-    (``<model>_weights_off``; ``<model>_off_<expression>`` of one), and the sum of weights reported for expressions that
+    (``<model>_weights_off``), and the sum of weights reported for expressions that
     a head does not have (``<model>_weights_told_of_none``).
     """
     code = (*CONTOUR, expression_evidence, expression_reading)
@@ -52,7 +51,7 @@ def expressions(models: Mapping[str, HeadModel], *, renderer: Renderer, bench: B
         bench.report(f"{label} {i} {kind}", (len(rows) + 1) / (2 * subjects * len(models)))
         row = kept[label].row(f"{label}-{i:02} {kind}", partial(_subject, model, i, kind == "posed", renderer))
         rows.append({"model": label, "kind": kind, "subject": i} | row)
-    return {"figures": _figures(rows, tuple(models)), "rows": rows, "markdown": _table(rows, tuple(models))}
+    return {"figures": _figures(rows, tuple(models)), "rows": rows}
 
 
 def _subject(model: HeadModel, number: int, posed: bool, renderer: Renderer) -> Row:
@@ -94,7 +93,7 @@ def _figures(rows: list[Row], labels: tuple[str, ...]) -> dict[str, float]:
 
 def _weights(rows: list[Row], label: str) -> dict[str, float]:
     """Correlation over the true weights and over all that were drawn or told in any head; how far off the true ones
-    are told, all and each. A weight that is not told is 0."""
+    are told. A weight that is not told is 0."""
     posed = [row for row in rows if (row["model"], row["kind"]) == (label, "posed")]
     names = sorted({name for row in posed for name in (*row["truth"], *row["weights"])})
     true = np.array([[row["truth"].get(name, 0.0) for name in names] for row in posed])
@@ -102,24 +101,9 @@ def _weights(rows: list[Row], label: str) -> dict[str, float]:
     there = true > 0.0
     if np.count_nonzero(there) < 2:
         return {}
-    each = {
-        name: np.abs(estimated - true)[:, k][there[:, k]].mean() for k, name in enumerate(names) if there[:, k].any()
-    }
     return {
         "weights_correlation_true": float(np.corrcoef(true[there], estimated[there])[0, 1]),
         "weights_correlation_all": float(np.corrcoef(true.ravel(), estimated.ravel())[0, 1]),
         "weights_off": float(np.abs(estimated - true)[there].mean()),
         "weights_told_of_none": float(estimated[~there].sum() / len(posed)),
-        **{f"off_{name}": float(value) for name, value in each.items()},
     }
-
-
-def _table(rows: list[Row], labels: tuple[str, ...]) -> str:
-    header = ("heads", "subjects", "median, mm", "vertices, mm", "fit, s", "weights")
-    figures, lines = _figures(rows, labels), []
-    for label, kind in product(labels, ("posed", "neutral")):
-        count = sum((row["model"], row["kind"]) == (label, kind) for row in rows)
-        means = [figures[f"{label}_{kind}_{quantity}"] for quantity in ("median_mm", "vertex_mm", "fit_s")]
-        correlation = f"r = {figures.get(f'{label}_weights_correlation_true', np.nan):.2f}" if kind == "posed" else "-"
-        lines.append([f"{label}, {kind}", count, *means, correlation])
-    return markdown.table(header, lines)

@@ -28,7 +28,6 @@ from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.subject import Subject, with_gaze
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.realism import REALISM, made_real
-from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.shapes import OPEN_TRIANGLES
 
@@ -50,7 +49,7 @@ def gazes(models: Mapping[str, HeadModel], *, renderer: Renderer, bench: Bench, 
             bench.report(name, len(rows) / (subjects * len(models)))
             records = bench.records(f"gazes-{label}", key_of(model.sha256, *CODE))
             rows.append({"name": name} | records.row(name, partial(_row, model, number, renderer)))
-    return {"figures": _figures(rows), "rows": rows, "markdown": _table(rows)}
+    return {"figures": _figures(rows), "rows": rows}
 
 
 def looking_head(model: HeadModel, number: int) -> Subject:
@@ -119,19 +118,3 @@ def _figures(rows: list[Row]) -> dict[str, float]:
             out[f"{name}_met"] = float(np.mean(error <= AIMS[name]))
             out[f"{name}_stated"] = float(np.sqrt(np.mean((error / stated) ** 2)))
     return {name: round(value, 4) for name, value in out.items()}
-
-
-def _table(rows: list[Row]) -> str:
-    header = ("head", "irises, mm", "gaze, degrees", "pupil distance, mm", "deviation", "not seen")
-    cells = []
-    for row in rows:
-        eyes = row["eyes"].values()
-        pupils = [f"{row['pupils_mm']:+.2f}", f"{row['pupils_std_mm']:.2f}"] if "pupils_mm" in row else ["-", "-"]
-        cells.append([
-            row["name"],
-            ", ".join(f"{eye['iris_mm']:.2f}" for eye in eyes),
-            ", ".join(f"{eye['gaze_deg']:.1f}" for eye in eyes),
-            *pupils,
-            "; ".join(row["causes"]) or "-",
-        ])  # fmt: skip
-    return markdown.table(header, cells)

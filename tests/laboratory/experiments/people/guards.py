@@ -2,110 +2,226 @@
 
 Each capture goes through reading, masks and the checks of its views, as ``eigenhead check`` does; no head is fitted, so
 that guards after the fit have none. Captures in a folder called ``faulty`` should not pass in silence, all others
-should. The studio adds good captures, and the same with a rig in another unit. Good ones are
-judged again with one camera 10 mm aside. A guard's false alarms are its messages
-on good captures, its hits those on faulty ones.
+should, and draws of 3 to 11 of their cameras. The studio adds the heads of ``people`` before rows and fans of cameras,
+at rest and with open mouths, and each with a rig in another unit. In every good capture faults are planted in one
+camera that shows the face: another moment (the rig has moved by 10 to 20 mm, in any direction), another person's
+picture, a mask cut at the crown, and a picture with an open jaw. A guard's false alarms are its messages on good
+captures, its hits those on faulty ones; of each planted fault, ``named`` counts the codes of ``NAMED_BY``.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
+import cv2
 import numpy as np
+from jaxtyping import Bool, Float
 
 from calibration.scene.rig_scale import times
 from pipeline.faces.networks import load_networks
 from pipeline.faces.subject import find_subject
 from pipeline.head_model.model import HeadModel
-from pipeline.imaging.silhouette import Silhouette
 from pipeline.segmentation.segment import segment
-from pipeline.view_checks.guards import GUARDS, Guard, Guards
+from pipeline.view_checks import head_size, one_moment, usable_views
+from pipeline.view_checks.guards import GUARDS, FaceEvidence, Guard, Guards, find_face_evidence
 from pipeline.view_checks.lens_distortion import judge_distortion
-from pipeline.view_checks.one_moment import judge_moments
-from pipeline.view_checks.usable_views import usable_views
 from rig.capture import Capture
 from rig.errors import EigenheadError
 from rig.geometry import RigidTransform
 from rig.messages.message import Message
+from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from server.tasks.photographs import read_scaled_capture
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.people.gazes import photograph_gaze
-from tests.laboratory.experiments.records import Bench, Outcome, Row
+from tests.laboratory.experiments.people.people_subjects import SEED, STUDIO_KINDS, StudioKind, photograph
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
-STUDIO_HEADS = 2
+KINDS = [kind for kind in STUDIO_KINDS if kind.kind.startswith("front")]
+OPEN_JAW = {"jawOpen": 1.0}
+COUNTS = (3, 5, 8, 11)  # of cameras in a draw, of which so many show the face if so many do:
+FACES_DRAWN = 3
+MOVED_MM = (10.0, 20.0)
+CUT_SHARE = 0.12  # of a mask's height, from its crown
 WRONG_SCALES = (0.3, 3.0)  # of the studio's rig
 FAULTY = "faulty"
+NAMED_BY = {
+    "another moment": {"moments-differ"},
+    "open jaw": {"moments-differ"},
+    "another person": {"moments-differ", "view-left-out"},
+    "cut crown": {"crown-low"},
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
-    """Holds the codes that the checks gave for one capture, nested ones too, and whether nothing is wrong with it."""
+class Shot:
+    """Holds a capture with its masks, and its face if two views agree on one."""
 
-    source: str
-    good: bool
-    codes: frozenset[str]
+    capture: Capture
+    rig: Rig
+    masks: Mapping[str, Bool[np.ndarray, "_ _"]]
+    face: FaceEvidence | None
+
+    def draw(self, rng: np.random.Generator) -> "Shot":
+        """Returns some of the cameras."""
+        faces = [] if self.face is None else rng.permutation(self.face.views)[:FACES_DRAWN].tolist()
+        rest = [name for name in rng.permutation(self.rig.names).tolist() if name not in faces]
+        names = (faces + rest)[: min(rng.choice(COUNTS), len(self.rig))]
+        of = {kind: {n: v for n, v in getattr(self.capture, kind).items() if n in names} for kind in PICTURES}
+        capture, rig = Capture(**of), self.rig.subset([name for name in self.rig.names if name in names])
+        return Shot(capture, rig, {n: self.masks[n] for n in names}, find_face_evidence(capture.images, rig))
+
+
+PICTURES = ("images", "backgrounds", "masks")
 
 
 def guards(
-    folders: Sequence[Path], *, model: HeadModel, renderer: Renderer, bench: Bench, subjects: int = STUDIO_HEADS
+    folders: Sequence[Path],
+    *,
+    model: HeadModel,
+    renderer: Renderer,
+    bench: Bench,
+    subjects: Annotated[int, "heads in the studio"] = len(KINDS),
+    draws: Annotated[int, "of cameras, for each folder"] = 3,
 ) -> Outcome:
     """Judges the captures ``folders`` and those of the studio. Returns a row for each guard and source of captures, and
-    the figures ``false_alarms``, ``good``, ``hits`` and ``faulty``: captures on which any guard that refuses spoke."""
-    judged = []
-    for number, path in enumerate(folders):
-        bench.report(path.name, number / (len(folders) + subjects))
-        good = FAULTY not in path.resolve().parts
-        capture, rig = read_scaled_capture(path)
-        judged.append(judge(path.resolve().parent.name, good, capture, rig))
-        judged += [judge("another moment", False, capture, move_one(rig, number))] if good else []
-    for number in range(subjects):
-        bench.report("studio", (len(folders) + number) / (len(folders) + subjects))
-        shot = photograph_gaze(model, number, renderer)
-        judged.append(judge("studio", True, shot.capture, shot.rig))
-        judged.append(judge("another moment", False, shot.capture, move_one(shot.rig, number)))
-        judged += [judge("studio", False, shot.capture, times(shot.rig, factor)) for factor in WRONG_SCALES]
+    the figures ``false_alarms``, ``good``, ``hits`` and ``faulty``: captures on which any guard that refuses spoke;
+    ``<fault>_named`` and ``<fault>_planted``."""
+    records = bench.records("guards", key_of(model.sha256, draws, one_moment, head_size, usable_views))
+    jobs = {path.name: partial(judge_folder, path, _other(path, folders), draws) for path in folders}
+    jobs |= {
+        f"studio {n} {KINDS[n % len(KINDS)].what}": partial(judge_studio, model, renderer, n) for n in range(subjects)
+    }
+    judged: list[Row] = []
+    for number, (name, job) in enumerate(jobs.items()):
+        bench.report(name, number / len(jobs))
+        judged += records.row(name, lambda job=job: {"judged": list(job())})["judged"]
     rows = [row for guard in GUARDS for row in rows_of(guard, judged)]
     refusing = {code for guard in GUARDS if guard.kind != "warns" for code in guard.codes}
     figures = {}
     for good, alarm, count in ((True, "false_alarms", "good"), (False, "hits", "faulty")):
-        those = [one for one in judged if one.good is good]
-        figures |= {alarm: float(sum(not one.codes.isdisjoint(refusing) for one in those)), count: float(len(those))}
+        those = [one for one in judged if one["good"] is good]
+        figures |= {alarm: float(sum(not refusing.isdisjoint(one["codes"]) for one in those)), count: float(len(those))}
+    for fault, codes in NAMED_BY.items():
+        those = [one for one in judged if one["source"] == fault]
+        figures |= {f"{fault}_named": float(sum(not codes.isdisjoint(one["codes"]) for one in those))}
+        figures |= {f"{fault}_planted": float(len(those))}
     header = ("guard", "kind", "captures", "false_alarms", "good", "hits", "faulty", "evidence", "prevents")
+    text = markdown.table(header, [[row[name] for name in header] for row in rows])
     return {
         "figures": figures,
         "rows": rows,
-        "markdown": markdown.table(header, [[row[name] for name in header] for row in rows]),
-        "lines": [
-            f"{row['guard']} ({row['captures']}): {row['false_alarms']} false alarms in {row['good']} good captures, "
-            f"{row['hits']} hits in {row['faulty']} faulty ones"
-            for row in rows
-            if row["false_alarms"] or row["hits"]
-        ],
+        "markdown": text,
+        "lines": [*text.splitlines(), *map(str, figures.items())],
     }
 
 
-def judge(source: str, good: bool, capture: Capture, rig: Rig) -> Judged:
-    """Runs the checks before a fit. A refusal counts with its warnings' codes, as it would with ``anyway``."""
+def _other(path: Path, folders: Sequence[Path]) -> Path | None:
+    """Returns the folder of another person: none whose name begins alike."""
+    return next(
+        (one for one in folders if not one.name.startswith(path.name) and not path.name.startswith(one.name)), None
+    )
 
-    def segmented(shot: Capture) -> dict[str, Silhouette]:
-        return segment(shot, rig, report=lambda stage, share: None)
 
+def judge_folder(path: Path, other: Path | None, draws: int) -> Iterator[Row]:
+    """Judges a folder's capture, draws of its cameras, and all of these with planted faults."""
+    capture, rig = read_scaled_capture(path)
+    source = path.resolve().parent.name
+    if FAULTY in path.resolve().parts:
+        yield judge(source, False, capture, rig)
+        return
+    rng = np.random.default_rng([SEED, *path.name.encode()])
+    whole, stranger = make_shot(capture, rig), None if other is None else make_shot(*read_scaled_capture(other))
+    for shot in (whole, *(whole.draw(rng) for _ in range(draws))):
+        yield judge(source, True, shot.capture, shot.rig)
+        yield from judge_planted(shot, rng, stranger)
+
+
+def judge_studio(model: HeadModel, renderer: Renderer, number: int) -> Iterator[Row]:
+    """Judges a head of the studio at rest and with an open mouth, and planted faults."""
+    kind = KINDS[number % len(KINDS)]
+
+    def make(kind: StudioKind) -> Shot:
+        made = photograph(kind, model, True, renderer, (SEED, number))
+        return make_shot(made.capture, made.rig)
+
+    shot, opened = make(kind), make(replace(kind, expression=OPEN_JAW))
+    rng = np.random.default_rng((SEED, number))
+    for one in (shot, opened):
+        yield judge("studio", True, one.capture, one.rig)
+    yield judge("studio", False, shot.capture, times(shot.rig, WRONG_SCALES[number % 2]))
+    yield from judge_planted(shot, rng, None)
+    if shot.face is not None and not kind.expression:
+        yield judge("open jaw", False, exchange_one(shot, str(rng.choice(shot.face.views)), opened), shot.rig)
+
+
+def make_shot(capture: Capture, rig: Rig) -> Shot:
+    """Returns a capture with its masks and its face."""
+    masks = {name: found.mask for name, found in segment(capture, rig, report=discard_progress).items()}
+    return Shot(capture, rig, masks, find_face_evidence(capture.images, rig))
+
+
+def judge_planted(shot: Shot, rng: np.random.Generator, stranger: Shot | None) -> Iterator[Row]:
+    """Plants faults in one camera that shows the face, and judges the captures."""
+    if shot.face is None:
+        return
+    name = str(rng.choice(shot.face.views))
+    yield judge("another moment", False, shot.capture, move_one(shot.rig, name, rng))
+    if stranger is not None:
+        yield judge("another person", False, exchange_one(shot, name, stranger), shot.rig)
+    if (cut := cut_crown(shot, name)) is not None:
+        yield judge("cut crown", False, cut, shot.rig)
+
+
+def move_one(rig: Rig, name: str, rng: np.random.Generator) -> Rig:
+    """Returns the rig for which one camera's picture shows the subject elsewhere, as of another moment."""
+    way = rng.standard_normal(3)
+    aside = RigidTransform(np.eye(3), rng.uniform(*MOVED_MM) * way / np.linalg.norm(way))
+    return Rig(tuple(replace(c, camera_from_world=aside @ c.camera_from_world) if c.name == name else c for c in rig))
+
+
+def exchange_one(shot: Shot, name: str, stranger: Shot) -> Capture:
+    """Returns the capture in which one camera has the picture and the mask that ``stranger`` has under the same name,
+    or under its first one that shows a face; scaled to the size of this one's."""
+    there = name if name in stranger.rig.names else (stranger.face.views if stranger.face else stranger.rig.names)[0]
+    size = shot.capture.images[name].shape[1::-1]
+    picture = cv2.resize(stranger.capture.images[there], size, interpolation=cv2.INTER_AREA)
+    mask = cv2.resize(stranger.masks[there].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    return Capture({**shot.capture.images, name: picture}, masks={**shot.masks, name: mask})
+
+
+def cut_crown(shot: Shot, name: str) -> Capture | None:
+    """Returns the capture with one mask that lacks the crown; None if the crown is not in the picture."""
+    assert shot.face is not None
+    middle: Float[np.ndarray, "2 2"] = shot.rig[name].project(
+        shot.face.centre_world + np.outer((0, 50.0), shot.face.up_world)
+    )
+    rows, columns = np.nonzero(shot.masks[name])
+    high = np.stack([columns, rows], axis=1) @ (middle[1] - middle[0])
+    top = int(np.argmax(high))
+    limit = np.array(shot.masks[name].shape) - 3
+    if not 2 < rows[top] < limit[0] or not 2 < columns[top] < limit[1]:
+        return None
+    kept, cut = high < high.max() - CUT_SHARE * np.ptp(high), np.zeros_like(shot.masks[name])
+    cut[rows[kept], columns[kept]] = True
+    return Capture(shot.capture.images, masks={**shot.masks, name: cut})
+
+
+def judge(source: str, good: bool, capture: Capture, rig: Rig) -> Row:
+    """Runs the checks before a fit. Returns the codes that they gave, nested ones too. A refusal counts with its
+    warnings' codes, as it would with ``anyway``."""
+    segmented = partial(segment, rig=rig, report=discard_progress)
+    row: Row = {"source": source, "good": good}
     try:
-        views = usable_views(capture, rig, segmented, exchanged="repair", guards=Guards(anyway=True))
+        views = usable_views.usable_views(capture, rig, segmented, exchanged="repair", guards=Guards(anyway=True))
     except EigenheadError as refusal:
-        return Judged(source, good, frozenset(codes_of(refusal.message)))
+        return row | {"codes": sorted(codes_of(refusal.message))}
     lenses = judge_distortion(views.capture.images, views.silhouettes, rig)
-    warnings = (*views.warnings, *lenses, *judge_moments(find_subject(views.capture.images, rig, load_networks()), rig))
-    return Judged(source, good, frozenset(code for said in warnings for code in codes_of(said)))
-
-
-def move_one(rig: Rig, number: int) -> Rig:
-    """Returns the rig for which one camera's picture shows the subject 10 mm aside, as of another moment."""
-    moved, aside = rig.cameras[number % len(rig)], RigidTransform(np.eye(3), np.array([10.0, 0.0, 0.0]))
-    return Rig(tuple(replace(c, camera_from_world=aside @ c.camera_from_world) if c is moved else c for c in rig))
+    moments = one_moment.judge_moments(find_subject(views.capture.images, rig, load_networks()), rig)
+    return row | {"codes": sorted({code for said in (*views.warnings, *lenses, *moments) for code in codes_of(said)})}
 
 
 def codes_of(message: Message) -> set[str]:
@@ -118,12 +234,13 @@ def codes_of(message: Message) -> set[str]:
     return codes
 
 
-def rows_of(guard: Guard, judged: Iterable[Judged]) -> list[Row]:
+def rows_of(guard: Guard, judged: Iterable[Row]) -> list[Row]:
     """Returns a guard's false alarms and hits, a row for each source of captures."""
     total, raised = Counter[tuple[str, bool]](), Counter[tuple[str, bool]]()
     for one in judged:
-        total[one.source, one.good] += 1
-        raised[one.source, one.good] += not one.codes.isdisjoint(guard.codes)
+        key = one["source"], one["good"]
+        total[key] += 1
+        raised[key] += any(code in guard.codes for code in one["codes"])
     return [
         {
             "guard": guard.codes[0],

@@ -4,8 +4,7 @@ All cameras with the masks that the folder has make the reference. Fewer cameras
 alone, half of the size and JPEG of quality 60 are compared with it, the two halves of the cameras with each other:
 distances (mm) from the face to the other surface, as delivered and in the region of ``repeat`` figures (80 mm behind
 the foremost point, 65 mm to either side, -85 to 55 mm high). Views that a row did not use are compared by colour (dB).
-Planted faults count whether a warning names them: one camera aside by 10 mm, one with another person's picture, one
-mask cut at the crown. Folders hold recognisable people: rows have figures and nothing else.
+Planted faults are in ``guards``. Folders hold recognisable people: rows have figures and nothing else.
 """
 
 import time
@@ -33,31 +32,22 @@ from rig.rig import Rig
 from server.tasks.photographs import read_scaled_capture
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.faults.real import psnr_db, surface_of
-from tests.laboratory.experiments.people.guards import codes_of, move_one
+from tests.laboratory.experiments.people.guards import codes_of
 from tests.laboratory.experiments.people.people import run_job
 from tests.laboratory.experiments.people.view_subsets import azimuths_deg, frontal_views
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 COUNTS = (16, 11, 8, 5, 3)  # of cameras
-PLANTED_COUNTS = (11, 3)
-CUT_SHARE = 0.12  # of a mask's height, from its crown
 JPEG_QUALITY = 60
 QUIET = {"unknown-key"}  # says nothing about the pictures
-NAMED_BY = {
-    "other moment": {"moments-differ"},
-    "other person": {"moments-differ", "view-left-out"},
-    "cut crown": {"mask-incomplete", "mask-contradicted", "view-left-out", "crown-differs"},
-}
-"""Codes of warnings, nested ones too, any of which names what was planted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """Holds one row before it is computed. ``planted`` names what is wrong with the capture, if anything is."""
+    """Holds one row before it is computed."""
 
     name: str
     read: Callable[[], tuple[Capture, Rig]]
-    planted: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,27 +69,27 @@ def living(
     bench: Bench,
     only: Annotated[Sequence[str], "words that rows must contain; may be repeated"] = (),
 ) -> Outcome:
-    """Runs this module's experiment. Returns a row for each head, and the figures ``good``, ``refused``,
-    ``false_warnings`` (the median of a capture), ``planted`` and ``named``."""
+    """Runs this module's experiment. Returns a row for each head, and the figures ``good``, ``refused`` and
+    ``false_warnings`` (the median of a capture)."""
     settings = replace(Settings(), outputs=OutputSettings(surface="head"))
     run = partial(run_job, model=model, settings=settings, renderer=renderer)
     records, rows = bench.records("living", key_of(model.sha256, settings)), list[Row]()
-    for folder, other in zip(folders, [*folders[1:], *folders[:1]], strict=True):
+    for folder in folders:
         capture, rig = read_scaled_capture(folder)
         subject = Subject(folder, capture, rig, run(capture, rig), segment(capture, rig, report=bench.report))
-        shots = [one for one in shots_of(subject, other) if all(word in one.name for word in only)]
+        shots = [one for one in shots_of(subject) if all(word in one.name for word in only)]
         for number, shot in enumerate(shots):
             bench.report(shot.name, number / len(shots))
             rows.append(records.row(shot.name, partial(judge, shot, subject, run)))
         if not only:
             rows.append(records.row(f"{folder.name} halves", partial(judge_halves, subject, run)))
-    header = ("name", "planted", "median", "mean", "p95", "dB", "seconds", "told")
+    header = ("name", "median", "mean", "p95", "dB", "seconds", "told")
     text = markdown.table(header, [[row.get(name) for name in header] for row in rows])
     return {"figures": figures_of(rows), "rows": rows, "markdown": text, "lines": text.splitlines()}
 
 
-def shots_of(subject: Subject, other: Path) -> Iterator[Shot]:
-    """Yields the rows of a person. ``other`` is the folder of another one."""
+def shots_of(subject: Subject) -> Iterator[Shot]:
+    """Yields the rows of a person."""
     for count in (count for count in COUNTS if count <= len(subject.rig)):
         names = frontal_views(subject.rig, subject.head.head.fit.world_from_head, count)
         for evidence in ("masks", "photographs"):
@@ -110,11 +100,6 @@ def shots_of(subject: Subject, other: Path) -> Iterator[Shot]:
             if count == 11:
                 yield Shot(f"{name} half", partial(some, share=0.5))
                 yield Shot(f"{name} jpeg", partial(change_pictures, some, compress))
-            if count in PLANTED_COUNTS:
-                yield Shot(f"{name} moment", partial(shift_one, some), "other moment")
-                yield Shot(f"{name} person", partial(exchange_one, some, other), "other person")
-            if count in PLANTED_COUNTS and evidence == "masks":
-                yield Shot(f"{name} crown", partial(cut_one, some), "cut crown")
 
 
 def read_views(folder: Path, names: Sequence[str], evidence: str, share: float = 1.0) -> tuple[Capture, Rig]:
@@ -142,34 +127,10 @@ def change_pictures(read: Read, change: Callable[[ImageRgb], ImageRgb]) -> tuple
     return replace(capture, images={name: change(image) for name, image in capture.images.items()}), rig
 
 
-def shift_one(read: Read) -> tuple[Capture, Rig]:
-    """Returns a capture one camera of which shows the subject 10 mm aside."""
-    capture, rig = read()
-    return capture, move_one(rig, 1)
-
-
-def exchange_one(read: Read, other: Path) -> tuple[Capture, Rig]:
-    """Returns a capture in which one camera has the picture, and the mask, of another person."""
-    capture, rig = read()
-    strange, name = read_scaled_capture(other)[0], rig.names[1]
-    masks = {**capture.masks, name: strange.masks[name]} if capture.masks else {}
-    return replace(capture, images={**capture.images, name: strange.images[name]}, masks=masks), rig
-
-
-def cut_one(read: Read) -> tuple[Capture, Rig]:
-    """Returns a capture with one mask that lacks the crown."""
-    capture, rig = read()
-    name = rig.names[1]
-    mask = np.array(capture.masks[name])
-    rows = np.flatnonzero((mask > 0).any(axis=1))
-    mask[: rows[0] + round(CUT_SHARE * (rows[-1] - rows[0]))] = 0
-    return replace(capture, masks={**capture.masks, name: mask}), rig
-
-
 def judge(shot: Shot, subject: Subject, run: Callable[[Capture, Rig], Reconstruction]) -> Row:
     """Runs one job and compares its head with the reference."""
     (capture, rig), began = shot.read(), time.perf_counter()
-    row: Row = {"name": shot.name, "planted": shot.planted}
+    row: Row = {"name": shot.name}
     try:
         done = run(capture, rig)
     except EigenheadError as refusal:
@@ -192,7 +153,7 @@ def judge_halves(subject: Subject, run: Callable[[Capture, Rig], Reconstruction]
         names = tuple(subject.rig.names[row] for place, row in enumerate(around) if place % 4 in of_half)
         halves.append(run(*read_views(subject.folder, names, "masks")))
     codes = sorted({warning.code for half in halves for warning in half.warnings} - QUIET)
-    row = {"name": f"{subject.folder.name} halves", "planted": None, "codes": codes, "told": ", ".join(codes) or "-"}
+    row = {"name": f"{subject.folder.name} halves", "codes": codes, "told": ", ".join(codes) or "-"}
     return row | distances(halves[0], halves[1])
 
 
@@ -217,15 +178,9 @@ def face_of(head: Reconstruction) -> Bool[np.ndarray, " v"]:
 
 
 def figures_of(rows: Sequence[Row]) -> dict[str, float]:
-    """Counts what was refused, warned of and named."""
-    good = [row for row in rows if not row["planted"]]
-    found = {
-        "good": len(good),
-        "refused": sum("refused" in row for row in good),
-        "false_warnings": float(np.median([len(row["codes"]) for row in good])) if good else 0.0,
+    """Counts what was refused and warned of."""
+    return {
+        "good": float(len(rows)),
+        "refused": float(sum("refused" in row for row in rows)),
+        "false_warnings": float(np.median([len(row["codes"]) for row in rows])) if rows else 0.0,
     }
-    for planted, codes in NAMED_BY.items():
-        those = [row for row in rows if row["planted"] == planted]
-        found |= {f"{planted}: planted": len(those)}
-        found |= {f"{planted}: named": sum(not codes.isdisjoint(row["codes"]) for row in those)}
-    return {key: float(value) for key, value in found.items()}

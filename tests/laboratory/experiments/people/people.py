@@ -36,14 +36,7 @@ from tests.laboratory.experiments.people.pose_error import PoseError, pose_error
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 EYES = "eyes"
-SPEAKING = (
-    "contour-implausible",
-    "face-elsewhere",
-    "no-face",
-    "pose-doubtful",
-    "scale-implausible",
-    "shape-implausible",
-)
+SPEAKING = ("contour-implausible", "face-elsewhere", "no-face", "pose-doubtful", "scale-implausible")
 """Warnings that say of a result, not of its input, that it may be wrong."""
 MAX_TURN_DEG, MAX_SHIFT_MM, MAX_DEVIATIONS = 3.0, 5.0, 3.0  # of a result that needs no warning
 REFUSAL_LETTERS = 120  # of a refusal's sentence, in a row
@@ -88,7 +81,7 @@ def people(
             {"name": case.name, "subject": case.subject, "kind": case.kind, "evidence": case.evidence}
             | records.row(case.name, partial(judge_case, case, model, settings, renderer))
         )
-    text = f"{table(rows)}\n{summary_table(rows)}"
+    text = table(rows)
     return {"figures": figures(rows), "rows": rows, "markdown": text, "lines": text.splitlines()}
 
 
@@ -190,19 +183,10 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
     found = summary("", rows)
     for evidence in EVIDENCE:
         found |= summary(f"{evidence}_", [row for row in rows if row["evidence"] == evidence])
-    for kind, evidence in groups(rows):
-        found |= summary(f"{kind}_{evidence}_", _of_group(rows, kind, evidence))
+    for kind, evidence in dict.fromkeys((row["kind"], row["evidence"]) for row in rows):
+        those = [row for row in rows if (row["kind"], row["evidence"]) == (kind, evidence)]
+        found |= summary(f"{kind}_{evidence}_", those)
     return found
-
-
-def groups(rows: Sequence[Row]) -> list[tuple[str, str]]:
-    """Returns the pairs of kind and evidence that occur in the rows, few cameras first."""
-    there = {(row["kind"], row["evidence"]) for row in rows}
-    return sorted(there, key=lambda group: (*_by_count(group[0]), EVIDENCE.index(group[1])))
-
-
-def _of_group(rows: Sequence[Row], kind: str, evidence: str) -> list[Row]:
-    return [row for row in rows if (row["kind"], row["evidence"]) == (kind, evidence)]
 
 
 def summary(prefix: str, rows: Sequence[Row]) -> dict[str, float]:
@@ -237,20 +221,6 @@ def table(rows: Sequence[Row]) -> str:
     )
     order = sorted(rows, key=lambda row: (*_by_count(row["kind"]), EVIDENCE.index(row["evidence"]), row["subject"]))
     return markdown.table(header, [_cells(row) for row in order])
-
-
-def summary_table(rows: Sequence[Row]) -> str:
-    """Returns a Markdown table with a row for each kind of rig and evidence."""
-    keys = ("rows", "refused", "crashed", "unwarned_share", "worst_unwarned_turn_deg", "worst_unwarned_shift_mm")
-    header = (
-        *("rig", "evidence", "rows", "refused", "crashed", "share not warned of", "its worst turn, deg"),
-        *("its worst shift, mm", "silently wrong"),
-    )
-    lines = []
-    for kind, evidence in groups(rows):
-        found = summary("", _of_group(rows, kind, evidence))
-        lines.append([kind, evidence, *(found.get(key) for key in keys), found["silent_wrong"]])
-    return markdown.table(header, lines)
 
 
 def _cells(row: Row) -> list[markdown.Cell]:

@@ -24,7 +24,6 @@ from tests.laboratory.experiments.people.people import (
     is_wrong,
     people,
     select_cases,
-    summary_table,
     table,
 )
 from tests.laboratory.experiments.people.people_subjects import (
@@ -102,7 +101,7 @@ def test_the_summary_counts_what_is_silently_wrong() -> None:
         row(),
         row(turn_deg=2.0),
         row(turn_deg=170.0, shift_mm=150.0, warnings=["camera-gain"]),
-        row(turn_deg=90.0, warnings=["shape-implausible"]),
+        row(turn_deg=90.0, warnings=["pose-doubtful"]),
         row("circle-8", "masks", deviations_off=5.0),
         {"name": "n", "subject": "s", "kind": "front-3", "evidence": "neither", "refused": "no view", "seconds": 1.0},
         {"name": "n", "subject": "s", "kind": "front-3", "evidence": "masks", "crashed": "KeyError: 3", "seconds": 1.0},
@@ -126,21 +125,12 @@ def test_the_table_marks_what_is_silently_wrong_and_says_how_others_ended() -> N
         row("circle-16"),
         row("circle-8", turn_deg=9.0),
         row(refused="no view shows a head"),
-        row("circle-8", turn_deg=9.0, warnings=["shape-implausible"]),
+        row("circle-8", turn_deg=9.0, warnings=["pose-doubtful"]),
     ]
     lines = table(rows).splitlines()[2:]
     assert [line.split(" | ")[0] for line in lines] == ["| front-3", "| circle-8", "| circle-8", "| circle-16"]
     assert ["! s" in line for line in lines] == [False, True, False, False]
     assert "refused: no view shows a head" in lines[0]
-
-
-def test_a_line_a_kind_says_the_worst_that_nobody_is_told_of() -> None:
-    refusal = {"name": "n", "subject": "s", "kind": "circle-8", "evidence": "plates", "refused": "no", "seconds": 1.0}
-    lines = summary_table([row(), row(turn_deg=9.0), refusal]).splitlines()[2:]
-    assert lines == [
-        "| front-3 | plates | 2 | 0 | 0 | 1 | 9 | 0.4 | 1 |",
-        "| circle-8 | plates | 1 | 1 | 0 | - | - | - | 0 |",
-    ]
 
 
 def cases() -> list[Case]:
