@@ -24,13 +24,14 @@ from server.services.storage_use import StorageCount
 from server.services.threads import Threads
 from server.services.uploads import ResumableUploads
 from server.services.webhooks import Webhooks
+from server.services.work import ReconstructionRequest
 from server.settings import ServiceSettings
 from server.storage.capture_blobs import open_capture_blobs
 from server.storage.database import open_database
 from server.storage.library import Library
 from server.storage.store import Store
 from server.tasks.calibrate import ingest_board_pictures, ingest_photographs
-from server.tasks.child import ChildProcessPool
+from server.tasks.child import ChildProcessPool, WorkFailed
 from server.tasks.export_archive import export_archive
 
 
@@ -130,10 +131,15 @@ class Service:
     def export(self, job_id: str, outputs: Mapping[str, object]) -> bytes:
         """Returns the files that the settings ``outputs`` name of a finished head, as a .zip. Raises NotFound, Conflict
         for a job without result, InputError for settings that are not allowed, and DiskFull."""
-        folder = self.jobs.result_folder(job_id)
+        folder, job = self.jobs.result_folder(job_id), self.jobs.get(job_id)
+        ReconstructionRequest(job.model, {"outputs": outputs}).check()
         with self.store.incoming() as scratch, self.children.one() as child:
             archive = scratch / "export.zip"
-            child.remote(export_archive)(result=str(folder), archive=str(archive), outputs=outputs)
+            try:
+                child.remote(export_archive)(result=str(folder), archive=str(archive), outputs=outputs)
+            except (InputError, WorkFailed):
+                self.jobs.files(job_id)  # erased while it was read
+                raise
             return archive.read_bytes()
 
     def result_address(self, job_id: str, name: str) -> str | None:

@@ -12,7 +12,7 @@ import anyio.to_thread
 
 from rig.errors import Cancelled
 from rig.messages.message import compose
-from server.errors import Conflict, InvalidInput, TooMany
+from server.errors import Conflict, DiskFull, InvalidInput, TooMany
 from server.services.keys import LOCAL
 from server.tasks.child import CANCELLED, WorkFailed
 
@@ -81,6 +81,8 @@ class Threads:
                 raise Conflict("client-gone", compose("client-gone")) from None
             raise InvalidInput("check-too-long", compose("check-too-long", seconds=self._check_s)) from None
         except WorkFailed as failure:
+            if failure.kind == "disk-full":
+                raise DiskFull from failure
             if failure.kind not in ("out-of-memory", "killed", "crash"):  # native code may die where memory is refused
                 raise
             raise InvalidInput("check-out-of-memory", compose("check-out-of-memory")) from failure

@@ -21,7 +21,7 @@ from tests.support.attacks import (
 )
 from tests.support.services import RunningService, running_service
 
-FILES = 512  # the service then takes 256 connections, 128 of one address; `attacks` has 1,024 and 1,100
+FILES = 512  # the service then takes 128 connections, 64 of one address; `attacks` has 1,024 and 1,100
 
 
 @pytest.fixture(scope="module")
