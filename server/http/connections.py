@@ -8,6 +8,7 @@ counted here, in front of the parser. A limit that passes closes the connection;
 
 import resource
 from asyncio import BaseTransport, TimerHandle, Transport
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -28,8 +29,9 @@ PIPELINED_MOST = 16  # requests that wait behind the one that is answered
 class BoundedConnection(HttpToolsProtocol):
     """Serves a connection, as uvicorn does, within the limits of this module.
 
-    Of too many connections, or too many of one address (half of all), the one that has waited longest for a header is
-    closed for a new one. If all of them are in the midst of a request, the new one is closed.
+    Of too many connections, or too many of one address (half of all), one that waits for a header is closed for a new
+    one: of the address that has the most, the one that has waited longest. If all of them are in the midst of a
+    request, the new one is closed.
     """
 
     _timer: TimerHandle | None = None
@@ -111,12 +113,17 @@ class BoundedConnection(HttpToolsProtocol):
     def _make_room(self, crowd: Sequence[object], most: int) -> None:
         if len(crowd) > most:
             idle = [one for one in crowd if isinstance(one, BoundedConnection) and one.waits and one is not self]
-            min(idle, key=lambda one: one.since, default=self).drop()
+            held = Counter(one.host for one in idle)
+            min(idle, key=lambda one: (-held[one.host], one.since), default=self).drop()
+
+    @property
+    def host(self) -> str:
+        """Returns the address that the connection comes from; empty if there is none."""
+        return self.client[0] if self.client else ""
 
     def _neighbours(self) -> list[Any]:
         """Returns the connections from the same address; none if there is no address."""
-        host = self.client and self.client[0]
-        return [one for one in self.connections if host and (getattr(one, "client", None) or " ")[0] == host]
+        return [one for one in self.connections if self.host and getattr(one, "host", "") == self.host]
 
     def _await_header(self) -> None:
         self._set_timer(self.loop.call_later(HEADER_S, self.drop))

@@ -14,7 +14,7 @@ from rig.errors import Cancelled
 from rig.messages.message import compose
 from server.errors import Conflict, DiskFull, InvalidInput, TooMany
 from server.services.keys import LOCAL
-from server.tasks.child import CANCELLED, WorkFailed
+from server.tasks.child import CALLER, CANCELLED, WorkFailed
 
 T = TypeVar("T")
 
@@ -59,7 +59,9 @@ class Threads:
         self._in_line[key] += 1
         try:
             async with self._share(key):
-                return await anyio.to_thread.run_sync(self._checked, gone, function, *arguments, limiter=self._checks)
+                return await anyio.to_thread.run_sync(
+                    self._checked, gone, key, function, *arguments, limiter=self._checks
+                )
         finally:
             self._in_line[key] -= 1
             if watching is not None:
@@ -69,12 +71,13 @@ class Threads:
         most = self._checks.total_tokens
         return self._shares.setdefault(key, anyio.CapacityLimiter(most if key == LOCAL else max(1, most - 1)))
 
-    def _checked(self, gone: threading.Event, function: Callable[..., T], *arguments: Any) -> T:
+    def _checked(self, gone: threading.Event, key: str, function: Callable[..., T], *arguments: Any) -> T:
         deadline = time.monotonic() + self._check_s
-        CANCELLED.set(
-            lambda: gone.is_set() or time.monotonic() > deadline
-        )  # of this call alone: a thread's own context
+        CALLER.set(key)  # both of this call alone: a thread's own context
+        CANCELLED.set(lambda: gone.is_set() or time.monotonic() > deadline)
         try:
+            if gone.is_set():  # while it waited
+                raise Cancelled
             return function(*arguments)
         except Cancelled:
             if gone.is_set():
