@@ -83,8 +83,7 @@ class Captures:
         of a real rig, NotFound for an unknown session, and Conflict if consent is missing.
         """
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
-        if not board:
-            self._check_consent(about.session)
+        self._check_consent(about.session, board=board)
         with self._store.incoming() as folder:
             capture = folder / "capture"
             shot = self._rig.capture(capture, seed=seed, board=board)
@@ -273,10 +272,11 @@ class Captures:
         erase_captures(self._store, self._jobs, [identity])
         self._library.scrub()
 
-    def _check_consent(self, session: str | None) -> None:
-        """Raises NotFound; Conflict where the service asks for consent and the session has no note of it."""
+    def _check_consent(self, session: str | None, *, board: bool = False) -> None:
+        """Raises NotFound; Conflict where the service asks for consent and the session has no note of it: a ``board``
+        needs none."""
         consent = "" if session is None else self._store.session(session).consent
-        if self._settings.ask_consent and not consent.strip():
+        if self._settings.ask_consent and not consent.strip() and not board:
             detail = compose("consent-missing")
             raise Conflict("consent-missing", detail)
 
@@ -290,8 +290,8 @@ class Captures:
         *,
         needs_consent: bool = True,
     ) -> CaptureRecord:
-        if needs_consent and not content.board:
-            self._check_consent(about.session)
+        if needs_consent:
+            self._check_consent(about.session, board=content.board)
         faults = tuple(without_consequences([*shot_faults(shot), *content.faults]))
         self._store.put_checks(folder, all_checks(shot, content))
         record = CaptureRecord(
