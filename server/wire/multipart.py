@@ -1,7 +1,8 @@
 """Receives multipart bodies straight into the data folder.
 
-The body is parsed here and not by the framework, for three reasons: key and free space are checked before the first
-byte, no file is held in memory or in a temporary folder elsewhere, and every write happens in a thread."""
+python-multipart parses, and bounds the headers of a part; its form parser and the framework's are not used, for three
+reasons: key and free space are checked before the first byte, no file is held in memory or in a temporary folder
+elsewhere, and every write happens in a thread."""
 
 from collections.abc import Collection, Iterable
 from functools import partial

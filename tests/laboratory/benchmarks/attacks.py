@@ -5,6 +5,7 @@ asks for /healthz and, with another key, for a list, twenty times a second (``te
 """
 
 import shlex
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -21,11 +22,13 @@ import httpx
 
 from tests.server.worker.test_durability import pinned_worker
 from tests.support.attacks import (
+    ATTACKER,
     Witness,
     add_keys,
     ask_often,
     client,
     flood_header,
+    get_begun,
     half_body,
     heavy_capture,
     limit_files,
@@ -110,8 +113,8 @@ def flood(field: Field) -> Seen:
     return others_under(field, name, lambda: [flood_header(field.service, MEGABYTES) for _ in range(2)])
 
 
-def hold(field: Field, begin: bytes) -> None:
-    with silent_connections(field.service, CONNECTIONS, begin):
+def hold(field: Field, begin: bytes, addresses: tuple[str, ...] = (ATTACKER,), buffer: int = 0) -> None:
+    with silent_connections(field.service, CONNECTIONS, begin, addresses, buffer):
         time.sleep(3.0)
 
 
@@ -123,6 +126,23 @@ def stay_silent(field: Field) -> Seen:
 def send_halves(field: Field) -> Seen:
     half = half_body("/v1/sessions", field.attacker)
     return others_under(field, f"{CONNECTIONS} half bodies with a key", lambda: hold(field, half))
+
+
+def watch_events(field: Field) -> Seen:
+    with client(field.service, add_keys(field.service, "read,capture,submit")[0]) as http:
+        capture = upload(http, packed(small_capture(field.folder / "watched"))).json()["id"]
+        events = http.post("/v1/jobs", json={"capture_id": capture}).headers["Location"] + "/events"
+    begin = get_begun(events, field.attacker)
+    return others_under(field, f"{CONNECTIONS} streams of events of a key", lambda: hold(field, begin))
+
+
+def read_nothing(field: Field) -> Seen:
+    name = f"{CONNECTIONS} readers from three addresses who ask for 4 MB and do not read"
+    with client(field.service, field.attacker) as http:
+        capture = upload(http, packed(small_capture(field.folder / "unread", size=1200))).json()["id"]
+    begin = get_begun(f"/v1/captures/{capture}/images/cam00", field.attacker)
+    addresses = (ATTACKER, "127.0.0.4", "127.0.0.5")
+    return others_under(field, name, lambda: hold(field, begin, addresses, buffer=4096))
 
 
 def send_metadata(field: Field) -> Seen:
@@ -140,14 +160,16 @@ def give_up_uploads(field: Field) -> Seen:
     slow, fine = slow_capture(field.folder / "slow"), packed(small_capture(field.folder / "fine"))
     with ThreadPoolExecutor(2) as pool:  # both processes that check have begun
         list(pool.map(lambda _: seconds_of_upload(field, fine), range(4)))
-    calm_s = seconds_of_upload(field, fine)
-    for _ in range(2):
+    calm_s = statistics.median(seconds_of_upload(field, fine) for _ in range(9))
+    under = list[float]()
+    for number in range(10):
         with client(field.service, field.attacker, 2.0) as http, suppress(httpx.TimeoutException):
             upload(http, slow)
-    under_s = seconds_of_upload(field, fine)
-    seen = f"{under_s:.1f} s beside {calm_s:.1f} s"
-    expected = "another key's upload takes 1.5 times as long at most, or 2 s more"
-    return Seen("two uploads that are given up", expected, seen, under_s < max(1.5 * calm_s, calm_s + 2.0))
+        under += [seconds_of_upload(field, fine)] if number % 2 else []
+    under_s = statistics.median(under)
+    seen = f"{under_s:.2f} s beside {calm_s:.2f} s, {max(under):.2f} at worst"
+    expected = "another key's upload takes 1.5 times as long at most"
+    return Seen("five times two uploads that are given up", expected, seen, under_s < 1.5 * calm_s)
 
 
 def call_inside(field: Field) -> Seen:
@@ -169,6 +191,7 @@ def send_hostile_files(field: Field) -> Seen:
     bombs = b"a: &a [x,x,x]\nb: &b [*a,*a,*a]\n" + b"".join(b"c%d: [*b,*b]\n" % n for n in range(2000))
     files = {"cameras.yaml": (b"%YAML:1.0\n" + many, bombs), "transforms.json": (deep, b'{"frames": 1e999}')}
     files |= {"cameras.bin": (b"\xff" * 64, bytes(4096)), "cameras.toml": (b"a = " + deep, b"[a.b]\n" * 9999)}
+    files |= {"cameras.json": (b"[" + b"1," * 30_000_000 + b"1]", b'{"cameras": ' + b"9" * 5_000_000 + b"}")}
     files |= {"scale.json": (deep, b'{"mm": NaN}'), "features.json": (deep, b'{"points": ' + b"9" * 9999 + b"}")}
     slowest, statuses = 0.0, list[int]()
     for number, (name, data) in enumerate((name, data) for name, some in files.items() for data in some):
@@ -231,8 +254,8 @@ def seconds_of_upload(field: Field, archive: bytes) -> float:
 
 
 ATTACKS = (
-    flood, stay_silent, send_halves, send_metadata, give_up_uploads, call_inside, send_hostile_files, ask_much,
-    starve_worker,
+    flood, stay_silent, send_halves, watch_events, read_nothing, send_metadata, give_up_uploads, call_inside,
+    send_hostile_files, ask_much, starve_worker,
 )  # fmt: skip
 AT = "tests/server"
 TESTS = {
