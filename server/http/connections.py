@@ -30,8 +30,8 @@ class BoundedConnection(HttpToolsProtocol):
     """Serves a connection, as uvicorn does, within the limits of this module.
 
     Of too many connections, or too many of one address (half of all), one that waits for a header is closed for a new
-    one: of the address that has the most, the one that has waited longest. If all of them are in the midst of a
-    request, the new one is closed.
+    one: of the address that has the most, the one that has waited longest. If all of addresses with as many as the new
+    one's are in the midst of a request, the new one is closed.
     """
 
     _timer: TimerHandle | None = None
@@ -112,8 +112,9 @@ class BoundedConnection(HttpToolsProtocol):
 
     def _make_room(self, crowd: Sequence[object], most: int) -> None:
         if len(crowd) > most:
-            idle = [one for one in crowd if isinstance(one, BoundedConnection) and one.waits and one is not self]
-            held = Counter(one.host for one in idle)
+            here = [one for one in crowd if isinstance(one, BoundedConnection)]
+            held = Counter(one.host for one in here)
+            idle = [one for one in here if one.waits and one is not self and held[one.host] >= held[self.host]]
             min(idle, key=lambda one: (-held[one.host], one.since), default=self).drop()
 
     @property

@@ -44,7 +44,7 @@ Reader = Annotated[Caller, Depends(require("read"))]
 Submitter = Annotated[Caller, Depends(require("submit"))]
 
 
-LOOKS_MOST = 16  # of a key's event streams in each ``poll_s``, at two queries; where there are more, each waits longer
+LOOKS_MOST = 8  # of a key's event streams in each ``poll_s``, at two queries; where there are more, each waits longer
 streams = Counter[str]()  # open ones, by key
 
 EXPORT: Responses = {200: {"content": {"application/zip": {}}}, **documented(400, 404, 409, 413, 415, 507)}

@@ -96,7 +96,7 @@ def test_a_reader_who_takes_nothing_is_dropped(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(connections, "STALL_S", 0.3)
     ended = threading.Event()
 
-    async def answer(_: Scope, receive: Receive, send: Send) -> None:
+    async def answer(scope: Scope, receive: Receive, send: Send) -> None:
         await send({"type": "http.response.start", "status": 200, "headers": []})
         for _ in range(64):
             await send({"type": "http.response.body", "body": bytes(1 << 20), "more_body": True})
