@@ -10,7 +10,7 @@ import resource
 from asyncio import BaseTransport, TimerHandle, Transport
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import cast
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
@@ -46,7 +46,8 @@ class BoundedConnection(HttpToolsProtocol):
         self._await_header()
         most = connections_most()
         if len(self.connections) > most // 2:
-            self._make_room(self._neighbours(), most // 2)
+            neighbours = [one for one in self.connections if self.host and getattr(one, "host", "") == self.host]
+            self._make_room(neighbours, most // 2)
             self._make_room(list(self.connections), most)
 
     @property
@@ -121,10 +122,6 @@ class BoundedConnection(HttpToolsProtocol):
     def host(self) -> str:
         """Returns the address that the connection comes from; empty if there is none."""
         return self.client[0] if self.client else ""
-
-    def _neighbours(self) -> list[Any]:
-        """Returns the connections from the same address; none if there is no address."""
-        return [one for one in self.connections if self.host and getattr(one, "host", "") == self.host]
 
     def _await_header(self) -> None:
         self._set_timer(self.loop.call_later(HEADER_S, self.drop))

@@ -84,14 +84,7 @@ class Captures:
         """
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
         self._check_consent(about.session, board=board)
-        with self._store.incoming() as folder:
-            capture = folder / "capture"
-            shot = self._rig.capture(capture, seed=seed, board=board)
-            with self._children.one() as child:
-                ingest = child.remote(ingest_board if board else ingest_folder)
-                judged = {} if board else {"measured": "checks" in shot}
-                content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels, **judged)
-            return self._add(capture, "rig", content, about, shot)
+        return self._shoot(self._rig, about, seed, board=board)
 
     def sample(self) -> CaptureRecord:
         """Takes a shot of the simulated studio, even if the service has a real rig. It shows no real person, so no
@@ -99,23 +92,28 @@ class Captures:
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
         studio = SimulatedRig(self._store.data / "rig" / "none")
         try:
-            with self._store.incoming() as folder:
-                capture = folder / "capture"
-                shot = studio.capture(capture, seed=SAMPLE_SEED)
-                with self._children.one() as child:
-                    content = child.remote(ingest_folder)(
-                        folder=str(capture / "files"), image_pixels=self._settings.image_pixels, measured=False
-                    )
-                return self._add(
-                    capture,
-                    "rig",
-                    content,
-                    CaptureMetadata(label="Sample, simulated studio"),
-                    shot,
-                    needs_consent=False,
-                )
+            about = CaptureMetadata(label="Sample, simulated studio")
+            return self._shoot(studio, about, SAMPLE_SEED, needs_consent=False)
         finally:
             studio.close()
+
+    def _shoot(
+        self,
+        rig: RigBackend,
+        about: CaptureMetadata,
+        seed: int | None,
+        *,
+        board: bool = False,
+        needs_consent: bool = True,
+    ) -> CaptureRecord:
+        with self._store.incoming() as folder:
+            capture = folder / "capture"
+            shot = rig.capture(capture, seed=seed, board=board)
+            with self._children.one() as child:
+                ingest = child.remote(ingest_board if board else ingest_folder)
+                judged = {} if board else {"measured": "checks" in shot}
+                content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels, **judged)
+            return self._add(capture, "rig", content, about, shot, needs_consent=needs_consent)
 
     def accept(self, archive: Path, folder: Path, about: CaptureMetadata) -> CaptureRecord:
         """Makes a capture from a received archive, which is unpacked and checked in a child process.

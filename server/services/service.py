@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import sqlalchemy as sa
@@ -74,24 +75,19 @@ class Service:
         self.jobs.close()
         self.engine.dispose()
 
-    def accept_board_pictures(self, archive: Path, folder: Path, label: str) -> Calibration:
-        """Unpacks an archive of IMAGES/ and board.toml and queues a calibration. ``folder`` is a folder of
-        ``Store.incoming``. Raises InputError naming every fault, and DiskFull."""
+    def accept_pictures(self, source: str, archive: Path, folder: Path, label: str) -> Calibration:
+        """Unpacks an archive of pictures and queues a calibration: of IMAGES/ and board.toml, or where ``source`` is
+        "scene" of photographs. ``folder`` is a folder of ``Store.incoming``. Raises InputError naming every fault, and
+        DiskFull."""
         limits, target = self.captures.archive_limits(archive), folder / "calibration" / "pictures"
         target.mkdir(parents=True)
         with self.children.one() as child:
-            child.remote(ingest_board_pictures)(archive=str(archive), folder=str(target), limits=limits)
-        return self.calibrations.add(target, "upload", label)
-
-    def accept_photographs(self, archive: Path, folder: Path, label: str) -> Calibration:
-        """Unpacks an archive of photographs of a scene and queues a calibration. ``folder`` is a folder of
-        ``Store.incoming``. Raises InputError naming every fault, and DiskFull."""
-        limits, target = self.captures.archive_limits(archive), folder / "calibration" / "pictures"
-        target.mkdir(parents=True)
-        with self.children.one() as child:
-            child.remote(ingest_photographs)(
-                archive=str(archive), folder=str(target), limits=limits, image_pixels=self.settings.image_pixels
-            )
+            if source == "scene":
+                pixels = self.settings.image_pixels
+                unpack = partial(child.remote(ingest_photographs), image_pixels=pixels)
+            else:
+                unpack = child.remote(ingest_board_pictures)
+            unpack(archive=str(archive), folder=str(target), limits=limits)
         return self.calibrations.add(target, "upload", label)
 
     def use_calibration(self, identity: str, *, poor: bool = False) -> RigState:
