@@ -24,7 +24,6 @@ from server.wire.problems import Problem
 
 SLOW_S, SLOW_MOST = 0.1, 8  # what takes longer, as a shot of the rig does, makes room for so many beside it
 SHARE = 4  # a caller may hold one in so many connections with answers that go on and long bodies
-AGAIN_S = 5  # Retry-After of one who holds as many
 SMALL_DIGITS = 5  # of a body's length in bytes; a longer one takes its client's time, not the service's
 
 bearer = HTTPBearer(auto_error=False, description="API key, eh_...; not needed on loopback while no key exists")
@@ -146,7 +145,7 @@ class FairShares:
         most = connections_most() // SHARE
         try:
             if line.under_way >= most:
-                detail, again = compose("too-many-under-way", most=most), {"Retry-After": str(AGAIN_S)}
+                detail, again = compose("too-many-under-way", most=most), {"Retry-After": "5"}
                 refusal = Problem(429, "too-many-requests", detail, headers=again)
                 await refusal.response()(scope, receive, begin_answer)
             else:

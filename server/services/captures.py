@@ -93,18 +93,12 @@ class Captures:
         studio = SimulatedRig(self._store.data / "rig" / "none")
         try:
             about = CaptureMetadata(label="Sample, simulated studio")
-            return self._shoot(studio, about, SAMPLE_SEED, needs_consent=False)
+            return self._shoot(studio, about, SAMPLE_SEED, consent=False)
         finally:
             studio.close()
 
     def _shoot(
-        self,
-        rig: RigBackend,
-        about: CaptureMetadata,
-        seed: int | None,
-        *,
-        board: bool = False,
-        needs_consent: bool = True,
+        self, rig: RigBackend, about: CaptureMetadata, seed: int | None, *, board: bool = False, consent: bool = True
     ) -> CaptureRecord:
         with self._store.incoming() as folder:
             capture = folder / "capture"
@@ -113,7 +107,7 @@ class Captures:
                 ingest = child.remote(ingest_board if board else ingest_folder)
                 judged = {} if board else {"measured": "checks" in shot}
                 content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels, **judged)
-            return self._add(capture, "rig", content, about, shot, needs_consent=needs_consent)
+            return self._add(capture, "rig", content, about, shot, needs_consent=consent)
 
     def accept(self, archive: Path, folder: Path, about: CaptureMetadata) -> CaptureRecord:
         """Makes a capture from a received archive, which is unpacked and checked in a child process.

@@ -83,8 +83,7 @@ class Service:
         target.mkdir(parents=True)
         with self.children.one() as child:
             if source == "scene":
-                pixels = self.settings.image_pixels
-                unpack = partial(child.remote(ingest_photographs), image_pixels=pixels)
+                unpack = partial(child.remote(ingest_photographs), image_pixels=self.settings.image_pixels)
             else:
                 unpack = child.remote(ingest_board_pictures)
             unpack(archive=str(archive), folder=str(target), limits=limits)

@@ -55,7 +55,9 @@ class Threads:
         if self._in_line[key] >= IN_LINE_MOST:
             raise TooMany("too-many-checks", compose("too-many-checks", most=IN_LINE_MOST), retry_after_s=AGAIN_S)
         gone = threading.Event()
-        watching = None if hung_up is None else asyncio.ensure_future(_set_after(hung_up, gone))
+        watching = None if hung_up is None else asyncio.ensure_future(hung_up())
+        if watching is not None:
+            watching.add_done_callback(lambda _: gone.set())
         self._in_line[key] += 1
         try:
             async with self._share(key):
@@ -89,8 +91,3 @@ class Threads:
             if failure.kind not in ("out-of-memory", "killed", "crash"):  # native code may die where memory is refused
                 raise
             raise InvalidInput("check-out-of-memory", compose("check-out-of-memory")) from failure
-
-
-async def _set_after(hung_up: Callable[[], Awaitable[None]], gone: threading.Event) -> None:
-    await hung_up()
-    gone.set()

@@ -163,14 +163,6 @@ class Witness:
     def others_median_s(self) -> float:
         return statistics.median(self.others_s)
 
-    def figures(self) -> dict[str, float]:
-        return {
-            "healthz_worst_s": round(max(self.healthz_s), 3),
-            "others_median_ms": round(1000 * self.others_median_s, 1),
-            "failures": len(self.failures),
-            "memory_mb": round(max(self.memory_mb)),
-        }
-
 
 def memory_mb(service: RunningService) -> float:
     """Resident memory of the service's process and all below it (MB)."""

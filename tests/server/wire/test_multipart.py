@@ -14,15 +14,7 @@ from server.errors import DiskFull, TooLarge
 from server.services.threads import Threads
 from server.settings import ServiceSettings
 from server.storage.store import Store
-from server.wire.multipart import (
-    BLOCK_BYTES,
-    FIELD_BYTES,
-    FIELDS_MOST,
-    check_fields,
-    check_length,
-    described_form,
-    receive_multipart,
-)
+from server.wire.multipart import BLOCK_BYTES, FIELD_BYTES, FIELDS_MOST, check_fields, check_length, receive_multipart
 from server.wire.problems import Problem
 
 DATA = bytes(range(256)) * 40
@@ -192,21 +184,6 @@ def test_the_announced_length_is_judged(
         return
     with pytest.raises(error):
         check_length(request, Store(tmp_path), settings)
-
-
-def test_a_form_is_described(tmp_path: Path) -> None:
-    described = described_form("an archive", ("label",), settings="JSON object")
-    schema = described["requestBody"]["content"]["multipart/form-data"]["schema"]
-    assert described["requestBody"]["required"]
-    assert schema == {
-        "type": "object",
-        "required": ["file"],
-        "properties": {
-            "file": {"type": "string", "format": "binary", "description": "an archive"},
-            "label": {"type": "string"},
-            "settings": {"type": "string", "description": "JSON object"},
-        },
-    }
 
 
 def test_each_field_that_a_form_does_not_have_is_named() -> None:
