@@ -106,8 +106,7 @@ def traces(service: RunningService, settings: dict[str, Any], values: list[str])
         engine = sa.create_engine(ServiceSettings(**settings).url)
         with engine.connect() as connection:
             of = "schemaname NOT IN ('pg_catalog', 'information_schema')"
-            tables = connection.execute(sa.text(f"SELECT schemaname, tablename FROM pg_tables WHERE {of}")).all()
-            for schema, table in tables:
+            for schema, table in connection.execute(sa.text(f"SELECT schemaname, tablename FROM pg_tables WHERE {of}")):
                 held += [
                     row.encode() for row in connection.scalars(sa.text(f'SELECT t::text FROM "{schema}"."{table}" t'))
                 ]
