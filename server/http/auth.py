@@ -17,11 +17,13 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rig.messages.message import compose
 from server.address import is_loopback
+from server.http.connections import connections_most
 from server.services.keys import LOCAL, SCOPES, Caller
 from server.services.service import Service
 from server.wire.problems import Problem
 
 SLOW_S, SLOW_MOST = 0.1, 8  # what takes longer, as a shot of the rig does, makes room for so many beside it
+SHARE = 4  # a caller may hold one in so many connections with answers that go on and long bodies
 SMALL_DIGITS = 5  # of a body's length in bytes; a longer one takes its client's time, not the service's
 
 bearer = HTTPBearer(auto_error=False, description="API key, eh_...; not needed on loopback while no key exists")
@@ -93,6 +95,7 @@ class FairShares:
 
     A caller is known by his key once it was accepted, and by his address before. The next one's turn comes when an
     answer begins, when a request waits for a long body, and after ``SLOW_S`` seconds if fewer than ``SLOW_MOST`` did.
+    A caller whose streams, slow downloads and uploads hold a ``SHARE`` of all connections is refused more (429).
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -106,7 +109,7 @@ class FairShares:
             await self._app(scope, receive, send)
             return
         headers = dict(scope["headers"])
-        shown = hashlib.sha256(headers.get(b"authorization", b"")).digest()
+        shown = hashlib.sha256(b" ".join(headers.get(b"authorization", b"").split()[1:])).digest()
         name = self._known.get(shown) or f"at {(scope.get('client') or ('',))[0]}"
         line = self._lines.setdefault(name, _Line())
         long_body = b"transfer-encoding" in headers or len(headers.get(b"content-length", b"")) > SMALL_DIGITS
@@ -116,6 +119,7 @@ class FairShares:
             nonlocal held
             if held:
                 held = False
+                line.under_way += 1
                 line.release()
 
         def make_room() -> None:
@@ -131,20 +135,28 @@ class FairShares:
             return await receive()
 
         async def begin_answer(message: Message) -> None:
+            if "caller" in scope:
+                self._known[shown] = scope["caller"]
             leave()
             await send(message)
 
         await line.acquire()
         held, timer = True, asyncio.get_running_loop().call_later(SLOW_S, make_room)
+        most = connections_most() // SHARE
         try:
-            await self._app(scope, receive_body, begin_answer)
+            if line.under_way >= most:
+                detail, again = compose("too-many-under-way", most=most), {"Retry-After": "5"}
+                refusal = Problem(429, "too-many-requests", detail, headers=again)
+                await refusal.response()(scope, receive, begin_answer)
+            else:
+                await self._app(scope, receive_body, begin_answer)
         finally:
             timer.cancel()
             leave()
+            line.under_way -= 1
             line.slow -= slow
-            if "caller" in scope:
-                self._known[shown] = scope["caller"]
 
 
 class _Line(asyncio.Lock):
     slow = 0  # requests that made room
+    under_way = 0  # requests that left the line and have not ended

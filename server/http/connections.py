@@ -1,5 +1,5 @@
 """Bounds what a connection may cost before anybody has shown a key: bytes and seconds to the end of a header, the pace
-of a body, and the number of connections.
+of a body and of the reader of an answer, and the number of connections.
 
 uvicorn's parser, httptools, joins a header that arrives in pieces quadratically and bounds neither it nor the time that
 it takes. h11 bounds the header, at 139 us of CPU a request against 60 us, and leaves the time open. So bytes are
@@ -8,8 +8,9 @@ counted here, in front of the parser. A limit that passes closes the connection;
 
 import resource
 from asyncio import BaseTransport, TimerHandle, Transport
+from collections import Counter
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import cast
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
@@ -19,19 +20,22 @@ from server.wire.problems import Problem
 HEADER_BYTES = 32 << 10  # of a request line and its fields, or of a body's trailer; nginx's default (4 x 8 KiB)
 HEADER_S = 30.0  # from the first byte to the end of a header
 PACE_S, PACE_BYTES = 60.0, 30_000  # a body that brings less in that time is dropped: 500 B/s, as Apache's MinRate
+STALL_S = 120.0  # a client who takes nothing of an answer for so long is dropped: twice nginx's send_timeout
 CONNECTIONS_MOST = 2048  # of 50 kB each, with what the kernel holds of them
-DESCRIPTORS_SPARED = 256  # of the process's limit: for the database, files, and children
+DESCRIPTORS_SPARED = 256  # of the process's limit: for the database and children; each connection may send a file
 PIPELINED_MOST = 16  # requests that wait behind the one that is answered
 
 
 class BoundedConnection(HttpToolsProtocol):
     """Serves a connection, as uvicorn does, within the limits of this module.
 
-    Of too many connections, or too many of one address (half of all), the one that has waited longest for a header is
-    closed for a new one. If all of them are in the midst of a request, the new one is closed.
+    Of too many connections, or too many of one address (half of all), one that waits for a header is closed for a new
+    one: of the address that has the most, the one that has waited longest. If all of addresses with as many as the new
+    one's are in the midst of a request, the new one is closed.
     """
 
     _timer: TimerHandle | None = None
+    _stalled: TimerHandle | None = None
     _in_header = True
     _unparsed = _received = 0
 
@@ -42,7 +46,8 @@ class BoundedConnection(HttpToolsProtocol):
         self._await_header()
         most = connections_most()
         if len(self.connections) > most // 2:
-            self._make_room(self._neighbours(), most // 2)
+            neighbours = [one for one in self.connections if self.host and getattr(one, "host", "") == self.host]
+            self._make_room(neighbours, most // 2)
             self._make_room(list(self.connections), most)
 
     @property
@@ -58,7 +63,19 @@ class BoundedConnection(HttpToolsProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """Ends the time that ran."""
         self._set_timer(None)
+        self.resume_writing()
         super().connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        """Begins the time in which the client has to take something of an answer."""
+        self._stalled = self.loop.call_later(STALL_S, self.drop)
+        super().pause_writing()
+
+    def resume_writing(self) -> None:
+        """Ends that time."""
+        if self._stalled is not None:
+            self._stalled.cancel()
+        super().resume_writing()
 
     def data_received(self, data: bytes) -> None:
         """Passes bytes to the parser as long as it makes a header or a body of them."""
@@ -96,13 +113,15 @@ class BoundedConnection(HttpToolsProtocol):
 
     def _make_room(self, crowd: Sequence[object], most: int) -> None:
         if len(crowd) > most:
-            idle = [one for one in crowd if isinstance(one, BoundedConnection) and one.waits and one is not self]
-            min(idle, key=lambda one: one.since, default=self).drop()
+            here = [one for one in crowd if isinstance(one, BoundedConnection)]
+            held = Counter(one.host for one in here)
+            idle = [one for one in here if one.waits and one is not self and held[one.host] >= held[self.host]]
+            min(idle, key=lambda one: (-held[one.host], one.since), default=self).drop()
 
-    def _neighbours(self) -> list[Any]:
-        """Returns the connections from the same address; none if there is no address."""
-        host = self.client and self.client[0]
-        return [one for one in self.connections if host and (getattr(one, "client", None) or " ")[0] == host]
+    @property
+    def host(self) -> str:
+        """Returns the address that the connection comes from; empty if there is none."""
+        return self.client[0] if self.client else ""
 
     def _await_header(self) -> None:
         self._set_timer(self.loop.call_later(HEADER_S, self.drop))
@@ -133,7 +152,7 @@ class BoundedConnection(HttpToolsProtocol):
 
 
 def connections_most() -> int:
-    """Returns how many connections may be open: as many as the limit of open files allows, at most
-    ``CONNECTIONS_MOST``."""
+    """Returns how many connections may be open: as many as the limit of open files allows where each of them sends a
+    file, at most ``CONNECTIONS_MOST``."""
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    return min(CONNECTIONS_MOST, max(files - DESCRIPTORS_SPARED, files // 2))
+    return min(CONNECTIONS_MOST, max(files - DESCRIPTORS_SPARED, files // 2) // 2)

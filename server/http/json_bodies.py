@@ -32,7 +32,8 @@ class JsonBodies:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one ASGI connection. What is no request with a JSON body is passed on unread."""
-        route = self._route(scope) if scope["type"] == "http" else None
+        fitting = (route for route in self._routes if route.matches(scope)[0] is Match.FULL)
+        route = next(fitting, None) if scope["type"] == "http" else None
         if route is None or route.body_field is None:
             await self._app(scope, receive, send)
             return
@@ -49,9 +50,6 @@ class JsonBodies:
             return messages.pop(0) if messages else await receive()
 
         await self._app(scope, receive_again, send)
-
-    def _route(self, scope: Scope) -> APIRoute | None:
-        return next((route for route in self._routes if route.matches(scope)[0] is Match.FULL), None)
 
     async def _read(self, request: Request) -> list[Message]:
         """Returns the ASGI messages of the body, up to its end or the client's disconnection.

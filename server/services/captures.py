@@ -83,16 +83,8 @@ class Captures:
         of a real rig, NotFound for an unknown session, and Conflict if consent is missing.
         """
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
-        if not board:
-            self._check_consent(about.session)
-        with self._store.incoming() as folder:
-            capture = folder / "capture"
-            shot = self._rig.capture(capture, seed=seed, board=board)
-            with self._children.one() as child:
-                ingest = child.remote(ingest_board if board else ingest_folder)
-                judged = {} if board else {"measured": "checks" in shot}
-                content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels, **judged)
-            return self._add(capture, "rig", content, about, shot)
+        self._check_consent(about.session, board=board)
+        return self._shoot(self._rig, about, seed, board=board)
 
     def sample(self) -> CaptureRecord:
         """Takes a shot of the simulated studio, even if the service has a real rig. It shows no real person, so no
@@ -100,23 +92,22 @@ class Captures:
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
         studio = SimulatedRig(self._store.data / "rig" / "none")
         try:
-            with self._store.incoming() as folder:
-                capture = folder / "capture"
-                shot = studio.capture(capture, seed=SAMPLE_SEED)
-                with self._children.one() as child:
-                    content = child.remote(ingest_folder)(
-                        folder=str(capture / "files"), image_pixels=self._settings.image_pixels, measured=False
-                    )
-                return self._add(
-                    capture,
-                    "rig",
-                    content,
-                    CaptureMetadata(label="Sample, simulated studio"),
-                    shot,
-                    needs_consent=False,
-                )
+            about = CaptureMetadata(label="Sample, simulated studio")
+            return self._shoot(studio, about, SAMPLE_SEED, consent=False)
         finally:
             studio.close()
+
+    def _shoot(
+        self, rig: RigBackend, about: CaptureMetadata, seed: int | None, *, board: bool = False, consent: bool = True
+    ) -> CaptureRecord:
+        with self._store.incoming() as folder:
+            capture = folder / "capture"
+            shot = rig.capture(capture, seed=seed, board=board)
+            with self._children.one() as child:
+                ingest = child.remote(ingest_board if board else ingest_folder)
+                judged = {} if board else {"measured": "checks" in shot}
+                content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels, **judged)
+            return self._add(capture, "rig", content, about, shot, needs_consent=consent)
 
     def accept(self, archive: Path, folder: Path, about: CaptureMetadata) -> CaptureRecord:
         """Makes a capture from a received archive, which is unpacked and checked in a child process.
@@ -273,10 +264,11 @@ class Captures:
         erase_captures(self._store, self._jobs, [identity])
         self._library.scrub()
 
-    def _check_consent(self, session: str | None) -> None:
-        """Raises NotFound; Conflict where the service asks for consent and the session has no note of it."""
+    def _check_consent(self, session: str | None, *, board: bool = False) -> None:
+        """Raises NotFound; Conflict where the service asks for consent and the session has no note of it: a ``board``
+        needs none."""
         consent = "" if session is None else self._store.session(session).consent
-        if self._settings.ask_consent and not consent.strip():
+        if self._settings.ask_consent and not consent.strip() and not board:
             detail = compose("consent-missing")
             raise Conflict("consent-missing", detail)
 
@@ -290,8 +282,8 @@ class Captures:
         *,
         needs_consent: bool = True,
     ) -> CaptureRecord:
-        if needs_consent and not content.board:
-            self._check_consent(about.session)
+        if needs_consent:
+            self._check_consent(about.session, board=content.board)
         faults = tuple(without_consequences([*shot_faults(shot), *content.faults]))
         self._store.put_checks(folder, all_checks(shot, content))
         record = CaptureRecord(

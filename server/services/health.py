@@ -37,7 +37,7 @@ def readiness(service: Service) -> dict[str, Check]:
         "disk": _disk(service),
         "worker": _workers(service),
         "queues": _queues(service),
-        "egl": _egl(service),
+        "egl": service.known.get("egl") or Check(ok=False, detail=compose("check-starting"), starting=True),
         "rig": _rig(service),
         "records": _records(service),
         "retention": _retention(service),
@@ -97,10 +97,6 @@ def check_egl(service: Service) -> None:
             service.known["egl"] = Check(ok=True, detail=verbatim(child.remote(try_egl)()))
     except WorkFailed as error:
         service.known["egl"] = Check(ok=False, detail=error.message)
-
-
-def _egl(service: Service) -> Check:
-    return service.known.get("egl") or Check(ok=False, detail=compose("check-starting"), starting=True)
 
 
 def _rig(service: Service) -> Check:

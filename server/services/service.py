@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import sqlalchemy as sa
@@ -24,13 +25,14 @@ from server.services.storage_use import StorageCount
 from server.services.threads import Threads
 from server.services.uploads import ResumableUploads
 from server.services.webhooks import Webhooks
+from server.services.work import ReconstructionRequest
 from server.settings import ServiceSettings
 from server.storage.capture_blobs import open_capture_blobs
 from server.storage.database import open_database
 from server.storage.library import Library
 from server.storage.store import Store
 from server.tasks.calibrate import ingest_board_pictures, ingest_photographs
-from server.tasks.child import ChildProcessPool
+from server.tasks.child import ChildProcessPool, WorkFailed
 from server.tasks.export_archive import export_archive
 
 
@@ -73,24 +75,18 @@ class Service:
         self.jobs.close()
         self.engine.dispose()
 
-    def accept_board_pictures(self, archive: Path, folder: Path, label: str) -> Calibration:
-        """Unpacks an archive of IMAGES/ and board.toml and queues a calibration. ``folder`` is a folder of
-        ``Store.incoming``. Raises InputError naming every fault, and DiskFull."""
+    def accept_pictures(self, source: str, archive: Path, folder: Path, label: str) -> Calibration:
+        """Unpacks an archive of pictures and queues a calibration: of IMAGES/ and board.toml, or where ``source`` is
+        "scene" of photographs. ``folder`` is a folder of ``Store.incoming``. Raises InputError naming every fault, and
+        DiskFull."""
         limits, target = self.captures.archive_limits(archive), folder / "calibration" / "pictures"
         target.mkdir(parents=True)
         with self.children.one() as child:
-            child.remote(ingest_board_pictures)(archive=str(archive), folder=str(target), limits=limits)
-        return self.calibrations.add(target, "upload", label)
-
-    def accept_photographs(self, archive: Path, folder: Path, label: str) -> Calibration:
-        """Unpacks an archive of photographs of a scene and queues a calibration. ``folder`` is a folder of
-        ``Store.incoming``. Raises InputError naming every fault, and DiskFull."""
-        limits, target = self.captures.archive_limits(archive), folder / "calibration" / "pictures"
-        target.mkdir(parents=True)
-        with self.children.one() as child:
-            child.remote(ingest_photographs)(
-                archive=str(archive), folder=str(target), limits=limits, image_pixels=self.settings.image_pixels
-            )
+            if source == "scene":
+                unpack = partial(child.remote(ingest_photographs), image_pixels=self.settings.image_pixels)
+            else:
+                unpack = child.remote(ingest_board_pictures)
+            unpack(archive=str(archive), folder=str(target), limits=limits)
         return self.calibrations.add(target, "upload", label)
 
     def use_calibration(self, identity: str, *, poor: bool = False) -> RigState:
@@ -130,10 +126,15 @@ class Service:
     def export(self, job_id: str, outputs: Mapping[str, object]) -> bytes:
         """Returns the files that the settings ``outputs`` name of a finished head, as a .zip. Raises NotFound, Conflict
         for a job without result, InputError for settings that are not allowed, and DiskFull."""
-        folder = self.jobs.result_folder(job_id)
+        folder, job = self.jobs.result_folder(job_id), self.jobs.get(job_id)
+        ReconstructionRequest(job.model, {"outputs": outputs}).check()
         with self.store.incoming() as scratch, self.children.one() as child:
             archive = scratch / "export.zip"
-            child.remote(export_archive)(result=str(folder), archive=str(archive), outputs=outputs)
+            try:
+                child.remote(export_archive)(result=str(folder), archive=str(archive), outputs=outputs)
+            except (InputError, WorkFailed):
+                self.jobs.files(job_id)  # erased while it was read
+                raise
             return archive.read_bytes()
 
     def result_address(self, job_id: str, name: str) -> str | None:

@@ -12,9 +12,9 @@ import anyio.to_thread
 
 from rig.errors import Cancelled
 from rig.messages.message import compose
-from server.errors import Conflict, InvalidInput, TooMany
+from server.errors import Conflict, DiskFull, InvalidInput, TooMany
 from server.services.keys import LOCAL
-from server.tasks.child import CANCELLED, WorkFailed
+from server.tasks.child import CALLER, CANCELLED, WorkFailed
 
 T = TypeVar("T")
 
@@ -55,11 +55,15 @@ class Threads:
         if self._in_line[key] >= IN_LINE_MOST:
             raise TooMany("too-many-checks", compose("too-many-checks", most=IN_LINE_MOST), retry_after_s=AGAIN_S)
         gone = threading.Event()
-        watching = None if hung_up is None else asyncio.ensure_future(_set_after(hung_up, gone))
+        watching = None if hung_up is None else asyncio.ensure_future(hung_up())
+        if watching is not None:
+            watching.add_done_callback(lambda _: gone.set())
         self._in_line[key] += 1
         try:
             async with self._share(key):
-                return await anyio.to_thread.run_sync(self._checked, gone, function, *arguments, limiter=self._checks)
+                return await anyio.to_thread.run_sync(
+                    self._checked, gone, key, function, *arguments, limiter=self._checks
+                )
         finally:
             self._in_line[key] -= 1
             if watching is not None:
@@ -69,23 +73,21 @@ class Threads:
         most = self._checks.total_tokens
         return self._shares.setdefault(key, anyio.CapacityLimiter(most if key == LOCAL else max(1, most - 1)))
 
-    def _checked(self, gone: threading.Event, function: Callable[..., T], *arguments: Any) -> T:
+    def _checked(self, gone: threading.Event, key: str, function: Callable[..., T], *arguments: Any) -> T:
         deadline = time.monotonic() + self._check_s
-        CANCELLED.set(
-            lambda: gone.is_set() or time.monotonic() > deadline
-        )  # of this call alone: a thread's own context
+        CALLER.set(key)  # both of this call alone: a thread's own context
+        CANCELLED.set(lambda: gone.is_set() or time.monotonic() > deadline)
         try:
+            if gone.is_set():  # while it waited
+                raise Cancelled
             return function(*arguments)
         except Cancelled:
             if gone.is_set():
                 raise Conflict("client-gone", compose("client-gone")) from None
             raise InvalidInput("check-too-long", compose("check-too-long", seconds=self._check_s)) from None
         except WorkFailed as failure:
+            if failure.kind == "disk-full":
+                raise DiskFull from failure
             if failure.kind not in ("out-of-memory", "killed", "crash"):  # native code may die where memory is refused
                 raise
             raise InvalidInput("check-out-of-memory", compose("check-out-of-memory")) from failure
-
-
-async def _set_after(hung_up: Callable[[], Awaitable[None]], gone: threading.Event) -> None:
-    await hung_up()
-    gone.set()

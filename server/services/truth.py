@@ -6,13 +6,10 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.spatial import KDTree
+from jaxtyping import Float
 
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh, face_normals
-
-NEAREST = 8  # vertices whose triangles are looked at; on an even mesh the nearest point lies on a triangle of the first
 
 
 def error_mm(truth: Path, result: Path) -> dict[str, float]:
@@ -31,35 +28,10 @@ def error_mm(truth: Path, result: Path) -> dict[str, float]:
 
 
 def surface_distance(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> Float[np.ndarray, " n"]:
-    """Computes the distance (mm) of each point to the nearest point on the triangles around the mesh's ``NEAREST``
-    nearest vertices."""
-    _, nearest = KDTree(mesh.vertices).query(points, k=NEAREST)
-    first = np.searchsorted(np.sort(mesh.faces.ravel()), np.arange(len(mesh.vertices) + 1))
-    of_vertex = np.argsort(mesh.faces.ravel(), kind="stable") // 3  # triangles, ordered by vertex
-    best = np.full(len(points), np.inf)
-    for column in np.asarray(nearest).T:
-        count = first[column + 1] - first[column]
-        for i in range(int(count.max())):
-            has = count > i
-            triangles = mesh.faces[of_vertex[first[column[has]] + i]]
-            best[has] = np.minimum(best[has], _to_triangles(points[has], mesh.vertices, triangles))
-    return best
+    """Computes the distance (mm) of each point to the mesh's nearest triangle."""
+    from pipeline.geometry.surface_index import SurfaceIndex  # its compiled loops take a second to load
 
-
-def _to_triangles(
-    p: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "n 3"]
-) -> Float[np.ndarray, " n"]:
-    """Returns the distance of point i to triangle i: to its plane if the foot lies inside, else to the nearest edge."""
-    corners = vertices[triangles]
-    edges = np.roll(corners, -1, axis=1) - corners
-    normal = np.cross(edges[:, 0], -edges[:, 2])
-    square = np.maximum((normal**2).sum(1), 1e-30)
-    towards = p[:, None] - corners
-    inside = (np.einsum("nij,nij->ni", np.cross(edges, towards), normal[:, None].repeat(3, 1)) >= 0).all(1)
-    plane = np.abs((towards[:, 0] * normal).sum(1)) / np.sqrt(square)
-    along = (towards * edges).sum(2) / np.maximum((edges**2).sum(2), 1e-30)
-    to_edges = np.linalg.norm(towards - np.clip(along, 0, 1)[:, :, None] * edges, axis=2).min(1)
-    return np.where(inside, plane, to_edges)
+    return SurfaceIndex(mesh.vertices, mesh.faces).closest(points).distances
 
 
 def _vertex_areas(mesh: Mesh) -> Float[np.ndarray, " v"]:

@@ -90,13 +90,8 @@ class Webhooks:
         round; for each round a webhook gets one message, even if the call is repeated."""
         for hook in self.all():
             identity = f"hook-{hook.id}-{batch_id}-{round_number}"
-            message: WebhookMessage = {
-                "webhook": hook.id,
-                "type": "batch.finished",
-                "batch_id": batch_id,
-                "id": identity,
-            }
-            enqueue(_delivery(identity), message)
+            what: WebhookMessage = {"webhook": hook.id, "type": "batch.finished", "batch_id": batch_id, "id": identity}
+            enqueue(_delivery(identity), what)
 
     def post(self, message: WebhookMessage) -> int:
         """Tries once to deliver a message and returns the HTTP status of the answer. Returns 0 without sending if the
@@ -130,12 +125,8 @@ class Webhooks:
         aim = target(hook["url"], self._origins)
         body, headers = _signed(message, hook["secret"])
         with httpx.Client(trust_env=False, timeout=TIMEOUT_S) as client:
-            headers |= aim.headers
-            return (
-                client.post(aim.url, content=body, headers=headers, extensions=aim.extensions)
-                .raise_for_status()
-                .status_code
-            )
+            answer = client.post(aim.url, content=body, headers=headers | aim.headers, extensions=aim.extensions)
+        return answer.raise_for_status().status_code
 
 
 def messages_of(job_id: str) -> str:

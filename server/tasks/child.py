@@ -42,6 +42,7 @@ T = TypeVar("T")
 CANCELLED: ContextVar[Callable[[], bool]] = ContextVar(
     "cancelled", default=lambda: False
 )  # asked where no other is named
+CALLER: ContextVar[str] = ContextVar("caller", default="")  # for whom a child of a pool works
 STOP = b""
 Report = Progress  # as the task of a reconstruction calls it
 
@@ -184,23 +185,34 @@ class Child:
 
 
 class ChildProcessPool:
-    """Lends a fixed number of child processes to many threads. Each child serves one thread at a time."""
+    """Lends a fixed number of child processes to many threads. Each child serves one thread at a time.
+
+    A child whose work is given up is killed, and the next one starts for a second: a caller is lent the child that
+    worked for him last, so that those who give up wait for new ones and others do not.
+    """
 
     def __init__(self, count: int, niceness: int = 0, memory: int = 0) -> None:
         self._all = [Child(niceness, memory=memory) for _ in range(count)]
-        self._free: queue.PriorityQueue[tuple[bool, int]] = queue.PriorityQueue()  # whether it is to be started; which
-        for number in range(count):
-            self._free.put((True, number))
+        self._free = {child: "" for child in self._all}  # and for whom each of them worked last
+        self._freed = threading.Condition()
 
     @contextmanager
     def one(self, timeout_s: float | None = None) -> Iterator[Child]:
-        """Yields a child that no other thread has during the block, a running one first. Raises queue.Empty if
-        none is free within ``timeout_s`` seconds."""
-        _, number = self._free.get(timeout=timeout_s)
+        """Yields a child that no other thread has during the block: that of ``CALLER``, one of nobody's, or a running
+        one. Raises queue.Empty if none is free within ``timeout_s`` seconds."""
+        caller = CALLER.get()
+        with self._freed:
+            if not self._freed.wait_for(lambda: self._free, timeout_s):
+                raise queue.Empty
+            whose = self._free
+            child = min(whose, key=lambda each: (whose[each] != caller, whose[each] != "", not each.runs))
+            del self._free[child]
         try:
-            yield self._all[number]
+            yield child
         finally:
-            self._free.put((not self._all[number].runs, number))
+            with self._freed:
+                self._free[child] = caller
+                self._freed.notify()
 
     def close(self) -> None:
         """Kills all child processes."""

@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from pipeline.settings import Settings
 
 UPLOAD_PIXELS = 64_000_000  # of all pictures whose outlines are checked: 1.3 GB with plates and distances, of 4 GiB
+JSON_BYTES_MOST = 16 << 20  # of cameras.json and its like; 64 cameras with all feature points have .5 MB
 PICTURES_MOST = 16  # of the largest size that one camera may have: picture, mask, eight plates, six texture sets
 Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as features.json has them
 
@@ -249,6 +250,9 @@ def check_capture(
     ``networks``: look for the subject's face with these. Pictures that belong to no camera are no fault, since a
     reconstruction ignores them with a warning.
     """
+    for path in (entry(root, name) for name in (CAMERAS, FEATURES, SCALE)):
+        if path.is_file() and path.stat().st_size > JSON_BYTES_MOST:
+            raise InputError(path.name, [compose("file-large", most_mib=JSON_BYTES_MOST >> 20)])
     rigs, read, files, faults = open_capture(root)
     rig_file, rig = rigs[0], read.rig
     digests: dict[str, str] = {}

@@ -1,6 +1,5 @@
 """Sends the table and the contact sheet of a batch. Both are made while they are sent."""
 
-from collections.abc import Iterator
 from typing import Literal
 
 from fastapi import Response
@@ -41,13 +40,9 @@ def send_sheet(service: Service, batch_id: str, form: SheetFormat) -> Response:
     batch, headers = service.batches.get(batch_id), {"Content-Disposition": f'inline; filename="sheet.{form}"'}
     if form == "pdf":
         return Response(batch_sheet_pdf(service.batches, service.store, batch), media_type=PDF_TYPE, headers=headers)
-    lines = batch_sheet(service.batches, service.store, batch)
     headers["Content-Security-Policy"] = CLOSED
-    return StreamingResponse(_encoded(lines), media_type="text/html", headers=headers)
-
-
-def _encoded(lines: Iterator[str]) -> Iterator[bytes]:
-    return (f"{line}\n".encode("utf-8", "replace") for line in lines)
+    lines = (f"{line}\n".encode("utf-8", "replace") for line in batch_sheet(service.batches, service.store, batch))
+    return StreamingResponse(lines, media_type="text/html", headers=headers)
 
 
 def _saved_as(name: str) -> dict[str, str]:

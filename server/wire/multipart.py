@@ -1,7 +1,8 @@
 """Receives multipart bodies straight into the data folder.
 
-The body is parsed here and not by the framework, for three reasons: key and free space are checked before the first
-byte, no file is held in memory or in a temporary folder elsewhere, and every write happens in a thread."""
+python-multipart parses, and bounds the headers of a part; its form parser and the framework's are not used, for three
+reasons: key and free space are checked before the first byte, no file is held in memory or in a temporary folder
+elsewhere, and every write happens in a thread."""
 
 from collections.abc import Collection, Iterable
 from functools import partial
@@ -109,14 +110,14 @@ class _Form:
         self.fields: dict[str, str] = {}
         self.files, self._parts = 0, 0
         self.ended = False
-        self._header, self._value = b"", b""
+        self._header, self._value = bytearray(), bytearray()
         self._name, self._data = "", bytearray()
 
     def callbacks(self) -> Any:
         return {
             "on_part_begin": self._part_begin,
-            "on_header_field": lambda data, start, end: self._add_header(data[start:end]),
-            "on_header_value": lambda data, start, end: self._add_value(data[start:end]),
+            "on_header_field": lambda data, start, end: self._header.extend(data[start:end]),
+            "on_header_value": lambda data, start, end: self._value.extend(data[start:end]),
             "on_header_end": self._header_end,
             "on_part_data": self._part_data,
             "on_part_end": self._part_end,
@@ -133,17 +134,12 @@ class _Form:
             raise Problem(413, "fields-too-many", compose("form-fields-too-many", most=FIELDS_MOST))
         self._name, self._data = "", bytearray()
 
-    def _add_header(self, data: bytes) -> None:
-        self._header += data
-
-    def _add_value(self, data: bytes) -> None:
-        self._value += data
-
     def _header_end(self) -> None:
         if self._header.lower() == b"content-disposition":
-            self._name = parse_options_header(self._value)[1].get(b"name", b"").decode("utf-8", "replace")
+            self._name = parse_options_header(bytes(self._value))[1].get(b"name", b"").decode("utf-8", "replace")
             self.files += self._name == "file"
-        self._header, self._value = b"", b""
+        self._header.clear()
+        self._value.clear()
 
     def _part_data(self, data: bytes, start: int, end: int) -> None:
         if self._name == "file" and self.files == 1:
@@ -208,14 +204,10 @@ async def receive_calibration_pictures(service: Service, request: Request, key: 
         archive, fields = await receive_multipart(request, folder, service.store, service.settings, service.threads)
         check_fields(fields, ("label", "from"))
         label = (fields.get("label") or "")[:500]
-        accept = {"board": service.accept_board_pictures, "scene": service.accept_photographs}
         source = fields.get("from") or "board"
-        if source not in accept:
-            raise Problem(
-                422,
-                "invalid-request",
-                compose("calibration-source-unknown"),
-                [compose("field-from-unknown", value=f"{source!r:.80}")],
-            )
+        if source not in ("board", "scene"):
+            fault = compose("field-from-unknown", value=f"{source!r:.80}")
+            raise Problem(422, "invalid-request", compose("calibration-source-unknown"), [fault])
         hung_up = partial(await_hang_up, request.receive)
-        return await service.threads.check(accept[source], archive, folder, label, key=key, hung_up=hung_up)
+        accept = partial(service.accept_pictures, source)
+        return await service.threads.check(accept, archive, folder, label, key=key, hung_up=hung_up)

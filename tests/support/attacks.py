@@ -33,8 +33,15 @@ def limit_files(service: RunningService, count: int) -> None:
     resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, (count, count))
 
 
-def connect(service: RunningService) -> socket.socket:
-    return socket.create_connection(("127.0.0.1", service.port), timeout=30, source_address=(ATTACKER, 0))
+def connect(service: RunningService, address: str = ATTACKER, buffer: int = 0) -> socket.socket:
+    """A connection from an address, perhaps with a small buffer of what was not read."""
+    sock = socket.socket()
+    sock.settimeout(30)
+    if buffer:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer)
+    sock.bind((address, 0))
+    sock.connect(("127.0.0.1", service.port))
+    return sock
 
 
 REQUEST = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n"
@@ -65,12 +72,14 @@ with httpx.Client(headers={"Authorization": f"Bearer {key}"}, timeout=120) as ht
 
 
 @contextmanager
-def silent_connections(service: RunningService, count: int, begin: bytes = b"") -> Iterator[list[socket.socket]]:
-    """Connections that send ``begin`` and then nothing."""
+def silent_connections(
+    service: RunningService, count: int, begin: bytes = b"", addresses: tuple[str, ...] = (ATTACKER,), buffer: int = 0
+) -> Iterator[list[socket.socket]]:
+    """Connections that send ``begin`` and then nothing, and read nothing."""
     with ExitStack() as stack:
         opened = []
-        for _ in range(count):
-            sock = stack.enter_context(connect(service))
+        for number in range(count):
+            sock = stack.enter_context(connect(service, addresses[number % len(addresses)], buffer))
             with suppress(ConnectionError):
                 sock.sendall(begin)
             opened.append(sock)
@@ -86,6 +95,10 @@ def half_body(path: str, key: str | None = None) -> bytes:
     access = "" if key is None else f"Authorization: Bearer {key}\r\n"
     head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\n{access}Content-Type: application/json\r\n"
     return (head + 'Content-Length: 400\r\n\r\n{"capture_id": ').encode()
+
+
+def get_begun(path: str, key: str) -> bytes:
+    return f"GET {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {key}\r\n\r\n".encode()
 
 
 def ask_often(service: RunningService, key: str, path: str, count: int = 2000) -> set[int]:
@@ -149,14 +162,6 @@ class Witness:
     @property
     def others_median_s(self) -> float:
         return statistics.median(self.others_s)
-
-    def figures(self) -> dict[str, float]:
-        return {
-            "healthz_worst_s": round(max(self.healthz_s), 3),
-            "others_median_ms": round(1000 * self.others_median_s, 1),
-            "failures": len(self.failures),
-            "memory_mb": round(max(self.memory_mb)),
-        }
 
 
 def memory_mb(service: RunningService) -> float:

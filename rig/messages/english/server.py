@@ -113,6 +113,7 @@ TEMPLATES = {
     "check-out-of-memory": "The check of this upload needed more memory than EIGENHEAD_CHECK_BYTES, or a damaged file made its reader crash: send whole, smaller pictures.",
     "check-too-long": "The check of this upload was ended after {seconds:g} s: send fewer or smaller pictures, or raise EIGENHEAD_CHECK_S.",
     "client-gone": "The client closed the connection before its request had ended.",
+    "too-many-under-way": "{most} streams, downloads and uploads of this key are under way, which is the most; wait for one to end.",
     "too-many-checks": "{most} uploads of this key are being checked or wait for it: send more once some of them have ended.",
     "header-too-large": "The header of a request may have {bytes:,} bytes; send fewer or shorter fields.",
     "json-body-too-large": "A JSON body may have {bytes:,} bytes.",

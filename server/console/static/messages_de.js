@@ -157,6 +157,7 @@ export default {
   "check-out-of-memory": "Die Prüfung dieser Sendung brauchte mehr Speicher als EIGENHEAD_CHECK_BYTES, oder eine beschädigte Datei ließ ihr Leseprogramm abstürzen: ganze, kleinere Bilder senden.",
   "check-too-long": "Die Prüfung dieser Sendung wurde nach {seconds:g} s beendet: weniger oder kleinere Bilder senden, oder EIGENHEAD_CHECK_S erhöhen.",
   "client-gone": "Der Absender hat die Verbindung geschlossen, bevor seine Anfrage beendet war.",
+  "too-many-under-way": "{most} Ströme, Abrufe und Sendungen dieses Schlüssels laufen, mehr dürfen es nicht sein; warten, bis einer endet.",
   "too-many-checks": "{most} Sendungen dieses Schlüssels werden geprüft oder warten darauf: weitere senden, wenn einige davon beendet sind.",
   "header-too-large": "Der Kopf einer Anfrage darf {bytes:,} Bytes haben; weniger oder kürzere Felder senden.",
   "json-body-too-large": "Ein JSON-Dokument darf {bytes:,} Bytes haben.",

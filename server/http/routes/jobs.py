@@ -1,7 +1,9 @@
 """Declares the routes of jobs: submitting, watching, cancelling and restarting them, and fetching the files they
 made."""
 
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
+from functools import partial
 from typing import Annotated
 from urllib.parse import quote
 
@@ -33,6 +35,7 @@ from server.services.records import Job
 from server.services.work import ReconstructionRequest
 from server.storage.job_index import JobOrder, JobQuery
 from server.storage.records import JobWebhook
+from server.wire.patience import await_hang_up
 from server.wire.problems import Responses, documented
 from server.wire.send_file import media_type, send_archive, send_file, send_zip
 
@@ -40,6 +43,9 @@ router = APIRouter(prefix="/v1", tags=["jobs"])
 Reader = Annotated[Caller, Depends(require("read"))]
 Submitter = Annotated[Caller, Depends(require("submit"))]
 
+
+LOOKS_MOST = 8  # of a key's event streams in each ``poll_s``, at two queries; where there are more, each waits longer
+streams = Counter[str]()  # open ones, by key
 
 EXPORT: Responses = {200: {"content": {"application/zip": {}}}, **documented(400, 404, 409, 413, 415, 507)}
 
@@ -120,6 +126,7 @@ def known_job(service: ServiceOf, caller: Reader, job_id: str) -> str:
 @router.get("/jobs/{job_id}/events", response_class=EventSourceResponse, responses=documented(404))
 async def job_events(
     service: ServiceOf,
+    caller: Reader,
     job: Annotated[str, Depends(known_job)],
     last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", max_length=40)] = None,
 ) -> AsyncIterator[ServerSentEvent]:
@@ -127,17 +134,21 @@ async def job_events(
 
     ``Last-Event-ID`` resumes after that event."""
     seq = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else 0
-    while True:
-        # The state is read before the events, so that no event of an ended job is missed.
-        state = await service.threads.disk(service.jobs.state, job)
-        for event in await service.threads.disk(service.jobs.events.since, job, min(seq, 2**31 - 1)):
-            seq = event.seq
-            yield ServerSentEvent(event="progress", id=str(seq), data=event.document)
-        if state in FINISHED:
-            ended = await service.threads.disk(service.jobs.get, job)
-            yield ServerSentEvent(event="end", id=str(seq), data=JobOut.model_validate(ended))
-            return
-        await anyio.sleep(service.settings.poll_s)
+    streams[caller.key] += 1
+    try:
+        while True:
+            # The state is read before the events, so that no event of an ended job is missed.
+            state = await service.threads.disk(service.jobs.state, job)
+            for event in await service.threads.disk(service.jobs.events.since, job, min(seq, 2**31 - 1)):
+                seq = event.seq
+                yield ServerSentEvent(event="progress", id=str(seq), data=event.document)
+            if state in FINISHED:
+                ended = await service.threads.disk(service.jobs.get, job)
+                yield ServerSentEvent(event="end", id=str(seq), data=JobOut.model_validate(ended))
+                return
+            await anyio.sleep(service.settings.poll_s * max(1.0, streams[caller.key] / LOOKS_MOST))
+    finally:
+        streams[caller.key] -= 1
 
 
 @router.post("/jobs/{job_id}/cancel", responses=documented(404))
@@ -164,10 +175,11 @@ def deliver_job(service: ServiceOf, caller: Submitter, job_id: str, wanted: NewD
 
 
 @router.post("/jobs/{job_id}/exports", responses=EXPORT, response_class=Response)
-async def export_job(service: ServiceOf, caller: Reader, job_id: str, wanted: NewExport) -> Response:
+async def export_job(service: ServiceOf, caller: Reader, request: Request, job_id: str, wanted: NewExport) -> Response:
     """Returns the head of a finished job in another format, with its materials and textures, as one .zip. No new job is
     made."""
-    return send_zip(await service.threads.check(service.export, job_id, wanted.outputs(), key=caller.key))
+    gone = partial(await_hang_up, request.receive)
+    return send_zip(await service.threads.check(service.export, job_id, wanted.outputs(), key=caller.key, hung_up=gone))
 
 
 @router.delete("/jobs/{job_id}", status_code=204, responses=documented(404, 409))

@@ -14,8 +14,10 @@ from tests.support.attacks import (
     add_keys,
     ask_often,
     client,
+    get_begun,
     half_body,
     heavy_capture,
+    limit_files,
     silent_connections,
     slow_capture,
 )
@@ -27,12 +29,13 @@ CHECK_S = 12.0
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
     with running_service(tmp_path_factory.mktemp("checks") / "data", worker=False, check_s=str(CHECK_S)) as running:
+        limit_files(running, 1024)
         yield running
 
 
 @pytest.fixture(scope="module")
 def keys(service: RunningService) -> list[str]:
-    return add_keys(service, "read,capture", "read,capture")
+    return add_keys(service, "read,capture,submit", "read,capture")
 
 
 @pytest.mark.parametrize("segment", [65_533, 20])
@@ -69,11 +72,33 @@ def test_a_slow_check_keeps_no_other_key_waiting_and_ends(
     assert (answer.status_code, answer.json()["detail_message"]["code"]) == (422, "check-too-long")
 
 
-def test_thousands_of_small_requests_of_a_key_leave_others_their_time(service: RunningService, keys: list[str]) -> None:
-    with Witness(service, keys[1]).watching() as calm:
+@pytest.fixture
+def calm(service: RunningService, keys: list[str]) -> Witness:
+    with Witness(service, keys[1]).watching() as witness:
         time.sleep(2.0)
+    return witness
+
+
+def test_thousands_of_small_requests_of_a_key_leave_others_their_time(
+    service: RunningService, keys: list[str], calm: Witness
+) -> None:
     with Witness(service, keys[1]).watching() as witness:
         assert ask_often(service, keys[0], "/v1/captures", 1000) == {200}
+    assert not witness.failures
+    assert witness.others_median_s < 3.0 * calm.others_median_s
+
+
+def test_streams_of_a_key_are_bounded_and_leave_others_their_time(
+    service: RunningService, keys: list[str], calm: Witness, tmp_path: Path
+) -> None:
+    """384 connections at 1,024 open files: half of an address, a quarter of a key."""
+    with client(service, keys[0]) as http:
+        capture = upload(http, packed(small_capture(tmp_path / "capture"))).json()["id"]
+        events = http.post("/v1/jobs", json={"capture_id": capture}).headers["Location"] + "/events"
+    with silent_connections(service, 120, get_begun(events, keys[0])) as opened:
+        assert [sock.recv(12)[9:] for sock in opened] == [b"200"] * 96 + [b"429"] * 24
+        with Witness(service, keys[1]).watching() as witness:
+            time.sleep(2.0)
     assert not witness.failures
     assert witness.others_median_s < 3.0 * calm.others_median_s
 

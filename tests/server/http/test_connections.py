@@ -2,11 +2,14 @@
 
 import json
 import socket
+import threading
 import time
 from collections.abc import Iterator
 
 import httpx
 import pytest
+import uvicorn
+from starlette.types import Receive, Scope, Send
 
 from server.http import connections
 from tests.support.attacks import (
@@ -21,7 +24,7 @@ from tests.support.attacks import (
 )
 from tests.support.services import RunningService, running_service
 
-FILES = 512  # the service then takes 256 connections, 128 of one address; `attacks` has 1,024 and 1,100
+FILES = 512  # the service then takes 128 connections, 64 of one address; `attacks` has 1,024 and 1,100
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +89,25 @@ def test_half_headers_and_half_bodies_end_after_half_a_minute(service: RunningSe
     for begin in begun:
         with silent_connections(service, 1, begin) as (sock,):
             assert 25.0 < seconds_to_end(sock, 60.0) < 35.0
+
+
+def test_a_reader_who_takes_nothing_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "STALL_S", 0.3)
+    ended = threading.Event()
+
+    async def answer(scope: Scope, receive: Receive, send: Send) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        for _ in range(64):
+            await send({"type": "http.response.body", "body": bytes(1 << 20), "more_body": True})
+        ended.set()
+
+    config = uvicorn.Config(answer, http=connections.BoundedConnection, lifespan="off", log_config=None)
+    server = uvicorn.Server(config)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        serving = threading.Thread(target=server.run, args=([listening],))
+        serving.start()
+        with socket.create_connection(listening.getsockname()[:2]) as sock:
+            sock.sendall(REQUEST + b"\r\n")
+            assert ended.wait(20.0)
+        server.should_exit = True
+        serving.join()

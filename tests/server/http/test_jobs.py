@@ -58,9 +58,9 @@ def test_an_upload_becomes_a_capture_and_a_job_a_result(http: httpx.Client, arch
         assert {name: len(zipped.read(name)) for name in zipped.namelist()} == {
             n: f["bytes"] for n, f in listed.items()
         }
-    for form, word in (("obj", "report.json"), ("fbx", "3mf")):  # the work of these tests writes no report
-        refused = http.post(f"/v1/jobs/{job['id']}/exports", json={"as": form})
-        assert (refused.status_code, word in refused.text) == (422, True)
+    for form, template, word in (("obj", None, "report.json"), ("fbx", None, "3mf"), ("obj", "nobodys", "add FILE")):
+        refused = http.post(f"/v1/jobs/{job['id']}/exports", json={"as": form, "template": template})
+        assert (refused.status_code, word in refused.text) == (422, True), "the work of these tests writes no report"
     condition = {"If-None-Match": f'"another", W/{packed.headers["etag"]}'}  # as a proxy that compresses sends it
     assert http.get(f"/v1/jobs/{job['id']}/result/all.zip", headers=condition).status_code == 304
     assert http.get(f"/v1/captures/{capture['id']}/images/cam01").headers["content-type"] == "image/png"

@@ -48,13 +48,14 @@ def test_an_archive_of_board_pictures_becomes_a_calibration(tmp_path: Path) -> N
     pack_folder(folder, tmp_path / "board.tar")
     with running_service(tmp_path / "data") as service, httpx.Client(base_url=service.url, timeout=200) as client:
         data = (tmp_path / "board.tar").read_bytes()
-        made = client.post("/v1/calibrations", files={"file": data}, data={"label": "Monday"})
+        made = client.post("/v1/calibrations", files={"file": data}, data={"label": "Monday" * 100})
         assert made.status_code == 202, made.text
         done = made.json()
         while done["state"] in ("queued", "running"):
             time.sleep(0.5)
             done = client.get(made.headers["location"]).json()
         assert done["state"] == "succeeded", done["error"]
+        assert done["label"] == ("Monday" * 100)[:500]
         assert done["figures"]["rms_px"] <= 1.1
         cameras = client.get(made.headers["location"] + "/cameras.json").json()
         assert [camera["name"] for camera in cameras["cameras"]] == ["cam_0", "cam_1", "cam_2", "cam_3"]

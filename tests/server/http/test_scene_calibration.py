@@ -40,6 +40,8 @@ def test_what_is_no_scene_is_refused_by_name(http: httpx.Client, tmp_path: Path)
     other = upload(http, packed(tmp_path / "photos"), "/v1/calibrations", **{"from": "mirror"})
     assert (other.status_code, other.json()["errors"]) == (422, ["from: 'mirror'"])
     assert upload(http, packed(tmp_path / "photos"), "/v1/calibrations").status_code == 422  # no board.toml
+    misspelt = upload(http, packed(tmp_path / "photos"), "/v1/calibrations", lable="Monday")
+    assert "did you mean 'label'" in misspelt.json()["errors"][0]
     for body in ({"from": "scene", "board": {}}, {"scale": {}, "board": {}}, {}, {"from": "scene", "captures": []}):
         assert http.post("/v1/calibrations", json={"captures": ["0" * 28]} | body).status_code == 422
 

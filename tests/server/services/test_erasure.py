@@ -3,11 +3,23 @@
 import base64
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
+import sqlalchemy as sa
 
-from tests.support.services import RunningService, await_state, packed_capture, running_service, served_client
+from server.settings import ServiceSettings
+from tests.server.worker.test_durability import database
+from tests.support.services import (
+    RunningService,
+    await_state,
+    packed,
+    packed_capture,
+    running_service,
+    served_client,
+    small_capture,
+)
 
 
 @pytest.fixture(scope="module")
@@ -25,28 +37,54 @@ def client(service: RunningService) -> Iterator[httpx.Client]:
 HOOK = "http://127.0.0.1:9"  # nobody answers there, so that its messages wait
 
 
-def test_nothing_that_the_subject_brought_is_left(tmp_path: Path) -> None:
-    """In database, files, caches and logs: what was typed, where webhooks were called, and with which secret."""
+@pytest.mark.parametrize("kind", ["sqlite", pytest.param("postgresql", marks=pytest.mark.slow)])
+def test_nothing_that_the_subject_brought_is_left(kind: str, tmp_path: Path) -> None:
+    """In database, files, caches and logs: what was typed and searched for, names of files and cameras, where webhooks
+    were called, and with which secret."""
     secret = base64.b64encode(b"of quast, of thirty-two bytes or so").decode()
-    who, ink, profile, smirk, tag, head, tus, run = (f"quast{number}-brought" for number in range(8))
-    brought = [who, ink, profile, smirk, tag, head, tus, run, f"{HOOK}/quast", secret]
-    with served_client(tmp_path / "data", webhook_origins=f'["{HOOK}"]') as (service, client):
+    who, ink, profile, smirk, tag, head, tus, run, file, lost, shape = (f"quast{n}-brought" for n in range(11))
+    brought = [who, ink, profile, smirk, tag, head, tus, run, lost, f"{HOOK}/quast", secret]
+    with (
+        database(kind) as settings,
+        served_client(tmp_path / "data", webhook_origins=f'["{HOOK}"]', **settings) as (service, client),
+    ):
         session = client.post("/v1/sessions", json={"label": who, "consent": ink}).json()["id"]
         fields = {"session": session, "label": profile, "expression": smirk, "tags": tag}
         captures = [upload(client, tmp_path, seed, **fields).json()["id"] for seed in (5, 6)]
         captures.append(upload_in_pieces(client, packed_capture(tmp_path, 7).read_bytes(), session=session, label=tus))
+        archive = {"file": (file, capture_that_lost(tmp_path / "lost", lost, file))}
+        captures.append(client.post("/v1/captures/uploads", files=archive, data={"session": session}).json()["id"])
         hook = {"url": f"{HOOK}/quast", "secret": f"whsec_{secret}"}
         wanted = {"capture_id": captures[0], "name": head, "webhook": hook}
         job = client.post("/v1/jobs", json=wanted).json()["id"]
         batch = client.post("/v1/batches", json={"captures": captures, "label": run}).json()["id"]
         await_state(client, job, ("succeeded",))
+        assert client.post(f"/v1/jobs/{job}/exports", json={"as": "obj", "template": shape}).status_code == 422
+        assert client.post(f"/v1/jobs/{job}/exports", json={"as": "obj"}).status_code == 422, (
+            "this work wrote no report"
+        )
+        for path in (f"/v1/sessions/{session}", f"/v1/captures/{captures[0]}"):
+            tagged = {"If-Match": client.get(path).headers["etag"]}
+            assert client.patch(path, json={"label": who}, headers=tagged).status_code == 200
+        assert client.get("/v1/captures", params={"q": who}).json()["total"] == 4
         (service.data / "captures" / captures[1] / "record.json").write_text("{")
         assert client.get(f"/v1/captures/{captures[1]}").status_code == 404, "it is set aside now"
-        assert traces(service, brought) == {*brought}
+        assert traces(service, settings, brought) == {*brought}
         assert client.delete(f"/v1/sessions/{session}").status_code == 204
         assert client.get(f"/v1/batches/{batch}").json()["label"] == ""
-        assert traces(service, brought) == set()
+        assert traces(service, settings, [*brought, file, shape]) == set()
         assert not [path for path in service.data.rglob("*") if any(each in path.name for each in (*captures, job))]
+
+
+def capture_that_lost(folder: Path, camera: str, file: str) -> bytes:
+    """An archive of a capture of which one camera, of that name, has a damaged picture, beside a strange file."""
+    cameras = small_capture(folder, cameras=4) / "cameras.json"
+    cameras.write_text(cameras.read_text().replace('"cam03"', f'"{camera}"'))
+    for kind in ("images", "background"):
+        (folder / kind / "cam03.png").rename(folder / kind / f"{camera}.png")
+    for damaged in (f"images/{camera}.png", f"images/{file}.png", f"{file}.txt"):
+        (folder / damaged).write_bytes(b"no picture")
+    return packed(folder)
 
 
 def upload_in_pieces(client: httpx.Client, archive: bytes, **fields: str) -> str:
@@ -58,10 +96,23 @@ def upload_in_pieces(client: httpx.Client, archive: bytes, **fields: str) -> str
     return client.patch(place, headers=headers, content=archive).headers["location"].rpartition("/")[2]
 
 
-def traces(service: RunningService, values: list[str]) -> set[str]:
-    """Those of the values that a file below the data folder holds, or the service's log."""
-    files = [service.log, *(path for path in service.data.rglob("*") if path.is_file())]
-    return {value for path in files for value in values if value.encode() in path.read_bytes()}
+def traces(service: RunningService, settings: dict[str, Any], values: list[str]) -> set[str]:
+    """Those of the values that a file below the data folder or its name holds, the service's log, or a row of
+    PostgreSQL."""
+    paths = [*service.data.rglob("*")]
+    held = [service.log.read_bytes(), *(path.read_bytes() for path in paths if path.is_file())]
+    held += [str(path).encode() for path in paths]
+    if settings:
+        engine = sa.create_engine(ServiceSettings(**settings).url)
+        with engine.connect() as connection:
+            of = "schemaname NOT IN ('pg_catalog', 'information_schema')"
+            for schema, table in connection.execute(sa.text(f"SELECT schemaname, tablename FROM pg_tables WHERE {of}")):
+                held += [
+                    row.encode() for row in connection.scalars(sa.text(f'SELECT t::text FROM "{schema}"."{table}" t'))
+                ]
+        engine.dispose()
+    spelt = {value: (value.encode(), value.encode().hex().encode()) for value in values}  # the latter: of a bytea
+    return {value for value, ways in spelt.items() if any(way in each for each in held for way in ways)}
 
 
 def upload(client: httpx.Client, folder: Path, seed: int, **fields: str) -> httpx.Response:

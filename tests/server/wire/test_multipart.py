@@ -1,9 +1,6 @@
 """Multipart bodies as they come over the wire, in pieces of any size: what is taken, and what is refused by name."""
 
 import asyncio
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,20 +11,10 @@ from fastapi import Request
 from rig.errors import EigenheadError, InputError
 from rig.messages.message import texts_of
 from server.errors import DiskFull, TooLarge
-from server.services.service import Service
 from server.services.threads import Threads
 from server.settings import ServiceSettings
 from server.storage.store import Store
-from server.wire.multipart import (
-    BLOCK_BYTES,
-    FIELD_BYTES,
-    FIELDS_MOST,
-    check_fields,
-    check_length,
-    described_form,
-    receive_calibration_pictures,
-    receive_multipart,
-)
+from server.wire.multipart import BLOCK_BYTES, FIELD_BYTES, FIELDS_MOST, check_fields, check_length, receive_multipart
 from server.wire.problems import Problem
 
 DATA = bytes(range(256)) * 40
@@ -85,59 +72,50 @@ def test_a_client_that_vanished_is_given_up(tmp_path: Path, monkeypatch: pytest.
     assert (refused.value.status, refused.value.kind) == (408, "body-silent")
 
 
-SEND_ONE = "Send multipart/form-data with the archive as the part 'file'."
-BREAKS_OFF = "The multipart body breaks off before its end; send it again."
+FILE, TWICE = part("file", DATA), part("file", DATA) * 2
+LONG = part("label", b"x" * (FIELD_BYTES + 1))
+CUT = "malformed-body: The multipart body breaks off before its end; send it again."
+REFUSED: dict[str, tuple[bytes, str, int, str, str]] = {
+    "JSON": (
+        b"{}",
+        "application/json",
+        415,
+        "unsupported-media-type: Send multipart/form-data with the archive as",
+        "",
+    ),
+    "no boundary": (body(FILE), "multipart/form-data", 415, "unsupported-media-type: Send multipart/form-data", ""),
+    "a long one": (body(FILE), TYPE + "x" * 300, 400, "malformed-body: The multipart boundary is no good (", ""),
+    "not in the body": (b"nowhere", TYPE, 400, "malformed-body: The body is no multipart/form", ""),
+    "a long header": (
+        body(part("x" * 5000, b"")),
+        TYPE,
+        400,
+        "malformed-body: The body is no multipart/form-data (",
+        "",
+    ),
+    "no end": (FILE, TYPE, 400, CUT, ""),
+    "cut": (body(FILE)[:500], TYPE, 400, CUT, ""),
+    "no file": (body(part("label", b"")), TYPE, 422, "file-missing: The form has no part 'file' that", "file: missing"),
+    "two": (body(TWICE), TYPE, 422, "file-repeated: The form has several parts 'file'; send one", "file: repeated"),
+    "a field": (
+        body(FILE, LONG),
+        TYPE,
+        413,
+        "field-too-large: The form field 'label' is longer than 65,536 bytes;",
+        "",
+    ),
+}
 
 
-@pytest.mark.parametrize(
-    ("data", "content_type", "status", "kind", "detail", "errors"),
-    [
-        (b"{}", "application/json", 415, "unsupported-media-type", SEND_ONE, ()),
-        (body(part("file", DATA)), "multipart/form-data", 415, "unsupported-media-type", SEND_ONE, ()),
-        (
-            body(part("file", DATA)),
-            "multipart/form-data; boundary=" + "x" * 300,
-            400,
-            "malformed-body",
-            "The multipart boundary is no good (",
-            (),
-        ),
-        (b"no boundary here", TYPE, 400, "malformed-body", "The body is no multipart/form-data (", ()),
-        (part("file", DATA), TYPE, 400, "malformed-body", BREAKS_OFF, ()),
-        (body(part("file", DATA))[:500], TYPE, 400, "malformed-body", BREAKS_OFF, ()),
-        (
-            body(part("label", b"Anna")),
-            TYPE,
-            422,
-            "file-missing",
-            "The form has no part 'file' that holds the archive.",
-            ("file: missing",),
-        ),
-        (
-            body(part("file", DATA), part("file", DATA)),
-            TYPE,
-            422,
-            "file-repeated",
-            "The form has several parts 'file'; send one archive.",
-            ("file: repeated",),
-        ),
-        (
-            body(part("file", DATA), part("label", b"x" * (FIELD_BYTES + 1))),
-            TYPE,
-            413,
-            "field-too-large",
-            "The form field 'label' is longer than 65,536 bytes; the archive is the part 'file'.",
-            (),
-        ),
-    ],
-)
+@pytest.mark.parametrize(("data", "content_type", "status", "said", "fault"), REFUSED.values(), ids=REFUSED.keys())
 def test_what_is_no_such_body_is_refused(
-    tmp_path: Path, data: bytes, content_type: str, status: int, kind: str, detail: str, errors: tuple[str, ...]
+    tmp_path: Path, data: bytes, content_type: str, status: int, said: str, fault: str
 ) -> None:
     with pytest.raises(Problem) as refused:
         received(tmp_path, data, content_type)
-    assert (refused.value.status, refused.value.kind, tuple(texts_of(refused.value.errors))) == (status, kind, errors)
-    assert str(refused.value.detail).startswith(detail)
+    problem = refused.value
+    assert (problem.status, " ".join(texts_of(problem.errors))) == (status, fault)
+    assert f"{problem.kind}: {problem.detail}".startswith(said)
 
 
 def test_a_form_may_have_a_hundred_parts_and_no_more(tmp_path: Path) -> None:
@@ -208,62 +186,6 @@ def test_the_announced_length_is_judged(
         check_length(request, Store(tmp_path), settings)
 
 
-def test_a_form_is_described(tmp_path: Path) -> None:
-    described = described_form("an archive", ("label",), settings="JSON object")
-    schema = described["requestBody"]["content"]["multipart/form-data"]["schema"]
-    assert described["requestBody"]["required"]
-    assert schema == {
-        "type": "object",
-        "required": ["file"],
-        "properties": {
-            "file": {"type": "string", "format": "binary", "description": "an archive"},
-            "label": {"type": "string"},
-            "settings": {"type": "string", "description": "JSON object"},
-        },
-    }
-
-
-def pictures_of(folder: Path, *fields: bytes) -> tuple[str, bytes, str]:
-    """What becomes of an archive of calibration pictures: who takes it, its bytes, its label."""
-    data = body(*fields, part("file", DATA))
-
-    def taken_as(what: str) -> Callable[[Path, Path, str], tuple[str, bytes, str]]:
-        return lambda archive, into, label: (what, archive.read_bytes(), label)
-
-    async def stream() -> Any:
-        yield data
-
-    @contextmanager
-    def incoming() -> Iterator[Path]:
-        yield folder
-
-    service = SimpleNamespace(
-        threads=Threads(),
-        settings=ServiceSettings(data=folder),
-        store=SimpleNamespace(incoming=incoming, reserve=lambda bytes_needed, free: None),
-        accept_board_pictures=taken_as("board"),
-        accept_photographs=taken_as("scene"),
-    )
-    request = SimpleNamespace(headers={"content-type": TYPE, "content-length": str(len(data))}, stream=stream)
-    request.receive = partial(asyncio.sleep, 60)  # the client stays
-    received_pictures = asyncio.run(
-        receive_calibration_pictures(cast(Service, service), cast(Request, request), "local")
-    )
-    return cast(tuple[str, bytes, str], received_pictures)
-
-
-@pytest.mark.parametrize(
-    ("source", "taken_as"), [(None, "board"), (b"", "board"), (b"board", "board"), (b"scene", "scene")]
-)
-def test_calibration_pictures_go_to_whom_they_are_from(tmp_path: Path, source: bytes | None, taken_as: str) -> None:
-    fields = [] if source is None else [part("from", source)]
-    assert pictures_of(tmp_path, *fields) == (taken_as, DATA, "")
-
-
-def test_a_label_of_a_calibration_is_cut(tmp_path: Path) -> None:
-    assert pictures_of(tmp_path, part("label", b"y" * 501))[2] == "y" * 500
-
-
 def test_each_field_that_a_form_does_not_have_is_named() -> None:
     check_fields(["label", "settings"], ("label", "settings"))
     with pytest.raises(InputError) as refused:
@@ -273,15 +195,3 @@ def test_each_field_that_a_form_does_not_have_is_named() -> None:
         "unknown field 'webhook'; there are file, label, settings",
         "unknown field ''; there are file, label, settings",
     ]
-
-
-def test_a_field_that_a_calibration_does_not_have_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="did you mean 'label'"):
-        pictures_of(tmp_path, part("lable", b"Monday"))
-
-
-def test_calibration_pictures_from_elsewhere_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(Problem, match=r"from is neither 'board' nor 'scene'\.") as refused:
-        pictures_of(tmp_path, part("from", b"moon"))
-    assert (refused.value.status, refused.value.kind) == (422, "invalid-request")
-    assert texts_of(refused.value.errors) == ["from: 'moon'"]
