@@ -57,7 +57,7 @@ def overlay(
     for near, colour in zip(contours, (INPUT_COLOUR, FITTED_COLOUR), strict=True):
         _paint(painted, near, colour, line, 1.0)
     entries = [(label, (255, 255, 255))] if label else []
-    entries += [("input contour", INPUT_COLOUR), ("fitted head", FITTED_COLOUR)]
+    entries += [("input outline", INPUT_COLOUR), ("fitted head", FITTED_COLOUR)]
     return legend(painted, entries + ([] if parts is None else list(PART_COLOURS.items())))
 
 

@@ -63,11 +63,17 @@ Device = Annotated[
 ]
 Method = Annotated[
     Literal["contour", "simplex"] | None,
-    typer.Option(help="Who solves; simplex is the paper's own, and slower.", show_default="contour"),
+    typer.Option(
+        help="contour is fast; simplex is the paper's downhill simplex, slower and coarser.", show_default="contour"
+    ),
 ]
 Detail = Annotated[
     Literal["span", "kernel", "photo", "fine", "pores"] | None,
-    typer.Option(help="How fine the head becomes, from seconds to minutes.", show_default="fine"),
+    typer.Option(
+        help="How fine the head becomes: span is the head model alone, kernel follows outlines (seconds); photo, fine "
+        "and pores follow photographs (minutes).",
+        show_default="fine",
+    ),
 ]
 Surface = Annotated[
     Literal["head", "bust", "both", "hair"] | None, typer.Option(help="What is written.", show_default="both")
