@@ -71,6 +71,7 @@ TEMPLATES = {
     "each-of-masks": "each of the {count} masks {first} to {last}",
     "masks-inverted-all": "all masks are inverted: black where the subject is (white holds the borders of the pictures): turned for this result. Write the subject white and all else black",
     "masks-inverted-some": "{masks} is inverted: black where the subject is (white holds the borders of the pictures): turned for this result. Write the subject white and all else black | {masks} are inverted: black where the subject is (white holds the borders of the pictures): turned for this result. Write the subject white and all else black",
+    "cameras-in-folder": "{file} holds cameras and is not read there: move it to the folder that holds images/",
     "folder-unread": "{folder}/ is not read: pictures lie in images/, masks/ and background/",
     "cameras-unread": "{file} is not read: the cameras come from {read}",
     "no-capture-folder": "is no folder; give the capture folder that holds cameras.json",
