@@ -28,6 +28,7 @@ TINT = 0.3  # of a part's colour where a pixel surely shows it
 AZIMUTHS_DEG = (-80, -60, -40, -20, 0, 20, 40, 60, 80)
 PANEL = (480, 360)  # width and height of one panel of the contact sheet
 PAPER = (245, 245, 245)
+KEY_PX = 36  # height of a sheet's line that says what its colours mean
 MARGIN_PX = 16  # around a fitted mask: wider than any line that is painted
 
 Resized = UInt8[np.ndarray, "_ _ 3"]  # a picture of any size, whatever others the call has
@@ -57,7 +58,7 @@ def overlay(
     for near, colour in zip(contours, (INPUT_COLOUR, FITTED_COLOUR), strict=True):
         _paint(painted, near, colour, line, 1.0)
     entries = [(label, (255, 255, 255))] if label else []
-    entries += [("input contour", INPUT_COLOUR), ("fitted head", FITTED_COLOUR)]
+    entries += [("input outline", INPUT_COLOUR), ("fitted head", FITTED_COLOUR)]
     return legend(painted, entries + ([] if parts is None else list(PART_COLOURS.items())))
 
 
@@ -122,12 +123,21 @@ def turntable(
     return map_in_threads(lambda k: draw(np.radians(AZIMUTHS_DEG[k])), len(AZIMUTHS_DEG))
 
 
-def contact_sheet(rows: Sequence[Sequence[tuple[str, Resized]]]) -> Resized:
-    """Returns one picture of rows of labelled pictures, each fitted into a panel of ``PANEL``."""
+def contact_sheet(rows: Sequence[Sequence[tuple[str, Resized]]], key: Sequence[str] = ()) -> Resized:
+    """Returns one picture of rows of labelled pictures, each fitted into a panel of ``PANEL``. Below them stands what
+    the colours of ``difference`` mean: ``key`` names that of the input and that of the model."""
     width = max(len(row) for row in rows)
     blank = np.full((PANEL[1], PANEL[0], 3), PAPER, np.uint8)
     drawn = [[legend(_panel(image), [(text, (255, 255, 255))] if text else []) for text, image in row] for row in rows]
-    return np.vstack([np.hstack(row + [blank] * (width - len(row))) for row in drawn])
+    sheet = np.vstack([np.hstack(row + [blank] * (width - len(row))) for row in drawn])
+    if not key:
+        return sheet
+    strip, font, at = np.full((KEY_PX, sheet.shape[1], 3), (45, 45, 45), np.uint8), cv2.FONT_HERSHEY_SIMPLEX, KEY_PX
+    for text, colour in zip(key, (INPUT_COLOUR, FITTED_COLOUR), strict=True):
+        cv2.rectangle(strip, (at - 24, 10), (at - 8, KEY_PX - 10), colour, cv2.FILLED)
+        cv2.putText(strip, text, (at, KEY_PX - 12), font, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+        at += cv2.getTextSize(text, font, 0.5, 1)[0][0] + 2 * KEY_PX
+    return np.vstack([sheet, strip])
 
 
 def _panel(image: ImageRgb) -> Resized:

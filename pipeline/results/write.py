@@ -191,4 +191,6 @@ def _sheet(result: Reconstruction, capture: Capture, shown: list[str], panels: l
         before = [] if start is None else [("before the fit", difference(image, observed, start))]
         after = ("after the fit", difference(image, observed, result.evidence.fitted_masks[name]))
         rows.append([(name, image), *before, after, ("", panels[view])])
-    return contact_sheet(rows or [[("", panel) for panel in panels]])
+    if not rows:
+        return contact_sheet([[("", panel) for panel in panels]])
+    return contact_sheet(rows, ("subject outside the head, such as hair and clothes", "head outside the subject"))

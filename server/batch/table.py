@@ -45,13 +45,15 @@ QUALITY = (
     Column("warnings", "text", "", "their codes, each once, with blanks between: docs/operator.md explains them"),
     Column("warning_count", "count", "", "number of warnings"),
     Column("detail", "text", "", "how deep the fit went: span, kernel, photo or fine"),
-    Column("method", "text", "", "contour or simplex"),
+    Column("method", "text", "", "contour (fast) or simplex"),
     Column("front", "text", "", "the camera that the subject faces"),
     Column("pose_method", "text", "", "what the pose came from: landmarks, features or silhouettes"),
     Column("pose_doubtful", "flag", "", "whether the pose is in doubt"),
     Column("cameras", "count", "", "cameras of the capture"),
     Column("cameras_used", "count", "", "those whose pictures were used"),
-    Column("contour_rms_px", "number", "px", "distance of input and fitted contour, RMS over the used cameras"),
+    Column(
+        "contour_rms_px", "number", "px", "distance of the outlines of input and fitted head, RMS over the used cameras"
+    ),
     Column("head_scale", "number", "", "of world_from_head: the head's size beside the model's"),
 )
 ORIGIN = (

@@ -19,7 +19,7 @@ import typer
 
 from pipeline.head_model.data_folder import DATA
 from rig.errors import EigenheadError, InputError
-from rig.messages.message import texts_of
+from rig.messages.message import compose, texts_of
 from rig.progress import Progress
 
 # Set before OpenCV is loaded, here and in workers. OpenCV would log damaged pictures; our own errors name them better.
@@ -235,6 +235,12 @@ def warn(message: str) -> None:
     """Prints a warning on standard error, unless ``--quiet`` was given; the command goes on."""
     if not QUIET.is_set():
         print(f"eigenhead: {message}", file=sys.stderr)
+
+
+def warn_of_replacement(path: Path, overwrite: bool) -> None:
+    """Warns that a file, or a folder with anything in it, will be replaced although ``--overwrite`` was not given."""
+    if not overwrite and (any(path.iterdir()) if path.is_dir() else path.exists()):
+        warn(f"result-replaced: {compose('result-replaced', file=str(path))}")
 
 
 def fail(message: str) -> NoReturn:

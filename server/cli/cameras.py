@@ -8,7 +8,17 @@ import typer
 
 from rig.atomic_write import write_atomically
 from rig.messages.message import compose, texts_of
-from server.cli.answers import Json, Overwrite, answer, prepare_file, prepare_folder, progress_bar, warn, wrong_usage
+from server.cli.answers import (
+    Json,
+    Overwrite,
+    answer,
+    prepare_file,
+    prepare_folder,
+    progress_bar,
+    warn,
+    warn_of_replacement,
+    wrong_usage,
+)
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -82,9 +92,11 @@ def calibrate(
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Of a board: write cameras.json even where checks refuse it.")
     ] = False,
+    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
     """Calibrate a rig from pictures of a board or scene."""
+    warn_of_replacement(out, overwrite)
     if source == "scene":
         board_options = {"--board": board, "--previous": previous}
         board_options |= {"--anyway": anyway or None, "--intrinsics-only": intrinsics_only or None}
@@ -201,16 +213,19 @@ def _calibrate_scene(
 def refine(
     captures: Annotated[list[Path], typer.Argument(help="Capture folders or archives, better 5 or more.", exists=True)],
     out: Annotated[Path, typer.Option(help="The cameras.json to write; its report goes beside it.", dir_okay=False)],
+    *,
     calibration: Annotated[
         Path | None, typer.Option(help="Start from this cameras.json, not from the captures' own.", exists=True)
     ] = None,
     focal: Annotated[bool, typer.Option(help="Refine focal lengths too.")] = False,
     model: Annotated[str | None, typer.Option(help="A head model whose rims speak as well: a name or file.")] = None,
+    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
     """Refine a calibration by silhouettes of captures.
 
     The change is kept only if each capture agrees with the others."""
+    warn_of_replacement(out, overwrite)
     prepare_file(out)
     from calibration.silhouette_refinement.report import refinement_page
     from rig.atomic_write import write_atomically
@@ -238,6 +253,7 @@ def convert(
         Path, typer.Option(help="The file to write; for COLMAP, RealityCapture's XMP and OpenCV's YAML the folder.")
     ],
     to: Annotated[CameraFormat, typer.Option(help="The program that shall read them.")] = "eigenhead",
+    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
     """Convert calibrations to and from other programs."""
@@ -261,6 +277,7 @@ def convert(
         raise InputError(file.name, faults)
     for remark in read.remarks:
         warn(f"{remark.code}: {remark}")
+    warn_of_replacement(out, overwrite)
     prepare = prepare_folder if to in FOLDER_FORMATS else prepare_file
     prepare(out)
     write_rig_file(rig, out, to)

@@ -9,6 +9,7 @@ from server.cli.answers import (
     Anyway,
     Data,
     Json,
+    Overwrite,
     Strict,
     answer,
     completing,
@@ -19,6 +20,7 @@ from server.cli.answers import (
     progress_bar,
     switch,
     warn,
+    warn_of_replacement,
 )
 
 app = typer.Typer(rich_markup_mode=None)
@@ -63,11 +65,17 @@ Device = Annotated[
 ]
 Method = Annotated[
     Literal["contour", "simplex"] | None,
-    typer.Option(help="Who solves; simplex is the paper's own, and slower.", show_default="contour"),
+    typer.Option(
+        help="contour is fast; simplex is the paper's downhill simplex, slower and coarser.", show_default="contour"
+    ),
 ]
 Detail = Annotated[
     Literal["span", "kernel", "photo", "fine", "pores"] | None,
-    typer.Option(help="How fine the head becomes, from seconds to minutes.", show_default="fine"),
+    typer.Option(
+        help="How fine the head becomes: span is the head model alone, kernel follows outlines (seconds); photo, fine "
+        "and pores follow photographs (minutes).",
+        show_default="fine",
+    ),
 ]
 Surface = Annotated[
     Literal["head", "bust", "both", "hair"] | None, typer.Option(help="What is written.", show_default="both")
@@ -123,6 +131,7 @@ def reconstruct(
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     trace: Trace = None,
     data: Data = None,
+    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
     """Reconstruct one capture without the service."""
@@ -140,6 +149,7 @@ def reconstruct(
     options["cap"] = {name: value for name, value in worn.items() if value is not None} or None
     named = {"method": method, "front": front, "detail": detail, "device": device}
     document = settings_document(settings, strict=strict, **named, **options)
+    warn_of_replacement(out / "report.json", overwrite)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report, trace=trace)
     for warning in written["warnings"]:
@@ -188,6 +198,7 @@ def verify(
     model: Annotated[str | None, typer.Option(help="A model's name or file.")] = None,
     settings: Annotated[Path | None, typer.Option(help="Of the reconstructions, TOML or JSON.", exists=True)] = None,
     data: Data = None,
+    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
     """Judge a rig by a mannequin of known shape.
@@ -197,6 +208,7 @@ def verify(
     from server.tasks.settings_file import settings_document
 
     wanted, chosen = read_limits(limits), settings_document(settings)
+    warn_of_replacement(out / "report.json", overwrite)
     prepare_file(out / "report.json")
     with progress_bar() as report:
         verification = verify_captures(

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from server.cli.answers import Data, Json, answer, prepare_file, progress_bar, switch
+from server.cli.answers import Data, Json, Overwrite, answer, prepare_file, progress_bar, switch, warn_of_replacement
 
 model_app = typer.Typer(help="Head models.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -69,16 +69,19 @@ def model_build(
         Path, typer.Argument(help="A folder of PLY, OBJ or GLB scans and their landmarks, or of results.", exists=True)
     ],
     out: Annotated[Path, typer.Option(help="The model file to write.", dir_okay=False)],
+    *,
     name: Annotated[str | None, typer.Option(help="What to call it.")] = None,
     skip_bad: Annotated[bool, typer.Option(help="Leave out scans that cannot be used, instead of stopping.")] = False,
     from_results: Annotated[
         bool, switch("--from-results", "Update the model that made the heads of these results.")
     ] = False,
+    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
     """Build a head model from raw scans (section 3.2).
 
     Or from delivered heads: results of one model, a result a person, whose deviations say how far each counts."""
+    warn_of_replacement(out, overwrite)
     prepare_file(out)
     from pipeline.applications.model_building.training.build import build_model
     from pipeline.applications.verification.delivered_heads import build_from_results
@@ -128,11 +131,13 @@ def model_show(
     out: Annotated[Path, typer.Option(help="Folder for the pictures.", file_okay=False)] = Path("out/model"),
     modes: Annotated[int, typer.Option(help="How many modes to draw.", min=1)] = 5,
     data: Data = None,
+    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
     """Draw a model's modes and a correspondence (figures 2 and 3).
 
     And how compact, general and specific it is."""
+    warn_of_replacement(out, overwrite)
     from pipeline.applications.model_building.training.figures import show_model
     from pipeline.head_model.model import load_model
 

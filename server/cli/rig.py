@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from server.cli.answers import Json, answer, number, progress_bar
+from server.cli.answers import Json, Overwrite, answer, number, progress_bar, warn_of_replacement
 
 rig_app = typer.Typer(help="The real rig of a rig.toml.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -34,12 +34,14 @@ def rig_check(rig: RigFile = Path("rig.toml"), json_out: Json = False) -> None:
 def rig_preview(
     out: Annotated[Path, typer.Option(help=".jpg or .png", dir_okay=False)] = Path("preview.jpg"),
     rig: RigFile = Path("rig.toml"),
+    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
     """Write a contact sheet of what every camera sees."""
     from rig.acquisition.commands import preview
     from rig.formats.rig_toml import read_rig_config
 
+    warn_of_replacement(out, overwrite)
     faults = [str(fault) for fault in preview(read_rig_config(rig), out)]
     answer({"sheet": str(out), "faults": faults}, json_out, [str(out), *faults])
 

@@ -140,10 +140,11 @@ def keys_list(data: Data = None, json_out: Json = False) -> None:
 
 
 @keys_app.command("remove", epilog="Example: eigenhead keys remove 3f2a90b1c4d5")
-def keys_remove(key_id: str, data: Data = None) -> None:
+def keys_remove(key_id: str, data: Data = None, json_out: Json = False) -> None:
     """Revoke an API key."""
     with _keys(data) as keys:
         keys.remove(key_id)
+    answer({"id": key_id}, json_out, [f"removed {key_id}"])
 
 
 @contextmanager

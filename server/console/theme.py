@@ -24,7 +24,13 @@ PAGES = (
 )
 
 # Before anything is drawn: a page that turns from dark to light while it loads dazzles.
-LOOK = 'document.documentElement.dataset.look = localStorage.getItem("eigenhead-look") || "dark"'
+LOOK = (
+    'document.documentElement.dataset.look = localStorage.getItem("eigenhead-look") '
+    '|| (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark")'
+)
+
+# What stands there until the scripts are loaded, at 400 kbit/s for ten seconds; the frame removes it.
+STARTING = '<p id="starting" lang="en">eigenhead is loading ... <span lang="de">wird geladen</span></p>'
 
 Answer = Callable[[Any], Awaitable[Any]]
 
@@ -55,6 +61,7 @@ def install() -> None:
     ui.add_head_html('<link rel="stylesheet" href="/console/static/theme.css">', shared=True)
     ui.add_head_html('<meta name="color-scheme" content="dark light">', shared=True)
     ui.add_head_html(f"<script>{LOOK}</script>", shared=True)
+    ui.add_body_html(STARTING, shared=True)
 
 
 @contextmanager

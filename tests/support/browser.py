@@ -77,7 +77,9 @@ class Visit:
 
 def visit(browser: Browser, base: str, size: str = "1366x768") -> Visit:
     width, height = SIZES[size]
-    context = browser.new_context(viewport={"width": width, "height": height}, accept_downloads=True)
+    context = browser.new_context(
+        viewport={"width": width, "height": height}, accept_downloads=True, color_scheme="dark"
+    )
     return Visit(context.new_page(), base)
 
 

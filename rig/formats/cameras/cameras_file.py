@@ -22,7 +22,14 @@ from typing import Any
 
 from rig.errors import InputError
 from rig.formats.cameras.blender_script import write_blender
-from rig.formats.cameras.cameras_json import CAMERAS_MOST, FORMAT, read_document, rig_from_document, write_rig
+from rig.formats.cameras.cameras_json import (
+    CAMERAS_LEAST,
+    CAMERAS_MOST,
+    FORMAT,
+    read_document,
+    rig_from_document,
+    write_rig,
+)
 from rig.formats.cameras.colmap import read_colmap, write_colmap
 from rig.formats.cameras.metashape import read_metashape, write_metashape
 from rig.formats.cameras.opencv_toml import looks_like_aniposelib, read_toml, write_aniposelib, write_caliscope
@@ -166,10 +173,20 @@ def _read_json(path: Path) -> CamerasRead:
     reader = next((read for is_of, read in JSON_READERS if is_of(document)), None)
     if reader is not None:
         return reader(document, path)
-    remarks = unread_keys_of(document, path.name)
-    return CamerasRead(
-        rig_from_document(document, path.name), tuple(compose("unknown-key", remark=remark) for remark in remarks)
+    remarks = [compose("unknown-key", remark=remark) for remark in unread_keys_of(document, path.name)]
+    entries = document.get("cameras") if isinstance(document, dict) else None
+    entries = entries if isinstance(entries, list) else []
+    posed = [entry for entry in entries if not isinstance(entry, dict) or entry.get("camera_from_world") is not None]
+    if len(posed) == len(entries) or len(posed) < CAMERAS_LEAST:
+        return CamerasRead(rig_from_document(document, path.name), tuple(remarks))
+    why, lenses = (
+        compose("left-without-pose"),
+        [f"{entry.get('name')!s:.64}" for entry in entries if entry not in posed],
     )
+    sentence = compose("cameras-left-out", cameras=some_of(lenses), why=why, file=path.name)
+    remarks.append(compose("view-left-out", remark=sentence))
+    rig = rig_from_document({**document, "cameras": posed}, path.name)
+    return CamerasRead(rig, tuple(remarks), dict.fromkeys(lenses, why))
 
 
 def _thinned(read: CamerasRead, file: str) -> CamerasRead:

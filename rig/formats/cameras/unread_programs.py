@@ -24,6 +24,10 @@ PATTERNS = (
     ("database.db", "COLMAP without a model: export it to sparse/0"),
     ("*.ps[xz]", "Metashape: export its cameras as XML"),
     ("*.r[cs]proj", "RealityCapture: export its cameras as XMP or CSV"),
+    ("*.fbx", "FBX: export COLMAP's model or transforms.json"),
+    ("*.abc", "Alembic: export COLMAP's model or transforms.json"),
+    ("*.mat", "MATLAB: write OpenCV's YAML"),
+    ("*.p4[dm]", "Pix4D: export its calibrated cameras as OpenCV's YAML"),
     ("*.opk", "positions and omega, phi, kappa without lenses: export Metashape's XML"),
     ("*.chan", "Nuke's camera over time: export one camera a file of a program that is read"),
 )  # fmt: skip

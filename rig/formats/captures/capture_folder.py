@@ -25,7 +25,7 @@ from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
 from rig.capture import TEXTURE_SETS, Capture, Features
 from rig.errors import InputError
-from rig.formats.cameras.cameras_file import no_rig_fault, read_cameras, rig_file_parts, rig_files
+from rig.formats.cameras.cameras_file import find_rig_file, no_rig_fault, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras.cameras_json import CAMERAS_LEAST, write_rig
 from rig.formats.cameras.reading import CamerasRead
 from rig.formats.cameras.unread_programs import program_of, unread_programs
@@ -101,7 +101,8 @@ def open_capture(folder: Path) -> tuple[list[Path], CamerasRead, ShotFiles, list
     judged = rig_faults(read.rig, any_unit=has_known_length(folder))
     files = find_files(folder, read.rig, read.left_out)
     faults = [compose("located", where=rigs[0].name, fault=fault) for fault in judged]
-    return rigs, read, files, [*faults, *files.faults]
+    elsewhere = unread_folders(folder, files, read.rig) if files.faults else []  # perhaps they are there
+    return rigs, read, files, [*faults, *files.faults, *elsewhere]
 
 
 def read_rig_of(rig_file: Path) -> CamerasRead:
@@ -115,13 +116,19 @@ def read_rig_of(rig_file: Path) -> CamerasRead:
 def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
     """Returns remarks on pictures that belong to no camera, and on folders of pictures that are not read."""
     remarks = [stray_sentence(files.strays, rig)] if files.strays else []
+    return [compose("file-unread", remark=message) for message in [*remarks, *unread_folders(folder, files, rig)]]
+
+
+def unread_folders(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
+    """Returns remarks on folders that hold pictures and are not read."""
+    remarks: list[Message] = []
     known = ("images", *BESIDE_PICTURES, TEXTURE_SETS, *rig.names)
     for path in sorted(folder.iterdir()):
         is_other = path.is_dir() and not {path.name, path.name.lower()} & {*known} and not is_junk(path.name)
         used = any(file.is_relative_to(path) for name in rig.names for _, file in files.of_camera(name))
         if is_other and not used and listed_pictures(path) and not (path / "report.json").is_file():
             remarks.append(compose("folder-unread", folder=path.name))
-    return [compose("file-unread", remark=message) for message in remarks]
+    return remarks
 
 
 def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
@@ -137,6 +144,11 @@ def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
         strange = [path.name for path in files if path.suffix.lower() in RIG_SUFFIXES and program_of(path) is None]
         strange = [name for name in strange if name.lower() not in known]
         remarks = unread_programs(folder)
+        for inner in (path for path in sorted(folder.iterdir()) if path.is_dir() and not is_junk(path.name)):
+            if not any((inner / of_a_result).is_file() for of_a_result in ("report.json", "calibration.json")):
+                remarks += unread_programs(inner)
+                if file := find_rig_file(inner):
+                    remarks.append(compose("cameras-in-folder", file=file.relative_to(folder).as_posix()))
         remarks += [compose("cameras-of-nobody", files=some_of(strange))] if strange else []
     return [compose("file-unread", remark=message) for message in remarks]
 

@@ -47,6 +47,7 @@ TEMPLATES = {
     "hint-result-files": "GET /v1/jobs/{job}/result lists what there is",
     "hint-rig": "GET /v1/rig lists them",
     "hint-studio-plates": "the simulated studio takes them with each shot",
+    "result-replaced": "{file} was there and is replaced; from 0.5.0 on that needs --overwrite",
     "hint-plates": "GET /v1/rig/background lists them",
     "hint-other-numbers": "{file} holds others",
 }

@@ -1,7 +1,7 @@
 // Batches at the left, one of them at the right.
 import { say, spoken } from "/console/static/language.js";
 import { Pager, paged } from "/console/static/list.js";
-import { clock, keepDraft, kept, span } from "/console/static/words.js";
+import { LEVELS, clock, keepDraft, kept, span } from "/console/static/words.js";
 
 const asked = new URLSearchParams(location.search);
 const DONE = ["succeeded", "failed", "cancelled", "removed"];
@@ -64,7 +64,7 @@ export default spoken({
       <form v-if="form" class="panel pad line wrap" style="align-items: end; flex: none" aria-label="New batch" @submit.prevent="busy = 'begin'; $emit('act', { name: 'begin', ...form })">
         <label class="field grow">Captures whose label begins with<input ref="prefix" v-model="form.prefix" id="prefix" maxlength="500" required></label>
         <label class="field grow">Name<input v-model="form.label" maxlength="500"></label>
-        <label class="field">Detail<select v-model="form.detail"><option value="">as deep as the images carry</option><option value="span">span</option><option value="kernel">kernel</option><option value="photo">photo</option><option value="fine">fine</option><option value="pores">pores</option></select></label>
+        <label class="field">Detail<select v-model="form.detail"><option value="">as deep as the images carry</option><option v-for="(words, l) in levels" :key="l" :value="l">{{ say(words) }}</option></select></label>
         <button class="b main-action" :disabled="!!busy">Begin</button><button type="button" class="b quiet" @click="form = null">Cancel</button></form>
       <div class="columns" style="grid-template-columns: 24rem minmax(0, 1fr)">
         <div class="stack" style="min-height: 0">
@@ -97,7 +97,7 @@ export default spoken({
       </div>
     </section>`,
   created() {
-    Object.assign(this, { clock, span, states: ["running", "paused", "finished", "cancelled"] });
+    Object.assign(this, { clock, levels: LEVELS, span, states: ["running", "paused", "finished", "cancelled"] });
   },
   methods: {
     title(b) {

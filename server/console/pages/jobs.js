@@ -1,12 +1,22 @@
 // The queue at the left, one job at the right.
 import { Pager, paged } from "/console/static/list.js";
 import { say, spoken } from "/console/static/language.js";
-import { clock, fixed, keepDraft, kept, span, stageWords } from "/console/static/words.js";
+import {
+  LEVELS,
+  METHODS,
+  clock,
+  fixed,
+  keepDraft,
+  kept,
+  methodWords,
+  span,
+  stageWords,
+} from "/console/static/words.js";
 
 const asked = new URLSearchParams(location.search);
 
 const MOSTLY = 0.25; // of the rim: beyond it hair or clothes hide the face, and the residual says nothing
-const POOR_PX = 3.0; // contour residual from which a camera is worth a look
+const POOR_PX = 3.0; // outline residual from which a camera is worth a look
 
 export default spoken({
   mixins: [paged],
@@ -112,12 +122,12 @@ export default spoken({
         <div class="panel pad scroll stack" tabindex="0" role="region" aria-label="The chosen job">
           <template v-if="job">
             <div class="line wrap"><h2>{{ captureOf(job) }}</h2><span class="tag" :class="kind(job)">{{ say(job.state) }}</span><span class="muted small mono">{{ job.id.slice(-6) }}</span>
-              <span class="muted small push">{{ job.model || say('default model') }} &middot; {{ say(job.settings.method || 'contour') }} &middot; {{ say('queue {name}', { name: job.queue }) }}</span></div>
+              <span class="muted small push">{{ job.model || say('default model') }} &middot; {{ methodWords(job.settings.method) }} &middot; {{ say('queue {name}', { name: job.queue }) }}</span></div>
             <form v-if="form" class="panel pad stack" style="background: var(--raised)" @submit.prevent="restart" aria-label="Restart with other settings">
               <div class="line wrap" style="align-items: end">
-                <label class="field">Method<select v-model="form.method"><option value="">as set</option><option value="contour">contour (fast)</option><option value="simplex">simplex (the paper's)</option></select></label>
+                <label class="field">Method<select v-model="form.method"><option value="">as set</option><option v-for="(words, m) in methods" :key="m" :value="m">{{ say(words) }}</option></select></label>
                 <label v-if="state.models.length > 1" class="field">Model<select v-model="form.model"><option value="">as before</option><option v-for="m in state.models" :key="m">{{ m }}</option></select></label>
-                <label class="field">Detail<select v-model="form.detail"><option value="">as deep as the images carry</option><option value="span">span</option><option value="kernel">kernel</option><option value="photo">photo</option><option value="fine">fine</option><option value="pores">pores</option></select></label>
+                <label class="field">Detail<select v-model="form.detail"><option value="">as deep as the images carry</option><option v-for="(words, l) in levels" :key="l" :value="l">{{ say(words) }}</option></select></label>
                 <label class="field">Front camera<input v-model="form.front" placeholder="guessed" size="8"></label></div>
               <label class="field">Further settings, JSON<textarea v-model="form.more" rows="3" spellcheck="false"></textarea></label>
               <div class="line"><button class="b main-action" :disabled="!!busy">Queue the new job</button><button type="button" class="b quiet" @click="form = null">Keep it as it is</button></div>
@@ -126,19 +136,19 @@ export default spoken({
             <ul v-if="state.detail.warnings.length" class="faults small"><li v-for="(w, i) in state.detail.warnings" :key="i" class="warn">{{ say(w) }}</li></ul>
             <div class="columns" style="grid-template-columns: minmax(0, 1fr) 15rem; flex: none">
               <div v-if="state.detail.cameras.length" class="scroll" tabindex="0" role="region" aria-label="Residuals by camera"><table>
-                <thead><tr><th>Camera</th><th class="num" title="Overlap of silhouette and fitted head in the face region">IoU</th><th class="num" title="From the fitted rim to the silhouette, hair and clothes among it">contour, px</th><th class="num" title="Share of the rim farther than 3 px from the silhouette: hair, clothes or misfit">excluded</th><th class="num" title="Silhouette difference of the starting head">XOR before</th><th class="num" title="The same of the fitted head">XOR after</th><th>Use</th></tr></thead>
+                <thead><tr><th>Camera</th><th class="num" title="Overlap of silhouette and fitted head in the face region">IoU</th><th class="num" title="From the fitted rim to the silhouette, hair and clothes among it">outline, px</th><th class="num" title="Share of the rim farther than 3 px from the silhouette: hair, clothes or misfit">outliers</th><th class="num" title="Pixels in which silhouette and starting head differ">difference before, px</th><th class="num" title="The same of the fitted head">after, px</th><th>Use</th></tr></thead>
                 <tbody><tr v-for="c in state.detail.cameras" :key="c.name"><td>{{ c.name }}</td><td class="num">{{ fixed(c.iou, 3) }}</td><td class="num" :class="{ warn: c.contour_rms_px > poor && c.excluded_share < mostly }">{{ fixed(c.contour_rms_px, 2) }}</td><td class="num">{{ c.excluded_share === null ? '-' : (100 * c.excluded_share).toFixed(0) + ' %' }}</td><td class="num">{{ fixed(c.xor_cost_start, 0) }}</td><td class="num">{{ fixed(c.xor_cost, 0) }}</td><td :class="{ warn: !c.used }">{{ c.used ? '' : say('left out') }}</td></tr></tbody></table></div>
               <div v-else-if="active" class="stack"><div class="line wrap"><strong class="grow" style="flex-basis: 12rem">{{ job.state === 'running' ? stageWords(job.stage) : waiting }}</strong><span class="num">{{ Math.round(100 * job.progress) }} %</span><span v-if="job.state === 'running' && job.eta_s !== null" class="num muted">{{ say('about {time} left', { time: span(job.eta_s) }) }}</span></div>
                 <div class="bar" aria-hidden="true"><i :style="{ width: 100 * job.progress + '%' }"></i></div><p class="muted small">Residuals by camera, silhouettes and overlays stand here when the job is done.</p></div>
               <p v-else class="muted">The job left no report.</p>
               <div class="stack"><h3>Log</h3><table class="small log"><tbody><tr v-for="(l, i) in state.detail.log" :key="i"><td class="num muted">{{ fixed(l.at_s, 1) }} s</td><td>{{ stageWords(l.text) }}</td></tr></tbody></table>
-                <p v-if="state.detail.stopped_because" class="small muted">{{ say('{reason}, {count} evaluation, {time} | {reason}, {count} evaluations, {time}', { reason: say(state.detail.stopped_because), count: state.detail.evaluations, time: span(state.detail.seconds.total) }) }}</p></div>
+                <p v-if="state.detail.stopped_because" class="small muted">{{ say('{count} evaluation, {time} | {count} evaluations, {time}', { count: state.detail.evaluations, time: span(state.detail.seconds.total) }) }}</p></div>
             </div>
             <template v-if="state.detail.pictures">
               <div class="line"><h3>Silhouette difference before and after</h3></div>
               <a :href="sheet" target="_blank" rel="noopener" aria-label="Open the contact sheet"><img :src="sheet" alt="Contact sheet: input, silhouette difference before and after the fit, and the head from new views" style="width: 100%; border-radius: 3px; display: block" @error="$event.target.style.display = 'none'"></a>
-              <h3>Input contour and fitted contour</h3>
-              <div class="thumbs"><a v-for="c in state.detail.cameras" :key="c.name" class="thumb" :href="overlay(c.name)" target="_blank" rel="noopener" :aria-label="say('Overlay of {name}', { name: c.name })"><img :src="overlay(c.name)" :alt="say('Contours in {name}', { name: c.name })" loading="lazy"><span>{{ c.name }}</span></a></div>
+              <h3>Outlines: input and fitted head</h3>
+              <div class="thumbs"><a v-for="c in state.detail.cameras" :key="c.name" class="thumb" :href="overlay(c.name)" target="_blank" rel="noopener" :aria-label="say('Overlay of {name}', { name: c.name })"><img :src="overlay(c.name)" :alt="say('Outlines in {name}', { name: c.name })" loading="lazy"><span>{{ c.name }}</span></a></div>
             </template>
           </template>
           <div v-else-if="!state.loading" class="empty"><h2>{{ say(jobs.length ? 'Choose a job' : 'No jobs yet') }}</h2><template v-if="!jobs.length"><p>Choose a capture and press Reconstruct.</p><a class="b main-action" href="/captures">Go to captures</a></template></div>
@@ -146,7 +156,17 @@ export default spoken({
       </div>
     </section>`,
   created() {
-    Object.assign(this, { clock, fixed, span, stageWords, poor: POOR_PX, mostly: MOSTLY });
+    Object.assign(this, {
+      clock,
+      fixed,
+      levels: LEVELS,
+      methods: METHODS,
+      methodWords,
+      span,
+      stageWords,
+      poor: POOR_PX,
+      mostly: MOSTLY,
+    });
   },
   methods: {
     captureOf(j) {

@@ -7,7 +7,7 @@ import { say, spoken } from "/console/static/language.js";
 import { told } from "/console/static/messages.js";
 import { fitted, lookThrough } from "/console/static/look_through.js";
 import { views3d } from "/console/static/views.js";
-import { clock, fixed, keepAddress, size, span, typing } from "/console/static/words.js";
+import { clock, fixed, keepAddress, levelWords, methodWords, size, span, typing } from "/console/static/words.js";
 
 // viridis sampled at nine places (dark is small), as linear steps between them; it stays readable without colour vision
 const RAMP = [
@@ -215,7 +215,7 @@ export default spoken({
         <div class="panel pad scroll stack" tabindex="0" role="region" aria-label="About the head">
           <template v-if="job">
             <ul v-if="job.warnings.length" class="faults small"><li v-for="(w, i) in job.warnings" :key="i" class="warn">{{ say(w) }}</li></ul>
-            <div class="stack" style="gap: .35rem"><label class="field">Compare with<select v-model="other"><option value="">nothing</option><option v-if="job.truth" value="truth">the truth (simulated)</option><option v-for="r in others" :key="r.id" :value="r.id">{{ same(r) ? headName(r) : say('ANOTHER PERSON? {head}', { head: headName(r) }) }}</option></select></label>
+            <div class="stack" style="gap: .35rem"><label class="field">Compare with<select v-model="other"><option value="">nothing</option><option v-if="job.truth" value="truth">the truth (simulated)</option><option v-for="r in others" :key="r.id" :value="r.id">{{ same(r) ? headName(r) : say('perhaps another person: {head}', { head: headName(r) }) }}</option></select></label>
               <label v-if="other && other !== 'truth'" class="check small"><input type="checkbox" v-model="beside" id="beside">side by side, turned together</label>
               <label v-if="elsewhere" class="check small"><input type="checkbox" v-model="strangers" id="strangers">{{ say('offer {count} head of other subjects, too | offer {count} heads of other subjects, too', { count: elsewhere }) }}</label>
               <label v-if="cameras.length || !camerasKnown" class="field">Look through<select v-model="through" id="through" :disabled="!cameras.length"><option value="">no camera</option><option v-for="c in cameras" :key="c.name">{{ c.name }}</option></select></label>
@@ -229,7 +229,7 @@ export default spoken({
             <h2 class="third">Measurements, mm</h2>
             <table class="small" id="measurements"><thead v-if="theirs"><tr><th>of</th><th class="num">this</th><th class="num">other</th><th class="num" title="this less other">&Delta;</th></tr></thead><tbody><tr v-for="m in compared" :key="m.name"><td>{{ say(m.name.replaceAll('_', ' ')) }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td v-if="!theirs" class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td><template v-if="theirs"><td class="num">{{ fixed(m.theirs?.value, 1) }}</td><td class="num">{{ m.theirs ? fixed(m.value - m.theirs.value, 1) : '-' }}</td></template></tr></tbody></table>
             <h2 class="third">Fit</h2>
-            <table class="small"><tbody><tr><td title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">{{ say('contour residual, {count} clear view | contour residual, {count} clear views', { count: job.clear_views }) }}</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>solver</td><td class="num">{{ say(job.method) }}</td></tr><tr><td>level of detail</td><td class="num">{{ say(job.level) }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
+            <table class="small"><tbody><tr><td title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">{{ say('outline residual, {count} clear view | outline residual, {count} clear views', { count: job.clear_views }) }}</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>solver</td><td class="num">{{ methodWords(job.method) }}</td></tr><tr><td>level of detail</td><td class="num">{{ levelWords(job.level) }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
             <a class="small" href="/jobs">Residuals and overlays are with the job</a>
           </template>
         </div>
@@ -241,6 +241,8 @@ export default spoken({
       three: { THREE, GLTFLoader },
       clock,
       fixed,
+      levelWords,
+      methodWords,
       size,
       span,
       parts: PARTS,
@@ -359,8 +361,8 @@ export default spoken({
     },
     headName(r) {
       const how = [
-        say(r.settings.method || "contour"),
-        say(r.settings.detail),
+        methodWords(r.settings.method),
+        levelWords(r.settings.detail),
         r.model && r.model !== "default" && r.model,
       ]
         .filter(Boolean)
@@ -550,7 +552,7 @@ export default spoken({
                 ? "Distance to the truth"
                 : this.same((this.state.results || []).find((r) => r.id === wanted) || {})
                   ? "Distance to the other head"
-                  : "Distance to a head of ANOTHER SUBJECT",
+                  : "Distance to a head of another subject",
             ),
           );
       } catch (error) {

@@ -14,14 +14,11 @@ export default spoken({
   components: { Tour },
   props: { links: Array, current: String, status: Object, removed: Array, followed: Array },
   emits: ["undo", "follow"],
-  data: () => ({ messages: [], next: 1, help: false, look: localStorage.getItem("eigenhead-look") || "dark" }),
+  data: () => ({ messages: [], next: 1, help: false, look: document.documentElement.dataset.look, lost: false }),
   watch: {
-    look: {
-      handler(look) {
-        document.documentElement.dataset.look = look;
-        localStorage.setItem("eigenhead-look", look);
-      },
-      immediate: true,
+    look(look) {
+      document.documentElement.dataset.look = look;
+      localStorage.setItem("eigenhead-look", look);
     },
   },
   computed: {
@@ -42,7 +39,7 @@ export default spoken({
         <a v-for="(link, i) in links" :key="link.name" :href="link.path" :aria-current="link.name === current ? 'page' : null">
           <span>{{ say(link.title) }}</span><kbd v-if="current !== 'features'" aria-hidden="true">{{ i + 1 }}</kbd></a>
         <div class="foot" role="status">
-          <div class="line"><i :class="['dot', faults.length ? 'warn' : starting.length || !known ? '' : 'good']"></i>{{ starting.length && known && !faults.length ? say('Starting: {parts}', { parts: starting.join(', ') }) : say(!known ? 'Connecting ...' : faults.length ? 'Needs a look' : 'Ready') }}</div>
+          <div class="line"><i :class="['dot', lost || faults.length ? 'warn' : starting.length || !known ? '' : 'good']"></i>{{ lost ? say('Connection lost.') : starting.length && known && !faults.length ? say('Starting: {parts}', { parts: starting.join(', ') }) : say(!known ? 'Connecting ...' : faults.length ? 'Needs a look' : 'Ready') }}</div>
           <div v-for="[name, detail] in faults" :key="name" class="warn">{{ part(name) }}: {{ say(detail) }}</div>
           <div>{{ say('{count} job under way | {count} jobs under way', { count: status.jobs || 0 }) }}</div>
           <div>{{ say(status.disk) || '\\u00a0' }}</div>
@@ -93,10 +90,21 @@ export default spoken({
     window.eigenheadSay = (kind, text, faults) => this.announce(kind, text, faults || []);
   },
   mounted() {
+    document.getElementById("starting")?.remove();
     window.addEventListener("keydown", this.key);
     document.addEventListener("scroll", this.scrolled, true);
     this.scrollBack();
     this.translatePopups();
+    setTimeout(() => {
+      // the page's root, mounted after this, makes the socket
+      for (const [event, lost] of [
+        ["disconnect", true],
+        ["connect", false],
+      ])
+        window.socket?.on(event, () => {
+          this.lost = lost;
+        });
+    });
     this.$el.querySelector(".rail [aria-current]")?.scrollIntoView({ block: "nearest", inline: "center" });
   },
   unmounted() {

@@ -72,6 +72,22 @@ const STAGES = {
   scale: "measuring the scale",
   silhouettes: "comparing silhouettes",
 };
+// What decides how fine a head becomes, and who solves: what stands in settings and reports is said in words.
+export const LEVELS = {
+  span: "head model alone",
+  kernel: "outlines of the pictures",
+  photo: "photographs",
+  fine: "photographs, fine",
+  pores: "photographs, with pores",
+};
+export const METHODS = { contour: "fast", simplex: "downhill simplex, slow" };
+export function levelWords(level) {
+  return level ? say(LEVELS[level] || level) : "";
+}
+export function methodWords(method) {
+  return say(METHODS[method || "contour"]);
+}
+
 export function stageWords(stage) {
   return say(STAGES[stage] || stage);
 }

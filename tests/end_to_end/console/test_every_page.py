@@ -77,6 +77,7 @@ def test_a_page_comes_back_after_the_service_was_killed(
     expect(page.get_by_text("GB free")).to_be_visible(timeout=20_000)  # over the socket, which is there now
     service.kill()
     expect(page.locator("#popup")).to_be_visible(timeout=20_000)
+    expect(page.locator(".rail .foot .line").first).to_have_text("Connection lost.")  # and not Ready beside it
     service.start()
     uploaded_capture(service, tmp_path, 2)
     expect(page.locator(".row-button")).to_have_count(2, timeout=60_000)

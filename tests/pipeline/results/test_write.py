@@ -17,7 +17,7 @@ from pipeline.faces.triangulated_face import triangulate_face
 from pipeline.geometry.raster import depth_map
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.results import report
-from pipeline.results.overlays import FITTED_COLOUR, INPUT_COLOUR, PART_COLOURS, TINT, overlay
+from pipeline.results.overlays import FITTED_COLOUR, INPUT_COLOUR, KEY_PX, PART_COLOURS, TINT, overlay
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report_types import FaceReport
 from pipeline.results.write import write_result
@@ -189,6 +189,8 @@ def test_every_camera_has_an_overlay_of_its_image_with_both_contours(folder: Pat
         assert 0.002 < changed.mean() < 0.15
     for picture in ("contact_sheet.png", "turntable.png"):
         assert read_image(folder / picture).std() > 10
+    key = read_image(folder / "contact_sheet.png")[-KEY_PX:]
+    assert all((key == colour).all(axis=2).any() for colour in (INPUT_COLOUR, FITTED_COLOUR))
 
 
 def test_contours_are_painted_where_they_are() -> None:

@@ -1,13 +1,21 @@
 """Exchanges of files planted in a capture of the studio: cables, pictures alone, plates alone, duplicates."""
 
+from dataclasses import replace
 from typing import Literal
 
+import cv2
 import numpy as np
 import pytest
 
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.segmentation.segment import segment
-from pipeline.view_checks.image_assignment import ExchangedPictures, WrongRig, assign_images, misplaced_plates
+from pipeline.view_checks.image_assignment import (
+    ExchangedPictures,
+    WrongRig,
+    assign_images,
+    duplicate_views,
+    misplaced_plates,
+)
 from rig.capture import Capture, reassign_images
 from tests.support.layouts import arrangement
 
@@ -95,6 +103,14 @@ def test_a_duplicated_picture_is_left_to_its_own_camera(half_size_shot):
     assert warning.code == "picture-duplicated"
     assert warning.text.startswith("cam08 holds the same picture as cam07")
     assert [name for name, s in found.silhouettes.items() if not s.quality.usable] == ["cam08"]
+
+
+def test_a_picture_that_was_encoded_anew_is_a_duplicate(half_size_shot):
+    shot, encoded = half_size_shot, cv2.imencode(".jpg", half_size_shot.capture.images["cam07"])[1]
+    images = {**shot.capture.images, "cam08": cv2.imdecode(encoded, cv2.IMREAD_COLOR)}
+    masks = {**shot.masks, "cam08": shot.masks["cam07"]}
+    silhouettes = {name: silhouette_from_mask(mask) for name, mask in masks.items()}
+    assert duplicate_views(replace(shot.capture, images=images), silhouettes, shot.rig) == {"cam08": "cam07"}
 
 
 def test_plates_of_one_backdrop_are_nobodys(half_size_shot):

@@ -208,6 +208,9 @@ def test_nothing_that_is_there_is_overwritten_unasked(run: Run, tmp_path: Path) 
     assert "board.toml is there already" in done.err
     assert run("board", "--out", tmp_path / "board.pdf", "--overwrite").status == 0
     assert "charuco" in (tmp_path / "board.toml").read_text()
+    convert = ("convert", small_capture(tmp_path / "shot"), "--to", "blender", "--out", tmp_path / "cameras.py")
+    for more, said in [((), False), ((), True), (("--overwrite",), False)]:
+        assert ("result-replaced" in run(*convert, *more).err) is said
     capture = small_capture(tmp_path / "capture")
     done = run("simulate", capture)
     assert (done.status, done.err.count("\n")) == (1, 1)

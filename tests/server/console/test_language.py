@@ -24,7 +24,6 @@ from tests.support.console_words import CONSOLE, Component, component, german
 
 SCRIPTS = [path for path in sorted(CONSOLE.rglob("*.js")) if path.name not in ("de.js", "messages_de.js")]
 CHECKS = ("cheirality", "held-out shots", "scale", "frame", "determined", "known layout", "lens stability")
-REASONS = ("step limit", "evaluation limit")
 PARTS = ("database", "disk", "worker", "rig")
 SENTENCE = re.compile(r"[a-z]{2,}[,.:;]? [a-z({\d]")
 # What looks like words in a script and is not shown: keys of the keyboard, names in the browser's store, styles.
@@ -62,7 +61,7 @@ def vocabulary() -> Iterator[str]:
     yield from (title for _, _, title in PAGES)
     yield from (name.replace("_", " ") for name in DISTANCES)
     yield from KINDS
-    yield from (*CHECKS, *REASONS, *PARTS, "contour", "simplex")
+    yield from (*CHECKS, *PARTS)
     yield from shot.FAULTS.keys() - named_faults().keys()
     yield from ("left", "right", "top", "bottom", "width", "height", "first", "second", "simulated", "real")
     yield from ("capture", "captures", "job", "jobs")  # what a message counts, or what it found faults in

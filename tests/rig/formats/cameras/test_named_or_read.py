@@ -96,6 +96,8 @@ def test_a_capture_s_folders_are_found_in_any_case(small: str, called: str, tmp_
         ("Transforms_Train.json", "{}", "transforms.json in parts"), ("poses_bounds.npy", "x", "LLFF"),
         ("cameras_sphere.npz", "x", "NeuS"), ("bundle.rd.out", "x", "Bundler"), ("model.NVM", "x", "VisualSFM"),
         ("project.psx", "x", "Metashape"), ("project.rcproj", "x", "RealityCapture"),
+        ("rig.fbx", "x", "FBX"), ("cameras.abc", "x", "Alembic"),
+        ("stereo.mat", "x", "MATLAB"), ("a.p4d", "x", "Pix4D"),
         ("stereo.yml", "%YAML:1.0\nM1: 1\n", "OpenCV"),
     ],
 )  # fmt: skip
@@ -113,6 +115,24 @@ def test_any_other_file_beside_photographs_is_named_too(tmp_path: Path) -> None:
     (tmp_path / "studio.txt").write_text("cam00 1 2 3\n")
     (remark,) = unread_files(tmp_path, [])
     assert "studio.txt" in remark.text
+
+
+@pytest.mark.parametrize(("file", "said"), [("intri.yml", "%YAML:1.0\nK_a: 1\n"), ("x.nvm", "NVM_V3")])
+def test_cameras_in_a_folder_where_none_are_read_are_named(file: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "calib").mkdir()
+    (tmp_path / "calib" / file).write_text(said)
+    (remark,) = unread_files(tmp_path, [])
+    assert file in remark.text
+
+
+def test_a_camera_without_a_pose_takes_no_part(tmp_path: Path) -> None:
+    write_rig_file(fan(4), tmp_path / "cameras.json", "eigenhead")
+    document = json.loads((tmp_path / "cameras.json").read_text())
+    document["cameras"][1].pop("camera_from_world")
+    (tmp_path / "cameras.json").write_text(json.dumps(document))
+    read = read_cameras(tmp_path / "cameras.json")
+    assert [*read.rig.names, *read.left_out] == [fan(4).names[i] for i in (0, 2, 3, 1)]
+    assert "without a pose" in read.remarks[0].text
 
 
 def splatting(rig: Rig) -> list[dict[str, object]]:
