@@ -13,6 +13,9 @@ from jaxtyping import Float
 from rig.geometry import RigidTransform
 from rig.recorded_lens import RecordedLens
 
+Pixels = Float[np.ndarray, "n 2"]
+Points = Float[np.ndarray, "n 3"]
+
 
 @lru_cache(maxsize=1024)  # needed at every projection; the roots of a cubic cost more than projecting a point
 def _turning_radius(k1: float, k2: float, k3: float) -> float:
@@ -47,15 +50,15 @@ class Distortion:
         points back."""
         return _turning_radius(self.k1, self.k2, self.k3)
 
-    def apply(self, normalised: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    def apply(self, normalised: Pixels) -> Pixels:
         """Distorts normalised coordinates ``X / Z, Y / Z``."""
         return _distorted(normalised, self.opencv())
 
-    def jacobian(self, normalised: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
+    def jacobian(self, normalised: Pixels) -> Float[np.ndarray, "n 2 2"]:
         """Computes the derivative of the distorted coordinates by the normalised ones."""
         return _distortion_slopes(normalised, self.opencv())
 
-    def remove(self, distorted: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    def remove(self, distorted: Pixels) -> Pixels:
         """Inverts ``apply`` by Newton's method. Returns NaN where no point inside the valid radius maps to the given
         one."""
         if self.is_zero:
@@ -134,32 +137,30 @@ class Camera:
         """Returns the unit vector along which the camera looks."""
         return self.camera_from_world.rotation[2]
 
-    def project(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    def project(self, points_world: Points) -> Pixels:
         """Projects world points (mm) to pixels. Returns NaN behind the camera and beyond the distortion's valid
         radius."""
         return self._image(self.camera_from_world.apply(points_world))
 
-    def project_with_jacobian(
-        self, points_world: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
+    def project_with_jacobian(self, points_world: Points) -> tuple[Pixels, Float[np.ndarray, "n 2 3"]]:
         """Returns the pixels of world points (mm), and their derivatives by the points (px / mm)."""
         points = self.camera_from_world.apply(points_world)
         with np.errstate(divide="ignore", invalid="ignore"):
             by_point, _ = lens_jacobians(points, self.intrinsics.values())
         return self._image(points), by_point @ self.camera_from_world.rotation
 
-    def rays_world(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    def rays_world(self, pixels: Pixels) -> Points:
         """Returns unit directions, in the world frame, of the rays through ``pixels``."""
         normalised = self.undistort(pixels)
         rays = np.concatenate([normalised, np.ones((len(pixels), 1))], axis=1) @ self.camera_from_world.rotation
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
-    def undistort(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    def undistort(self, pixels: Pixels) -> Pixels:
         """Returns the normalised coordinates ``X / Z, Y / Z`` of pixels, with the distortion removed."""
         k = self.intrinsics
         return k.distortion.remove((pixels - (k.cx, k.cy)) / (k.fx, k.fy))
 
-    def _image(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    def _image(self, points: Points) -> Pixels:
         """Projects points in the camera's frame (mm) to pixels."""
         with np.errstate(divide="ignore", invalid="ignore"):
             pixels = lens_image(points, self.intrinsics.values())
@@ -175,7 +176,7 @@ class CameraStack:
     one camera."""
 
     rotations: Float[np.ndarray, "n 3 3"]
-    translations: Float[np.ndarray, "n 3"]  # mm
+    translations: Points  # mm
     lenses: Float[np.ndarray, "n 9"]
     turning_radii: Float[np.ndarray, " n"]
 
@@ -189,9 +190,7 @@ class CameraStack:
             np.array([camera.intrinsics.distortion.max_valid_radius() for camera in cameras]),
         )
 
-    def project_with_jacobian(
-        self, point_world: Float[np.ndarray, " 3"]
-    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
+    def project_with_jacobian(self, point_world: Float[np.ndarray, " 3"]) -> tuple[Pixels, Float[np.ndarray, "n 2 3"]]:
         """Returns the pixel of a world point (mm) in each camera, and its derivatives by the point (px / mm); NaN as in
         ``Camera.project``."""
         points = self.rotations @ point_world + self.translations
@@ -203,7 +202,7 @@ class CameraStack:
         return pixels, by_point @ self.rotations
 
 
-def lens_image(points: Float[np.ndarray, "n 3"], lens: Float[np.ndarray, "*n 9"]) -> Float[np.ndarray, "n 2"]:
+def lens_image(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Pixels:
     """Projects points in a camera's frame (mm) to pixels.
 
     ``lens`` is fx fy cx cy (px) k1 k2 p1 p2 k3, one for all points or one for each. The caller must make sure that the
@@ -212,7 +211,7 @@ def lens_image(points: Float[np.ndarray, "n 3"], lens: Float[np.ndarray, "*n 9"]
 
 
 def lens_jacobians(
-    points: Float[np.ndarray, "n 3"], lens: Float[np.ndarray, "*n 9"]
+    points: Points, lens: Float[np.ndarray, "*n 9"]
 ) -> tuple[Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 9"]]:
     """Returns the derivatives of ``lens_image`` by the point (px / mm) and by the nine values of the lens."""
     normalised, z = points[:, :2] / points[:, 2:], points[:, 2]
@@ -231,7 +230,7 @@ def lens_jacobians(
     return slopes @ pinhole, by_lens
 
 
-def _distorted(normalised: Float[np.ndarray, "n 2"], lens: Float[np.ndarray, "*n 5"]) -> Float[np.ndarray, "n 2"]:
+def _distorted(normalised: Pixels, lens: Float[np.ndarray, "*n 5"]) -> Pixels:
     """Distorts normalised coordinates by the module's equation."""
     (x, y), (k1, k2, p1, p2, k3) = normalised.T, lens.T
     r2 = x * x + y * y
@@ -243,9 +242,7 @@ def _distorted(normalised: Float[np.ndarray, "n 2"], lens: Float[np.ndarray, "*n
     return np.stack([across, down], axis=1)
 
 
-def _distortion_slopes(
-    normalised: Float[np.ndarray, "n 2"], lens: Float[np.ndarray, "*n 5"]
-) -> Float[np.ndarray, "n 2 2"]:
+def _distortion_slopes(normalised: Pixels, lens: Float[np.ndarray, "*n 5"]) -> Float[np.ndarray, "n 2 2"]:
     """Returns the derivative of ``_distorted`` by the normalised coordinates, a symmetric matrix."""
     (x, y), (k1, k2, p1, p2, k3) = normalised.T, lens.T
     r2 = x * x + y * y

@@ -34,6 +34,8 @@ from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
+Points = Float[np.ndarray, "n 3"]
+
 MIN_POINTS = 3
 MIN_AGREED_SIDES = 0.85  # of all points, that agree where right and left are as they should be
 MIN_TRIANGLE_MM = 5.0  # rms distance from the best line; less leaves the turn about that line to the noise
@@ -122,11 +124,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig) -> Feature
 
 
 def _sides_exchanged(
-    model: HeadModel,
-    names: list[str],
-    target: Float[np.ndarray, "n 3"],
-    noise: Float[np.ndarray, "n 3 3"],
-    kept: Bool[np.ndarray, " n"],
+    model: HeadModel, names: list[str], target: Points, noise: Float[np.ndarray, "n 3 3"], kept: Bool[np.ndarray, " n"]
 ) -> bool:
     """Tells whether most points agree with the mean head only after right and left are exchanged in all of them."""
     others = [mirrored(name) for name in names]
@@ -138,9 +136,7 @@ def _sides_exchanged(
     return found is not None and float(found.mean()) >= MIN_AGREED_SIDES and bool(found.sum() > kept.sum() + 1)
 
 
-def landmark_statistics(
-    model: HeadModel, names: list[str], noise_mm: float
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "p p"]]:
+def landmark_statistics(model: HeadModel, names: list[str], noise_mm: float) -> tuple[Points, Float[np.ndarray, "p p"]]:
     """Returns the mean head's landmarks (head frame, mm) and their covariance over the population (mm^2, p = 3 n).
 
     ``noise_mm`` is the standard deviation between where a person and the model place the same landmark.
@@ -151,9 +147,7 @@ def landmark_statistics(
     return mean, modes.T @ modes + noise_mm**2 * np.eye(modes.shape[1])
 
 
-def consensus(
-    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], expected_mm: Float[np.ndarray, " n"]
-) -> Bool[np.ndarray, " n"] | None:
+def consensus(source: Points, target: Points, expected_mm: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"] | None:
     """Tells which points agree with one rigid alignment; None if no three of them span a triangle.
 
     The rigid alignment through every three points is tried, and the one with the smallest truncated sum of squared
@@ -179,13 +173,13 @@ def consensus(
     return agreed
 
 
-def _rigid(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> RigidTransform:
+def _rigid(source: Points, target: Points) -> RigidTransform:
     # Scale stays 1 here: three points fit too well when they may also shrink.
     fitted = procrustes(source, target)
     return RigidTransform(fitted.rotation, target.mean(axis=0) - fitted.rotation @ source.mean(axis=0))
 
 
-def flatness(points: Float[np.ndarray, "n 3"]) -> float:
+def flatness(points: Points) -> float:
     """Returns the RMS distance (mm) of points from the line that fits them best."""
     singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return float(np.hypot(singular[1], singular[2]) / np.sqrt(len(points)))

@@ -22,6 +22,8 @@ from pipeline.estimation.robust import GemanMcClure
 from pipeline.estimation.terms import LinearisedQuadratic, NormalEquations, Quadratic
 from rig.geometry import Similarity
 
+Points = Float[np.ndarray, "n 3"]
+
 FORGIVEN_SIGMAS = 3.0
 LOSS = GemanMcClure(FORGIVEN_SIGMAS)
 
@@ -31,7 +33,7 @@ def surface_residual(
     coefficients: Float[np.ndarray, " m"],
     world_from_head: Similarity,
     camera_shift: Float[np.ndarray, "k 6"],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+) -> tuple[Float[np.ndarray, " n"], Points]:
     """Returns the residual e (mm) of each observation, as the module defines it, and the current positions of the
     vertices (world, mm). An observation that is only a bound (of hair) has the residual 0 if the head keeps it."""
     count = len(coefficients)
@@ -64,7 +66,7 @@ class LinearisedSurfaceTerm:
     term: SurfaceTerm
     state: State
     residual: Float[np.ndarray, " n"]
-    points: Float[np.ndarray, "n 3"]
+    points: Points
 
     @property
     def squares(self) -> Float[np.ndarray, " n"]:
@@ -100,12 +102,7 @@ class LinearisedSurfaceTerm:
 
 
 def surface_rows(
-    seen: SurfaceObservations,
-    count: int,
-    world_from_head: Similarity,
-    points: Float[np.ndarray, "n 3"],
-    *,
-    cameras: bool,
+    seen: SurfaceObservations, count: int, world_from_head: Similarity, points: Points, *, cameras: bool
 ) -> Float32[np.ndarray, "n p"]:
     """Returns the derivative of each residual e (mm) by the first ``count`` coefficients, rotation, translation, log
     scale and, if ``cameras``, the cameras' corrections, in columns of this order. ``points`` are the current vertices

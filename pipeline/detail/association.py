@@ -14,6 +14,8 @@ from pipeline.geometry.closest_point_kernels import FannedMesh, closest_at_verti
 from pipeline.geometry.fans import corners_at_vertices
 from pipeline.geometry.nearest import PointTree, nearest
 
+Faces = Int[np.ndarray, "f 3"]
+
 CANDIDATES = 4  # vertices whose triangles are tried
 
 
@@ -28,9 +30,7 @@ class Associated:
     distance_mm: Float[np.ndarray, " n"]
 
 
-def faces_at_vertices(
-    faces: Int[np.ndarray, "f 3"], count: int
-) -> tuple[Int[np.ndarray, " v1"], Int[np.ndarray, " e"]]:
+def faces_at_vertices(faces: Faces, count: int) -> tuple[Int[np.ndarray, " v1"], Int[np.ndarray, " e"]]:
     """Returns the faces at each vertex as compressed rows, ``start`` and ``members``: those of vertex i are
     ``members[start[i]:start[i + 1]]``."""
     start, corner = corners_at_vertices(faces, count)
@@ -46,9 +46,7 @@ class Target:
     corner_mm: float  # from no place of a triangle is its nearest corner farther
 
     @classmethod
-    def of(
-        cls, vertices: Float[np.ndarray, "v 3"], vertex_normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-    ) -> "Target":
+    def of(cls, vertices: Float[np.ndarray, "v 3"], vertex_normals: Float[np.ndarray, "v 3"], faces: Faces) -> "Target":
         """Builds a target from a mesh (mm) with unit vertex normals."""
         sides = [np.linalg.norm(vertices[faces[:, j]] - vertices[faces[:, j - 1]], axis=1) for j in range(3)]
         head = FannedMesh(vertices, vertex_normals, faces, *faces_at_vertices(faces, len(vertices)))
@@ -93,7 +91,7 @@ def associate(
     normals: Float[np.ndarray, "p 3"],
     vertices: Float[np.ndarray, "v 3"],
     vertex_normals: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
+    faces: Faces,
     *,
     reach_mm: float,
     least_agreement: float,

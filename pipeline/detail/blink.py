@@ -20,6 +20,8 @@ from pipeline.head_model.model import HeadModel
 from pipeline.part_labels.codes import Part
 from rig.mesh import vertex_normals
 
+Vertices = Float[np.ndarray, "v 3"]
+
 HALF, OTHERS = 0.5, (0.25, 0.75, 1.0)
 NEAR = 0.6  # of the fissure's length: points about the eye
 REACH_MM, AGREEMENT, ROBUST_MM = 6.0, 0.3, 0.3
@@ -42,7 +44,7 @@ def blinks_of(model: HeadModel) -> dict[str, int]:
 
 
 def estimate_eyelid_closure(
-    fit: Fit, model: HeadModel, base: Float[np.ndarray, "v 3"], surface: SurfacePoints, eyes: Mapping[str, EyeEvidence]
+    fit: Fit, model: HeadModel, base: Vertices, surface: SurfacePoints, eyes: Mapping[str, EyeEvidence]
 ) -> tuple[dict[str, float], frozenset[str]]:
     """Estimates how far each eye that the model can close is closed (0 open, 1 closed). Also returns the eyes whose
     lids must be bridged instead: they look closed, but no blink of the model brings its lids nearer to the points.
@@ -69,7 +71,7 @@ def estimate_eyelid_closure(
     return found, frozenset(unexplained)
 
 
-def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Float[np.ndarray, "v 3"]:
+def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Vertices:
     """Returns the displacement (full level, world frame, mm) that takes each eye from the fit's blink weight to the
     weight in ``lids``."""
     shift, places = np.zeros((model.levels["full"].count, 3)), blinks_of(model)
@@ -79,7 +81,7 @@ def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Float[
     return shift
 
 
-def _moved(fit: Fit, model: HeadModel, place: int) -> Float[np.ndarray, "v 3"]:
+def _moved(fit: Fit, model: HeadModel, place: int) -> Vertices:
     """Returns the displacement of every vertex (full level, world frame, mm) by the mode ``place`` at weight 1."""
     moved = model.levels["full"].operator @ model.modes[place].astype(float)
     return fit.world_from_head.scale * moved @ fit.world_from_head.rotation.T
@@ -93,7 +95,7 @@ def with_lids(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Fit:
     return replace(fit, coefficients=coefficients)
 
 
-def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Float[np.ndarray, "v 3"]:
+def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Vertices:
     """Returns the fitted head (full level, world frame, mm) with eigenheads and expressions only: the coefficients of
     all other modes are set to 0."""
     plain = fit.coefficients.copy()
@@ -102,12 +104,7 @@ def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Float[np.ndarray
 
 
 def _nearest_closure(
-    open_lids: Float[np.ndarray, "v 3"],
-    moved: Float[np.ndarray, "v 3"],
-    fitted: float,
-    model: HeadModel,
-    surface: SurfacePoints,
-    slit: Fissure,
+    open_lids: Vertices, moved: Vertices, fitted: float, model: HeadModel, surface: SurfacePoints, slit: Fissure
 ) -> tuple[float, float]:
     """Returns the blink weight whose lids lie nearest to the points, or ``fitted`` where too few points lie there or
     none is nearer. Also returns the misfit of half closed lids divided by that of open ones, 1 where too few points lie
@@ -131,7 +128,7 @@ def _nearest_closure(
 
 
 def _patch(
-    vertices: Float[np.ndarray, "v 3"], model: HeadModel, middle: Float[np.ndarray, " 3"], radius_mm: float
+    vertices: Vertices, model: HeadModel, middle: Float[np.ndarray, " 3"], radius_mm: float
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, "f 3"]]:
     """Returns the vertices within ``radius_mm`` of an eye's middle, and the triangles between them, numbered within
     this patch."""

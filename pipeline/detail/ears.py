@@ -20,6 +20,9 @@ from pipeline.part_labels.codes import Part
 from rig.geometry import rotation_from_vector
 from rig.mesh import vertex_normals
 
+Vector = Float[np.ndarray, " 3"]
+Vertices = Float[np.ndarray, "v 3"]
+
 ABOUT_MM = 25.0  # points that far from the ear may be its own
 BLEND_MM = 10.0  # over which the head follows
 STARTS_MM = (0.0, -9.0, 9.0)  # up and down the head, and to and fro
@@ -40,13 +43,11 @@ class Motion:
     cost: float
     scale: float
     turn: Float[np.ndarray, "3 3"]
-    shift: Float[np.ndarray, " 3"]  # mm
+    shift: Vector  # mm
     shown: int
 
 
-def with_ears_in_place(
-    vertices: Float[np.ndarray, "v 3"], model: HeadModel, surface: SurfacePoints
-) -> Float[np.ndarray, "v 3"]:
+def with_ears_in_place(vertices: Vertices, model: HeadModel, surface: SurfacePoints) -> Vertices:
     """Returns the head with each ear moved to where the points of skin show it. An ear with too few points around it
     stays.
 
@@ -75,12 +76,12 @@ def with_ears_in_place(
 
 
 def _registered(
-    vertices: Float[np.ndarray, "v 3"],
+    vertices: Vertices,
     faces: Int[np.ndarray, "f 3"],
     ear: Bool[np.ndarray, " v"],
     points: SurfacePoints,
     model: HeadModel,
-) -> Float[np.ndarray, "v 3"]:
+) -> Vertices:
     """Returns all vertices under the similarity that best fits the ear to the points about it. Returns them unchanged
     if fewer than ``MIN_SHOWN`` points show the ear itself: where hair covers the ear, the cheek before it would drag it
     along."""
@@ -105,9 +106,7 @@ def _registered(
     return best.scale * (vertices - centre) @ best.turn.T + centre + best.shift
 
 
-def _axes(
-    vertices: Float[np.ndarray, "v 3"], model: HeadModel
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+def _axes(vertices: Vertices, model: HeadModel) -> tuple[Vector, Vector]:
     """Returns the unit vectors up and ahead of the head, world frame."""
     at = {name: vertices[row] for name, row in model.landmarks.items()}
     up = at["nasion"] - at["gnathion"]
@@ -118,11 +117,7 @@ def _axes(
 
 
 def _descend(
-    target: Target,
-    ear: Bool[np.ndarray, " v"],
-    points: SurfacePoints,
-    centre: Float[np.ndarray, " 3"],
-    shift: Float[np.ndarray, " 3"],
+    target: Target, ear: Bool[np.ndarray, " v"], points: SurfacePoints, centre: Vector, shift: Vector
 ) -> Motion:
     """Computes the similarity about ``centre`` to which iterated closest points converge from one starting ``shift``
     (mm). ``target`` is the ear with its surroundings, relative to ``centre``.

@@ -29,6 +29,8 @@ from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit.patches import thinned
 from rig.mesh import vertex_normals
 
+Points = Float[np.ndarray, "n 3"]
+
 SPACING_MM = 2.5  # of the places that are asked
 EVIDENCE = 4  # rounds in which the kernel's variance is estimated
 VARIANCE_RANGE = (0.02, 4.0)
@@ -49,7 +51,7 @@ class ReadingBasis:
     expressions."""
 
     vertex: Int[np.ndarray, " n"]  # of the full level
-    mean: Float[np.ndarray, "n 3"]
+    mean: Points
     modes: Float32[np.ndarray, "m n 3"]
     eigenheads: int  # the first of them; the kernel's follow
     faces: Int[np.ndarray, "f 3"]  # about the face
@@ -117,12 +119,8 @@ def with_read_expression(
 
 
 def _solved(
-    basis: ReadingBasis,
-    place: Float[np.ndarray, "n 3"],
-    normal: Float[np.ndarray, "n 3"],
-    information: Float[np.ndarray, " n"],
-    expressions: int,
-) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"], Float[np.ndarray, "n 3"], float]:
+    basis: ReadingBasis, place: Points, normal: Points, information: Float[np.ndarray, " n"], expressions: int
+) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"], Points, float]:
     """Estimates the expression weights. Returns the weights, their deviations, the modelled places under them (head
     frame, mm) and the variance of the kernel's modes (MacKay 1992, as in ``posterior``)."""
     count = len(basis.modes)

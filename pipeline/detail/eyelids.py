@@ -22,6 +22,8 @@ from pipeline.head_model.model import HeadModel
 from rig.mesh import vertex_normals
 from rig.rig import Rig
 
+Photograph = UInt8[np.ndarray, "h w 3"]
+
 Vertices = Float[np.ndarray, "v 3"]
 
 SIDES = ("right", "left")
@@ -95,11 +97,7 @@ def eye_fissure(model: HeadModel, side: str) -> Fissure:
 
 @traced
 def measure_eye_appearance(
-    model: HeadModel,
-    vertices: Vertices,
-    images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
-    rig: Rig,
-    openings: Mapping[str, float],
+    model: HeadModel, vertices: Vertices, images: Mapping[str, Photograph], rig: Rig, openings: Mapping[str, float]
 ) -> dict[str, EyeEvidence]:
     """Measures what the photographs show between the lids of each eye (``right``, ``left``).
 
@@ -125,10 +123,7 @@ def measure_eye_appearance(
 
 
 def _facing(
-    places: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "m 3"],
-    images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
-    rig: Rig,
+    places: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "m 3"], images: Mapping[str, Photograph], rig: Rig
 ) -> list[str]:
     """Returns the names of the cameras, at most ``VIEWS``, that see the eye most frontally."""
     if not len(places) or not len(normals):
@@ -143,7 +138,7 @@ def _facing(
 
 
 def _shares(
-    image: UInt8[np.ndarray, "h w 3"], opening: Float[np.ndarray, "n 2"], skin: Float[np.ndarray, "m 2"]
+    image: Photograph, opening: Float[np.ndarray, "n 2"], skin: Float[np.ndarray, "m 2"]
 ) -> tuple[float, float] | None:
     """Returns the shares of the opening that are white and that are dark, compared with the skin about it; None where
     too little of either lies inside the photograph."""
@@ -156,7 +151,7 @@ def _shares(
     return float(white.mean()), float((light < DARK_LIGHT * skin_light).mean())
 
 
-def _colours(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 3"]:
+def _colours(image: Photograph, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 3"]:
     at = np.rint(pixels)
     inside = (at >= 0).all(axis=1) & (at < image.shape[1::-1]).all(axis=1)
     column, row = at[inside].astype(int).T

@@ -29,6 +29,9 @@ from pipeline.head_model.model import HeadModel
 from rig.geometry import cross_matrix
 from rig.mesh import vertex_normals
 
+Vertices = Float[np.ndarray, "v 3"]
+Points = Float[np.ndarray, "n 3"]
+
 DISTANCES: Mapping[str, tuple[str, str]] = {
     "head_breadth": ("euryon_right", "euryon_left"),
     "head_length": ("glabella", "opisthocranion"),
@@ -79,7 +82,7 @@ class Measurement:
         return Measurement(self.value_mm, std)
 
 
-def landmarks(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None = None) -> dict[str, Landmark]:
+def landmarks(model: HeadModel, fit: Fit, vertices: Vertices | None = None) -> dict[str, Landmark]:
     """Returns the model's landmarks on the fitted head, world frame, mm. If the head was refined beyond the fit,
     ``vertices`` is the delivered head (full level, world, mm); the standard deviations remain those of the fit."""
     names = list(model.landmarks)
@@ -95,9 +98,7 @@ def landmarks(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | N
     return {name: Landmark(points[i], std[i]) for i, name in enumerate(names)}
 
 
-def measurements(
-    model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None = None
-) -> dict[str, Measurement]:
+def measurements(model: HeadModel, fit: Fit, vertices: Vertices | None = None) -> dict[str, Measurement]:
     """Returns every distance of ``DISTANCES`` (mm) whose end points the model has, with its standard deviation. If the
     head was refined beyond the fit, ``vertices`` is the delivered head (full level, world, mm)."""
     rows = dict(model.landmarks) | _cranial_points(model, fit)
@@ -118,17 +119,14 @@ def measurements(
     return {name: Measurement(float(values[i]), float(stds[i])) for i, name in enumerate(found)}
 
 
-def _normals(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None) -> Float[np.ndarray, "v 3"]:
+def _normals(model: HeadModel, fit: Fit, vertices: Vertices | None) -> Vertices:
     """Returns the vertex normals (world frame) of the delivered head or, if None, of the fitted one."""
     head = fit.world_from_head.apply(model.vertices(fit.coefficients)) if vertices is None else vertices
     return vertex_normals(head, model.levels["full"].faces)
 
 
 def _sliding_apart(
-    units: Float[np.ndarray, "n 3"],
-    lengths_mm: Float[np.ndarray, " n"],
-    first_normals: Float[np.ndarray, "n 3"],
-    second_normals: Float[np.ndarray, "n 3"],
+    units: Points, lengths_mm: Float[np.ndarray, " n"], first_normals: Points, second_normals: Points
 ) -> Float[np.ndarray, " n"]:
     """Returns the variance of distances along ``units`` between places that slide in their tangent planes with unit
     variance. Near places slide together."""
@@ -140,9 +138,7 @@ def _sliding_apart(
     return (first**2).sum(axis=1) + (second**2).sum(axis=1) - 2.0 * alike * (first * second).sum(axis=1)
 
 
-def _points(
-    model: HeadModel, fit: Fit, vertices: np.ndarray
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 p"]]:
+def _points(model: HeadModel, fit: Fit, vertices: np.ndarray) -> tuple[Points, Float[np.ndarray, "n 3 p"]]:
     """Returns the world positions of full-level vertices, and their derivatives by the parameters in the order of
     ``Fit``."""
     place = fit.world_from_head

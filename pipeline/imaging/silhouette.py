@@ -10,6 +10,8 @@ from scipy.special import ndtri
 
 from rig.messages.message import Message
 
+Mask = Bool[np.ndarray, "h w"]
+
 CONTOUR_BLUR_PX = 1.0  # noise of a digital edge falls from 0.29 to 0.1 px; a bend of radius r shifts by 1 / (2 r)
 
 
@@ -33,17 +35,17 @@ class Silhouette:
     """Holds one camera's silhouette: the mask (True = subject) and the sub-pixel signed distance to its contour (px,
     negative inside)."""
 
-    mask: Bool[np.ndarray, "h w"]
+    mask: Mask
     distance: Float32[np.ndarray, "h w"]
     quality: ViewQuality = ViewQuality()
 
 
-def silhouette_from_mask(mask: Bool[np.ndarray, "h w"]) -> Silhouette:
+def silhouette_from_mask(mask: Mask) -> Silhouette:
     """Builds the silhouette from a given binary mask."""
     return Silhouette(mask, signed_distance(mask))
 
 
-def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+def signed_distance(mask: Mask) -> Float32[np.ndarray, "h w"]:
     """Returns sub-pixel signed distance (px) to the contour of a binary mask, negative inside. Without a contour it is
     +-(h + w), farther than any pixel.
 
@@ -63,14 +65,12 @@ def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]
     return distance.astype(np.float32)
 
 
-def _distance_transforms(
-    mask: Bool[np.ndarray, "h w"],
-) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+def _distance_transforms(mask: Mask) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Returns the distance transforms ``D(S)`` and ``D(~S)`` of a mask S (px); each is zero outside its set."""
     return _distance_transform(mask), _distance_transform(~mask)
 
 
-def _distance_transform(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+def _distance_transform(mask: Mask) -> Float32[np.ndarray, "h w"]:
     """Computes ``D(S)`` exactly, the same in every call. OpenCV's result can differ in the last bit between calls, in
     pictures of less than 16384 pixels and on one core (it then calls IPP). Squared distances between pixels are
     integers, so rounding the squares recovers them, up to 1400 px."""
@@ -79,12 +79,12 @@ def _distance_transform(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h
     return np.sqrt(np.rint(squares, out=squares), out=squares).astype(np.float32)
 
 
-def xor_cost(observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> float:
+def xor_cost(observed: Mask, model: Mask) -> float:
     """Computes the paper's eq. (4): the number of pixels in which two masks differ."""
     return float(np.count_nonzero(observed ^ model))
 
 
-def boundary_weights(observed: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+def boundary_weights(observed: Mask) -> Float32[np.ndarray, "h w"]:
     """Returns the weights ``1 / d(i, j)^2`` of eq. (5), where ``d = D(S) + D(~S)`` is the distance (px) from the
     observed contour."""
     inside, outside = _distance_transforms(observed)
@@ -92,9 +92,7 @@ def boundary_weights(observed: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "
     return (1.0 / np.maximum(inside + outside, 1.0) ** 2).astype(np.float32)
 
 
-def boundary_weighted_xor(
-    observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"], weights: Float[np.ndarray, "h w"]
-) -> float:
+def boundary_weighted_xor(observed: Mask, model: Mask, weights: Float[np.ndarray, "h w"]) -> float:
     """Computes the paper's eq. (5): the sum of ``weights`` over the pixels in which two masks differ; see
     ``boundary_weights``."""
     return float(weights[observed ^ model].sum(dtype=np.float64))

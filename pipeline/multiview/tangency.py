@@ -16,6 +16,8 @@ from pipeline.imaging.silhouette import Silhouette
 from rig.camera import Camera
 from rig.rig import Rig
 
+Vector = Float[np.ndarray, " 3"]
+
 BORDER_PX = 4.0  # a tangent this near the image border may belong to what the border has cut off
 LONGEST_SPAN = 2.0  # rad of a silhouette about the line of two centres: beyond, the epipole lies in or near it
 MIN_SLOPE = 1e-9  # rad a pixel: at the epipole a plane has no direction
@@ -56,7 +58,7 @@ def find_tangencies(silhouettes: Mapping[str, Silhouette], rig: Rig, inset_mm: f
     return found
 
 
-def pixel_mm(camera: Camera, place_world: Float[np.ndarray, " 3"]) -> float:
+def pixel_mm(camera: Camera, place_world: Vector) -> float:
     """Returns the width (mm) that a pixel covers at the distance of a point."""
     return float(np.linalg.norm(place_world - camera.centre_world)) / camera.intrinsics.fx
 
@@ -124,9 +126,7 @@ def _pair(first: _Outline, second: _Outline, one: Camera, two: Camera) -> list[T
     return found
 
 
-def epipolar_plane_axes(
-    one: Camera, two: Camera, towards: Float[np.ndarray, " 3"]
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+def epipolar_plane_axes(one: Camera, two: Camera, towards: Vector) -> tuple[Vector, Vector]:
     """Returns two unit vectors u, v (world) perpendicular to the line through both camera centres. The plane through
     this line and a ray has the angle ``arctan2(ray @ v, ray @ u)``, counted from the direction ``towards``."""
     axis = two.centre_world - one.centre_world
@@ -143,9 +143,7 @@ def rays_about(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.nd
     return camera.rays_world(around.reshape(-1, 2)).reshape(*around.shape[:-1], 3)
 
 
-def angle_slopes(
-    around: Float[np.ndarray, "*n 4 3"], u: Float[np.ndarray, " 3"], v: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "*n 2"]:
+def angle_slopes(around: Float[np.ndarray, "*n 4 3"], u: Vector, v: Vector) -> Float[np.ndarray, "*n 2"]:
     """Returns how much the angle of the epipolar plane through a pixel changes for each pixel (rad), by x and by y.
     ``around`` is the result of ``rays_about``; ``u`` and ``v`` are those of ``epipolar_plane_axes``."""
     angle = np.arctan2(around @ v, around @ u)

@@ -24,6 +24,8 @@ from rig.mesh import Mesh
 from rig.messages.message import compose
 from rig.rig import Rig
 
+Vector = Float[np.ndarray, " 3"]
+
 SPACING_MM = 3.0
 MIN_SHARE = 0.5  # of the views must see a point of the hull; where fewer look, anything could be
 
@@ -35,13 +37,13 @@ class NoHull(EigenheadError):
         super().__init__(compose("no-common-hull"))
 
 
-def hull_extent(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
+def hull_extent(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Vector, float]:
     """Returns centre (world, mm) and edge length (mm) of a cube that contains the subject, as ``mask_extent`` of the
     usable silhouettes."""
     return mask_extent({camera.name: silhouettes[camera.name].mask for camera in _believed(silhouettes, rig)}, rig)
 
 
-def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
+def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple[Vector, float]:
     """Returns the centre (world, mm) and edge length (mm) of a cube that contains what the masks show. Masks may be
     smaller than the images.
 
@@ -62,7 +64,7 @@ def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple
     return centre, float(max(diagonal * depth_of(camera, centre) / camera.intrinsics.fx for camera, diagonal in views))
 
 
-def depth_of(camera: Camera, point: Float[np.ndarray, " 3"]) -> float:
+def depth_of(camera: Camera, point: Vector) -> float:
     """Returns the distance (mm) of a point along the camera's z axis, at least 1 mm."""
     return max(1.0, float(camera.camera_from_world.apply(point)[2]))
 
@@ -96,11 +98,7 @@ def _believed(silhouettes: Mapping[str, Silhouette], rig: Rig) -> list[Camera]:
 
 
 def _field(
-    silhouettes: Mapping[str, Silhouette],
-    cameras: list[Camera],
-    centre: Float[np.ndarray, " 3"],
-    edge: float,
-    blocks: int,
+    silhouettes: Mapping[str, Silhouette], cameras: list[Camera], centre: Vector, edge: float, blocks: int
 ) -> tuple[Float32[np.ndarray, "n n n"], float]:
     """Computes the signed distance (mm) on a grid with ``COARSE * blocks + 1`` points along each side, exact only near
     the surface. Also returns the grid's step (mm)."""

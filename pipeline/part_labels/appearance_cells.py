@@ -21,6 +21,8 @@ from rig.colour_space import linear_from_srgb
 from rig.mesh import Mesh
 from rig.rig import Rig
 
+Vector = Float[np.ndarray, " 3"]
+
 BALANCE_VERTICES = 3000  # of the face, enough to tell the cameras' gains
 CHEEK_INSIDE_MM, CHEEK_MARGIN_MM = 12.0, 3.0  # from the border of the face, and above the nose's lower end
 DOWNWARD = (-0.25, -0.5)  # cosine between normal and up: below jaw and chin, where light from above leaves skin dark
@@ -43,9 +45,9 @@ class HeadGuide:
     cheek: Float[np.ndarray, " v"]  # 1 on cheeks and nose, which no beard and no fringe reaches, else 0
     feature: Float[np.ndarray, " v"]  # 0 to 1: brows, eyes, lips and nostrils, whose colours are not those of skin
     underside: Float[np.ndarray, " v"]  # 0 to 1: below jaw, chin and nose, in shadow
-    up: Float[np.ndarray, " 3"]  # unit, world
-    chin: Float[np.ndarray, " 3"]
-    middle: Float[np.ndarray, " 3"]
+    up: Vector  # unit, world
+    chin: Vector
+    middle: Vector
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,9 +71,7 @@ class Cells:
     outside_mm: Float32[np.ndarray, "r c"]  # from the head's outline, 0 within
 
 
-def head_guide(
-    mesh: Mesh, face_region: Bool[np.ndarray, " v"], landmarks: Mapping[str, Float[np.ndarray, " 3"]]
-) -> HeadGuide:
+def head_guide(mesh: Mesh, face_region: Bool[np.ndarray, " v"], landmarks: Mapping[str, Vector]) -> HeadGuide:
     """Computes the guide of a fitted head. ``landmarks`` (world) must hold the corners of eyes and mouth, glabella,
     subnasale, stomion and gnathion."""
     vertices, chin = mesh.vertices, landmarks["gnathion"]
@@ -104,9 +104,7 @@ def head_guide(
     )
 
 
-def _features(
-    vertices: Float[np.ndarray, "v 3"], marks: Mapping[str, Float[np.ndarray, " 3"]], up: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, " v"]:
+def _features(vertices: Float[np.ndarray, "v 3"], marks: Mapping[str, Vector], up: Vector) -> Float[np.ndarray, " v"]:
     found = np.zeros(len(vertices))
     spots = [(marks["subnasale"], 9.0)]
     for side in ("right", "left"):
@@ -148,7 +146,7 @@ def make_cells(
     return map_in_threads(cells, len(cameras))
 
 
-def _cell_px(camera: Camera, at_world: Float[np.ndarray, " 3"], cell_mm: float) -> int:
+def _cell_px(camera: Camera, at_world: Vector, cell_mm: float) -> int:
     depth = float(camera_depths(camera, at_world[None])[0])
     # A head that lies on the camera, or before it, has cells as large as the picture.
     largest = min(camera.intrinsics.width, camera.intrinsics.height)

@@ -33,6 +33,9 @@ from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.rig import Rig
 
+Plane = Float32[np.ndarray, "h w"]
+Photograph = UInt8[np.ndarray, "h w 3"]
+
 THREADS = 4  # a view of four megapixels takes half a gigabyte while it is resampled
 
 
@@ -93,7 +96,7 @@ def _write_view(folder: Path, dataset: ViewDataset, camera: Camera, pinholes: Ri
     write_image(folder / layout.masks / file, mask)
 
 
-def _subject_share(dataset: ViewDataset, name: str) -> Float32[np.ndarray, "h w"]:
+def _subject_share(dataset: ViewDataset, name: str) -> Plane:
     """Returns the share of the subject in every pixel, 0 to 1: of a mask in the capture as it is, else of the sub-pixel
     contour that was found."""
     capture = dataset.capture
@@ -104,9 +107,7 @@ def _subject_share(dataset: ViewDataset, name: str) -> Float32[np.ndarray, "h w"
     return np.clip(np.float32(0.5) - dataset.silhouettes[name].distance, 0.0, 1.0)
 
 
-def _before_white(
-    picture: UInt8[np.ndarray, "h w 3"], share: Float[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]
-) -> UInt8[np.ndarray, "h w 3"]:
+def _before_white(picture: Photograph, share: Float[np.ndarray, "h w"] | Plane) -> Photograph:
     weight = share[:, :, None]
     return np.rint(picture * weight + 255.0 * (1.0 - weight)).astype(np.uint8)
 
@@ -123,9 +124,7 @@ def pinhole_of(lens: Intrinsics, *, centred: bool = False) -> Intrinsics:
     return Intrinsics(lens.width, lens.height, focal, focal, 0.5 * (lens.width - 1), 0.5 * (lens.height - 1))
 
 
-def undistorted_picture(
-    picture: UInt8[np.ndarray, "h w 3"], lens: Intrinsics, pinhole: Intrinsics
-) -> UInt8[np.ndarray, "y x 3"]:
+def undistorted_picture(picture: Photograph, lens: Intrinsics, pinhole: Intrinsics) -> UInt8[np.ndarray, "y x 3"]:
     """Returns the picture that ``pinhole`` would have taken instead; black where the lens shows nothing."""
     if lens == pinhole:
         return picture
@@ -137,9 +136,7 @@ def undistorted_picture(
     return np.clip(np.rint(np.stack(channels, axis=2)), 0, 255).astype(np.uint8)
 
 
-def undistorted_share(
-    share: Float32[np.ndarray, "h w"], lens: Intrinsics, pinhole: Intrinsics
-) -> Float32[np.ndarray, "y x"]:
+def undistorted_share(share: Plane, lens: Intrinsics, pinhole: Intrinsics) -> Float32[np.ndarray, "y x"]:
     """Returns a mask's share of the subject in every pixel (0 to 1) in the pinhole's picture; 0 where the lens shows
     nothing."""
     if lens == pinhole:

@@ -19,6 +19,8 @@ from pipeline.stereo.crop_kernels import fill_lens_map
 from rig.camera import Camera, Intrinsics
 from rig.rig import Rig
 
+Photograph = UInt8[np.ndarray, "h w 3"]
+
 LEVELS = 4  # full, half, quarter, eighth
 MARGIN_PX = 12  # about the subject: windows and the defocused edge
 UNSEEN_PX = -1e6  # signed distance beyond the photograph's edge: the subject may go on there
@@ -43,7 +45,7 @@ class Crop:
     the one before."""
 
     levels: tuple[Level, ...]
-    colour: UInt8[np.ndarray, "h w 3"]
+    colour: Photograph
     mask: Float32[np.ndarray, "h w"]  # coverage, 0 to 1; 0 beyond the photograph
 
     @property
@@ -53,7 +55,7 @@ class Crop:
 
 
 def make_crops(
-    images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+    images: Mapping[str, Photograph],
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
     *,
@@ -75,11 +77,7 @@ def make_crops(
 
 
 def _crop(
-    camera: Camera,
-    image: UInt8[np.ndarray, "h w 3"],
-    silhouette: Silhouette,
-    pixel_mm: float,
-    at_world: Float[np.ndarray, " 3"],
+    camera: Camera, image: Photograph, silhouette: Silhouette, pixel_mm: float, at_world: Float[np.ndarray, " 3"]
 ) -> Crop:
     depth = max(1.0, float(camera.camera_from_world.apply(at_world)[2]))
     scale = min(1.0, depth / camera.intrinsics.fx / pixel_mm)

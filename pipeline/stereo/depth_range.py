@@ -20,6 +20,8 @@ from pipeline.stereo.depth_range_kernels import find_depth_range
 from pipeline.stereo.stack import Stack
 from rig.mesh import Mesh
 
+Plane = Float32[np.ndarray, "h w"]
+
 REACH_MM = 90.0  # behind the hull's front where the fitted head bounds nothing: hair is 60 mm thick at most
 BEHIND_HEAD_MM = 6.0  # how far the surface may lie behind the fitted head: its error beside the face
 BEFORE_HEAD_MM = 60.0  # depth of what stands before the fitted head: hair, a beard, a cap's brim
@@ -37,8 +39,8 @@ class DepthRange:
     """Holds the range of depths to search in one view: at each pixel the smallest and the largest depth (mm), 0 where
     nothing is searched, and the slopes of both bounds by x and y (mm per pixel)."""
 
-    near: Float32[np.ndarray, "h w"]
-    far: Float32[np.ndarray, "h w"]
+    near: Plane
+    far: Plane
     slopes: Float32[np.ndarray, "h w 4"]  # of near by x and y, of far by x and y
 
 
@@ -68,7 +70,7 @@ def find_depth_ranges(
 
 def _bounds(
     crop: Crop, least: Stack, view: int, head_world: Mesh | None, extent: tuple[Float[np.ndarray, " 3"], float]
-) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+) -> tuple[Plane, Plane]:
     """Returns the nearest and farthest depth (mm) of each pixel at the least size; 0 where no depth is possible."""
     camera = crop.levels[-1].camera
     centre, edge = extent
@@ -92,12 +94,7 @@ def _bounds(
     return near, far
 
 
-def _bound_by_head(
-    near: Float32[np.ndarray, "h w"],
-    far: Float32[np.ndarray, "h w"],
-    room: Bool[np.ndarray, "h w"],
-    head: Float[np.ndarray, "h w"],
-) -> None:
+def _bound_by_head(near: Plane, far: Plane, room: Bool[np.ndarray, "h w"], head: Float[np.ndarray, "h w"]) -> None:
     """Narrows the bounds in place to depths near the fitted head, whose depths are ``head`` (mm, infinite beside it).
 
     Cameras that all stand on one side leave a visual hull that begins decimetres before the face. Then the bounds come
@@ -114,7 +111,7 @@ def _bound_by_head(
     far[seen] = np.minimum(far[seen], head[seen] + BEHIND_HEAD_MM)
 
 
-def _enlarged(near: Float32[np.ndarray, "h w"], far: Float32[np.ndarray, "h w"], stack: Stack, view: int) -> DepthRange:
+def _enlarged(near: Plane, far: Plane, stack: Stack, view: int) -> DepthRange:
     """Returns the bounds smoothed, enlarged to the size of ``stack`` and extended over every pixel of the subject."""
     room = near > 0.0
     width, height = (int(side) for side in stack.size[view])
@@ -131,7 +128,7 @@ def _enlarged(near: Float32[np.ndarray, "h w"], far: Float32[np.ndarray, "h w"],
     return DepthRange(bounds[0], bounds[1], np.stack(slopes, axis=2).astype(np.float32))
 
 
-def _extended(values: Float32[np.ndarray, "h w"], room: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+def _extended(values: Plane, room: Bool[np.ndarray, "h w"]) -> Plane:
     """Returns the values blurred within the room; pixels outside take the value of the nearest pixel inside."""
     weight = cv2.GaussianBlur(room.astype(np.float32), (0, 0), BOUND_BLUR_PX)
     smooth = cv2.GaussianBlur(np.where(room, values, np.float32(0.0)), (0, 0), BOUND_BLUR_PX) / np.maximum(weight, 1e-3)

@@ -35,6 +35,8 @@ from rig.progress import Progress
 from rig.render.compute import ComputeDevice
 from rig.rig import Rig
 
+Plane = Float32[np.ndarray, "h w"]
+
 MAX_DEVIATION_MM = 2.0  # a depth with a larger standard deviation is discarded
 OUTLINE_PX = 1.0  # no depth nearer to the background: the edge is blurred over it
 AGREE_MM = 1.5  # two views agree where their surfaces are nearer than that ...
@@ -79,9 +81,7 @@ def depth_maps(crops: Sequence[Crop], stack: Stack, fields: Sequence[Field]) -> 
     return tuple(map_in_threads(work, len(crops)))
 
 
-def stated_deviation(
-    camera: Camera, field: Field, agreeing: UInt8[np.ndarray, "h w"], apart: Float32[np.ndarray, "h w"]
-) -> Float32[np.ndarray, "h w"]:
+def stated_deviation(camera: Camera, field: Field, agreeing: UInt8[np.ndarray, "h w"], apart: Plane) -> Plane:
     """Returns the standard deviation (mm) of the depth at each pixel, along the ray.
 
     ``camera``: of the view. ``field``: depths of the view. ``agreeing``: how many other views have the surface at the
@@ -96,11 +96,7 @@ def stated_deviation(
 
 
 def _depth_map(
-    crop: Crop,
-    field: Field,
-    known: Bool[np.ndarray, "h w"],
-    deviation: Float32[np.ndarray, "h w"],
-    agreeing: UInt8[np.ndarray, "h w"],
+    crop: Crop, field: Field, known: Bool[np.ndarray, "h w"], deviation: Plane, agreeing: UInt8[np.ndarray, "h w"]
 ) -> DepthMap:
     zero = np.float32(0.0)
     return DepthMap(

@@ -20,6 +20,8 @@ from pipeline.stereo.stack import SHADES, Stack
 from pipeline.stereo.sweep_kernels import sweep_view
 from rig.render.compute import ComputeDevice, DeviceArray
 
+Plane = Float32[np.ndarray, "h w"]
+
 SHADERS = Path(__file__).with_name("shaders")
 GROUP = 8  # invocations across and down of one group, as in shaders/matching.glsl
 
@@ -27,9 +29,9 @@ GROUP = 8  # invocations across and down of one group, as in shaders/matching.gl
 class Planes(NamedTuple):
     """Holds the present plane of each pixel of a view, and its matching cost. The arrays are changed in place."""
 
-    depth: Float32[np.ndarray, "h w"]  # mm; 0 where there is none
+    depth: Plane  # mm; 0 where there is none
     slopes: Float32[np.ndarray, "h w 2"]  # by x and y, mm a pixel
-    cost: Float32[np.ndarray, "h w"]  # below 0: not yet known
+    cost: Plane  # below 0: not yet known
     fresh: Bool[np.ndarray, "h w"]  # neighbours have not tried it yet
 
 
@@ -52,9 +54,7 @@ class Matcher(Protocol):
         chequerboard (``parity`` 0 or 1). Changes ``planes`` in place; ``refine_kernels.propagate`` says how."""
         ...
 
-    def slide(
-        self, most_px: float, depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"]
-    ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    def slide(self, most_px: float, depth: Plane, slopes: Float32[np.ndarray, "h w 2"]) -> tuple[Plane, Plane, Plane]:
         """Moves each plane along its ray by a step of least squares, at most ``most_px`` pixels in the neighbours'
         images. Returns the new depths (mm), their information (mm^-2), and how alike the windows are (0 to 1)."""
         ...
@@ -126,9 +126,7 @@ class LoopMatcher:
             self._sight, self._scratch, parity, steps, same_mm, planes.fresh, planes.depth, planes.slopes, planes.cost
         )
 
-    def slide(
-        self, most_px: float, depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"]
-    ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    def slide(self, most_px: float, depth: Plane, slopes: Float32[np.ndarray, "h w 2"]) -> tuple[Plane, Plane, Plane]:
         """Moves planes by a step of least squares, as ``Matcher.slide``."""
         place_mm, information, likeness = np.empty_like(depth), np.empty_like(depth), np.empty_like(depth)
         slide(self._sight, self._scratch, most_px, depth, slopes, place_mm, information, likeness)
@@ -173,9 +171,7 @@ class ShaderMatcher:
         )  # fmt: skip
         planes.fresh[:] = flags != 0
 
-    def slide(
-        self, most_px: float, depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"]
-    ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    def slide(self, most_px: float, depth: Plane, slopes: Float32[np.ndarray, "h w 2"]) -> tuple[Plane, Plane, Plane]:
         """Moves planes by a step of least squares, as ``Matcher.slide``."""
         results = np.empty((*depth.shape, 4), np.float32)
         self._run("slide.comp", [depth, slopes, results], [2], most_px=most_px)

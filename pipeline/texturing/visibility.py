@@ -21,6 +21,9 @@ from pipeline.texturing.visibility_kernels import POOR, sample_colours, visibili
 from rig.camera import Camera
 from rig.colour_space import linear_from_srgb
 
+Vertices = Float[np.ndarray, "v 3"]
+Photograph = UInt8[np.ndarray, "h w 3"]
+
 CONTOUR_MARGIN_PX = 2.0  # nothing is sampled nearer to the background: 3 sigma of a 0.7 px defocus
 FOOTPRINT_PX = 0.45  # sigma of the sampling window; 0.7 loses 0.3 dB of detail, 0.4 lets 1.5 dB more noise
 HIDDEN_MM = 1.5  # a nearer surface hides a vertex beyond this: a fit's own error, and no nose is thinner
@@ -43,11 +46,11 @@ class Sight:
 
 def see_points(
     camera: Camera,
-    image: UInt8[np.ndarray, "h w 3"],
+    image: Photograph,
     silhouette: Silhouette,
     depth: Float32[np.ndarray, "h w"],
-    points: Float[np.ndarray, "v 3"],
-    normals: Float[np.ndarray, "v 3"],
+    points: Vertices,
+    normals: Vertices,
 ) -> Sight:
     """Returns the weight and linear colour that ``camera`` gives each point of a surface (world frame, mm). ``depth``
     is the surface's depth map in that camera."""
@@ -69,11 +72,7 @@ def unclipped(colours: Float32[np.ndarray, "v 3"]) -> Float32[np.ndarray, " v"]:
 
 
 def see_weights(
-    camera: Camera,
-    silhouette: Silhouette,
-    depth: Float32[np.ndarray, "h w"],
-    points: Float[np.ndarray, "v 3"],
-    normals: Float[np.ndarray, "v 3"],
+    camera: Camera, silhouette: Silhouette, depth: Float32[np.ndarray, "h w"], points: Vertices, normals: Vertices
 ) -> Float32[np.ndarray, " v"]:
     """Returns how well ``camera`` sees each point of a surface (world frame, mm); 0 where it does not. ``depth`` is the
     surface's depth map in that camera."""
@@ -89,9 +88,7 @@ def see_weights(
     )
 
 
-def sharpened(
-    image: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], amount: float
-) -> UInt8[np.ndarray, "h w 3"]:
+def sharpened(image: Photograph, inside: Bool[np.ndarray, "h w"], amount: float) -> Photograph:
     """Sharpens a photograph where it has detail, which removes part of the blur of the lens and of the sampling window.
     ``amount`` is that of an unsharp mask.
 

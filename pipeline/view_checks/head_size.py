@@ -31,6 +31,9 @@ from rig.errors import EigenheadError
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
+Vector = Float[np.ndarray, " 3"]
+Mask = Bool[np.ndarray, "h w"]
+
 HEAD_MM = 200.0  # median diameter of 32 heads with hair, 18 captures of the studio and 5 of a path tracer (174 to 230)
 WARNED_MM = (145.0, 270.0)  # bald heads of adults have 161 and more, hair 40 mm thick 245 at most
 REFUSED_MM = (122.0, 350.0)  # a bald child of three has 130, hair 60 mm thick 310 at most; twice a bald head has 322
@@ -66,7 +69,7 @@ def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig, face: Face
 
 
 def _diameters_mm(
-    solid: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig, up_world: Float[np.ndarray, " 3"], face: FaceEvidence | None
+    solid: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig, up_world: Vector, face: FaceEvidence | None
 ) -> list[float]:
     """Returns the head's diameter (mm) in each view whose disc lies where the others, or the face, say that the head
     is; none if these are less than ``MIN_MEETING`` of the views that show a crown."""
@@ -98,10 +101,7 @@ def find_low_crowns(
 
 
 def _low_crowns(
-    solid: Mapping[str, Bool[np.ndarray, "_ _"]],
-    rig: Rig,
-    middle_world: Float[np.ndarray, " 3"],
-    up_world: Float[np.ndarray, " 3"],
+    solid: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig, middle_world: Vector, up_world: Vector
 ) -> dict[str, float]:
     heights = {name: crown_height_mm(mask, rig[name], middle_world, up_world) for name, mask in solid.items()}
     known = {name: height for name, height in heights.items() if height is not None}
@@ -111,9 +111,7 @@ def _low_crowns(
     return {name: others[name] - known[name] for name in known if others[name] - known[name] > MAX_LOW_MM}
 
 
-def crown_height_mm(
-    mask: Bool[np.ndarray, "h w"], camera: Camera, middle_world: Float[np.ndarray, " 3"], up_world: np.ndarray
-) -> float | None:
+def crown_height_mm(mask: Mask, camera: Camera, middle_world: Vector, up_world: np.ndarray) -> float | None:
     """Returns the distance (mm) from the middle of the skull to the plane through the camera that touches the mask from
     above; None if the mask ends at the picture's border there, or shows nothing."""
     middle, above = camera.project(np.stack([middle_world, middle_world + 50.0 * up_world]))
@@ -135,7 +133,7 @@ def crown_height_mm(
     return float(normal @ (camera.centre_world - middle_world))
 
 
-def _mm_per_px(camera: Camera, point_world: Float[np.ndarray, " 3"]) -> float:
+def _mm_per_px(camera: Camera, point_world: Vector) -> float:
     """Returns the width (mm) of a pixel in the plane of a point parallel to the picture."""
     return float(camera.camera_from_world.apply(point_world)[2]) / camera.intrinsics.fx
 
@@ -194,7 +192,7 @@ def _size_message(diameter_mm: float) -> Message:
     return compose("head-times-as-large", ratio=ratio, diameter_mm=diameter_mm)
 
 
-def crown_disc(mask: Bool[np.ndarray, "h w"], turns: int) -> tuple[Float[np.ndarray, " 2"], float] | None:
+def crown_disc(mask: Mask, turns: int) -> tuple[Float[np.ndarray, " 2"], float] | None:
     """Returns the middle (px) and diameter (px) of the head in a mask that is upright after ``turns`` quarter turns
     (anticlockwise); None if its crown is not inside the picture."""
     upright = np.rot90(mask, turns)
@@ -218,20 +216,20 @@ def crown_disc(mask: Bool[np.ndarray, "h w"], turns: int) -> tuple[Float[np.ndar
     return np.array(place[turns], float), 2.0 * float(way[row])
 
 
-def _without_strands(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def _without_strands(mask: Mask) -> Mask:
     """Returns the mask without parts thinner than ``STRAND_SHARE`` of its size."""
     side = max(3, 2 * round(STRAND_SHARE * float(np.sqrt(mask.sum())) / 2) + 1)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, disc).view(bool)
 
 
-def turns_to_upright(camera: Camera, up_world: Float[np.ndarray, " 3"]) -> int:
+def turns_to_upright(camera: Camera, up_world: Vector) -> int:
     """Returns the number of quarter turns (anticlockwise) after which up is up in the camera's picture."""
     right, down = (camera.camera_from_world.rotation @ up_world)[:2]
     return int(np.argmax([-down, right, down, -right]))  # up is at the top, right, bottom and left
 
 
-def _middle(discs: Discs, rig: Rig) -> Float[np.ndarray, " 3"] | None:
+def _middle(discs: Discs, rig: Rig) -> Vector | None:
     """Returns the point (world) on which most discs lie: the best of those where two rays pass each other, and then the
     one nearest to the rays through all discs that it lies on. One view with a wrong outline must not move it."""
     if len(discs) < MIN_VIEWS:

@@ -21,6 +21,8 @@ from rig.formats.meshes.markups import Axes, axes_turn
 from rig.geometry import RigidTransform
 from rig.messages.message import compose
 
+Vector = Float[np.ndarray, " 3"]
+
 Plane = Literal["head", "frankfurt"]
 PLANES: tuple[Plane, ...] = ("head", "frankfurt")
 POINTS = ("porion_right", "porion_left", "orbitale_right", "orbitale_left")
@@ -53,9 +55,7 @@ def head_axes(measured: Measured, axes: Axes) -> AnatomicalFrame:
     return AnatomicalFrame(axes, "head", turn @ measured.head_from_world, {})
 
 
-def frankfurt_axes(
-    measured: Measured, axes: Axes, marked: Mapping[str, Float[np.ndarray, " 3"]] | None = None
-) -> AnatomicalFrame:
+def frankfurt_axes(measured: Measured, axes: Axes, marked: Mapping[str, Vector] | None = None) -> AnatomicalFrame:
     """Returns the patient's axes in the Frankfurt plane. Raises InputError if points lie where no head has them.
 
     Args:
@@ -93,9 +93,7 @@ def frankfurt_axes(
     )
 
 
-def _plane_points(
-    measured: Measured, marked: Mapping[str, Float[np.ndarray, " 3"]]
-) -> tuple[dict[str, Float[np.ndarray, " 3"]], dict[str, str]]:
+def _plane_points(measured: Measured, marked: Mapping[str, Vector]) -> tuple[dict[str, Vector], dict[str, str]]:
     """Returns the four points (world frame) and where each comes from. Raises InputError for heads without the
     landmarks that stand for those that nobody marked."""
     points, sources = dict(marked), dict.fromkeys(marked, "marked")
@@ -120,7 +118,7 @@ def _plane_points(
     return points, sources
 
 
-def _below_eye(measured: Measured, side: str) -> Float[np.ndarray, " 3"]:
+def _below_eye(measured: Measured, side: str) -> Vector:
     """Returns the point straight below an eye in the head frame, as deep as the skin there (world frame)."""
     corners = [measured.landmarks[f"{corner}_{side}"] for corner in ("exocanthion", "endocanthion")]
     target = measured.head_from_world.apply(np.mean(corners, axis=0)) - (0.0, ORBITALE_BELOW_EYE_MM, 0.0)

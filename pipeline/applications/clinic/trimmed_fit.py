@@ -16,6 +16,9 @@ from pipeline.geometry.registration.rigid import Counterparts, fit_motion, motio
 from pipeline.geometry.surface_index import Hits, SurfaceIndex
 from rig.geometry import RigidTransform, Similarity
 
+PerPoint = Float[np.ndarray, " n"]
+PointFlags = Bool[np.ndarray, " n"]
+
 TUKEY = 4.685  # standard deviations at which a point no longer counts: 95 % efficient with normal errors
 MIN_STD_MM = 0.01
 MAX_REACH_MM, MIN_REACH_MM = 20.0, 2.0  # of counterparts, at first and in the end
@@ -33,7 +36,7 @@ class Patch:
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
-    areas: Float[np.ndarray, " n"]
+    areas: PerPoint
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,8 +49,8 @@ class TrimmedFit:
     """
 
     motion: RigidTransform
-    residual_mm: Float[np.ndarray, " n"]
-    weights: Float[np.ndarray, " n"]
+    residual_mm: PerPoint
+    weights: PerPoint
     std_mm: float
     centre: Float[np.ndarray, " 3"]
     covariance: Float[np.ndarray, "6 6"]
@@ -57,19 +60,14 @@ class TrimmedFit:
         """Returns the share of the points that count."""
         return float(np.mean(self.weights > 0.0))
 
-    def std_along(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def std_along(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> PerPoint:
         """Returns how far the motion's error moves points on the surface along normals: standard deviations, mm."""
         jacobian = motion_columns(points - self.centre, normals)
         return np.sqrt(np.einsum("np,pq,nq->n", jacobian, self.covariance, jacobian))
 
 
 def trimmed_fit(
-    patch: Patch,
-    surface: SurfaceIndex,
-    start: RigidTransform,
-    *,
-    share: float,
-    beside: Callable[[Hits], Bool[np.ndarray, " n"]],
+    patch: Patch, surface: SurfaceIndex, start: RigidTransform, *, share: float, beside: Callable[[Hits], PointFlags]
 ) -> TrimmedFit | None:
     """Returns the motion that lays a patch on a surface, None if fewer than ``MIN_POINTS`` have a counterpart there.
 
@@ -116,9 +114,9 @@ class _Met:
     surface's normals (positive where the points lie outside), the weights, and the deviation of those that count."""
 
     hits: Hits
-    valid: Bool[np.ndarray, " n"]
-    residual: Float[np.ndarray, " n"]
-    weights: Float[np.ndarray, " n"]
+    valid: PointFlags
+    residual: PerPoint
+    weights: PerPoint
     std_mm: float
 
 
@@ -130,7 +128,7 @@ def _met(
     reach: float,
     *,
     share: float,
-    beside: Callable[[Hits], Bool[np.ndarray, " n"]],
+    beside: Callable[[Hits], PointFlags],
 ) -> _Met | None:
     """Returns what the points meet where the motion brings them, None if fewer than ``MIN_POINTS`` do."""
     normals = patch.normals @ motion.rotation.T
@@ -143,9 +141,7 @@ def _met(
     return _Met(hits, valid, residual, *_weights(residual, valid, share))
 
 
-def _weights(
-    residual: Float[np.ndarray, " n"], valid: Bool[np.ndarray, " n"], share: float
-) -> tuple[Float[np.ndarray, " n"], float]:
+def _weights(residual: PerPoint, valid: PointFlags, share: float) -> tuple[PerPoint, float]:
     """Returns a weight for each point, and the standard deviation (mm) of those that count."""
     away = np.abs(residual)
     kept = valid & (away <= np.quantile(away[valid], share))

@@ -15,6 +15,8 @@ from pipeline.applications.templates.pivots import EYE_RADIUS_MM, Points
 from rig.geometry import rotation_from_vector
 from rig.mesh import Mesh, boundary_edges
 
+Places = Float[np.ndarray, "t 3"]
+
 CORNEA_MM, LIMBUS_MM, PUPIL_MM = 7.8, 5.9, 2.0
 GAP_MM = 0.15  # between lids and ball: what a flat triangle of 4 mm lies below a ball
 REACH_MM = 20.0  # of the lids about the ball's centre
@@ -113,7 +115,7 @@ def turn_to(gaze: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def placed_eyeballs(
-    mesh: Float[np.ndarray, "t 3"],
+    mesh: Places,
     triangles: Int[np.ndarray, "g 3"],
     landmarks: Points,
     centres: Mapping[str, Float[np.ndarray, " 3"]],
@@ -140,7 +142,7 @@ def placed_eyeballs(
     return out
 
 
-def _is_open(mesh: Float[np.ndarray, "t 3"], triangles: Int[np.ndarray, "g 3"], landmarks: Points, side: str) -> bool:
+def _is_open(mesh: Places, triangles: Int[np.ndarray, "g 3"], landmarks: Points, side: str) -> bool:
     """Tells whether the mesh has a border near the middle of an eye, as lids about an open eye have."""
     outer, inner = landmarks[f"exocanthion_{side}"], landmarks[f"endocanthion_{side}"]
     border = mesh[np.unique(boundary_edges(triangles))]
@@ -148,15 +150,13 @@ def _is_open(mesh: Float[np.ndarray, "t 3"], triangles: Int[np.ndarray, "g 3"], 
     return bool(away.min(initial=np.inf) < OPEN_SHARE * np.linalg.norm(outer - inner))
 
 
-def _near(
-    mesh: Float[np.ndarray, "t 3"], triangles: Int[np.ndarray, "g 3"], centre: Float[np.ndarray, " 3"]
-) -> Bool[np.ndarray, " g"]:
+def _near(mesh: Places, triangles: Int[np.ndarray, "g 3"], centre: Float[np.ndarray, " 3"]) -> Bool[np.ndarray, " g"]:
     """Tells which triangles lie about an eye and before its centre."""
     near = (np.linalg.norm(mesh - centre, axis=1) < REACH_MM) & (mesh[:, 2] > centre[2] - BACK_MM)
     return near[triangles].all(axis=1)
 
 
-def _samples(mesh: Float[np.ndarray, "t 3"], triangles: Int[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 7 3"]:
+def _samples(mesh: Places, triangles: Int[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 7 3"]:
     """Returns points of each triangle: corners, middles of edges, and the middle."""
     corners = mesh[triangles]
     middles = 0.5 * (corners + np.roll(corners, -1, axis=1))
@@ -172,11 +172,8 @@ def _depths(eyeball: Eyeball, points: Float[np.ndarray, "g 7 3"]) -> Float[np.nd
 
 
 def lifted(
-    mesh: Float[np.ndarray, "t 3"],
-    triangles: Int[np.ndarray, "g 3"],
-    displacement: Float[np.ndarray, "t 3"],
-    eyeballs: Mapping[str, Eyeball],
-) -> Float[np.ndarray, "t 3"]:
+    mesh: Places, triangles: Int[np.ndarray, "g 3"], displacement: Places, eyeballs: Mapping[str, Eyeball]
+) -> Places:
     """Returns a shape's displacement (mm) with lids lifted off the eyeballs at ``WEIGHTS``; all else is kept."""
     out = displacement
     for eyeball in eyeballs.values():

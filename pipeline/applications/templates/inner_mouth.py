@@ -23,6 +23,8 @@ from pipeline.head_model.visemes import VISEMES, mixed
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 
+Places = Float[np.ndarray, "t 3"]
+
 PACK = Path(__file__).parents[2] / "head_model" / "packs" / "inner_mouth.npz"
 PARTS = ("teeth_upper", "teeth_lower", "tongue")
 ANCHORS = (
@@ -70,7 +72,7 @@ WITH_JAW = ("teeth_lower", "tongue")
 TONGUE_OUT = "tongueOut"
 OPENED = ("mouthClose", TONGUE_OUT)  # shapes that are meant for an open jaw: as far as they are, and wholly
 Absence = Literal["own-parts", "mouth-sealed", "no-room"]
-Shapes = Mapping[str, Float[np.ndarray, "t 3"]]
+Shapes = Mapping[str, Places]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +99,7 @@ def jaw_weight(shape: str, weight: float) -> float:
 
 
 def placed_inner_mouth(
-    mesh: Float[np.ndarray, "t 3"],
+    mesh: Places,
     triangles: Int[np.ndarray, "g 3"],
     shapes: Shapes,
     landmarks: Points,
@@ -139,7 +141,7 @@ def _shaded(part: Mesh) -> UInt8[np.ndarray, "n 3"]:
     return np.asarray(light[:, None] * part.colours, np.uint8)
 
 
-def _has_own(mesh: Float[np.ndarray, "t 3"], loose: Int[np.ndarray, " t"], parts: Mapping[str, Mesh]) -> bool:
+def _has_own(mesh: Places, loose: Int[np.ndarray, " t"], parts: Mapping[str, Mesh]) -> bool:
     """Tells whether a part of the mesh's own lies where teeth would."""
     inside = np.concatenate([part.vertices for part in parts.values()])
     low, high = inside.min(axis=0), inside.max(axis=0)
@@ -163,7 +165,7 @@ def _moving(
 
 
 def _about(
-    mesh: Float[np.ndarray, "t 3"], triangles: Int[np.ndarray, "g 3"], inner: InnerMouth, margin_mm: float = ABOUT_MM
+    mesh: Places, triangles: Int[np.ndarray, "g 3"], inner: InnerMouth, margin_mm: float = ABOUT_MM
 ) -> Int[np.ndarray, " r"]:
     """Returns which triangles lie about the parts, or where the jaw takes them."""
     points = np.concatenate([inner.posed("jawOpen", weight)[name] for name in inner.parts for weight in (0.0, 1.0)])
@@ -173,10 +175,7 @@ def _about(
 
 
 def meeting_triangles(
-    mesh: Float[np.ndarray, "t 3"],
-    triangles: Int[np.ndarray, "g 3"],
-    vertices: Mapping[str, Float[np.ndarray, "n 3"]],
-    inner: InnerMouth,
+    mesh: Places, triangles: Int[np.ndarray, "g 3"], vertices: Mapping[str, Float[np.ndarray, "n 3"]], inner: InnerMouth
 ) -> Bool[np.ndarray, " g"]:
     """Tells which triangles of a mesh some of the parts cross, whose vertices are given."""
     points = np.concatenate([vertices[name] for name in inner.parts])
@@ -198,9 +197,7 @@ def meeting_triangles(
     return out
 
 
-def _meets(
-    mesh: Float[np.ndarray, "t 3"], triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth
-) -> bool:
+def _meets(mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth) -> bool:
     """Tells whether the mesh meets a part while the jaw opens."""
     about = triangles[_about(mesh, triangles, inner)]
     opened = shapes.get("jawOpen", np.zeros_like(mesh))
@@ -210,9 +207,7 @@ def _meets(
     )
 
 
-def _is_covered(
-    mesh: Float[np.ndarray, "t 3"], triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth
-) -> bool:
+def _is_covered(mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth) -> bool:
     """Tells whether the mesh hides the gap between the front teeth although the jaw is open: its lips do not part."""
     if "jawOpen" not in shapes:
         return True
@@ -229,8 +224,8 @@ def _is_covered(
 
 
 def kept_off_teeth(
-    mesh: Float[np.ndarray, "t 3"], triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth
-) -> dict[str, Float[np.ndarray, "t 3"]]:
+    mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth
+) -> dict[str, Places]:
     """Returns shapes (mm) whose lips are lifted off the teeth at ``WEIGHTS``; all else is kept."""
     if not inner.parts:
         return dict(shapes)

@@ -15,6 +15,8 @@ from jaxtyping import Float
 
 from rig.geometry import RigidTransform, rotation_from_vector
 
+Vertices = Float[np.ndarray, "v 3"]
+
 HINGE_MM = 13.0
 EYE_RADIUS_MM, EYE_REACH_MM = 12.0, 20.0  # an eyeball's centre is no farther from the middle between the eye's corners
 NECK_MM = np.array([0.0, -26.0, -11.0])
@@ -24,10 +26,7 @@ Points = Mapping[str, Float[np.ndarray, " 3"]]
 
 
 def pivots(
-    landmarks: Points,
-    vertices: Float[np.ndarray, "v 3"],
-    shapes: Mapping[str, Float[np.ndarray, "v 3"]],
-    balls: list[Float[np.ndarray, "b 3"]],
+    landmarks: Points, vertices: Vertices, shapes: Mapping[str, Vertices], balls: list[Float[np.ndarray, "b 3"]]
 ) -> dict[str, Float[np.ndarray, " 3"]]:
     """Returns the pivots of a head by name, mm.
 
@@ -58,7 +57,7 @@ def hinge(landmarks: Points) -> Float[np.ndarray, " 3"]:
     return np.mean(sides, axis=0)
 
 
-def _lid_centre(vertices: Float[np.ndarray, "v 3"], blink: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " 3"]:
+def _lid_centre(vertices: Vertices, blink: Vertices) -> Float[np.ndarray, " 3"]:
     """Returns the centre of the eyeball under a lid: the ball through the lid's edge, open and closed, has its front in
     common with it."""
     moved = np.linalg.norm(blink, axis=1)
@@ -71,9 +70,7 @@ def _lid_centre(vertices: Float[np.ndarray, "v 3"], blink: Float[np.ndarray, "v 
     return centre - np.array([0.0, 0.0, EYE_RADIUS_MM - radius])
 
 
-def jaw_motions(
-    landmarks: Points, vertices: Float[np.ndarray, "v 3"], shapes: Mapping[str, Float[np.ndarray, "v 3"]]
-) -> dict[str, RigidTransform]:
+def jaw_motions(landmarks: Points, vertices: Vertices, shapes: Mapping[str, Vertices]) -> dict[str, RigidTransform]:
     """Returns how the lower jaw moves with the shapes that move it, by the skin over the chin: ``jawOpen`` turns about
     the hinge axis, the others shift."""
     chin = np.linalg.norm(vertices - landmarks["gnathion"], axis=1) < CHIN_MM

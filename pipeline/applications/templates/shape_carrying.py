@@ -24,6 +24,8 @@ from pipeline.applications.templates.pivots import Points, in_mouth, jaw_motions
 from pipeline.geometry.surface_index import SurfaceIndex
 from rig.mesh import vertex_normals
 
+Places = Float[np.ndarray, "t 3"]
+
 OFF_MM, FACING = 1.5, 0.4  # as the registration has it: what is farther off, or faces away, lies deeper
 ALIKE = 2.0  # millimetres that neighbours may part by, a millimetre between them: 99 % of the models' own do by less
 ALIKE_MM = 0.5
@@ -37,7 +39,7 @@ class Neutral:
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
-    mesh: Float[np.ndarray, "t 3"]
+    mesh: Places
 
 
 def carried_shapes(
@@ -46,7 +48,7 @@ def carried_shapes(
     neutral: Neutral,
     shapes: Shapes,
     landmarks: Points,
-) -> dict[str, Float[np.ndarray, "t 3"]]:
+) -> dict[str, Places]:
     """Returns the displacement of each vertex of a mesh (mm, weight 1), by shape; everything in the head frame.
 
     ``surface_binding``: how the model carries the mesh. ``triangles``: of the mesh. ``neutral``: the head that the
@@ -108,13 +110,13 @@ def _with_skin(attachment: Attachment, surface_binding: SurfaceBinding) -> Attac
     return attachment
 
 
-def _moved(attachment: Attachment, neutral: Neutral, shape: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "t 3"]:
+def _moved(attachment: Attachment, neutral: Neutral, shape: Float[np.ndarray, "v 3"]) -> Places:
     at_rest = attachment.on(neutral.vertices, neutral.faces)
     return attachment.on(neutral.vertices + shape, neutral.faces) - at_rest
 
 
 def _led(
-    mesh: Float[np.ndarray, "t 3"],
+    mesh: Places,
     edges: Int[np.ndarray, "e 2"],
     moves: Float[np.ndarray, "t s 3"],
     skin: Int[np.ndarray, " n"],
@@ -133,7 +135,7 @@ def _led(
 
 
 def _follow(
-    mesh: Float[np.ndarray, "t 3"],
+    mesh: Places,
     edges: Int[np.ndarray, "e 2"],
     moves: Float[np.ndarray, "t s 3"],
     leading: Bool[np.ndarray, " t"],
@@ -152,9 +154,7 @@ def _follow(
     moves[rows] = splu(system).solve(right).reshape(len(rows), *moves.shape[1:])
 
 
-def _jaw_moves(
-    landmarks: Points, neutral: Neutral, shapes: Shapes, mesh: Float[np.ndarray, "t 3"]
-) -> Float[np.ndarray, "t s 3"]:
+def _jaw_moves(landmarks: Points, neutral: Neutral, shapes: Shapes, mesh: Places) -> Float[np.ndarray, "t s 3"]:
     """Returns how each vertex would move if it were fixed to the lower jaw."""
     motions = jaw_motions(landmarks, neutral.vertices, shapes)
     still = np.zeros_like(mesh)
@@ -162,7 +162,7 @@ def _jaw_moves(
 
 
 def _standing_at_roots(
-    mesh: Float[np.ndarray, "t 3"],
+    mesh: Places,
     edges: Int[np.ndarray, "e 2"],
     rows: Int[np.ndarray, " r"],
     skin: Int[np.ndarray, "g 3"],
@@ -177,10 +177,7 @@ def _standing_at_roots(
 
 
 def _nearest_root(
-    mesh: Float[np.ndarray, "t 3"],
-    edges: Int[np.ndarray, "e 2"],
-    rows: Int[np.ndarray, " r"],
-    roots: Bool[np.ndarray, " r"],
+    mesh: Places, edges: Int[np.ndarray, "e 2"], rows: Int[np.ndarray, " r"], roots: Bool[np.ndarray, " r"]
 ) -> Int[np.ndarray, " r"]:
     """Returns for each vertex of a part which of its roots is the nearest along its edges."""
     number = np.full(len(mesh), -1)
@@ -193,10 +190,7 @@ def _nearest_root(
 
 
 def _standing(
-    mesh: Float[np.ndarray, "t 3"],
-    rows: Int[np.ndarray, " r"],
-    corners: Int[np.ndarray, "r 3"],
-    moves: Float[np.ndarray, "t s 3"],
+    mesh: Places, rows: Int[np.ndarray, " r"], corners: Int[np.ndarray, "r 3"], moves: Float[np.ndarray, "t s 3"]
 ) -> Float[np.ndarray, "r s 3"]:
     """Returns the moves of vertices that stand on triangles of the mesh's own skin and turn with them."""
     used, local = np.unique(corners, return_inverse=True)

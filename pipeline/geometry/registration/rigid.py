@@ -9,30 +9,25 @@ from jaxtyping import Float
 
 from rig.geometry import Similarity, rotation_from_vector
 
+Points = Float[np.ndarray, "n 3"]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Counterparts:
     """Holds what n points meet: the unit normals there, how far the surface lies ahead along them (mm), and weights, 0
     for a point without a counterpart. ``reach_mm`` is how far counterparts may be at the next step."""
 
-    normals: Float[np.ndarray, "n 3"]
+    normals: Points
     ahead_mm: Float[np.ndarray, " n"]
     weights: Float[np.ndarray, " n"]
     reach_mm: float
 
 
-Meet = Callable[[Similarity, Float[np.ndarray, "n 3"], float], Counterparts | None]
+Meet = Callable[[Similarity, Points, float], Counterparts | None]
 
 
 def fit_motion(
-    points: Float[np.ndarray, "n 3"],
-    meet: Meet,
-    start: Similarity,
-    *,
-    reach_mm: float,
-    steps: int,
-    still_mm: float,
-    scale: bool = False,
+    points: Points, meet: Meet, start: Similarity, *, reach_mm: float, steps: int, still_mm: float, scale: bool = False
 ) -> Similarity | None:
     """Lays points on a surface by a rigid motion or, with ``scale``, a similarity. ``meet`` finds the counterparts of
     the points where a motion brings them, within a reach that is ``reach_mm`` at first; once it returns None, for too
@@ -55,9 +50,7 @@ def fit_motion(
     return motion
 
 
-def motion_columns(
-    arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], *, scale: bool = False
-) -> Float[np.ndarray, "n p"]:
+def motion_columns(arms: Points, normals: Points, *, scale: bool = False) -> Float[np.ndarray, "n p"]:
     """Returns how far points move along normals by a turn (rad) about the origin of ``arms``, by a shift (mm) and, with
     ``scale``, by the logarithm of the scale."""
     columns = [np.cross(arms, normals), normals]

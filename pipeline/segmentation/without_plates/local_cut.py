@@ -17,6 +17,8 @@ from pipeline.imaging.masks import dilated, eroded
 from pipeline.segmentation.mean_field_kernels import MAX_ODDS
 from pipeline.segmentation.without_plates.viewing_volume import ViewingVolume, ask_other_views
 
+Mask = Bool[np.ndarray, "h w"]
+
 COLUMNS = 640  # of the images that are cut: 2 px of a picture of 1300
 WINDOW, STEP = 80, 28  # px of them: side of a window, and from one to the next along the outline
 ITERATIONS = 2
@@ -37,9 +39,7 @@ BANDS = (Bands(14, 8), Bands(8, 6))
 """Of the first cut, whose masks are of the coarse level, and of the second."""
 
 
-def cut_along(
-    image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], bands: Bands
-) -> Float32[np.ndarray, "h w"]:
+def cut_along(image: UInt8[np.ndarray, "h w 3"], mask: Mask, bands: Bands) -> Float32[np.ndarray, "h w"]:
     """Cuts the image in windows along the mask's outline. Returns, for each pixel, the share of the windows over it
     that assign it to the subject, weighted towards their middles."""
     height, width = mask.shape
@@ -64,12 +64,7 @@ def cut_along(
     return share
 
 
-def _cut(
-    image: UInt8[np.ndarray, "h w 3"],
-    mask: Bool[np.ndarray, "h w"],
-    inner: Bool[np.ndarray, "h w"],
-    outer: Bool[np.ndarray, "h w"],
-) -> Bool[np.ndarray, "h w"] | None:
+def _cut(image: UInt8[np.ndarray, "h w 3"], mask: Mask, inner: Mask, outer: Mask) -> Mask | None:
     """Cuts one window into subject and background; None if too few of its pixels are sure on either side."""
     if min(np.count_nonzero(inner), np.count_nonzero(outer)) < MIN_SAMPLES:
         return None

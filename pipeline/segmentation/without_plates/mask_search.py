@@ -23,6 +23,9 @@ from pipeline.segmentation.without_plates.viewing_volume import OtherViews, View
 from rig.camera import Camera
 from rig.rig import Rig
 
+Picture = Float32[np.ndarray, "h w 3"]
+Vector = Float[np.ndarray, " 3"]
+
 ROUNDS = 8  # masks of the studio do not change after the sixth
 BORDER_ROUNDS = 1  # in which the background is what the border shows, no more
 LOCAL_ROUNDS = 4  # after which the colours nearby count
@@ -64,11 +67,7 @@ class CoarseMask:
 
 
 def find_seeds(
-    camera: Camera,
-    volume: ViewingVolume,
-    up_world: Float[np.ndarray, " 3"],
-    size: tuple[int, int],
-    head: HeadSeed | None = None,
+    camera: Camera, volume: ViewingVolume, up_world: Vector, size: tuple[int, int], head: HeadSeed | None = None
 ) -> Seeds:
     """Finds the seeds of a view whose reduced image has ``size`` (height, width)."""
     height, width = size
@@ -132,11 +131,7 @@ def search_masks(
 
 
 def _with_neighbours(
-    image: Float32[np.ndarray, "h w 3"],
-    odds: Float32[np.ndarray, "h w"],
-    other_views: OtherViews,
-    seeds: Seeds,
-    noise: Float[np.ndarray, " 3"],
+    image: Picture, odds: Float32[np.ndarray, "h w"], other_views: OtherViews, seeds: Seeds, noise: Vector
 ) -> CoarseMask:
     combined = (
         odds + np.clip(SUPPORT_WEIGHT * other_views.support, -MAX_DENIAL, MAX_SUPPORT) + SOLID_ODDS * other_views.solid
@@ -167,7 +162,7 @@ def _one_piece(mask: Mask, core: Mask) -> Mask:
     return labels == 1 + int(np.argmax(sizes[1:]))
 
 
-def _with_texture(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+def _with_texture(image: Picture) -> Picture:
     """Returns a grey photograph with two of its equal channels replaced by the local mean and scatter; colour
     photographs are returned unchanged."""
     if np.ptp(image, axis=2).max() > MAX_GREY:
@@ -178,7 +173,7 @@ def _with_texture(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h
     return cv2.merge([grey, mean, np.minimum(TEXTURE_GAIN * scatter, 255)])
 
 
-def _noise(image: Float32[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
+def _noise(image: Picture) -> Vector:
     """Estimates the noise (levels) of each channel from differences of neighbours, at least 1; weave and texture count
     as noise."""
     return np.maximum(1.4826 * np.median(np.abs(np.diff(image, axis=1)), axis=(0, 1)) / np.sqrt(2), 1.0)

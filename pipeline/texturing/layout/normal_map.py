@@ -24,6 +24,13 @@ from pipeline.head_model.subdivision import boundary_vertices
 from pipeline.texturing.layout.uv_unwrap import Layout, spread_texels, unwrap
 from rig.mesh import Mesh
 
+Faces = Int[np.ndarray, "f 3"]
+Vertices = Float[np.ndarray, "v 3"]
+Pixels = Float[np.ndarray, "n 2"]
+
+Points = Float[np.ndarray, "n 3"]
+Picture = Float32[np.ndarray, "h w 3"]
+
 FACES = 10_000  # what games give a head; 1,100 of a model of 22,000 left lids too few
 FACE_WEIGHT = 8.0  # of an error in the face region
 
@@ -34,7 +41,7 @@ class ReducedLayout:
     ``faces`` the triangles as indices into ``rows``."""
 
     rows: Int[np.ndarray, " n"]
-    faces: Int[np.ndarray, "f 3"]
+    faces: Faces
 
 
 def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
@@ -51,7 +58,7 @@ def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
 
 
 def reduce(
-    layout: Layout, vertices: Float[np.ndarray, "v 3"], importance: Float[np.ndarray, " v"], count: int = FACES
+    layout: Layout, vertices: Vertices, importance: Float[np.ndarray, " v"], count: int = FACES
 ) -> ReducedLayout:
     """Reduces the texture layout of a mesh to ``count`` triangles or a few more; its border stays unchanged.
     ``importance`` multiplies the error of each vertex: the layout stays denser where it is high."""
@@ -78,18 +85,14 @@ class NormalMapped:
 
     mesh: Mesh
     rows: Int[np.ndarray, " n"]
-    uv: Float[np.ndarray, "n 2"]
-    normals: Float[np.ndarray, "n 3"]
+    uv: Pixels
+    normals: Points
     tangents: Float[np.ndarray, "n 4"]  # the last is the bitangent's sign, as in glTF
     image: UInt8[np.ndarray, "s s 3"]
 
 
 def normal_mapped(
-    vertices: Float[np.ndarray, "v 3"],
-    normals: Float[np.ndarray, "v 3"],
-    layout: Layout,
-    reduced: ReducedLayout,
-    size: int = SIZE_PX,
+    vertices: Vertices, normals: Vertices, layout: Layout, reduced: ReducedLayout, size: int = SIZE_PX
 ) -> NormalMapped:
     """Reduces the full mesh of a head (mm, unit normals). Returns it with a normal map of the lost detail."""
     rows = layout.source[reduced.rows]
@@ -112,12 +115,7 @@ def normal_mapped(
     return NormalMapped(Mesh(places, reduced.faces), rows, uv, reduced_normals, tangents, image)
 
 
-def vertex_tangents(
-    vertices: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    uv: Float[np.ndarray, "n 2"],
-    faces: Int[np.ndarray, "f 3"],
-) -> Float[np.ndarray, "n 4"]:
+def vertex_tangents(vertices: Points, normals: Points, uv: Pixels, faces: Faces) -> Float[np.ndarray, "n 4"]:
     """Computes the tangents of MikkTSpace at the vertices; the fourth number is the sign of the bitangent. All
     triangles must have the same orientation in the layout, whose v points downwards."""
     corners, flat = vertices[faces], uv[faces]
@@ -138,7 +136,7 @@ def vertex_tangents(
     return np.concatenate([_laid(total, normals), np.full((len(vertices), 1), sign)], axis=1)
 
 
-def _laid(directions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def _laid(directions: Points, normals: Points) -> Points:
     """Returns unit vectors in the planes of the normals."""
     return _unit(directions - np.einsum("nx,nx->n", directions, normals)[:, None] * normals)
 
@@ -147,21 +145,14 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
-def _image(
-    uv: Float[np.ndarray, "n 2"], faces: Int[np.ndarray, "f 3"], values: Float[np.ndarray, "n k"], size: int
-) -> Float32[np.ndarray, "s s k"]:
+def _image(uv: Pixels, faces: Faces, values: Float[np.ndarray, "n k"], size: int) -> Float32[np.ndarray, "s s k"]:
     """Values of the vertices over the layout; NaN beside it."""
     texels, ones = size * uv - 0.5, np.ones(len(uv))
     _, shown = rasterise(texels, ones, faces, size, size)
     return interpolate(shown, texels, ones, faces, values.astype(np.float32))
 
 
-def _in_frame(
-    wanted: Float32[np.ndarray, "h w 3"],
-    tangent: Float32[np.ndarray, "h w 3"],
-    normal: Float32[np.ndarray, "h w 3"],
-    sign: np.float32,
-) -> Float32[np.ndarray, "h w 3"]:
+def _in_frame(wanted: Picture, tangent: Picture, normal: Picture, sign: np.float32) -> Picture:
     """Returns the wanted unit vectors as shares of tangent, bitangent and normal, which are no longer at right angles
     once interpolated."""
     lean = np.einsum("yxc,yxc->yx", tangent, normal)

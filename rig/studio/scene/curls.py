@@ -5,17 +5,15 @@ from jaxtyping import Float
 
 from rig.studio.sensor.noise import waves
 
+Vertices = Float[np.ndarray, "v 3"]
+
 RIDGE_SHARE = 0.5  # how high curls stand, against the distance from one to the next
 VALLEY = 0.45  # tone between curls, where little light falls
 
 
 def curled(
-    vertices: Float[np.ndarray, "v 3"],
-    normals: Float[np.ndarray, "v 3"],
-    curl_mm: float,
-    amount: Float[np.ndarray, " v"],
-    rng: np.random.Generator,
-) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, " v"]]:
+    vertices: Vertices, normals: Vertices, curl_mm: float, amount: Float[np.ndarray, " v"], rng: np.random.Generator
+) -> tuple[Vertices, Float[np.ndarray, " v"]]:
     """Raises curls on a surface of hair. Returns the new vertices, and a shade for each, relative to the hair's tone. A
     ridge winds along where a random field is near zero.
 

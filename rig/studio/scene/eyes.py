@@ -18,6 +18,8 @@ from rig.studio.scene.anatomy import Landmarks
 from rig.studio.scene.grids import grid_faces
 from rig.studio.scene.skin_texture import eye_gap
 
+Vector = Float[np.ndarray, " 3"]
+
 Colour = tuple[float, float, float]
 IRIS_TONES: tuple[Colour, ...] = (
     (0.055, 0.030, 0.016),
@@ -44,12 +46,12 @@ SIDES = ("right", "left")
 class Eye:
     """Holds an eyeball (mm): where it turns, where it looks (a unit vector), and the albedo of its iris."""
 
-    centre: Float[np.ndarray, " 3"]
-    gaze: Float[np.ndarray, " 3"]
+    centre: Vector
+    gaze: Vector
     iris: Colour
 
     @property
-    def iris_centre(self) -> Float[np.ndarray, " 3"]:
+    def iris_centre(self) -> Vector:
         """Returns the middle of the limbus."""
         return self.centre + np.sqrt(RADIUS_MM**2 - LIMBUS_MM**2) * self.gaze
 
@@ -77,9 +79,7 @@ class EyeSurface:
     oil: Float[np.ndarray, " v"]
 
 
-def look_at_point(
-    centres: Mapping[str, Float[np.ndarray, " 3"]], target: Float[np.ndarray, " 3"], iris: Colour
-) -> dict[str, Eye]:
+def look_at_point(centres: Mapping[str, Vector], target: Vector, iris: Colour) -> dict[str, Eye]:
     """Returns eyes, by side, that look at one point."""
     out = {}
     for side, centre in centres.items():
@@ -164,14 +164,12 @@ def _with_margins(mesh: Mesh, edges: Int[np.ndarray, "e 2"]) -> Mesh:
     return Mesh(np.concatenate([mesh.vertices, behind]), np.concatenate([mesh.faces, *walls]))
 
 
-def _between_lids(
-    vertices: Float[np.ndarray, "v 3"], inner: Float[np.ndarray, " 3"], outer: Float[np.ndarray, " 3"]
-) -> Bool[np.ndarray, " v"]:
+def _between_lids(vertices: Float[np.ndarray, "v 3"], inner: Vector, outer: Vector) -> Bool[np.ndarray, " v"]:
     gap = eye_gap(vertices, inner, outer, 0.0)
     return gap.here & (np.abs(gap.off) < gap.height)
 
 
-def eye_centres(mesh: Mesh, landmarks: Landmarks, gaze: Float[np.ndarray, " 3"]) -> dict[str, Float[np.ndarray, " 3"]]:
+def eye_centres(mesh: Mesh, landmarks: Landmarks, gaze: Vector) -> dict[str, Vector]:
     """Returns where the eyeballs of a head lie by side (head frame), as far in front as the lids leave room for eyes
     that look along ``gaze``."""
     out = {}

@@ -11,7 +11,10 @@ from rig.studio.scene.anatomy import Anatomy
 from rig.studio.scene.grids import grid_faces
 from rig.studio.scene.hair import COLUMNS, LOWEST_DEG, ROWS, outer_radius
 
-Surface = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]
+Vertices = Float[np.ndarray, "v 3"]
+Vector = Float[np.ndarray, " 3"]
+
+Surface = tuple[Vertices, Int[np.ndarray, "f 3"]]
 AnySurface = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]  # in lists, where each has its own counts
 
 CAP_ROWS = 60
@@ -68,7 +71,7 @@ def _visor(rim: Float[np.ndarray, "c 3"], azimuth: Float[np.ndarray, " c"], body
     return vertices, faces if upward > 0 else faces[:, ::-1]
 
 
-def glasses(head: Float[np.ndarray, "v 3"], body: Anatomy) -> AnySurface:
+def glasses(head: Vertices, body: Anatomy) -> AnySurface:
     """Makes glasses from a head's landmarks: two rims, a bridge and two temples (head frame, mm).
 
     Raises InputError for a head without landmarks.
@@ -95,9 +98,7 @@ def glasses(head: Float[np.ndarray, "v 3"], body: Anatomy) -> AnySurface:
     return joined([*pieces, _tube(bridge, RIM_MM, np.array([0.0, 0.0, 1.0]), closed=False)])
 
 
-def _temple(
-    head: Float[np.ndarray, "v 3"], body: Anatomy, start: Float[np.ndarray, " 3"], sign: float
-) -> Float[np.ndarray, "n 3"]:
+def _temple(head: Vertices, body: Anatomy, start: Vector, sign: float) -> Float[np.ndarray, "n 3"]:
     """Makes the path of an arm of glasses: from the rim back beside the temple, over the ear and down behind it."""
     over = body.ears + np.array([0.0, 14.0, -4.0]) * body.unit
     between = np.abs(head[:, 1] - over[1]) < 6.0
@@ -112,9 +113,7 @@ def _temple(
     return np.stack([np.interp(t, np.arange(4), corners[:, axis]) for axis in range(3)], axis=1)
 
 
-def _tube(
-    path: Float[np.ndarray, "n 3"], radius_mm: float, reference: Float[np.ndarray, " 3"], *, closed: bool
-) -> Surface:
+def _tube(path: Float[np.ndarray, "n 3"], radius_mm: float, reference: Vector, *, closed: bool) -> Surface:
     """Makes a round tube about a path; ``reference`` is never along it."""
     tangent = np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0) if closed else np.gradient(path, axis=0)
     across = np.cross(tangent, reference)
@@ -147,8 +146,6 @@ def _directions(elevation: Float[np.ndarray, "r 1"], azimuth: Float[np.ndarray, 
     return np.stack([ring * np.sin(azimuth), up, ring * np.cos(azimuth)], axis=-1)
 
 
-def _outward(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], centre: Float[np.ndarray, " 3"]
-) -> Int[np.ndarray, "f 3"]:
+def _outward(vertices: Vertices, faces: Int[np.ndarray, "f 3"], centre: Vector) -> Int[np.ndarray, "f 3"]:
     away = (face_normals(vertices, faces) * (vertices - centre)[faces[:, 0]]).sum()
     return faces if away > 0 else faces[:, ::-1]

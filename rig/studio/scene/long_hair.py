@@ -11,6 +11,8 @@ from rig.studio.scene.grids import grid_faces
 from rig.studio.scene.hair import Hair, HairStyle, grow_strands
 from rig.studio.sensor.noise import around
 
+Points = Float[np.ndarray, "n 3"]
+
 ROWS, COLUMNS = 150, 260
 FRONT_EDGE_DEG = 112.0  # from the back: just before the ears
 TOP_MM = 34.0  # above the ears' openings: there the sheet lies within the shell
@@ -20,9 +22,7 @@ BUN_ROWS, BUN_COLUMNS = 60, 120
 BUN_ELEVATION_DEG = 58.0  # over the back of the head
 
 
-def hang(
-    shell: Hair, below: Float[np.ndarray, "n 3"], body: Anatomy, style: HairStyle, rng: np.random.Generator
-) -> Hair:
+def hang(shell: Hair, below: Points, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
     """Makes the sheet of hair that hangs down from the shell to ``style.hanging_mm`` below the openings of the ears.
 
     Args:
@@ -61,12 +61,7 @@ def hang(
 
 
 def _fall(
-    shell: Hair,
-    below: Float[np.ndarray, "n 3"],
-    axis: Float[np.ndarray, " 3"],
-    style: HairStyle,
-    unit: float,
-    length_mm: float,
+    shell: Hair, below: Points, axis: Float[np.ndarray, " 3"], style: HairStyle, unit: float, length_mm: float
 ) -> Float[np.ndarray, "r c"]:
     """Returns the radius (float32) by drop and angle: the shell's, then straight down except over what pushes out."""
     hair = _envelope(shell.shell[np.unique(shell.shell_faces)] - axis, unit, length_mm)
@@ -83,7 +78,7 @@ def _fall(
     return cv2.GaussianBlur(radius, (0, 0), sigmaX=4.0, sigmaY=3.0, borderType=cv2.BORDER_REPLICATE)
 
 
-def _envelope(points: Float[np.ndarray, "n 3"], unit: float, length_mm: float) -> Float[np.ndarray, "r c"]:
+def _envelope(points: Points, unit: float, length_mm: float) -> Float[np.ndarray, "r c"]:
     """Returns the outermost radius about the vertical axis by drop and angle (float32), 0 where there is nothing."""
     limit = np.radians(FRONT_EDGE_DEG)
     angle = np.arctan2(-points[:, 0], -points[:, 2])

@@ -32,6 +32,9 @@ from rig.studio.sensor.noise import smooth
 from rig.studio.sensor.preset import Preset
 from rig.studio.sensor.sensor import Sensor, drift, expose, focus, rolled
 
+Vector = Float[np.ndarray, " 3"]
+Plane = Float[np.ndarray, "h w"]
+
 
 def matt_light(
     renderer: Renderer, rig: Rig, parts: Sequence[Part], gallery: Gallery, preset: Preset
@@ -128,7 +131,7 @@ class Scene:
     face_region: Bool[np.ndarray, " v"] | None
     photographed: Bool[np.ndarray, " v"]  # vertices of the head that a camera sees, not under hair
     head_masks: Mapping[str, Bool[np.ndarray, "h w"]]  # of the bare head
-    landmarks_world: Mapping[str, Float[np.ndarray, " 3"]]
+    landmarks_world: Mapping[str, Vector]
     landmarks_seen: Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]  # true pixels, by landmark and camera
     world_from_head: Similarity
     visible: VisiblePoints
@@ -318,17 +321,14 @@ def _knocked(camera: Camera, faults: Sequence[Fault], rng: np.random.Generator) 
     return camera
 
 
-def _sway(preset: Preset, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
+def _sway(preset: Preset, rng: np.random.Generator) -> Vector:
     """Returns how far the subject moves (mm) while a rolling shutter reads all rows."""
     direction = rng.standard_normal(3)
     return direction / np.linalg.norm(direction) * preset.sway_mm_s * preset.rolling_ms / 1000
 
 
 def _rolling(
-    rig: Rig,
-    light: Mapping[str, Float[np.ndarray, "_ _ 4"]],
-    at_world: Float[np.ndarray, " 3"],
-    sway_mm: Float[np.ndarray, " 3"],
+    rig: Rig, light: Mapping[str, Float[np.ndarray, "_ _ 4"]], at_world: Vector, sway_mm: Vector
 ) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
     """Distorts pictures as a rolling shutter does if the subject sways while rows are read. The true position is that
     at the middle row. The whole image moves as the head's origin does; nearer parts would move by a tenth more."""
@@ -420,10 +420,7 @@ def _wrong_masks(scene: Scene, faults: Sequence[Fault]) -> dict[str, Bool[np.nda
 
 
 def _photographed(
-    rig: Rig,
-    depth: Mapping[str, Float[np.ndarray, "h w"]],
-    vertices: Float[np.ndarray, "v 3"],
-    normals: Float[np.ndarray, "v 3"],
+    rig: Rig, depth: Mapping[str, Plane], vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]
 ) -> Bool[np.ndarray, " v"]:
     """Returns the vertices that at least one camera sees, not at a grazing angle and not behind hair."""
     seen = np.zeros(len(vertices), bool)
@@ -435,7 +432,7 @@ def _photographed(
 
 
 def _unhidden(
-    camera: Camera, depth: Float[np.ndarray, "h w"], points: Float[np.ndarray, "n 3"], slack_mm: float
+    camera: Camera, depth: Plane, points: Float[np.ndarray, "n 3"], slack_mm: float
 ) -> Bool[np.ndarray, " n"]:
     k = camera.intrinsics
     at = np.rint(np.nan_to_num(camera.project(points), nan=-9.0))
@@ -446,7 +443,7 @@ def _unhidden(
 
 
 def _seen_landmarks(
-    coarse: Rig, rig: Rig, depth: Mapping[str, Float[np.ndarray, "h w"]], marks: Mapping[str, Float[np.ndarray, " 3"]]
+    coarse: Rig, rig: Rig, depth: Mapping[str, Plane], marks: Mapping[str, Vector]
 ) -> dict[str, dict[str, Float[np.ndarray, " 2"]]]:
     """Returns the true pixels of each landmark in the cameras that see it, those nearest to the front first."""
     front = rig[rig.front_camera()].centre_world - rig.centre_world()

@@ -8,13 +8,16 @@ from jaxtyping import Bool, Float
 
 from rig.studio.scene.anatomy import Anatomy, Landmarks
 
+Vertices = Float[np.ndarray, "v 3"]
+Vector = Float[np.ndarray, " 3"]
+
 BROW = np.array([0.035, 0.022, 0.015])
 LIP = np.array([0.40, 0.13, 0.12])
 DRY = 0.25  # oil of skin beside the oily zones
 
 
 def skin_paint(
-    vertices: Float[np.ndarray, "v 3"],
+    vertices: Vertices,
     body: Anatomy,
     tone: tuple[float, float, float],
     stubble: float,
@@ -38,7 +41,7 @@ def skin_paint(
     return paint
 
 
-def oily_zones(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
+def oily_zones(vertices: Vertices, body: Anatomy) -> Float[np.ndarray, " v"]:
     """Returns how oily the skin is at each vertex, 0 to 1: most on forehead, nose, cheeks and chin; the same everywhere
     if landmarks are unknown."""
     marks = body.landmarks
@@ -55,14 +58,14 @@ def oily_zones(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.nd
     return DRY + (1.0 - DRY) * apart.max(axis=0)
 
 
-def _blotches(vertices: Float[np.ndarray, "v 3"], rng: np.random.Generator) -> Float[np.ndarray, "v 1"]:
+def _blotches(vertices: Vertices, rng: np.random.Generator) -> Float[np.ndarray, "v 1"]:
     """Returns a sum of waves in random directions, 15 to 60 mm long, standard deviation about 0.06."""
     waves = rng.normal(0, 1, (24, 3))
     waves *= (2 * np.pi / rng.uniform(15, 60, (24, 1))) / np.linalg.norm(waves, axis=1, keepdims=True)
     return 0.06 * np.sin(vertices @ waves.T + rng.uniform(0, 2 * np.pi, 24)).sum(axis=1, keepdims=True) / np.sqrt(12)
 
 
-def _mix(paint: Float[np.ndarray, "v 4"], share: Float[np.ndarray, " v"], colour: Float[np.ndarray, " 3"]) -> None:
+def _mix(paint: Float[np.ndarray, "v 4"], share: Float[np.ndarray, " v"], colour: Vector) -> None:
     paint[:, :3] += share[:, None] * (colour - paint[:, :3])
 
 
@@ -71,7 +74,7 @@ def _smoothstep(low: float, high: float, x: Float[np.ndarray, " v"]) -> Float[np
     return t * t * (3 - 2 * t)
 
 
-def _blush(paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], marks: Landmarks) -> None:
+def _blush(paint: Float[np.ndarray, "v 4"], vertices: Vertices, marks: Landmarks) -> None:
     for side, sign in (("right", -1), ("left", 1)):
         cheek = (marks[f"exocanthion_{side}"] + marks[f"cheilion_{side}"]) / 2 + (8 * sign, -2, 0)
         share = np.exp(-((vertices - cheek) ** 2).sum(axis=1) / 500)
@@ -80,9 +83,7 @@ def _blush(paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], 
     paint[:, 1:3] *= 1 - 0.15 * nose[:, None]
 
 
-def _beard(
-    paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], marks: Landmarks, stubble: float
-) -> None:
+def _beard(paint: Float[np.ndarray, "v 4"], vertices: Vertices, marks: Landmarks, stubble: float) -> None:
     x, y, z = vertices.T
     mouth, chin = marks["stomion"], marks["gnathion"]
     share = _smoothstep(14, 2, y - mouth[1] - 0.004 * (x - mouth[0]) ** 2) * _smoothstep(-75, -45, z - chin[2])
@@ -91,7 +92,7 @@ def _beard(
     paint[:, 3] += 1.6 * share
 
 
-def _mouth(paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], marks: Landmarks) -> None:
+def _mouth(paint: Float[np.ndarray, "v 4"], vertices: Vertices, marks: Landmarks) -> None:
     x, y, z = vertices.T
     right, left, line = marks["cheilion_right"], marks["cheilion_left"], marks["stomion"]
     half = (left[0] - right[0]) / 2
@@ -107,13 +108,7 @@ def _mouth(paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], 
 
 
 def _eye(
-    paint: Float[np.ndarray, "v 4"],
-    vertices: Float[np.ndarray, "v 3"],
-    marks: Landmarks,
-    side: str,
-    closed: float,
-    *,
-    eyeballs: bool,
+    paint: Float[np.ndarray, "v 4"], vertices: Vertices, marks: Landmarks, side: str, closed: float, *, eyeballs: bool
 ) -> None:
     """Paints a brow, and an eye or lashes."""
     x, y, z = vertices.T
@@ -147,9 +142,7 @@ class EyeGap:
     here: Bool[np.ndarray, " v"]
 
 
-def eye_gap(
-    vertices: Float[np.ndarray, "v 3"], inner: Float[np.ndarray, " 3"], outer: Float[np.ndarray, " 3"], closed: float
-) -> EyeGap:
+def eye_gap(vertices: Vertices, inner: Vector, outer: Vector, closed: float) -> EyeGap:
     """Returns the gap between the lids of an eye that is ``closed`` so far, 0 to 1; the upper lid comes down to the
     lower one."""
     x, y, z = vertices.T
@@ -160,13 +153,7 @@ def eye_gap(
     return EyeGap(along, off, 4.0 * bow * (1.0 - closed), bow, here)
 
 
-def _open_eye(
-    paint: Float[np.ndarray, "v 4"],
-    vertices: Float[np.ndarray, "v 3"],
-    inner: Float[np.ndarray, " 3"],
-    outer: Float[np.ndarray, " 3"],
-    closed: float,
-) -> None:
+def _open_eye(paint: Float[np.ndarray, "v 4"], vertices: Vertices, inner: Vector, outer: Vector, closed: float) -> None:
     """Paints white, iris and pupil between the lids, and the upper lashes."""
     x, y, _ = vertices.T
     gap = eye_gap(vertices, inner, outer, closed)

@@ -27,13 +27,12 @@ from rig.studio.scene.skin_texture import oily_zones, skin_paint
 from rig.studio.scene.tight_cap import TightCap, lay_cap
 from rig.studio.sensor.noise import volume
 
+Vertices = Float[np.ndarray, "v 3"]
+
 
 def scattered(
-    vertices: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
-    irradiance: Float[np.ndarray, "v 3"],
-    scattering_mm: tuple[float, float, float],
-) -> Float[np.ndarray, "v 3"]:
+    vertices: Vertices, faces: Int[np.ndarray, "f 3"], irradiance: Vertices, scattering_mm: tuple[float, float, float]
+) -> Vertices:
     """Spreads light within the skin, by one implicit step of heat flow on the surface for each channel. The sum of the
     light over the surface stays the same; a channel with 0 mm is unchanged.
 
@@ -52,9 +51,7 @@ def scattered(
     return scattered
 
 
-def _laplacian(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> tuple[sparse.csr_array, Float[np.ndarray, " v"]]:
+def _laplacian(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> tuple[sparse.csr_array, Float[np.ndarray, " v"]]:
     """Returns the cotangent stiffness (positive semidefinite) and a third of the area about each vertex (mm2)."""
     double = np.maximum(np.linalg.norm(face_normals(vertices, faces), axis=1), 1e-6)
     rows, columns, values = [], [], []
@@ -145,9 +142,9 @@ class Piece:
     """Holds a part of the subject before it is placed and lit (head frame, mm). ``shows`` is head, hair or clothes."""
 
     shows: str
-    vertices: Float[np.ndarray, "v 3"]
+    vertices: Vertices
     faces: Int[np.ndarray, "f 3"]
-    places: Float[np.ndarray, "v 3"]
+    places: Vertices
     paint: Float[np.ndarray, "v 4"]
     grain: Grain
     one_sided: bool
@@ -167,7 +164,7 @@ class Dressed:
     skin: Part
     worn: tuple[Part, ...]
     gallery: Gallery
-    solid: tuple[Float[np.ndarray, "v 3"], np.ndarray]
+    solid: tuple[Vertices, np.ndarray]
     surfaces: Mapping[str, Mesh]
 
 
@@ -372,7 +369,7 @@ def _tight_cap(head: Mesh, body: Anatomy, worn: TightCap, rng: np.random.Generat
     return Piece("clothes", vertices, faces, vertices, paint, RUBBER if worn.glossy else CLOTH, False)
 
 
-def _even(vertices: Float[np.ndarray, "v 3"], tone: Colour) -> Float[np.ndarray, "v 4"]:
+def _even(vertices: Vertices, tone: Colour) -> Float[np.ndarray, "v 4"]:
     return np.tile((*tone, 1.0), (len(vertices), 1))
 
 
@@ -393,7 +390,7 @@ def _strand_part(hair: Hair, shell: Part, world_from_head: Similarity, rng: np.r
     )
 
 
-def _joined(pieces: list[tuple[Float[np.ndarray, "_ 3"], np.ndarray]]) -> tuple[Float[np.ndarray, "v 3"], np.ndarray]:
+def _joined(pieces: list[tuple[Float[np.ndarray, "_ 3"], np.ndarray]]) -> tuple[Vertices, np.ndarray]:
     offsets = np.cumsum([0] + [len(vertices) for vertices, _ in pieces])
     faces = [faces + offset for (_, faces), offset in zip(pieces, offsets[:-1], strict=True)]
     return np.concatenate([vertices for vertices, _ in pieces]), np.concatenate(faces)

@@ -15,6 +15,8 @@ from rig.mesh import Mesh, face_normals
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
+Points = Float[np.ndarray, "n 3"]
+
 PARTS = ("head", "hair", "clothes")
 AREA_MM2 = 2.25  # of surface for each point: 1.5 mm apart
 VIEWS_LEAST = 2  # what one camera alone sees has no depth
@@ -77,9 +79,7 @@ def part_masks(
     return parts
 
 
-def sample_surface(
-    mesh: Mesh, area_mm2: float, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+def sample_surface(mesh: Mesh, area_mm2: float, rng: np.random.Generator) -> tuple[Points, Points]:
     """Draws points on a surface at random, one for each ``area_mm2``. Returns the points and the unit normals of their
     triangles."""
     normals = face_normals(mesh.vertices, mesh.faces)
@@ -94,9 +94,7 @@ def sample_surface(
     return points, normals[face] / double[face, None]
 
 
-def sees(
-    camera: Camera, depth: Float[np.ndarray, "h w"], points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
-) -> np.ndarray:
+def sees(camera: Camera, depth: Float[np.ndarray, "h w"], points: Points, normals: Points) -> np.ndarray:
     """Tells which points of a surface a camera sees. ``depth`` is the surface's depth map in the camera (z, mm; inf
     where there is nothing).
 
