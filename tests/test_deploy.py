@@ -1,7 +1,6 @@
 """The files of deploy/: what systemd, containers and proxies are told fits the code and each other."""
 
 import configparser
-import importlib.util
 import json
 import os
 import re
@@ -19,6 +18,7 @@ from server.problem_types import PROBLEM_TYPES
 from server.services.job_rows import WORKFLOW
 from server.settings import PREFIX, ServiceSettings
 from server.storage.job_index import ENQUEUED, RUNNING, engine_jobs
+from tests.support.scripts import import_script
 
 ROOT = Path(__file__).resolve().parents[1]
 DEPLOY = ROOT / "deploy"
@@ -100,11 +100,7 @@ def test_every_variable_of_the_containers_is_a_setting() -> None:
 
 
 def test_the_image_fetches_before_it_copies_sources_and_pins_uv() -> None:
-    spec = importlib.util.spec_from_file_location("fetch_uv", DEPLOY / "fetch_uv.py")
-    assert spec is not None
-    assert spec.loader is not None
-    fetch_uv = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(fetch_uv)
+    fetch_uv = import_script(DEPLOY / "fetch_uv.py")
     lines = (DEPLOY / "Dockerfile").read_text().splitlines()
     assert any(line.endswith(f"uv=={fetch_uv.VERSION}") for line in lines)
     synced = next(number for number, line in enumerate(lines) if "--no-install-project" in line)

@@ -1,7 +1,6 @@
 """deploy/setup.sh and what it stands on: the download of uv, the quick way out, the list of allowed skips."""
 
 import hashlib
-import importlib.util
 import io
 import os
 import shutil
@@ -17,6 +16,7 @@ from types import ModuleType
 import pytest
 
 from tests.support.loopback import served
+from tests.support.scripts import import_script
 
 ROOT = Path(__file__).resolve().parents[1]
 PROGRAM = b"#!/bin/sh\necho uv 9.9.9\n"
@@ -24,12 +24,7 @@ PROGRAM = b"#!/bin/sh\necho uv 9.9.9\n"
 
 @pytest.fixture
 def fetch_uv() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fetch_uv", ROOT / "deploy" / "fetch_uv.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return import_script(ROOT / "deploy" / "fetch_uv.py")
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """The wheel carries the packages under a name of its own, and runs beside any folder."""
 
 import importlib.metadata
-import importlib.util
 import json
 import os
 import re
@@ -18,6 +17,7 @@ import numpy as np
 import pytest
 
 from tests.support.hostile_folder import hostile_folder
+from tests.support.scripts import import_script
 from tests.support.uv import uv
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -25,12 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="module")
 def wheel_imports() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("wheel_imports", ROOT / "deploy" / "wheel_imports.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return import_script(ROOT / "deploy" / "wheel_imports.py")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from importlib import resources
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
+from playwright.sync_api import Browser, ConsoleMessage, Page, ViewportSize, sync_playwright
 
 FLAGS = [
     "--headless",
@@ -77,9 +77,8 @@ class Visit:
 
 def visit(browser: Browser, base: str, size: str = "1366x768") -> Visit:
     width, height = SIZES[size]
-    context = browser.new_context(
-        viewport={"width": width, "height": height}, accept_downloads=True, color_scheme="dark"
-    )
+    window = ViewportSize(width=width, height=height)
+    context = browser.new_context(viewport=window, accept_downloads=True, color_scheme="dark")
     return Visit(context.new_page(), base)
 
 

@@ -155,6 +155,14 @@ def await_state(client: httpx.Client, job: str, states: tuple[str, ...], timeout
         time.sleep(0.05)
 
 
+def await_calibration(client: httpx.Client, calibration: str, timeout_s: float = 200.0) -> dict:
+    deadline = time.monotonic() + timeout_s
+    while (found := client.get(f"/v1/calibrations/{calibration}").json())["state"] in ("queued", "running"):
+        assert time.monotonic() < deadline, found
+        time.sleep(0.1)
+    return found
+
+
 def await_true(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():

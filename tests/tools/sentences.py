@@ -53,9 +53,7 @@ def draw(count: int, seed: str) -> list[tuple[str, str]]:
 
 
 if __name__ == "__main__":
-    commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True
-    ).stdout
+    commit = subprocess.check_output(["git", "rev-parse", "HEAD"], cwd=ROOT, text=True)
     options = dict(enumerate(sys.argv[1:]))
     for number, (place, sentence) in enumerate(draw(int(options.get(0, 40)), options.get(1, commit.strip())), 1):
         sys.stdout.write(f"{number:3} {place}\n    {sentence}\n")

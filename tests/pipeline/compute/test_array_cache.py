@@ -4,7 +4,6 @@ import logging
 import os
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ from pipeline.compute.array_cache import UNUSED_S
 from rig import jit as compiled
 from rig.mesh import vertex_normals
 from server.processes import python_environment
+from tests.support.at_once import run_at_once
 
 GIVEN = (np.arange(12.0).reshape(4, 3), 2.5, {"radius_mm": 4.0})
 MADE = {
@@ -121,14 +121,7 @@ def test_a_full_disk_leaves_nothing_half(folder: Path, monkeypatch: pytest.Monke
 
 
 def test_two_at_once_do_no_harm(folder: Path) -> None:
-    maker, found = Maker(), []
-    threads = [threading.Thread(target=lambda: found.append(maker())) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(found) == 8
-    assert all(map(equal, found))
+    assert all(map(equal, run_at_once(Maker(), 8)))
     assert len(list(folder.iterdir())) == 1
 
 

@@ -1,7 +1,5 @@
-import importlib.util
 import json
 import struct
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +30,7 @@ from tests.support.drawn_faces import seen_face
 from tests.support.drawn_studio import drawn_studio
 from tests.support.made_up_results import made_up_result
 from tests.support.scenes import ellipsoid, fan, pattern
+from tests.support.scripts import import_script
 from tests.support.shared_data import shared
 
 CONTRACT_KEYS = {
@@ -225,13 +224,7 @@ def test_parts_tint_by_their_probability_and_the_unknown_keeps_its_colour() -> N
 def test_the_shared_checker_finds_no_breach_of_the_contract(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = shared("tools/score.py")
     monkeypatch.syspath_prepend(str(path.parent))
-    spec = importlib.util.spec_from_file_location("shared_score", path)
-    assert spec is not None
-    assert spec.loader is not None
-    score = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "shared_score", score)
-    spec.loader.exec_module(score)
-    faults, mesh = score.check_result(str(folder))
+    faults, mesh = import_script(path).check_result(str(folder))
     assert faults == []
     assert mesh is not None
 

@@ -1,7 +1,6 @@
 """What the pages fetch by address: every address asks who the session is, pictures are small, upright and whole."""
 
 import inspect
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from server.console import media
 from server.console.media import THUMBNAIL_WIDTH, make_thumbnail
 from server.errors import NotFound
 from server.storage.records import CaptureRecord
+from tests.support.at_once import run_at_once
 from tests.support.services import small_capture
 
 ROUTES = [
@@ -65,11 +65,7 @@ def test_a_thumbnail_is_narrow_and_keeps_the_pictures_shape(tmp_path: Path, widt
 def test_two_that_ask_at_once_get_a_whole_picture(tmp_path: Path) -> None:
     write_image(tmp_path / "cam00.png", np.random.default_rng(1).integers(0, 256, (900, 1200, 3), dtype=np.uint8))
     target = tmp_path / "small" / "cam00.jpg"
-    threads = [threading.Thread(target=make_thumbnail, args=(tmp_path / "cam00.png", target)) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    run_at_once(lambda: make_thumbnail(tmp_path / "cam00.png", target), 4)
     assert [path.name for path in target.parent.iterdir()] == ["cam00.jpg"], "no unfinished file is left"
     assert read_image(target).shape == (360, 480, 3)
 

@@ -20,7 +20,7 @@ from server.services.rigs.opening import open_rig
 from server.settings import ServiceSettings
 from tests.rig.acquisition.test_session import flat_rig
 from tests.support.board_pictures import BoardPictures
-from tests.support.services import running_service, served_client
+from tests.support.services import await_calibration, running_service, served_client
 from tests.support.shared_data import shared
 from tests.support.textured_studio import NAMES, FlatStudio
 
@@ -158,10 +158,7 @@ def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> 
         wanted = {"board": described, "captures": [capture["id"] for capture in captures]}
         made = client.post("/v1/calibrations", json=wanted)
         assert made.status_code == 202, made.text
-        done = made.json()
-        while done["state"] in ("queued", "running"):
-            time.sleep(0.5)
-            done = client.get(made.headers["location"]).json()
+        done = await_calibration(client, made.json()["id"])
         assert done["state"] == "succeeded", done["error"]
         assert done["pictures"] == {"cam_0": 26, "cam_1": 26, "cam_2": 25, "cam_3": 26}
         assert done["figures"]["rms_px"] <= 1.1

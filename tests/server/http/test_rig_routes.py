@@ -1,7 +1,6 @@
 """The rig and calibrations over HTTP: the simulated studio, and the recordings of a real board."""
 
 import json
-import time
 from pathlib import Path
 
 import cv2
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 from rig.formats.captures.archive import pack_folder
-from tests.support.services import running_service
+from tests.support.services import await_calibration, running_service
 from tests.support.shared_data import shared
 
 
@@ -50,10 +49,7 @@ def test_an_archive_of_board_pictures_becomes_a_calibration(tmp_path: Path) -> N
         data = (tmp_path / "board.tar").read_bytes()
         made = client.post("/v1/calibrations", files={"file": data}, data={"label": "Monday" * 100})
         assert made.status_code == 202, made.text
-        done = made.json()
-        while done["state"] in ("queued", "running"):
-            time.sleep(0.5)
-            done = client.get(made.headers["location"]).json()
+        done = await_calibration(client, made.json()["id"])
         assert done["state"] == "succeeded", done["error"]
         assert done["label"] == ("Monday" * 100)[:500]
         assert done["figures"]["rms_px"] <= 1.1

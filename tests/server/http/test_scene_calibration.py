@@ -1,7 +1,6 @@
 """Calibrations from photographs that show no board, over HTTP: what comes out, what is kept, what is refused."""
 
 import json
-import time
 from pathlib import Path
 
 import httpx
@@ -11,16 +10,8 @@ import pytest
 from calibration.adjustment.gauge import image_distance
 from rig.formats.cameras.cameras_json import rig_from_document
 from rig.formats.pictures.images import write_image
-from tests.support.services import RunningService, packed, small_capture, upload
+from tests.support.services import RunningService, await_calibration, packed, small_capture, upload
 from tests.support.textured_wedge import TAG_MM, wedge_rig, write_photographs
-
-
-def ended(http: httpx.Client, identity: str) -> dict:
-    deadline = time.monotonic() + 120
-    while (found := http.get(f"/v1/calibrations/{identity}").json())["state"] in ("queued", "running"):
-        assert time.monotonic() < deadline, found
-        time.sleep(0.1)
-    return found
 
 
 def test_what_is_no_scene_is_refused_by_name(http: httpx.Client, tmp_path: Path) -> None:
@@ -57,7 +48,7 @@ def test_photographs_of_a_scene_become_a_calibration(
     made = upload(http, packed(tmp_path / "photos"), "/v1/calibrations", **{"from": "scene", "label": "the wedge"})
     assert made.status_code == 202, made.text
     assert (made.json()["kind"], made.json()["pictures"]) == ("scene", dict.fromkeys(wedge_rig().names, 1))
-    found = ended(http, made.json()["id"])
+    found = await_calibration(http, made.json()["id"])
     assert found["state"] == "succeeded", found["error"]
     assert (found["verdict"], found["warnings"]) == ("usable", [])
     assert all(missing.endswith("at the subject: add views beside it") for missing in found["missing"])
@@ -77,7 +68,7 @@ def test_shots_of_the_rig_become_one_or_are_refused_with_the_views(
     capture = upload(http, packed(small_capture(tmp_path / "noise"))).json()["id"]
     made = http.post("/v1/calibrations", json={"from": "scene", "captures": [capture], "label": "noise"})
     assert made.status_code == 202, made.text
-    found = ended(http, made.json()["id"])
+    found = await_calibration(http, made.json()["id"])
     assert (found["state"], found["source"], found["kind"]) == ("failed", "rig", "scene")
     assert any(error.startswith("cam00: only") for error in found["error"]["errors"])
     assert not (service.data / "calibrations" / found["id"] / "images").exists()

@@ -1,6 +1,5 @@
 """Results in the store that no job claims: they go when they are old, and nothing else does, whoever else collects."""
 
-import threading
 from collections.abc import Collection
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from server.settings import ServiceSettings
 from server.storage.database import database_identity, open_database
 from server.storage.objects import FolderObjects, sha256_of
 from server.storage.store import new_id
+from tests.support.at_once import run_at_once
 
 
 @pytest.fixture
@@ -58,20 +58,8 @@ def test_a_job_that_is_submitted_again_under_its_id_keeps_its_result(objects: Fo
 
 def test_two_services_collect_at_once(objects: FolderObjects, tmp_path: Path) -> None:
     ids = [stored(objects, tmp_path, new_id()) for _ in range(40)]
-    claimed, failed = {*ids[::2]}, list[BaseException]()
-
-    def run() -> None:
-        try:
-            collect(objects, "mine", lambda some: claimed & {*some}, 0.0, tmp_path)
-        except BaseException as error:
-            failed.append(error)
-
-    threads = [threading.Thread(target=run) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not failed
+    claimed = {*ids[::2]}
+    run_at_once(lambda: collect(objects, "mine", lambda some: claimed & {*some}, 0.0, tmp_path))
     assert {*objects.folders()} == claimed
 
 

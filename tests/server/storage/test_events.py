@@ -1,9 +1,9 @@
 """The events of jobs: numbers that grow, one writer or two, one end, and no more rows for a long job than for a short
 one."""
 
-import threading
 import time
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -17,6 +17,7 @@ from server.storage.database import open_database
 from server.storage.events import END, EventLog
 from server.storage.failure_counts import failure_counts
 from server.tasks.progress import JobProgress, ProgressMeter
+from tests.support.at_once import run_at_once
 from tests.support.postgres import running_postgres
 
 
@@ -60,11 +61,7 @@ def test_two_writers_never_share_a_number(log: EventLog) -> None:
             last = log.append("job", {"state": "running"}, instead_of=last)
             numbers.append(last)
 
-    threads = [threading.Thread(target=write) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    run_at_once(write)
     assert sorted(filter(None, numbers)) == list(range(1, 41))
     assert len(log.since("job", 0)) == 2
 
@@ -84,18 +81,13 @@ def test_a_long_job_has_as_many_events_as_it_has_stages(log: EventLog) -> None:
 
 
 def test_a_job_ends_once_however_many_write_it(engine: sa.Engine) -> None:
-    log, firsts = EventLog(engine), list[bool]()
+    log = EventLog(engine)
     log.append("job", {"state": "running", "stage": "fit"})
 
-    def write() -> None:
-        firsts.extend(log.end("job", {"state": "failed"}, failure="no-hull") for _ in range(5))
+    def write() -> list[bool]:
+        return [log.end("job", {"state": "failed"}, failure="no-hull") for _ in range(5)]
 
-    threads = [threading.Thread(target=write) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert sorted(firsts) == [False] * 19 + [True]
+    assert sorted(chain(*run_at_once(write, 4))) == [False] * 19 + [True]
     assert log.append("job", {"state": "running", "stage": "late"}) == 2, "of a worker that was thought dead"
     assert [(event.seq, event.document.get("state")) for event in log.since("job", 0)][1:] == [
         (2, "running"),
