@@ -143,7 +143,7 @@ TEMPLATES = {
     "level-surface-too-small": "the dense surface shows only {share:.0%} of the face, {needed:.0%} are needed",
     "level-surface": "the dense surface shows {share:.0%} of the face",
     "scale-implausible": "{finding}",
-    "size-unusual": "the face is {size:.2f} times as large as a mean one ({sigmas:.1f} standard deviations; of adults one in 300 is that far off): where it is no child's, compare a measurement with a tape, and check the board's square size and the unit of the translations",
+    "size-unusual": "the face is {size:.2f} times as large as a mean one ({sigmas:.1f} standard deviations; of adults at most one in 300 is that far off): where it is no child's, compare a measurement with a tape, and check the board's square size and the unit of the translations",
     "contour-implausible": "{camera}: the head reaches {outside_px:.0f} px (RMS) beyond its outline: look at overlays/{camera}.png",
     "file-unreadable": "cannot be read",
     "file-incomplete": "damaged or incomplete ({reason})",

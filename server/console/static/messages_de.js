@@ -519,7 +519,7 @@ export default {
   "level-surface-too-small": "die dichte Oberfläche zeigt nur {share:.0%} des Gesichts, nötig sind {needed:.0%}",
   "level-surface": "die dichte Oberfläche zeigt {share:.0%} des Gesichts",
   "scale-implausible": "{finding}",
-  "size-unusual": "das Gesicht ist {size:.2f} mal so groß wie ein mittleres ({sigmas:.1f} Standardabweichungen; von Erwachsenen liegt einer von 300 so weit daneben): ist es kein Kind, ein Maß mit dem Band vergleichen und Feldgröße der Tafel und Einheit der Verschiebungen prüfen",
+  "size-unusual": "das Gesicht ist {size:.2f} mal so groß wie ein mittleres ({sigmas:.1f} Standardabweichungen; von Erwachsenen liegt höchstens einer von 300 so weit daneben): ist es kein Kind, ein Maß mit dem Band vergleichen und Feldgröße der Tafel und Einheit der Verschiebungen prüfen",
   "contour-implausible": "{camera}: Der Kopf ragt {outside_px:.0f} px (RMS) über seinen Umriss hinaus: overlays/{camera}.png ansehen",
   "file-unreadable": "lässt sich nicht lesen",
   "file-incomplete": "beschädigt oder unvollständig ({reason})",
