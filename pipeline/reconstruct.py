@@ -65,9 +65,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
                 judge_head(stage.context, views, faces, alignment, head, refined, texturing=texturing, pose=pose)
             )
     with run.stage("bust") as stage:
-        bust = stage.keep(
-            colour_bust(stage.context, views, labels, refined, surface.product, coloured=texturing.capture)
-        )
+        bust = stage.keep(colour_bust(stage.context, views, labels, surface.product, texturing.capture))
         hair = stage.keep(push_out_hair(stage.context, views, refined, bust, texturing.capture))
     if any(warning.code == "pose-doubtful" for warning in run.warnings):  # of a refusal that was overruled, too
         pose = replace(pose, doubtful=True)

@@ -37,9 +37,11 @@ FACE_REACH_MM = 10.0  # from the head's face: what lies farther in front of it i
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapedBust:
     """Holds the surface of the bust. Of its vertices on the face, ``face_silent_share`` (0 to 1) is the share that no
-    view's depth agrees with, and ``guessed_share`` the share that the refined head did not measure either."""
+    view's depth agrees with, and ``guessed_share`` the share that the refined head did not measure either.
+    ``likely_part`` is the part of each vertex, the most likely one where nobody sees it."""
 
     surface: BustSurface
+    likely_part: UInt8[np.ndarray, " v"]
     face_silent_share: float
     guessed_share: float
 
@@ -114,7 +116,8 @@ def shape_bust(
     silent = ~surface.seen[on_face]
     measured = np.zeros(len(face), bool) if refined.displaced is None else refined.displaced.observed
     guessed = silent & ~measured[near[on_face]]
-    shaped = ShapedBust(surface, _share(silent), _share(guessed))
+    likely = _likely_parts(surface, head.mesh_world, context.model)
+    shaped = ShapedBust(surface, likely, _share(silent), _share(guessed))
     doubtful = shaped.guessed_share > MAX_GUESSED_SHARE
     return Staged(shaped, [compose("bust-guessed", share=shaped.guessed_share)] if doubtful else [])
 
@@ -124,24 +127,14 @@ def _share(chosen: Bool[np.ndarray, " n"]) -> float:
 
 
 def colour_bust(
-    context: ReconstructionContext,
-    views: Views,
-    labels: PartLabels,
-    refined: RefinedHead,
-    shaped: ShapedBust | None,
-    *,
-    coloured: Capture,
+    context: ReconstructionContext, views: Views, labels: PartLabels, shaped: ShapedBust | None, coloured: Capture
 ) -> Staged[Bust | None]:
     """Colours the bust from the photographs of ``coloured``. Returns None without a surface."""
     if shaped is None:
         return Staged(None)
     settings, rig, mesh = context.settings, context.rig, shaped.surface.mesh_world
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
-    shown = Shown(
-        _likely_parts(shaped.surface, refined.mesh_world, context.model),
-        lambda camera: labels.shares(camera, mesh.vertices),
-        measured=shaped.surface.seen,
-    )
+    shown = Shown(shaped.likely_part, lambda camera: labels.shares(camera, mesh.vertices), measured=shaped.surface.seen)
     colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture, shown=shown)
     return Staged(Bust(shaped, normals, colours.colours, colours.views, settings.bust.spacing_mm))
 

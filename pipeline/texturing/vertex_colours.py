@@ -166,21 +166,16 @@ def texture(
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
     hidden = np.asarray((weights > 0).any(axis=0))
-    parts = None
-    if shown is not None:
-        weights, parts = shown.weigh(weights, views)
+    weights, parts = (weights, None) if shown is None else shown.weigh(weights, views)
     hidden &= ~(weights > 0).any(axis=0)
-    gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
-    if settings.balance:
-        gains, offsets = balance(weights, colours)
+    unit = np.ones((len(views), 3)), np.zeros((len(views), 3))
+    gains, offsets = balance(weights, colours) if settings.balance else unit
     weights *= gain_confidence(gains)[:, None]
     balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
     agreed, seen = blend_views(weights, balanced, outlier)
     if not seen.any():
         return _untextured(len(seen))
-    doubtful = wide_doubtful_surface(weights, mesh_world)
-    if shown is not None:
-        doubtful |= shown.find_guessed(weights)
+    doubtful = wide_doubtful_surface(weights, mesh_world) | (False if shown is None else shown.find_guessed(weights))
     weights[:, doubtful], seen[doubtful], hidden = 0.0, 0, hidden | doubtful
     decision = None
     if around is not None:

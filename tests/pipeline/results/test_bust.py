@@ -63,7 +63,7 @@ def photographed(renderer: Renderer) -> tuple[Bust, Capture, dict]:
     views = Views(capture, made.silhouettes, {})
     fused = fuse_depth(context, views, head, PartLabels({}), depth).product
     surface = shape_bust(context, views, depth, refined, fused).product
-    bust = colour_bust(context, views, surface, capture).product
+    bust = colour_bust(context, views, PartLabels({}), surface, capture).product
     assert bust is not None
     return bust, capture, made.silhouettes
 

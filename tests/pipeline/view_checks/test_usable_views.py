@@ -92,7 +92,7 @@ def test_what_is_true_of_many_views_is_said_once(seen: Seen) -> None:
     assert [warning.code for warning in warnings] == ["view-left-out", "view", "view"]
     doubts = {name: replace(s, quality=replace(s.quality, doubts=(weak[0],))) for name, s in silhouettes.items()}
     (doubt,) = view_warnings(doubts)
-    assert doubt.text.startswith("cam00: 31% of the contour")
+    assert doubt.text.startswith("cam00: 31% of the outline")
     assert "the same is true of 10 more (cam01, " in doubt.text
 
 

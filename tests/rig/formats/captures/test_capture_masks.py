@@ -27,7 +27,7 @@ def write(folder: Path, name: str, pixels: np.ndarray) -> None:
     cv2.imwrite(str(folder / "masks" / f"{name}.png"), pixels)
 
 
-@pytest.mark.parametrize(("names", "words"), [("abc", "all masks are black"), ("b", "masks/b.png is black")])
+@pytest.mark.parametrize(("names", "words"), [("abc", "all masks are inverted"), ("b", "masks/b.png is inverted")])
 def test_inverted_masks_are_turned_and_told(folder: Path, names: str, words: str) -> None:
     for name in names:
         write(folder, name, np.where(BUST, 0, 255).astype(np.uint8))
