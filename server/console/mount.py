@@ -91,7 +91,8 @@ def style_first(inner: ASGIApp) -> ASGIApp:
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
         async def ordered(message: Message) -> None:
             if path_below(scope) in PAGES and message["type"] == "http.response.body":
-                message = message | {"body": message["body"].replace(b'rel="modulepreload"', b'rel="prefetch"     ')}
+                body = message["body"].replace(b'rel="modulepreload"', b'rel="prefetch"     ')
+                message = {**message, "body": body}
             await send(message)
 
         await inner(scope, receive, ordered)

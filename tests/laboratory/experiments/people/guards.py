@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -70,7 +70,7 @@ class Shot:
         faces = [] if self.face is None else rng.permutation(self.face.views)[:FACES_DRAWN].tolist()
         rest = [name for name in rng.permutation(self.rig.names).tolist() if name not in faces]
         names = (faces + rest)[: min(rng.choice(COUNTS), len(self.rig))]
-        of = {kind: {n: v for n, v in getattr(self.capture, kind).items() if n in names} for kind in PICTURES}
+        of: Any = {kind: {n: v for n, v in getattr(self.capture, kind).items() if n in names} for kind in PICTURES}
         capture, rig = Capture(**of), self.rig.subset([name for name in self.rig.names if name in names])
         return Shot(capture, rig, {n: self.masks[n] for n in names}, find_face_evidence(capture.images, rig))
 
