@@ -29,7 +29,7 @@ LOOK = (
     '|| (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark")'
 )
 
-# What stands there until the scripts are loaded, at 400 kbit/s for ten seconds; the frame removes it.
+# What stands there until the scripts are loaded, at 400 kbit/s for ten seconds; then the style sheet hides it.
 STARTING = '<p id="starting" lang="en">eigenhead is loading ... <span lang="de">wird geladen</span></p>'
 
 Answer = Callable[[Any], Awaitable[Any]]

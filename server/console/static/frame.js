@@ -90,7 +90,6 @@ export default spoken({
     window.eigenheadSay = (kind, text, faults) => this.announce(kind, text, faults || []);
   },
   mounted() {
-    document.getElementById("starting")?.remove();
     window.addEventListener("keydown", this.key);
     document.addEventListener("scroll", this.scrolled, true);
     this.scrollBack();

@@ -207,7 +207,7 @@ def check_comparison(page: Page) -> None:
     expect(options.nth(1)).to_contain_text("Anna")
     page.locator("#strangers").check()
     expect(options).to_have_count(3)
-    expect(options.nth(2)).to_contain_text("ANOTHER PERSON? Bert")
+    expect(options.nth(2)).to_contain_text("perhaps another person: Bert")
     page.get_by_label("Compare with").select_option(index=2)
     expect(page.get_by_text("Distance to a head of ANOTHER SUBJECT")).to_be_visible(timeout=30_000)
     page.get_by_label("Compare with").select_option("")

@@ -82,7 +82,7 @@ def test_results_are_judged_as_they_are_and_a_missed_limit_is_status_1(tmp_path:
     (tmp_path / "scan.obj").write_bytes(obj_bytes(Mesh(scan, model.levels["full"].faces)))
     write_landmarks(tmp_path / "scan.json", {name: scan[row] for name, row in model.landmarks.items()})
     right, wrong = planted_result(tmp_path / "right", 1.0), planted_result(tmp_path / "wrong", 1.01)
-    options = ("--reference", str(tmp_path / "scan.obj"), "--out", str(tmp_path / "out"), "--json")
+    options = ("--reference", str(tmp_path / "scan.obj"), "--out", str(tmp_path / "out"), "--json", "--overwrite")
     good = command(str(right), *options)
     assert (good.returncode, good.stderr) == (0, "")
     assert json.loads(good.stdout) == json.loads((tmp_path / "out" / "report.json").read_text())
