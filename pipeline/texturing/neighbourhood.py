@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
-from jaxtyping import Bool, Float, Int, Int32
+from jaxtyping import Bool, Float, Int, Int32, UInt8
 
 from pipeline.texturing.inpaint_kernels import LANES, by_rings, first_guess, relax
 
@@ -60,7 +60,7 @@ def fill_unknown(
     values: Float[np.ndarray, "v c"],
     known: Bool[np.ndarray, " v"],
     faces: Int[np.ndarray, "f 3"],
-    parts: Int[np.ndarray, " v"] | None = None,
+    parts: UInt8[np.ndarray, " v"] | None = None,
 ) -> Float[np.ndarray, "v c"]:
     """Fills in the values (at most four channels) of unknown vertices smoothly from their neighbours. A piece of the
     mesh without any known vertex gets the mean of all known ones. With ``parts``, a vertex is filled from those of its
