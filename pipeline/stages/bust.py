@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
@@ -110,13 +110,12 @@ def shape_bust(
     head = HeadSkin(refined.mesh_world, refined.deviation_mm)
     surface = finished(fused, depth.votes, head, views.silhouettes, context.rig)
     mesh, face = surface.mesh_world, context.model.levels["full"].face_region
-    far, near = nearest(PointTree.of(head.mesh_world.vertices), mesh.vertices, within=FACE_REACH_MM)
-    on_face = np.isfinite(far)
-    on_face[on_face] = face[near[on_face]]
+    far, near = nearest(PointTree.of(head.mesh_world.vertices), mesh.vertices)
+    on_face = (far < FACE_REACH_MM) & face[near]
     silent = ~surface.seen[on_face]
     measured = np.zeros(len(face), bool) if refined.displaced is None else refined.displaced.observed
     guessed = silent & ~measured[near[on_face]]
-    likely = _likely_parts(surface, head.mesh_world, context.model)
+    likely = _likely_parts(surface, far, near, context.model)
     shaped = ShapedBust(surface, likely, _share(silent), _share(guessed))
     doubtful = shaped.guessed_share > MAX_GUESSED_SHARE
     return Staged(shaped, [compose("bust-guessed", share=shaped.guessed_share)] if doubtful else [])
@@ -139,13 +138,15 @@ def colour_bust(
     return Staged(Bust(shaped, normals, colours.colours, colours.views, settings.bust.spacing_mm))
 
 
-def _likely_parts(surface: BustSurface, head_world: Mesh, model: HeadModel) -> UInt8[np.ndarray, " v"]:
+def _likely_parts(
+    surface: BustSurface, far_mm: Float[np.ndarray, " v"], near: Int[np.ndarray, " v"], model: HeadModel
+) -> UInt8[np.ndarray, " v"]:
     """Returns what each vertex most likely shows, so that what is unseen gets the colour of its like: ``HAIR`` is the
-    whole scalp, bald or not, and what lies far off the head; ``CLOTHES`` lie beyond its open border."""
-    far, near = nearest(PointTree.of(head_world.vertices), surface.mesh_world.vertices)
+    whole scalp, bald or not, and what lies far off the head; ``CLOTHES`` lie beyond its open border. ``far_mm`` and
+    ``near``: distance to the nearest vertex of the head, and its row."""
     part, unseen = surface.part.copy(), surface.part == Part.UNSEEN
     part[unseen] = Part.SKIN
-    part[scalp(model)[near] | (unseen & (far > OFF_HEAD_MM))] = Part.HAIR
+    part[scalp(model)[near] | (unseen & (far_mm > OFF_HEAD_MM))] = Part.HAIR
     part[unseen & model.levels["full"].boundary[near]] = Part.CLOTHES
     return part
 
