@@ -34,7 +34,7 @@ export default Object.fromEntries(Object.entries(german).map(([code, text]) => [
 SCRIPT = "text/javascript"
 SHOWN = """() => {
   const seen = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
-  const silent = "script, style, kbd, .mono, #esm-fallback, button[lang]";
+  const silent = "script, style, kbd, .mono, #esm-fallback, #starting, button[lang]";
   while (walker.nextNode())
     if (!walker.currentNode.parentElement.closest(silent)) seen.push(walker.currentNode.textContent);
   for (const name of ["aria-label", "title", "placeholder", "alt"])
