@@ -146,7 +146,7 @@ class Camera:
         """Returns the pixels of world points (mm), and their derivatives by the points (px / mm)."""
         points = self.camera_from_world.apply(points_world)
         with np.errstate(divide="ignore", invalid="ignore"):
-            by_point, _ = lens_jacobians(points, self.intrinsics.values())
+            by_point = lens_slopes(points, self.intrinsics.values())
         return self._image(points), by_point @ self.camera_from_world.rotation
 
     def rays_world(self, pixels: Pixels) -> Points:
@@ -195,7 +195,7 @@ class CameraStack:
         ``Camera.project``."""
         points = self.rotations @ point_world + self.translations
         with np.errstate(divide="ignore", invalid="ignore"):
-            by_point, _ = lens_jacobians(points, self.lenses)
+            by_point = lens_slopes(points, self.lenses)
             pixels = lens_image(points, self.lenses)
             radius = np.hypot(points[:, 0], points[:, 1]) / points[:, 2]
             pixels[(points[:, 2] <= 0) | (radius > self.turning_radii)] = np.nan
@@ -210,16 +210,20 @@ def lens_image(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Pixels:
     return _distorted(points[:, :2] / points[:, 2:], lens[..., 4:]) * lens[..., :2] + lens[..., 2:4]
 
 
+def lens_slopes(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Float[np.ndarray, "n 2 3"]:
+    """Returns the derivatives of ``lens_image`` by the point (px / mm)."""
+    normalised = points[:, :2] / points[:, 2:]
+    slopes = lens[..., :2, None] / points[:, 2, None, None] * _distortion_slopes(normalised, lens[..., 4:])
+    by_depth = -(slopes * normalised[:, None]).sum(axis=2)
+    return np.concatenate([slopes, by_depth[:, :, None]], axis=2)
+
+
 def lens_jacobians(
     points: Points, lens: Float[np.ndarray, "*n 9"]
 ) -> tuple[Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 9"]]:
     """Returns the derivatives of ``lens_image`` by the point (px / mm) and by the nine values of the lens."""
-    normalised, z = points[:, :2] / points[:, 2:], points[:, 2]
-    (x, y), focal = normalised.T, lens[..., :2, None]
-    slopes = focal * _distortion_slopes(normalised, lens[..., 4:])
-    pinhole = np.zeros((len(points), 2, 3))
-    pinhole[:, 0, 0] = pinhole[:, 1, 1] = 1.0 / z
-    pinhole[:, :, 2] = -normalised / z[:, None]
+    normalised, focal = points[:, :2] / points[:, 2:], lens[..., :2, None]
+    x, y = normalised.T
     r2 = x * x + y * y
     by_lens = np.zeros((len(points), 2, 9))
     by_lens[:, [0, 1], [0, 1]] = _distorted(normalised, lens[..., 4:])
@@ -227,7 +231,7 @@ def lens_jacobians(
     by_lens[:, 0, 4:] = np.stack([x * r2, x * r2**2, 2.0 * x * y, r2 + 2.0 * x * x, x * r2**3], axis=1)
     by_lens[:, 1, 4:] = np.stack([y * r2, y * r2**2, r2 + 2.0 * y * y, 2.0 * x * y, y * r2**3], axis=1)
     by_lens[:, :, 4:] *= focal
-    return slopes @ pinhole, by_lens
+    return lens_slopes(points, lens), by_lens
 
 
 def _distorted(normalised: Pixels, lens: Float[np.ndarray, "*n 5"]) -> Pixels:

@@ -23,6 +23,38 @@ def triangle_boxes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
+def any_corner(vertex: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Tells which triangles have a corner among the vertices ``vertex`` (v), (f)."""
+    found = np.empty(len(faces), np.bool_)
+    for f in range(len(faces)):
+        found[f] = vertex[faces[f, 0]] | vertex[faces[f, 1]] | vertex[faces[f, 2]]
+    return found
+
+
+@njit(cache=True, nogil=True)
+def beside_active(boxes: np.ndarray, active: np.ndarray) -> np.ndarray:
+    """Tells which triangles lie in or beside a cell that holds the middle of an ``active`` triangle, (f)."""
+    wide, low, high = 1e-9, np.full(3, np.inf), np.full(3, -np.inf)
+    for f in range(len(boxes)):
+        for axis in range(3):
+            wide = max(wide, boxes[f, 3 + axis] - boxes[f, axis])
+            middle = 0.5 * (boxes[f, axis] + boxes[f, 3 + axis])
+            low[axis], high[axis] = min(low[axis], middle), max(high[axis], middle)
+    cells, near = np.empty((len(boxes), 3), np.int64), np.empty(len(boxes), np.bool_)
+    nx, ny, nz = ((high - low) / wide).astype(np.int64) + 3
+    taken = np.zeros((nx, ny, nz), np.bool_)
+    for f in range(len(boxes)):
+        for axis in range(3):
+            cells[f, axis] = int((0.5 * (boxes[f, axis] + boxes[f, 3 + axis]) - low[axis]) / wide) + 1
+        if active[f]:
+            x, y, z = cells[f]
+            taken[x - 1 : x + 2, y - 1 : y + 2, z - 1 : z + 2] = True
+    for f in range(len(boxes)):
+        near[f] = taken[cells[f, 0], cells[f, 1], cells[f, 2]]
+    return near
+
+
+@njit(cache=True, nogil=True)
 def crossing_triangles(
     vertices: np.ndarray,
     faces: np.ndarray,
