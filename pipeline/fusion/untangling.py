@@ -17,12 +17,12 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.array_cache import cached_arrays
 from pipeline.estimation.positive_definite import factorised
-from pipeline.fusion.crossing_kernels import any_corner
+from pipeline.fusion.crossing_kernels import any_corner, turned_and_folded
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.fusion.net_kernels import component_of
 from pipeline.geometry.registration.procrustes import procrustes
 from pipeline.head_model.model import HeadModel
-from rig.mesh import Mesh, face_normals
+from rig.mesh import Mesh
 
 MAX_FOLD_DEG = 100.0  # between the normals of triangles that share an edge
 RINGS = (1, 1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 33, 41, 50)  # about a spot that was spoilt so many times; heads of random
@@ -208,25 +208,9 @@ def _turned_and_folded(
 ) -> tuple[Bool[np.ndarray, " f"], Int[np.ndarray, "e 2"]]:
     """Returns which triangles face against the mean normal of their corners, and the pairs of triangles that are folded
     at their common edge; of those in ``near`` alone."""
-    rows, pairs = np.flatnonzero(near), topology.pairs
-    used = np.zeros(len(vertices), bool)
-    used[topology.faces[rows]] = True
-    number = np.cumsum(used) - 1  # of a vertex among those of ``near``
-    vertices, faces = vertices[used], number[topology.faces[rows]]
-    triangle_normals = face_normals(vertices, faces)
-    corners = faces.ravel()
-    mean = np.stack([np.bincount(corners, np.repeat(triangle_normals[:, k], 3), len(vertices)) for k in range(3)], 1)
-    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    turned, unit = np.zeros(len(near), bool), np.zeros((len(near), 3))
-    a, b, c = faces.T
-    turned[rows] = np.einsum("fk,fk->f", triangle_normals, mean[a] + mean[b] + mean[c]) <= 0.0
-    unit[rows] = (
-        triangle_normals
-        / np.maximum(np.sqrt(np.einsum("fk,fk->f", triangle_normals, triangle_normals)), 1e-12)[:, None]
-    )
-    pairs = pairs if near.all() else pairs[near[pairs[:, 0]] & near[pairs[:, 1]]]
-    cosine = np.einsum("ek,ek->e", unit[pairs[:, 0]], unit[pairs[:, 1]])
-    return turned, pairs[cosine < np.cos(np.radians(MAX_FOLD_DEG))]
+    args = vertices, topology.faces, topology.pairs, near, np.cos(np.radians(MAX_FOLD_DEG))
+    turned, folded = turned_and_folded(*args)
+    return turned, topology.pairs[folded]
 
 
 def _around(chosen: Bool[np.ndarray, " f"], faces: Faces, count: int) -> Bool[np.ndarray, " f"]:
