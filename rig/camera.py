@@ -3,7 +3,6 @@
 ``x = X / Z`` in the camera frame is distorted to ``x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + tangential`` (OpenCV's
 order k1 k2 p1 p2 k3), and ``u = fx x_d + cx``. Pixel (0, 0) is the centre of the top-left pixel."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -168,38 +167,6 @@ class Camera:
             bad = (points[:, 2] <= 0) | (radius > self.intrinsics.distortion.max_valid_radius())
         pixels[bad] = np.nan
         return pixels
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraStack:
-    """Holds several cameras as arrays, to project one point to all of them at once. ``Camera`` projects many points to
-    one camera."""
-
-    rotations: Float[np.ndarray, "n 3 3"]
-    translations: Points  # mm
-    lenses: Float[np.ndarray, "n 9"]
-    turning_radii: Float[np.ndarray, " n"]
-
-    @classmethod
-    def of(cls, cameras: Sequence[Camera]) -> "CameraStack":
-        """Builds the arrays from cameras."""
-        return cls(
-            np.array([camera.camera_from_world.rotation for camera in cameras]),
-            np.array([camera.camera_from_world.translation for camera in cameras]),
-            np.array([camera.intrinsics.values() for camera in cameras]),
-            np.array([camera.intrinsics.distortion.max_valid_radius() for camera in cameras]),
-        )
-
-    def project_with_jacobian(self, point_world: Float[np.ndarray, " 3"]) -> tuple[Pixels, Float[np.ndarray, "n 2 3"]]:
-        """Returns the pixel of a world point (mm) in each camera, and its derivatives by the point (px / mm); NaN as in
-        ``Camera.project``."""
-        points = self.rotations @ point_world + self.translations
-        with np.errstate(divide="ignore", invalid="ignore"):
-            by_point = lens_slopes(points, self.lenses)
-            pixels = lens_image(points, self.lenses)
-            radius = np.hypot(points[:, 0], points[:, 1]) / points[:, 2]
-            pixels[(points[:, 2] <= 0) | (radius > self.turning_radii)] = np.nan
-        return pixels, by_point @ self.rotations
 
 
 def lens_image(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Pixels:
