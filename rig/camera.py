@@ -179,10 +179,10 @@ def lens_image(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Pixels:
 
 def lens_slopes(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Float[np.ndarray, "n 2 3"]:
     """Returns the derivatives of ``lens_image`` by the point (px / mm)."""
-    normalised = points[:, :2] / points[:, 2:]
-    slopes = lens[..., :2, None] / points[:, 2, None, None] * _distortion_slopes(normalised, lens[..., 4:])
-    by_depth = -(slopes * normalised[:, None]).sum(axis=2)
-    return np.concatenate([slopes, by_depth[:, :, None]], axis=2)
+    normalised, z = points[:, :2] / points[:, 2:], points[:, 2, None]
+    slopes = lens[..., :2, None] * _distortion_slopes(normalised, lens[..., 4:])
+    by_depth = (slopes * (-normalised / z)[:, None]).sum(axis=2)
+    return np.concatenate([slopes * (1.0 / z)[:, None], by_depth[:, :, None]], axis=2)
 
 
 def lens_jacobians(
