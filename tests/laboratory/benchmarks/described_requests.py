@@ -3,7 +3,7 @@
 python -m tests.laboratory described_requests admin capture submit read erase --requests 20000 --out FOLDER
 
 A round is a run on a new service with captures, jobs, a session and a batch, whose ids half the requests name. None
-asks for a shot or a preview of the simulated studio, which takes up to a minute: tests/server/http/test_openapi.py does.
+asks for a shot or a preview of the simulated studio, which takes up to a minute: server/http/test_openapi.py does.
 Rounds stand in ``--out``, by scope and seed: a run that is begun again goes on behind the last of them.
 """
 
