@@ -48,6 +48,7 @@ FOREIGN_KINDS = {
     b"\x28\xb5\x2f\xfd": "Zstandard",
     b"\x1f\x9d": "compress",
 }
+DAMAGES = zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, struct.error, ValueError, RecursionError
 HEADER_BYTES_MOST = 1 << 16  # of a tar header with a long name or pax records
 DIRECTORY_BYTES_MOST = 4 << 20  # of a zip's list of members: 5000 with long names fit
 
@@ -180,15 +181,7 @@ def _opened(path: Path) -> Iterator[Iterable[_Member]]:
                 yield _tar_members(archive)
     except InputError:
         raise
-    except (
-        zipfile.BadZipFile,
-        tarfile.TarError,
-        zlib.error,
-        EOFError,
-        struct.error,
-        ValueError,
-        RecursionError,
-    ) as error:
+    except DAMAGES as error:
         raise InputError("archive", [compose("archive-damaged", reason=_words(error))]) from error
     except (NotImplementedError, RuntimeError) as error:  # zipfile's errors for unknown methods and encrypted members
         raise InputError("archive", [compose("archive-not-unpacked", reason=_words(error))]) from error
