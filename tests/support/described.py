@@ -4,13 +4,12 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import httpx
 
-from tests.support.services import ROOT, RunningService
+from tests.support.services import ROOT, RunningService, await_true
 
 SECONDS_MOST = 120  # drawing a shot of the simulated studio takes seconds, on a machine that is busy many
 # An If-Match of another state is answered before the body is read.
@@ -21,8 +20,7 @@ def ask_as_described(
     service: RunningService, folder: Path, key: str, *options: str, ids: Mapping[str, Sequence[str]] | None = None
 ) -> "subprocess.CompletedProcess[str]":
     """Runs it in ``folder`` with a key. ``ids``: values that half the requests have for a path's parameter."""
-    while not httpx.get(service.url + "/readyz", timeout=60).json()["ready"]:
-        time.sleep(0.2)
+    await_true(lambda: httpx.get(service.url + "/readyz", timeout=60).json()["ready"])
     configured = f"[checks]\nnegative_data_rejection.expected-statuses = {json.dumps(REFUSALS)}\n"
     for name, values in (ids or {}).items():
         configured += f"[parameters.'path.{name}']\ndictionary = '{name}'\nprobability = 0.5\n"

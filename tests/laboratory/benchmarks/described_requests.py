@@ -38,8 +38,8 @@ def run(
     kept.mkdir(parents=True, exist_ok=True)
     for scope in scopes:
         rows = [json.loads(path.read_text()) for path in kept.glob(f"{scope}-*.json")]
-        while (asked := sum(row["requests"] for row in rows)) < requests:
-            report(scope, asked / requests)
+        while (total := sum(row["requests"] for row in rows)) < requests:
+            report(scope, total / requests)
             seed = len(rows) + 1
             phases = "examples,coverage,fuzzing,stateful" if seed == 1 else "fuzzing,stateful"  # others know no seed
             options = ("--seed", str(seed), "--phases", phases, "--max-time", str(round(60 * minutes)), *OPTIONS)
