@@ -637,6 +637,7 @@ export default {
   "photographs-of-sizes": "haben {sizes} Größen, und ein Objektiv macht eine Größe",
   "photograph-size-differs": "{camera}/{shot} hat {width} x {height} Pixel, die anderen Aufnahmen der Kamera {wanted}",
   "no-folder-of-photographs": "ist kein Ordner; den Ordner mit den Fotos geben",
+  "is-a-result": "ist das Ergebnis eines Auftrags: die Aufnahme angeben, aus der es entstand",
   "photographs-beside-folders": "Fotos neben Ordnern mit Fotos: ein Bild je Kamera oder ein Ordner je Kamera",
   "photograph-repeated": "{folder} enthält {name} {count} Mal, mit verschiedenen Endungen",
   "scale-camera-lost": "cameras: {camera} gehört nicht zu den anderen; zwei nennen, die zusammengehören",
