@@ -778,6 +778,7 @@ export default {
   "picture-large": "hat {width} x {height} Pixel; höchstens {most:,} werden gelesen",
   "picture-damaged": "ist beschädigt und lässt sich nicht lesen: noch einmal senden",
   "picture-black": "ist überall schwarz: Deckel auf dem Objektiv, oder kein Licht?",
+  "cameras-too-few-left": "{left} von {count} Kameras sind brauchbar, {needed} sind nötig: beheben, oder unbeteiligte Kameras aus der Kameradatei nehmen",
   "picture-lost": "{faults}; das beheben, oder ohne {camera} weiterarbeiten, die nicht mitwirkt",
   "picture-of-kind": "ist von der Art {kind}, wie ihr Name auch endet: als PNG, JPEG, TIFF, WebP, BMP oder PPM speichern",
   "picture-link-broken": "{picture} verweist auf eine Datei, die nicht da ist: {target}",
