@@ -35,9 +35,8 @@ COSTS_S: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "bust": {"bust": (0.4, 0.2)},
     "write": {"head": (0.7, 0.04), "bust": (0.1, 0.02), "morphs": (15.0, 0.0)},
 }
-"""Of every stage, in their order, what each part of a job adds: CPU seconds, and CPU seconds a megapixel. Measured on
-one core by `python -m tests.laboratory remaining-time` over jobs of 3, 11 and 24 photographs, with and without a bust
-that other threads make beside the head."""
+"""Of every stage, in order, what each part of a job adds: CPU seconds, and CPU seconds a megapixel, as jobs of 3, 11
+and 24 photographs took them on one core (`python -m tests.laboratory remaining-time`)."""
 SIMPLEX_S = 60.0  # of the simplex's fit, on one idle core
 USUAL_MEGAPIXELS = 8.65  # eleven photographs of 1024 x 768: where a capture's own are not known
 LEARNING = 0.3  # weight of a job's stage, beside what was learnt or else the pace of the whole job
@@ -92,11 +91,10 @@ class StageDurations:
         """Mixes the measured seconds of a job's stages into what is expected of its kind, with the weight
         ``LEARNING``."""
         learnt, guess = self._read(), first_guess(settings, megapixels)
-        before, stages = learnt.get(kind_of(settings), {}), [stage for stage in guess if stage in seconds]
+        before, stages = learnt.get(kind_of(settings), {}), guess.keys() & seconds.keys()
         whole = sum(seconds[stage] for stage in stages) / max(sum(guess[stage] for stage in stages), 1e-9)
-        for stage in stages:
-            mixed = (1 - LEARNING) * before.get(stage, whole) + LEARNING * seconds[stage] / guess[stage]
-            before[stage] = round(mixed, 4)
+        for stage, pace in ((stage, seconds[stage] / guess[stage]) for stage in stages):
+            before[stage] = round((1 - LEARNING) * before.get(stage, whole) + LEARNING * pace, 4)
         self._learnt = learnt | {kind_of(settings): before}
         with suppress(OSError):
             write_atomically(self._file, json.dumps(self._learnt, indent=1).encode())
