@@ -20,7 +20,6 @@ import numpy as np
 from pipeline.head_model.model import load_model
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.pictures.images import write_image
-from rig.image import ImageRgb
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -30,8 +29,6 @@ from server.processes import python_command, python_environment
 from server.tasks.subjects import drawn_subject
 
 DRAWN, WRITTEN = 3.0, 5.5234375  # times 1024 x 768: 7 Mpx, and 5656 x 4242 = 24 Mpx
-
-
 TIME_LIMIT_S = 1800
 
 
@@ -62,14 +59,11 @@ def write(folder: Path, seed: int = 1) -> Rig:
     write_rig(rig, folder / "cameras.json")
     for camera in rig:
         size = (camera.intrinsics.width, camera.intrinsics.height)
-        picture, plate = taken.capture.images[camera.name], taken.capture.backgrounds[camera.name][0]
-        write_image(folder / "images" / f"{camera.name}.jpg", _enlarged(picture, size))
-        write_image(folder / "background" / f"{camera.name}.jpg", _enlarged(plate, size))
+        shots = {"images": taken.capture.images[camera.name], "background": taken.capture.backgrounds[camera.name][0]}
+        for kind, picture in shots.items():
+            larger = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
+            write_image(folder / kind / f"{camera.name}.jpg", larger)
     return rig
-
-
-def _enlarged(picture: ImageRgb, size: tuple[int, int]) -> ImageRgb:
-    return cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
 
 
 def cost(capture: Path, scratch: Path, options: Sequence[str]) -> dict[str, float]:

@@ -1,12 +1,10 @@
-"""Compares the remaining time that a job tells after a fifth of its time with what the job then takes.
+"""Compares the remaining time that a job tells after a fifth of its processor time with what the job then takes.
 
-Each job is learnt from those before it, as a service does.
-"""
+Each job is learnt from those before it, as a service does."""
 
-import tempfile
-import time
 from contextlib import closing
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 from pipeline.settings import settings_from_document
@@ -18,32 +16,25 @@ from server.tasks.stage_durations import StageDurations, megapixels_of
 JOBS = [("scan-a", "fine both"), ("three-brows", "kernel head"), ("scan-a", "photo head"), ("scan-a", "kernel head")]
 JOBS += [("scan-a", "kernel both"), ("beard-smile", "fine both"), ("three-brows", "fine both"), ("draw-b", "span head")]
 JOBS += [("circle-hair", "photo both"), ("draw-b", "fine head"), ("scan-a-skin", "fine both"), ("draw-b", "photo both")]
-SHARE, NEAR = 0.2, 1 / 3
 
 
-def run(*, captures: Path = Path("../shared/data/captures")) -> dict[str, Any]:
-    """Returns for each job its seconds and the told over the true remaining time, and how many are near 1."""
-    found, clock = {}, time.process_time  # of the job: what else runs here is no fault of the estimate
-    with tempfile.TemporaryDirectory() as scratch, closing(WorkerContext()) as context:
-        durations = StageDurations(Path(scratch) / "paces.json")
+def run(scratch: Path, *, captures: Path = Path("../shared/data/captures")) -> dict[str, Any]:
+    """Returns for each job its seconds and the told by the true remaining time, and how many of these are near 1."""
+    found, durations, context = {}, StageDurations(scratch / "paces.json"), WorkerContext()
+    with closing(context):
         for name, kind in JOBS:
-            detail, surface = kind.split()
-            chosen = settings_from_document({"detail": detail, "outputs": {"surface": surface}})
-            folder, out = captures / name, Path(scratch) / f"{name} {kind}"
-            progress, told, began = JobProgress(durations.of(chosen, megapixels_of(folder)), clock), [], clock()
+            chosen = settings_from_document({"detail": kind.split()[0], "outputs": {"surface": kind.split()[1]}})
+            folder, told, began = captures / name, [(0.0, 0.0)], process_time()
+            progress = JobProgress(durations.of(chosen, megapixels_of(folder)), process_time)
 
             def tell(stage: str, fraction: float, progress: JobProgress = progress, told: list[Any] = told) -> None:
-                told.append((clock(), progress.remaining_s()))
                 progress.report(stage, fraction)
-                told.append((clock(), progress.remaining_s()))
+                told.append((process_time(), process_time() + progress.remaining_s()))
 
-            reconstruct_folder(
-                context, tell, folder=folder, out=out, kept=out, model=None, chosen=chosen, preparation=lambda *_: None
-            )  # fmt: skip
+            places = {"folder": folder, "out": scratch / f"{name} {kind}", "kept": scratch / f"{name} {kind}"}
+            reconstruct_folder(context, tell, **places, model=None, chosen=chosen, preparation=lambda *_: None)
             durations.learn(chosen, progress.finish(), megapixels_of(folder))
-            took = clock() - began
-            at, rest = [(at, rest) for at, rest in told if at <= began + SHARE * took][-1]
-            true = took - (at - began)
-            found[f"{name} {kind}"] = {"seconds": round(took, 1), "told_over_true": round(rest / true, 2)}
-    near = sum(abs(of["told_over_true"] - 1) <= NEAR for of in found.values())
-    return {"figures": found, "near": near, "jobs": len(found)}
+            ended, fifth = process_time(), began + 0.2 * (process_time() - began)
+            end = [end for at, end in told if at <= fifth][-1]
+            found[f"{name} {kind}"] = (round(ended - began, 1), round((end - fifth) / (ended - fifth), 2))
+    return {"figures": found, "near": sum(abs(ratio - 1) <= 1 / 3 for _, ratio in found.values())}
