@@ -1,6 +1,4 @@
-"""Compares the remaining time that a job tells after a fifth of its processor time with what the job then takes.
-
-Each job is learnt from those before it, as a service does."""
+"""Compares the remaining time told after a fifth of a job with what it then takes; jobs are learnt as by a service."""
 
 from contextlib import closing
 from pathlib import Path
