@@ -61,8 +61,7 @@ def write(folder: Path, seed: int = 1) -> Rig:
         size = (camera.intrinsics.width, camera.intrinsics.height)
         shots = {"images": taken.capture.images[camera.name], "background": taken.capture.backgrounds[camera.name][0]}
         for kind, picture in shots.items():
-            larger = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
-            write_image(folder / kind / f"{camera.name}.jpg", larger)
+            write_image(folder / kind / f"{camera.name}.jpg", cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC))
     return rig
 
 

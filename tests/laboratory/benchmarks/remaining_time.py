@@ -22,17 +22,18 @@ def run(scratch: Path, *, captures: Path = Path("../shared/data/captures")) -> d
     with closing(context):
         for name, kind in JOBS:
             chosen = settings_from_document({"detail": kind.split()[0], "outputs": {"surface": kind.split()[1]}})
-            folder, told, began = captures / name, [(0.0, 0.0)], process_time()
+            folder, ends, began = captures / name, list[tuple[float, float]](), process_time()
             progress = JobProgress(durations.of(chosen, megapixels_of(folder)), process_time)
 
-            def tell(stage: str, fraction: float, progress: JobProgress = progress, told: list[Any] = told) -> None:
+            def tell(stage: str, fraction: float, progress: JobProgress = progress, ends: list[Any] = ends) -> None:
                 progress.report(stage, fraction)
-                told.append((process_time(), process_time() + progress.remaining_s()))
+                ends.append((process_time(), process_time() + progress.remaining_s()))
 
+            tell("read", 0.0)
             places = {"folder": folder, "out": scratch / f"{name} {kind}", "kept": scratch / f"{name} {kind}"}
             reconstruct_folder(context, tell, **places, model=None, chosen=chosen, preparation=lambda *_: None)
-            durations.learn(chosen, progress.finish(), megapixels_of(folder))
             ended, fifth = process_time(), began + 0.2 * (process_time() - began)
-            end = [end for at, end in told if at <= fifth][-1]
+            durations.learn(chosen, progress.finish(), megapixels_of(folder))
+            end = [end for at, end in ends if at <= fifth][-1]
             found[f"{name} {kind}"] = (round(ended - began, 1), round((end - fifth) / (ended - fifth), 2))
     return {"figures": found, "near": sum(abs(ratio - 1) <= 1 / 3 for _, ratio in found.values())}
