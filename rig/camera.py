@@ -3,7 +3,6 @@
 ``x = X / Z`` in the camera frame is distorted to ``x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + tangential`` (OpenCV's
 order k1 k2 p1 p2 k3), and ``u = fx x_d + cx``. Pixel (0, 0) is the centre of the top-left pixel."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -146,7 +145,7 @@ class Camera:
         """Returns the pixels of world points (mm), and their derivatives by the points (px / mm)."""
         points = self.camera_from_world.apply(points_world)
         with np.errstate(divide="ignore", invalid="ignore"):
-            by_point, _ = lens_jacobians(points, self.intrinsics.values())
+            by_point = lens_slopes(points, self.intrinsics.values())
         return self._image(points), by_point @ self.camera_from_world.rotation
 
     def rays_world(self, pixels: Pixels) -> Points:
@@ -170,38 +169,6 @@ class Camera:
         return pixels
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraStack:
-    """Holds several cameras as arrays, to project one point to all of them at once. ``Camera`` projects many points to
-    one camera."""
-
-    rotations: Float[np.ndarray, "n 3 3"]
-    translations: Points  # mm
-    lenses: Float[np.ndarray, "n 9"]
-    turning_radii: Float[np.ndarray, " n"]
-
-    @classmethod
-    def of(cls, cameras: Sequence[Camera]) -> "CameraStack":
-        """Builds the arrays from cameras."""
-        return cls(
-            np.array([camera.camera_from_world.rotation for camera in cameras]),
-            np.array([camera.camera_from_world.translation for camera in cameras]),
-            np.array([camera.intrinsics.values() for camera in cameras]),
-            np.array([camera.intrinsics.distortion.max_valid_radius() for camera in cameras]),
-        )
-
-    def project_with_jacobian(self, point_world: Float[np.ndarray, " 3"]) -> tuple[Pixels, Float[np.ndarray, "n 2 3"]]:
-        """Returns the pixel of a world point (mm) in each camera, and its derivatives by the point (px / mm); NaN as in
-        ``Camera.project``."""
-        points = self.rotations @ point_world + self.translations
-        with np.errstate(divide="ignore", invalid="ignore"):
-            by_point, _ = lens_jacobians(points, self.lenses)
-            pixels = lens_image(points, self.lenses)
-            radius = np.hypot(points[:, 0], points[:, 1]) / points[:, 2]
-            pixels[(points[:, 2] <= 0) | (radius > self.turning_radii)] = np.nan
-        return pixels, by_point @ self.rotations
-
-
 def lens_image(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Pixels:
     """Projects points in a camera's frame (mm) to pixels.
 
@@ -210,16 +177,20 @@ def lens_image(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Pixels:
     return _distorted(points[:, :2] / points[:, 2:], lens[..., 4:]) * lens[..., :2] + lens[..., 2:4]
 
 
+def lens_slopes(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Float[np.ndarray, "n 2 3"]:
+    """Returns the derivatives of ``lens_image`` by the point (px / mm)."""
+    normalised, z = points[:, :2] / points[:, 2:], points[:, 2, None]
+    slopes = lens[..., :2, None] * _distortion_slopes(normalised, lens[..., 4:])
+    by_depth = (slopes * (-normalised / z)[:, None]).sum(axis=2)
+    return np.concatenate([slopes * (1.0 / z)[:, None], by_depth[:, :, None]], axis=2)
+
+
 def lens_jacobians(
     points: Points, lens: Float[np.ndarray, "*n 9"]
 ) -> tuple[Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 9"]]:
     """Returns the derivatives of ``lens_image`` by the point (px / mm) and by the nine values of the lens."""
-    normalised, z = points[:, :2] / points[:, 2:], points[:, 2]
-    (x, y), focal = normalised.T, lens[..., :2, None]
-    slopes = focal * _distortion_slopes(normalised, lens[..., 4:])
-    pinhole = np.zeros((len(points), 2, 3))
-    pinhole[:, 0, 0] = pinhole[:, 1, 1] = 1.0 / z
-    pinhole[:, :, 2] = -normalised / z[:, None]
+    normalised, focal = points[:, :2] / points[:, 2:], lens[..., :2, None]
+    x, y = normalised.T
     r2 = x * x + y * y
     by_lens = np.zeros((len(points), 2, 9))
     by_lens[:, [0, 1], [0, 1]] = _distorted(normalised, lens[..., 4:])
@@ -227,7 +198,7 @@ def lens_jacobians(
     by_lens[:, 0, 4:] = np.stack([x * r2, x * r2**2, 2.0 * x * y, r2 + 2.0 * x * x, x * r2**3], axis=1)
     by_lens[:, 1, 4:] = np.stack([y * r2, y * r2**2, r2 + 2.0 * y * y, 2.0 * x * y, y * r2**3], axis=1)
     by_lens[:, :, 4:] *= focal
-    return slopes @ pinhole, by_lens
+    return lens_slopes(points, lens), by_lens
 
 
 def _distorted(normalised: Pixels, lens: Float[np.ndarray, "*n 5"]) -> Pixels:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri
 
-from pipeline.multiview.triangulation import NoPoint, TriangulatedPoint, rays_of, triangulate
+from pipeline.multiview.triangulation import NoPoint, TriangulatedPoint, triangulate
 from rig.capture import Features
 from rig.messages.message import Message, compose
 from rig.rig import Rig
@@ -74,15 +74,13 @@ def _consistent(
 ) -> tuple[TriangulatedPoint | None, str | None]:
     """Triangulates a point from all views or, if these contradict each other, from all but one, and returns that view's
     name as well. Returns (None, None) if that fails too."""
-    rays = rays_of(pixels, rig)
-    point = triangulate(pixels, rig, noise_px=noise_px, rays_world=rays)
+    point = triangulate(pixels, rig, noise_px=noise_px)
     if _agrees(point, noise_px):
         return point, None
     if len(pixels) == 2:
         return None, None
     without = {
-        name: triangulate({k: v for k, v in pixels.items() if k != name}, rig, noise_px=noise_px, rays_world=rays)
-        for name in pixels
+        name: triangulate({k: v for k, v in pixels.items() if k != name}, rig, noise_px=noise_px) for name in pixels
     }
     dropped = min(without, key=lambda name: without[name].misfit(noise_px))
     return (without[dropped], dropped) if _agrees(without[dropped], noise_px) else (None, None)

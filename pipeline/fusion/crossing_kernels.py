@@ -23,6 +23,74 @@ def triangle_boxes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
+def any_corner(vertex: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Tells which triangles have a corner among the vertices ``vertex`` (v), (f)."""
+    found = np.empty(len(faces), np.bool_)
+    for f in range(len(faces)):
+        found[f] = vertex[faces[f, 0]] | vertex[faces[f, 1]] | vertex[faces[f, 2]]
+    return found
+
+
+@njit(cache=True, nogil=True)
+def turned_and_folded(
+    vertices: np.ndarray, faces: np.ndarray, pairs: np.ndarray, near: np.ndarray, least_cosine: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Tells which triangles face against the mean normal of their corners (f), and of which ``pairs`` (e, 2) the
+    normals have a cosine below ``least_cosine`` (e); of the triangles ``near`` (f) alone."""
+    normals, means = np.zeros((len(faces), 3)), np.zeros((len(vertices), 3))
+    for f in range(len(faces)):
+        if near[f]:
+            a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+            for x in range(3):
+                y, z = (x + 1) % 3, (x + 2) % 3
+                normals[f, x] = (b[y] - a[y]) * (c[z] - a[z]) - (b[z] - a[z]) * (c[y] - a[y])
+                for corner in range(3):
+                    means[faces[f, corner], x] += normals[f, x]
+    turned, folded = np.zeros(len(faces), np.bool_), np.zeros(len(pairs), np.bool_)
+    for f in range(len(faces)):
+        if near[f]:
+            along = 0.0
+            for corner in range(3):
+                mean = means[faces[f, corner]]
+                along += _dot(mean, normals[f]) / max(np.sqrt(_dot(mean, mean)), 1e-12)
+            turned[f] = along <= 0.0
+    for e in range(len(pairs)):
+        if near[pairs[e, 0]] and near[pairs[e, 1]]:
+            one, other = normals[pairs[e, 0]], normals[pairs[e, 1]]
+            sizes = np.sqrt(_dot(one, one) * _dot(other, other))
+            folded[e] = _dot(one, other) < least_cosine * max(sizes, 1e-24)
+    return turned, folded
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, nogil=True)
+def beside_active(boxes: np.ndarray, active: np.ndarray) -> np.ndarray:
+    """Tells which triangles lie in or beside a cell that holds the middle of an ``active`` triangle, (f)."""
+    wide, low, high = 1e-9, np.full(3, np.inf), np.full(3, -np.inf)
+    for f in range(len(boxes)):
+        for axis in range(3):
+            wide = max(wide, boxes[f, 3 + axis] - boxes[f, axis])
+            middle = 0.5 * (boxes[f, axis] + boxes[f, 3 + axis])
+            low[axis], high[axis] = min(low[axis], middle), max(high[axis], middle)
+    cells, near = np.empty((len(boxes), 3), np.int64), np.empty(len(boxes), np.bool_)
+    nx, ny, nz = ((high - low) / wide).astype(np.int64) + 3
+    taken = np.zeros((nx, ny, nz), np.bool_)
+    for f in range(len(boxes)):
+        for axis in range(3):
+            cells[f, axis] = int((0.5 * (boxes[f, axis] + boxes[f, 3 + axis]) - low[axis]) / wide) + 1
+        if active[f]:
+            x, y, z = cells[f]
+            taken[x - 1 : x + 2, y - 1 : y + 2, z - 1 : z + 2] = True
+    for f in range(len(boxes)):
+        near[f] = taken[cells[f, 0], cells[f, 1], cells[f, 2]]
+    return near
+
+
+@njit(cache=True, nogil=True)
 def crossing_triangles(
     vertices: np.ndarray,
     faces: np.ndarray,

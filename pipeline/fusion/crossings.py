@@ -5,8 +5,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
-from pipeline.fusion.crossing_kernels import crossing_triangles, triangle_boxes
-from pipeline.fusion.grid_kernels import grown
+from pipeline.fusion.crossing_kernels import beside_active, crossing_triangles, triangle_boxes
 from pipeline.geometry.cells import sorted_into_cells
 from rig.mesh import Mesh
 
@@ -25,7 +24,7 @@ def crossing_faces(
     if not active.any():
         return np.zeros(len(faces), bool)
     boxes, crossing = triangle_boxes(vertices, faces), np.zeros(len(faces), bool)
-    near = np.flatnonzero(_near(boxes, active))
+    near = np.flatnonzero(beside_active(boxes, active))
     crossing[near] = _crossing(vertices, faces[near], boxes[near], active[near])
     return crossing
 
@@ -61,16 +60,6 @@ def _crossing(
 
     in_threads(len(faces), mark)
     return crossing
-
-
-def _near(boxes: Float[np.ndarray, "f 6"], active: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles lie in or beside a cell of the grid that holds an active triangle."""
-    middle = 0.5 * (boxes[:, :3] + boxes[:, 3:])
-    wide = max(float((boxes[:, 3:] - boxes[:, :3]).max(initial=0.0)), 1e-9)
-    cell = ((middle - middle.min(axis=0, initial=np.inf)) / wide).astype(np.int64) + 1
-    taken = np.zeros(cell.max(axis=0, initial=0) + 2, bool)
-    taken[tuple(cell[active].T)] = True
-    return grown(taken)[tuple(cell.T)]
 
 
 @traced

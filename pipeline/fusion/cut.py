@@ -89,14 +89,15 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
     far, near = nearest(tree, seen)
     if low[near].all() or not low[near].any():
         return Cut(box, beyond, np.zeros(len(beyond), bool))
-    below, under = low[near], low[nearest(tree, places)[1]]
-    down = vertices[low].mean(axis=0) - vertices.mean(axis=0)
-    base = under & (places @ down > np.quantile(seen[below] @ down, BASE_QUANTILE))
+    below, down = low[near], vertices[low].mean(axis=0) - vertices.mean(axis=0)
+    base = places @ down > np.quantile(seen[below] @ down, BASE_QUANTILE)
+    base[base] = low[nearest(tree, places[base])[1]]
     towards = views.cameras[:, CENTRE:] - np.median(seen, axis=0)
     back = -(towards / np.linalg.norm(towards, axis=1, keepdims=True)).mean(axis=0)
     if np.linalg.norm(back) > ONE_SIDED:
         back /= np.linalg.norm(back)
         end = max(np.quantile(seen[below] @ back, BEHIND_QUANTILE), (vertices[low] @ back).max())
         head_end = (vertices @ back).max() + np.quantile(far[~below], THICK_QUANTILE)
+        under = low[nearest(tree, places)[1]]
         beyond = np.maximum(beyond, places @ back - np.where(under, end, head_end))
     return Cut(box, beyond, base)

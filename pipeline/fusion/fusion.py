@@ -26,6 +26,7 @@ from pipeline.fusion.net_kernels import component_of, compose_well
 from pipeline.fusion.refinement import (
     MAX_MM,
     Measured,
+    SeenVertices,
     deviation_mm,
     refine_vertices,
     seen_deviation_mm,
@@ -157,6 +158,7 @@ def finished(
     """
     mesh, measured = surface.mesh_world, surface.measured
     seen = measured.views > 0
+    seen_vertices = SeenVertices.of(mesh.vertices, seen)
     shares, shown = np.tile([1.0, 0.0, 0.0], (len(seen), 1)), np.full(len(seen), Part.SKIN, np.uint8)
     if votes is not None:
         shown = part_codes(votes, mesh.vertices)
@@ -164,8 +166,8 @@ def finished(
     skin, moved_mm = shares[:, Part.SKIN.channel], np.zeros(len(seen))
     strands = surface.scatter * shares[:, Part.HAIR.channel]
     if head is not None:
-        mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured))
-    mesh = smooth_hair(mesh, strands, seen, surface.capped)
+        mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured), seen_vertices)
+    mesh = smooth_hair(mesh, strands, seen_vertices, surface.capped)
     if surface.shell_deviation_mm is None:
         mesh, moved_mm = grown_to_outlines(mesh, strands, silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))
@@ -174,7 +176,7 @@ def finished(
     mended_mm = np.linalg.norm(clean.vertices - mesh.vertices, axis=1)
     mesh = clean
     part = np.where(seen, shown, Part.UNSEEN).astype(np.uint8)
-    deviation = np.hypot(np.hypot(deviation_mm(mesh, measured), STRAND_SHARE * moved_mm), mended_mm)
+    deviation = np.hypot(np.hypot(deviation_mm(seen_vertices, measured), STRAND_SHARE * moved_mm), mended_mm)
     if surface.shell_deviation_mm is not None:
         guessed = ~seen & facing_a_camera(mesh, rig)
         deviation[guessed] = np.minimum(deviation[guessed], surface.shell_deviation_mm)

@@ -25,7 +25,7 @@ from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion.grid import Grid
 from pipeline.fusion.prior import near_rim
-from pipeline.fusion.refinement import EDGE_MM, guessed_deviation_mm, neighbours
+from pipeline.fusion.refinement import EDGE_MM, SeenVertices, neighbours
 from pipeline.fusion.refinement_kernels import blurred_over_mesh
 from pipeline.fusion.skin import mean_around, skin_share
 from pipeline.fusion.view_stack import ViewStack
@@ -248,7 +248,7 @@ def parts_over_head(votes: PartVotes, head_world: Mesh, stubble: bool = True) ->
 
 @traced
 def smooth_hair(
-    mesh_world: Mesh, hair: Float[np.ndarray, " v"], seen: Bool[np.ndarray, " v"], held: Bool[np.ndarray, " v"]
+    mesh_world: Mesh, hair: Float[np.ndarray, " v"], seen: SeenVertices, held: Bool[np.ndarray, " v"]
 ) -> Mesh:
     """Returns the mesh with the vertices of hair, and those far from all that is seen, moved to the mean of their
     surroundings.
@@ -256,11 +256,11 @@ def smooth_hair(
     ``mesh_world``: closed, mm. ``hair``: probability that a vertex shows hair. ``seen``: by a view; the others are what
     is seen next to them. ``held``: vertices that stay.
     """
-    beside = neighbours(mesh_world.faces, len(seen))
-    share = skin_share(beside, mesh_world.vertices, 1.0 - hair, seen)
-    share *= EDGE_MM / np.maximum(guessed_deviation_mm(mesh_world.vertices, seen), EDGE_MM)
+    beside = neighbours(mesh_world.faces, len(hair))
+    share = skin_share(beside, 1.0 - hair, seen)
+    share *= EDGE_MM / np.maximum(seen.guess_deviation_mm(), EDGE_MM)
     share = np.where(held, 1.0, share)[:, None]
-    area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / len(seen)
+    area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / len(hair)
     mean = blurred_over_mesh(mesh_world.vertices, *beside, round(RESOLVED_MM**2 / (STEP_SHARE * area_mm2)))
     return Mesh(share * mesh_world.vertices + (1.0 - share) * mean, mesh_world.faces)
 

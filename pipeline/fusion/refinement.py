@@ -23,7 +23,6 @@ ROUNDS, SWEEPS = 2, 6
 MIN_MM = 0.05  # what no view shows: the calibration's own error, and the surface between vertices
 ALONE_MM = 0.3  # of what a single view says, beside its own deviation: nobody contradicts it
 EDGE_MM, SLOPE, MAX_MM = 1.5, 0.25, 15.0  # a guess at the edge of what is seen, its growth with the distance, its end
-EVERY = 4  # seen vertices stand for the others
 # Smaller patches that views agree on, with nothing seen about them, are often chance: without this the farthest places
 # of the laboratory's `planted` are six times as far off.
 ISLAND_MM2 = 100.0
@@ -38,6 +37,30 @@ class Measured:
     information: Float[np.ndarray, " v"]
     scatter: Float[np.ndarray, " v"]
     views: UInt8[np.ndarray, " v"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenVertices:
+    """Tells which vertices a view sees (``themselves``), how far (mm) each one is from the nearest of them, and which
+    that is: the vertex itself where it is seen."""
+
+    themselves: Bool[np.ndarray, " v"]
+    far_mm: Float[np.ndarray, " v"]
+    nearest: Int[np.ndarray, " v"]
+
+    @classmethod
+    def of(cls, vertices: Float[np.ndarray, "v 3"], seen: Bool[np.ndarray, " v"]) -> "SeenVertices":
+        """Finds the nearest seen vertices. Where there is none at all, the distance is infinite."""
+        far_mm, row, those = np.where(seen, 0.0, np.inf), np.arange(len(seen)), np.flatnonzero(seen)
+        if len(those):
+            far_mm[~seen], at = nearest(PointTree.of(vertices[those]), vertices[~seen])
+            row[~seen] = those[at]
+        return cls(seen, far_mm, row)
+
+    def guess_deviation_mm(self) -> Float[np.ndarray, " v"]:
+        """Returns the standard deviation (mm) of a guess at each vertex, which grows with the distance; 0 where it is
+        seen."""
+        return np.where(self.themselves, 0.0, np.minimum(EDGE_MM + SLOPE * self.far_mm, MAX_MM))
 
 
 @traced
@@ -89,21 +112,10 @@ def without_islands(mesh: Mesh, measured: Measured) -> Measured:
     return replace(measured, views=np.where(held < ISLAND_MM2, 0, measured.views).astype(np.uint8))
 
 
-def deviation_mm(mesh: Mesh, measured: Measured) -> Float[np.ndarray, " v"]:
-    """Returns the standard deviation (mm) of each vertex along its normal. Seen vertices have that of
-    ``seen_deviation_mm``; the others a guess that grows with the distance to the nearest seen vertex."""
-    seen = measured.views > 0
-    return np.where(seen, seen_deviation_mm(measured), guessed_deviation_mm(mesh.vertices, seen))
-
-
-def guessed_deviation_mm(vertices: Float[np.ndarray, "v 3"], seen: Bool[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
-    """Returns the standard deviation (mm) of the guess at every vertex that no view sees, from its distance to those
-    that one sees; 0 for these."""
-    out = np.where(seen, 0.0, MAX_MM)
-    if seen.any():
-        far, _ = nearest(PointTree.of(vertices[seen][::EVERY]), vertices[~seen])
-        out[~seen] = np.minimum(EDGE_MM + SLOPE * far, MAX_MM)
-    return out
+def deviation_mm(seen: SeenVertices, measured: Measured) -> Float[np.ndarray, " v"]:
+    """Returns the standard deviation (mm) of each vertex along its normal: that of ``seen_deviation_mm``, or of a
+    guess."""
+    return np.where(seen.themselves, seen_deviation_mm(measured), seen.guess_deviation_mm())
 
 
 def seen_deviation_mm(measured: Measured) -> Float[np.ndarray, " v"]:

@@ -23,9 +23,8 @@ from jaxtyping import Bool, Float, Int32, Int64
 
 from pipeline.compute.trace import traced
 from pipeline.fusion.prior import near_rim
-from pipeline.fusion.refinement import guessed_deviation_mm, neighbours
+from pipeline.fusion.refinement import SeenVertices, neighbours
 from pipeline.fusion.refinement_kernels import blurred_over_mesh, smooth_offsets
-from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.surface_index import SurfaceIndex
 from rig.mesh import Mesh, face_normals
 
@@ -66,33 +65,35 @@ class HeightField:
 
 
 @traced
-def combine_with_head(mesh_world: Mesh, skin: PerVertex, head: HeadSkin, deviation_mm: PerVertex) -> Mesh:
+def combine_with_head(
+    mesh_world: Mesh, skin: PerVertex, head: HeadSkin, deviation_mm: PerVertex, seen: SeenVertices
+) -> Mesh:
     """Moves the vertices of skin along the head's normals to the estimate from depth and head.
 
     Args:
         mesh_world: the fused surface, closed, mm.
         skin: probability that a vertex shows skin; 0 where no view sees it.
         head: the delivered head.
-        deviation_mm: standard deviation of depth along the normal; 0 where no view sees the vertex.
+        deviation_mm: standard deviation of depth along the normal, where a view sees the vertex.
+        seen: by any view.
     """
-    seen = deviation_mm > 0.0
     field = heights_over(head, mesh_world)
-    if not len(field.row) or not seen.any():
+    if not len(field.row) or not seen.themselves.any():
         return mesh_world
-    count, row = len(seen), field.row
+    count, row = len(deviation_mm), field.row
     beside = neighbours(mesh_world.faces, count)
-    share = skin_share(beside, mesh_world.vertices, skin, seen)
-    noise_mm = depth_deviation_mm(beside, mesh_world.vertices, deviation_mm, seen)
+    share = skin_share(beside, skin, seen)
+    noise_mm = depth_deviation_mm(beside, deviation_mm, seen)
     height, stated_mm, within = np.zeros(count), np.zeros(count), np.zeros(count)
     height[row], stated_mm[row], within[row] = field.height_mm, np.hypot(field.deviation_mm, MIN_DEVIATION_MM), 1.0
     most = 4.0 * np.hypot(noise_mm, stated_mm)
-    shown = within * seen * skin
+    shown = within * seen.themselves * skin
     offset = within * mean_around(beside, np.clip(height, -most, most), shown)
     head_mm = np.sqrt(stated_mm**2 + mean_around(beside, offset**2, shown))
     stiffness = within * head_stiffness(head_mm)
     area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / count
     pull = share * stiffness * area_mm2 / LENGTH_MM**2
-    information = within * depth_information(noise_mm, seen, area_mm2)
+    information = within * depth_information(noise_mm, seen.themselves, area_mm2)
     both_mm, root = np.hypot(noise_mm, head_mm), np.sqrt(stiffness)
     estimate = offset
     for narrowing in NARROWING:
@@ -106,13 +107,11 @@ def combine_with_head(mesh_world: Mesh, skin: PerVertex, head: HeadSkin, deviati
     return Mesh(vertices, mesh_world.faces)
 
 
-def depth_deviation_mm(
-    beside: Adjacency, vertices: Float[np.ndarray, "v 3"], stated_mm: PerVertex, seen: Bool[np.ndarray, " v"]
-) -> PerVertex:
+def depth_deviation_mm(beside: Adjacency, stated_mm: PerVertex, seen: SeenVertices) -> PerVertex:
     """Returns s, at least ``MIN_DEVIATION_MM``: the larger of a vertex' deviation and its surroundings' mean; where no
     view sees the vertex, that of a guess."""
-    around_mm = mean_around(beside, stated_mm, seen.astype(float))
-    noise_mm = np.where(seen, np.maximum(stated_mm, around_mm), guessed_deviation_mm(vertices, seen))
+    around_mm = mean_around(beside, stated_mm, seen.themselves.astype(float))
+    noise_mm = np.where(seen.themselves, np.maximum(stated_mm, around_mm), seen.guess_deviation_mm())
     return np.hypot(noise_mm, MIN_DEVIATION_MM)
 
 
@@ -147,15 +146,11 @@ def heights_over(head: HeadSkin, mesh_world: Mesh) -> HeightField:
     return HeightField(row[near], height[near], normal[near], deviation_mm[near])
 
 
-def skin_share(
-    beside: Adjacency, vertices: Float[np.ndarray, "v 3"], skin: PerVertex, seen: Bool[np.ndarray, " v"]
-) -> PerVertex:
+def skin_share(beside: Adjacency, skin: PerVertex, seen: SeenVertices) -> PerVertex:
     """Returns the probability that each vertex shows skin; where no view sees it, that of what is seen nearest."""
-    rim = np.flatnonzero(seen)
-    nearest_seen = nearest(PointTree.of(vertices[rim]), vertices[~seen])[1]
-    share = skin.copy()
-    share[~seen] = mean_around(beside, skin, seen.astype(float))[rim[nearest_seen]]
-    return np.where(seen, share, mean_around(beside, share, np.ones(len(seen))))
+    around = mean_around(beside, skin, seen.themselves.astype(float))
+    share = np.where(seen.themselves, skin, around[seen.nearest])
+    return np.where(seen.themselves, skin, mean_around(beside, share, np.ones(len(skin))))
 
 
 def mean_around(beside: Adjacency, values: PerVertex, weight: PerVertex) -> PerVertex:

@@ -60,11 +60,11 @@ class ViewStack:
             x, y, z = camera[:9].reshape(3, 3) @ places.T + camera[9:12, None]
             fx, fy, cx, cy = camera[LENS : LENS + 4]
             depth = np.maximum(z, 1.0)
-            pixel = np.stack([fx * x / depth + cx, fy * y / depth + cy], axis=1)
-            within = np.clip(pixel, 0, size - 1.0)
-            column, row = np.rint(within).astype(int).T
-            edge, outline = PIXEL_STEP * self.shown[self.starts[view] + row * size[0] + column][:, [FRAME, OUTLINE]].T
-            beyond = edge + np.linalg.norm(pixel - within, axis=1)
+            u, v = fx * x / depth + cx, fy * y / depth + cy
+            column, row = np.clip(u, 0, size[0] - 1.0), np.clip(v, 0, size[1] - 1.0)
+            pixel = self.starts[view] + np.rint(row).astype(int) * size[0] + np.rint(column).astype(int)
+            edge, outline = (PIXEL_STEP * self.shown[pixel, channel] for channel in (FRAME, OUTLINE))
+            beyond = edge + np.hypot(u - column, v - row)
             return np.where(z > 1.0, np.stack([beyond, outline]) * depth / fx, np.inf)
 
         return np.stack(map_in_threads(outside_of, len(self.cameras)), axis=1)

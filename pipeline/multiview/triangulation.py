@@ -1,4 +1,4 @@
-"""Computes a point from its pixels in several views (section 4.2), by Levenberg-Marquardt on the reprojection error.
+"""Computes a point from its pixels in several views (section 4.2), by Gauss-Newton steps on the reprojection error.
 
 Enters: one pixel per camera. Leaves: the world point with its covariance. The search starts at the point nearest to all
 rays (linear least squares). Lens distortion is part of the projection, so that nothing is undistorted first.
@@ -10,17 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.estimation.levenberg_marquardt import Limits, minimise
-from pipeline.estimation.terms import Problem, Residuals
-from rig.camera import Camera, CameraStack
+from rig.camera import Camera
 from rig.errors import EigenheadError
 from rig.geometry import ray_equations
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 CLICK_NOISE_PX = 1.5  # of a person's click; measured on captures rendered by another program
-LIMITS = Limits(steps=50, tolerance=1e-12, tries=6)  # a step of 1e-6 standard deviations
-STEPS = 10  # of many points at once; three are usual
+STEPS = 10  # three are usual
 SETTLED = 1e-9  # share of the misfit that a last step still takes away
 MIN_RAYS_APART = 1e-4  # rad; between rays closer to parallel, 0.1 px at f = 1500 px, depth is unknown
 
@@ -47,60 +44,22 @@ class TriangulatedPoint:
         return sum(float(r @ r) for r in self.residuals_px.values()) / noise_px**2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ReprojectionTerm:
-    """Computes the residuals ``(projected - picked) / noise`` of a world point (mm), two for each view; NaN for a point
-    behind a camera."""
-
-    pixels: Float[np.ndarray, "n 2"]
-    cameras: CameraStack
-    noise_px: float
-
-    def at(self, position_world: Float[np.ndarray, " 3"]) -> Residuals:
-        """Returns the residuals of all views for a point, with their derivatives by its position."""
-        projected, slopes = self.cameras.project_with_jacobian(position_world)
-        return Residuals((projected - self.pixels) / self.noise_px, lambda: slopes / self.noise_px)
-
-
-def triangulate(
-    pixels: Mapping[str, Float[np.ndarray, " 2"]],
-    rig: Rig,
-    *,
-    noise_px: float,
-    rays_world: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
-) -> TriangulatedPoint:
+def triangulate(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig, *, noise_px: float) -> TriangulatedPoint:
     """Computes the point that minimises the sum of squared reprojection errors over the cameras in ``pixels``.
 
     Args:
         pixels: the picked pixel by camera.
         rig: the cameras.
         noise_px: standard deviation of each coordinate of a picked pixel, to which the covariance scales.
-        rays_world: the result of ``rays_of``, if the caller has it already; it may contain other cameras, too.
 
-    Raises NoPoint for fewer than two views, for parallel rays, and for a point behind a camera.
+    Raises NoPoint as ``triangulate_many`` does, and for fewer than two views.
     """
     if len(pixels) < 2:
         raise NoPoint(compose("point-in-few-views", count=len(pixels)))
-    picked = np.array([np.asarray(pixel, float) for pixel in pixels.values()])
-    term = ReprojectionTerm(picked, CameraStack.of([rig[name] for name in pixels]), noise_px)
-    problem = Problem((term,), 3, np.add)
-    rays = rays_of(pixels, rig) if rays_world is None else rays_world
-    start = _nearest_to_rays(
-        np.stack([rig[name].centre_world for name in pixels]), np.stack([rays[name] for name in pixels])[:, None]
-    )[0]
-    at_start = problem.at(start)
-    if not np.isfinite(at_start.cost):
-        raise NoPoint(compose("point-behind-camera"))
-    found = minimise(problem, start, LIMITS, at_start=at_start)
-    miss_px = -noise_px * term.at(found.value).residual
-    covariance = np.linalg.inv(problem.equations(found.at).matrix)
-    return TriangulatedPoint(found.value, covariance, dict(zip(pixels, miss_px, strict=True)))
-
-
-def rays_of(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns the unit direction (world) of the ray through each view's pixel. Undoing the lens distortion here takes
-    most of a triangulation's time."""
-    return {name: rig[name].rays_world(np.asarray(pixel, float)[None])[0] for name, pixel in pixels.items()}
+    picked = np.array([np.asarray(pixel, float) for pixel in pixels.values()])[:, None]
+    found = triangulate_many(picked, [rig[name] for name in pixels], np.full((len(pixels), 1), noise_px))
+    residuals = dict(zip(pixels, found.residuals_px[:, 0], strict=True))
+    return TriangulatedPoint(found.positions_world[0], found.covariances[0], residuals)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,7 +79,7 @@ def triangulate_many(
     *,
     start: Float[np.ndarray, "n 3"] | None = None,
 ) -> TriangulatedPoints:
-    """Triangulates many points, each seen by every camera, as ``triangulate`` does one.
+    """Triangulates many points, each seen by every camera.
 
     Args:
         pixels: of each point in each view.

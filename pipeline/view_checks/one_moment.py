@@ -27,7 +27,8 @@ from rig.rig import Rig
 MAX_SIGMAS = 5.0  # 4.9 in 24 clean studio heads of 410 px, 4.2 in other clean captures; 10 mm aside are 5 to 8 there
 OPEN_MM = 3.0  # between lips: 0.4 to 2.3 of eight shut mouths, 4.3 to 11 of six jaws opened by half and fully
 OPENING_NOISE = 0.15  # of the opening that the other views see, by which lips seen from above or below differ
-MIN_FACING = 0.5  # cosine, of a view whose lips are judged: seen from the side, all mouths look shut
+MIN_FACING = 0.5  # cosine, of a view that is judged: from the side all mouths look shut, and points lie up to 7 mm off
+MIN_OFFSET_MM = 5.0  # of a head: half of a movement that must be named. A bearded open mouth from below is 4.9 mm off
 UPPER_LIP, LOWER_LIP = [0, 37, 267, 13, 82, 312, 81, 311], [17, 84, 314, 14, 87, 317, 178, 402]  # of the 468 points
 
 
@@ -64,6 +65,8 @@ def _offset(name: str, seen: FaceDetection, agreeing: Mapping[str, FaceDetection
     if face is None:
         return None
     camera, points = rig[name], face.points.positions_world
+    if direction_from_face(face.world_from_face, camera)[2] < MIN_FACING:
+        return None
     pixels, slopes = camera.project_with_jacobian(points)
     missed = unbiased_px(seen, face.world_from_face, camera) - pixels
     unknown = np.einsum("nij,mnj->mni", slopes, shared_modes(face, rig)).mean(axis=1)
@@ -75,8 +78,7 @@ def _offset(name: str, seen: FaceDetection, agreeing: Mapping[str, FaceDetection
     there, seen_there, world = (_lips_apart(each) for each in (pixels, pixels + missed, points))
     lips_px, open_px = float(np.linalg.norm(seen_there - there)), float(np.linalg.norm(there))
     is_open = min(float(np.linalg.norm(world)), float(np.linalg.norm(seen_there)) * mm_per_px) > OPEN_MM
-    if is_open or direction_from_face(face.world_from_face, camera)[2] < MIN_FACING:
-        lips_px = 0.0
+    head_px, lips_px = head_px * (head_px * mm_per_px > MIN_OFFSET_MM), lips_px * (not is_open)
     by_head = _Offset(head_px / float(noise_px), head_px * mm_per_px, name)
     by_lips = _Offset(lips_px / float(np.hypot(noise_px, OPENING_NOISE * open_px)), lips_px * mm_per_px, name)
     return max(by_head, by_lips)

@@ -236,8 +236,8 @@ class Worker:
         return name
 
     def _fit_in_memory(self, job_id: str, request: JobRequest, folder: Path) -> None:
-        """Runs a job's work; once more where its child was killed with signal 9, as the system does where memory is
-        short; and then at the level photo, which report.json tells. Raises JobFailed if that is killed, too."""
+        """Runs a job's work; once more where its child was out of memory, or killed with signal 9, as the system does
+        where memory is short; and then at the level photo, which report.json tells. Raises what that ends with, too."""
         settings = request.get("settings") or {}
         tries = [settings, settings]
         if settings.get("detail") in PHOTO_LEVELS and settings.get("detail") != "photo":
@@ -247,9 +247,9 @@ class Worker:
             try:
                 self._run_work(job_id, request, folder, chosen)
             except WorkFailed as error:
-                if error.kind != "killed":
+                if error.kind != "killed" and (error.kind != "out-of-memory" or count == len(tries)):
                     raise
-                log.warning("work was killed", times=count, of=len(tries))
+                log.warning("work had too little memory", times=count, of=len(tries))
                 shutil.rmtree(folder, ignore_errors=True)
             else:
                 if chosen is not settings:

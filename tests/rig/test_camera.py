@@ -1,7 +1,6 @@
 """The camera against OpenCV's projection, finite differences, and itself turned round."""
 
 from dataclasses import replace
-from itertools import product
 
 import cv2
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.camera import Camera, CameraStack, Distortion, Intrinsics
+from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import RigidTransform, look_at, rotation_from_vector, vector_from_rotation
 
 LENSES = [
@@ -117,20 +116,3 @@ def test_moving_world_and_camera_together_changes_no_pixel(turn: np.ndarray, shi
     moved = camera(LENSES[2], POSE @ world_from_other)
     points = world_from_other.inverse().apply(POINTS)
     np.testing.assert_allclose(moved.project(points), camera(LENSES[2]).project(POINTS), atol=1e-7)
-
-
-def test_a_stack_of_cameras_sees_a_point_as_each_of_them_does() -> None:
-    """NaN as in the camera's own, behind one of them and past a lens's turning point."""
-    turned = RigidTransform(rotation_from_vector(np.array([0.2, 1.1, -0.1])), np.array([30.0, -20.0, 900.0]))
-    behind = RigidTransform(np.eye(3), np.array([0.0, 0.0, -5000.0]))
-    cameras = [camera(lens, pose) for lens, pose in product(LENSES, (POSE, turned, behind))]
-    stack = CameraStack.of(cameras)
-    for point in (*POINTS[:10], np.array([4000.0, 0.0, 100.0])):
-        pixels, slopes = stack.project_with_jacobian(point)
-        for one, pixel, slope in zip(cameras, pixels, slopes, strict=True):
-            expected, by_point = one.project_with_jacobian(point[None])
-            np.testing.assert_allclose(pixel, expected[0], atol=1e-8)  # of 1000 px
-            if np.isfinite(pixel).all():
-                np.testing.assert_allclose(slope, by_point[0], atol=1e-9)
-        assert np.isnan(pixels[2::3]).all(), "behind"
-        assert np.isfinite(pixels).any() or point[0] > 1000.0

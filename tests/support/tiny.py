@@ -30,6 +30,8 @@ def work(
         raise InputError("capture", ["cam00 sees nobody", "cam01 sees nobody"])
     if mode == "crash":
         os.kill(os.getpid(), 11)
+    if mode == "short below photo" and settings.get("detail") != "photo":
+        raise MemoryError
     if mode == "killed" or (mode == "killed below photo" and settings.get("detail") != "photo"):
         os.kill(os.getpid(), 9)
     if mode == "killed once" and not (killed := Path(cache) / "killed").exists():
@@ -45,7 +47,7 @@ def work(
         if mode != "deaf":
             report("fit", share)
         time.sleep(0.01)
-    if mode in ("moved", "killed below photo"):
+    if mode in ("moved", "killed below photo", "short below photo"):
         warning = {"code": "camera-moved", "message": "cam02 has moved by 5.0 px"}
         report_json = json.dumps({"warnings": [{"code": "other", "message": "?"}, warning]})
         write_atomically(Path(result) / "report.json", report_json.encode())

@@ -15,7 +15,7 @@ from rig.camera import Intrinsics
 from rig.capture import Features
 from rig.rig import Rig
 
-# Eleven pictures with a plate each take 2.5 GB, at 6 Mpx 3.5 GB (tests/laboratory/benchmarks/large_pictures.py).
+# Eleven pictures with a plate each take 2.5 GB, at 6 Mpx 3.5 GB (`python -m tests.laboratory growth`).
 WORK_PIXELS = 4_000_000
 NEAR = 0.15  # a scale so near to a half or a quarter becomes it, since JPEG is decoded so at a third of the cost
 HALVINGS_MOST = 3  # JPEG decoders reduce to 1/8 at most

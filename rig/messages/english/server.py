@@ -55,8 +55,7 @@ TEMPLATES = {
     "no-worker": "No worker serves the queue {queue}: start one with `eigenhead worker --queue {queue_name}`.",
     "killed-for-memory": "The system ended the job's process {count} times with signal 9, as it does where memory is "
     "short; it had up to {gb:.1f} GB. Give the worker more memory, or run fewer jobs at once.",
-    "level-lowered": "The system ended the job's process twice, as it does where memory is short: this head is made at "
-    "the level photo.",
+    "level-lowered": "The job had too little memory twice: this head is made at the level photo.",
     "worker-died": "The job took its worker down with it again and again; the worker's log says why.",
     "job-failed-unforeseen": "The job failed in a way that nobody foresaw; the log says more.",
     "rig-not-calibrated": "no calibration: calibrate the rig and put the calibration to use",

@@ -97,7 +97,7 @@ export default {
   "capture-missing": "Seine Bilder sind weder im Datenordner noch im Speicher der Aufnahmen: aus einer Sicherung zurückholen oder die Aufnahme entfernen.",
   "file-damaged": "Auf der Platte verändert, seit der Auftrag sie schrieb, oder abgeschnitten: {files}. Aus einer Sicherung zurückholen oder den Auftrag neu starten.",
   "killed-for-memory": "Das System hat den Prozess des Auftrags {count}-mal mit Signal 9 beendet, wie bei knappem Speicher; er hatte bis zu {gb:.1f} GB. Dem Worker mehr Speicher geben oder weniger Aufträge zugleich rechnen.",
-  "level-lowered": "Das System hat den Prozess des Auftrags zweimal beendet, wie bei knappem Speicher: dieser Kopf ist auf der Stufe photo gerechnet.",
+  "level-lowered": "Dem Auftrag fehlte zweimal Speicher: dieser Kopf ist auf der Stufe photo gerechnet.",
   "clock-trusted": "der Uhr wird vertraut",
   "retention-stopped": "Die Uhr ist seit dem letzten Aufräumen {days:.0f} Tage weiter, was zur Laufzeit der Maschine oder zu dem, was gelöscht würde, nicht passt: nichts wird gelöscht. Die Uhr richtig stellen, dann {file} entfernen.",
   "results-orphaned": "{count} Ergebnisse gehören zu keinem Auftrag der Datenbank, die verloren ging oder eine andere ist: {jobs}; sie wiederherstellen",

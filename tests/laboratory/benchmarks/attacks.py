@@ -245,7 +245,7 @@ TESTS = {
     "a data folder of version 3ee27d5": f"{AT}/worker/test_durability.py -k earlier",
     "schemathesis with a key of each scope": f"{AT}/http/test_openapi.py",
     "a result changed or cut on the disk": f"{AT}/services/test_retention.py -k somebody_changed",
-    "values of an erased subject": f"{AT}/services/test_erasure.py -k brought",
+    "an erased subject": f"{AT}/services/test_erasure.py {AT}/worker/test_results_store.py -k 'brought or every'",
     "work killed with signal 9": f"{AT}/worker/test_worker.py -k kills",
     "a tus upload cut, and many open": f"{AT}/http/test_tus.py {AT}/services/test_uploads.py",
     "a database gone, emptied, damaged": f"{AT}/http/test_serve.py -k lost_database",

@@ -35,10 +35,8 @@ from pipeline.contour_fit.rim_term import observed_rim, rim_rows
 from pipeline.contour_fit.surface_term import SurfaceTerm, surface_rows
 from pipeline.estimation.terms import NormalEquations, Residuals
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.triangulation import ReprojectionTerm
 from pipeline.settings import FittingSettings
 from pipeline.view_checks.camera_drift import ShiftEquations, ShiftTerm
-from rig.camera import CameraStack
 from rig.geometry import Similarity, rotation_from_vector
 from tests.support.board_sessions import session
 from tests.support.photo_scene import ellipsoid_model
@@ -59,13 +57,6 @@ def case(term: Any, value: Any, moved: Callable[[Any, np.ndarray], Any], steps: 
     here: Residuals = term.at(value)
     jacobian = here.jacobian().reshape(here.residual.size, -1)
     return Case(lambda step: term.at(moved(value, step)).residual.ravel(), jacobian, steps)
-
-
-def reprojection() -> Case:
-    rig, point = fan(640, 480), np.array([20.0, -30.0, 40.0])
-    pixels = {camera.name: camera.project(point[None])[0] + 3.0 for camera in rig}
-    term = ReprojectionTerm(np.array(list(pixels.values())), CameraStack.of([rig[name] for name in pixels]), 1.5)
-    return case(term, point, np.add, np.full(3, 1e-2))
 
 
 def image_shift() -> Case:
@@ -225,7 +216,6 @@ def surface_of_a_head() -> Case:
 
 
 CASES: dict[str, Callable[[], Case]] = {
-    "reprojection of a point": reprojection,
     "shift of an image": image_shift,
     "tangency": lambda: tangency(False),
     "tangency with focal lengths": lambda: tangency(True),

@@ -8,6 +8,7 @@ import trimesh
 
 from pipeline.fusion.fusion import fuse
 from pipeline.fusion.hair import OFF_HEAD_MM, STUBBLE_MM, grown_to_outlines, loosened, parts_over_head, smooth_hair
+from pipeline.fusion.refinement import SeenVertices
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
@@ -111,7 +112,7 @@ def test_scatter_of_strands_is_smoothed_and_skin_stays() -> None:
     noisy = Mesh(mesh.vertices * (1.0 + rng.normal(0.0, 1.0 / OUTLINE_MM, (len(mesh.vertices), 1))), mesh.faces)
     side = mesh.vertices[:, 0]
     held = mesh.vertices[:, 2] > 40.0
-    smooth = smooth_hair(noisy, (side <= 0.0).astype(float), np.ones(len(side), bool), held)
+    smooth = smooth_hair(noisy, (side <= 0.0).astype(float), SeenVertices.of(noisy.vertices, side < np.inf), held)
     assert np.array_equal(smooth.vertices[held], noisy.vertices[held])
     off = radii(smooth)[(side < -20.0) & ~held] - OUTLINE_MM
     assert off.std() < 0.25  # of 1 mm: the 45 vertices about one leave a seventh, and near ones count more

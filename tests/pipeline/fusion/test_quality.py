@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.fusion.refinement import MAX_MM, Measured, deviation_mm, without_islands
+from pipeline.fusion.refinement import MAX_MM, Measured, SeenVertices, deviation_mm, without_islands
 from rig.mesh import Mesh
 from tests.support.scenes import ellipsoid
 
@@ -31,6 +31,8 @@ def test_a_larger_patch_stays() -> None:
 def test_what_is_taken_off_has_the_deviation_of_a_guess() -> None:
     alone = np.zeros(len(HEAD.vertices), bool)
     alone[HEAD.faces[0]] = True
-    measured = seen_where(HEAD, alone)
-    assert deviation_mm(HEAD, measured)[HEAD.faces[0]].max() < 1.0
-    assert (deviation_mm(HEAD, without_islands(HEAD, measured)) == MAX_MM).all()
+    before = seen_where(HEAD, alone)
+    after = without_islands(HEAD, before)
+    found = [deviation_mm(SeenVertices.of(HEAD.vertices, one.views > 0), one) for one in (before, after)]
+    assert found[0][HEAD.faces[0]].max() < 1.0
+    assert (found[1] == MAX_MM).all()

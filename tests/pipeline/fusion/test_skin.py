@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.fusion.refinement import neighbours
+from pipeline.fusion.refinement import SeenVertices, neighbours
 from pipeline.fusion.skin import REACH_MM, HeadSkin, combine_with_head, skin_share
 from rig.mesh import Mesh
 from tests.support.scenes import ellipsoid
@@ -30,7 +30,9 @@ def combined(
     """Returns the heights (mm) over the head of a surface at the given heights, after both are combined."""
     count = len(head.vertices)
     surface = lifted(head, height_mm)
-    mesh = combine_with_head(surface, skin * np.ones(count), stating(head, stated_mm), depth_mm * np.ones(count))
+    depth_mm = depth_mm * np.ones(count)
+    seen = SeenVertices.of(surface.vertices, depth_mm > 0.0)
+    mesh = combine_with_head(surface, skin * np.ones(count), stating(head, stated_mm), depth_mm, seen)
     return ((mesh.vertices - head.vertices) * head.normals()).sum(axis=1)
 
 
@@ -117,7 +119,7 @@ def test_a_place_that_no_view_sees_is_what_is_seen_next_to_it() -> None:
     head = ellipsoid(5)
     seen, right = head.vertices[:, 2] > 0.0, head.vertices[:, 0] > 0.0
     beside = neighbours(head.faces, len(seen))
-    share = skin_share(beside, head.vertices, (seen & right).astype(float), seen)
+    share = skin_share(beside, (seen & right).astype(float), SeenVertices.of(head.vertices, seen))
     middle = np.abs(head.vertices[:, 0]) < 20.0
     assert share[~seen & right & ~middle].min() > 0.9
     assert share[~seen & ~right & ~middle].max() < 0.1
@@ -126,5 +128,6 @@ def test_a_place_that_no_view_sees_is_what_is_seen_next_to_it() -> None:
 def test_without_depth_nothing_moves() -> None:
     head = ellipsoid(3)
     surface = lifted(head, 0.3)
-    count = len(head.vertices)
-    assert combine_with_head(surface, np.zeros(count), stating(head), np.zeros(count)) is surface
+    none = np.zeros(len(head.vertices))
+    seen = SeenVertices.of(surface.vertices, none > 0.0)
+    assert combine_with_head(surface, none, stating(head), none, seen) is surface

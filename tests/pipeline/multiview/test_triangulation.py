@@ -128,17 +128,6 @@ def many(count: int, noise_px: float, seed: int = 0) -> tuple[np.ndarray, np.nda
     return points, pixels + rng.normal(0.0, noise_px, pixels.shape)
 
 
-def test_many_points_are_each_what_one_is() -> None:
-    """Found alone and together: the same points and covariances, to where the iteration stops."""
-    _, pixels = many(12, 1.5)
-    together = triangulate_many(pixels, RIG.cameras, np.full(pixels.shape[:2], 1.5))
-    for k in range(12):
-        alone = triangulate(dict(zip(RIG.names, pixels[:, k], strict=True)), RIG, noise_px=1.5)
-        np.testing.assert_allclose(together.positions_world[k], alone.position_world, atol=1e-4)
-        np.testing.assert_allclose(together.covariances[k], alone.covariance, rtol=1e-4)
-        np.testing.assert_allclose(together.residuals_px[:, k], np.stack(list(alone.residuals_px.values())), atol=1e-4)
-
-
 def test_views_count_by_their_noise() -> None:
     """A view of infinite noise says nothing, whatever it shows; one of large noise hardly anything."""
     points, pixels = many(30, 0.0)

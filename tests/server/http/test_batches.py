@@ -20,6 +20,7 @@ from tests.support.services import (
     await_state,
     await_true,
     running_service,
+    served_client,
     uploaded_capture,
     worker_pids,
 )
@@ -234,10 +235,7 @@ def test_a_removed_capture_holds_no_other_up(served: RunningService, http: httpx
 
 def test_the_table_and_the_sheet_are_those_of_the_command_line(tmp_path: Path) -> None:
     """Of results that have what a head's have."""
-    with (
-        running_service(tmp_path / "data", work="tests.support.tiny:reporting") as service,
-        httpx.Client(base_url=service.url, timeout=30) as http,
-    ):
+    with served_client(tmp_path / "data", work="tests.support.tiny:reporting") as (service, http):
         captures = [uploaded_capture(service, tmp_path, seed) for seed in (1, 2)]
         batch = begin(http, captures=captures, label="Study <4>")["id"]
         waiting = http.get(f"/v1/batches/{batch}/table")

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
-import httpx
 import numpy as np
 import pytest
 
@@ -20,7 +19,7 @@ from server.services.rigs.opening import open_rig
 from server.settings import ServiceSettings
 from tests.rig.acquisition.test_session import flat_rig
 from tests.support.board_pictures import BoardPictures
-from tests.support.services import await_calibration, running_service, served_client
+from tests.support.services import await_calibration, served_client
 from tests.support.shared_data import shared
 from tests.support.textured_studio import NAMES, FlatStudio
 
@@ -131,8 +130,7 @@ def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> 
     (tmp_path / "studio").mkdir()
     with (
         StudioDevices(tmp_path / "studio", names, board, board) as studio,
-        running_service(tmp_path / "data", rig=str(studio.folder / "rig.toml")) as service,
-        httpx.Client(base_url=service.url, timeout=100) as client,
+        served_client(tmp_path / "data", rig=str(studio.folder / "rig.toml")) as (_, client),
     ):
         state = client.get("/v1/rig").json()
         assert (state["calibration"], state["ready"]) == (None, False)

@@ -3,16 +3,11 @@
 import time
 from pathlib import Path
 
-import httpx
-
-from tests.support.services import packed, running_service, small_capture, upload
+from tests.support.services import packed, served_client, small_capture, upload
 
 
 def test_storage_and_retention_are_told(tmp_path: Path) -> None:
-    with (
-        running_service(tmp_path / "data", worker=False, keep_captures_days="30", keep_jobs="1") as service,
-        httpx.Client(base_url=service.url) as http,
-    ):
+    with served_client(tmp_path / "data", worker=False, keep_captures_days="30", keep_jobs="1") as (service, http):
         capture = upload(http, packed(small_capture(tmp_path / "capture"))).json()
         jobs = [http.post("/v1/jobs", json={"capture_id": capture["id"]}).json()["id"] for _ in range(2)]
         http.post("/v1/jobs/bulk", json={"action": "cancel", "ids": jobs})

@@ -19,6 +19,7 @@ from tests.support.services import (
     running_service,
     served_client,
     small_capture,
+    upload,
 )
 
 
@@ -50,7 +51,9 @@ def test_nothing_that_the_subject_brought_is_left(kind: str, tmp_path: Path) -> 
     ):
         session = client.post("/v1/sessions", json={"label": who, "consent": ink}).json()["id"]
         fields = {"session": session, "label": profile, "expression": smirk, "tags": tag}
-        captures = [upload(client, tmp_path, seed, **fields).json()["id"] for seed in (5, 6)]
+        captures = [
+            upload(client, packed_capture(tmp_path, seed).read_bytes(), **fields).json()["id"] for seed in (5, 6)
+        ]
         captures.append(upload_in_pieces(client, packed_capture(tmp_path, 7).read_bytes(), session=session, label=tus))
         archive = {"file": (file, capture_that_lost(tmp_path / "lost", lost, file))}
         captures.append(client.post("/v1/captures/uploads", files=archive, data={"session": session}).json()["id"])
@@ -115,19 +118,16 @@ def traces(service: RunningService, settings: dict[str, Any], values: list[str])
     return {value for value, ways in spelt.items() if any(way in each for each in held for way in ways)}
 
 
-def upload(client: httpx.Client, folder: Path, seed: int, **fields: str) -> httpx.Response:
-    return client.post("/v1/captures/uploads", files={"file": packed_capture(folder, seed).read_bytes()}, data=fields)
-
-
 def test_consent_comes_before_the_first_picture(client: httpx.Client, tmp_path: Path) -> None:
     silent = client.post("/v1/sessions", json={"label": "Bert"}).json()["id"]
+    archive = packed_capture(tmp_path, 1).read_bytes()
     for fields in ({}, {"session": silent}):
-        refused = upload(client, tmp_path, 1, **fields)
+        refused = upload(client, archive, **fields)
         assert (refused.status_code, refused.json()["type"].endswith("consent-missing")) == (409, True)
         shot = client.post("/v1/captures", json=fields)
         assert (shot.status_code, shot.json()["type"]) == (409, refused.json()["type"])
     client.patch(f"/v1/sessions/{silent}", json={"consent": "signed"})
-    assert upload(client, tmp_path, 1, session=silent).status_code == 201
+    assert upload(client, archive, session=silent).status_code == 201
 
 
 def test_a_removal_says_what_stays_and_an_erasure_leaves_nothing(
@@ -135,8 +135,8 @@ def test_a_removal_says_what_stays_and_an_erasure_leaves_nothing(
 ) -> None:
     consented = {"label": "Anna", "consent": "signed 2026-11-22"}
     session = client.post("/v1/sessions", json=consented).json()["id"]
-    removed = upload(client, tmp_path, 2, session=session).json()["id"]
-    erased = upload(client, tmp_path, 3, session=session).json()["id"]
+    removed = upload(client, packed_capture(tmp_path, 2).read_bytes(), session=session).json()["id"]
+    erased = upload(client, packed_capture(tmp_path, 3).read_bytes(), session=session).json()["id"]
     client.patch(f"/v1/captures/{erased}", json={"session": None})  # with or without a session
     jobs: dict[str, str] = {}
     for capture in (removed, erased):

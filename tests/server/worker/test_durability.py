@@ -232,8 +232,7 @@ def test_the_job_of_a_worker_that_never_returns_is_taken_over_within_30_s(kind: 
     a session beside it stays inside a transaction on the job's row, as that of a host that lost its power would."""
     with (
         database(kind) as settings,
-        running_service(tmp_path / "data", worker=False, tiny_s="3", **settings) as service,
-        httpx.Client(base_url=service.url, timeout=30) as client,
+        served_client(tmp_path / "data", worker=False, tiny_s="3", **settings) as (service, client),
     ):
         capture = uploaded_capture(service, tmp_path)
         with pinned_worker(service) as first:

@@ -99,7 +99,9 @@ def read_real_capture(
     prepared = read_or_calibrate(folder, kept, front=front, report=report)
     default = capture_root(folder) / "outlines.json"
     path = outlines or (default if default.is_file() else None)
-    outlined = {} if path is None else json.loads(path.read_text())["outlines"]
+    outlined = {} if path is None else json.loads(path.read_text()).get("outlines")
+    if outlined is None:
+        raise InputError("outlines.json", ["has no outlines"])
     drawn = {name: _filled(outlined[name], prepared.rig[name]) for name in prepared.rig.names if name in outlined}
     # A mask that the folder has serves as reference too; an outline drawn by hand replaces it.
     drawn = {**prepared.capture.masks, **drawn}

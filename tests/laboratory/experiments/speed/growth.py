@@ -62,11 +62,11 @@ class Size:
 
 
 def sizes(only: Sequence[str] = ()) -> list[Size]:
-    """Returns the sizes of each kind, or of the kinds of ``only``."""
+    """Returns the sizes of each kind, or those whose kind or name is in ``only``."""
     standard = WIDTH * HEIGHT / 1e6
     all_sizes = [Size("views", count, standard) for count in VIEWS]
     all_sizes += [Size("pixels", len(DEFAULT_DIRECTIONS_DEG), megapixels) for megapixels in MEGAPIXELS]
-    return [size for size in all_sizes if not only or size.kind in only]
+    return [size for size in all_sizes if not only or {size.kind, size.name} & {*only}]
 
 
 def growth(
@@ -87,10 +87,10 @@ def growth(
     figures: dict[str, float] = {}
     for kind, quantity in (("views", "views"), ("pixels", "megapixels")):
         of_kind = [row for row in rows if row["kind"] == kind]
-        if of_kind:
+        figures |= {f"peak_mb_{row['name'].replace(' ', '_')}": row["peak_mb"] for row in of_kind}
+        if len(of_kind) > 1:
             figures[f"exponent_of_{kind}"] = exponent(of_kind, quantity, "cpu_s")
             figures[f"exponent_of_{kind}_memory"] = exponent(of_kind, quantity, "peak_mb")
-            figures |= {f"peak_mb_{row['name'].replace(' ', '_')}": row["peak_mb"] for row in of_kind}
     return {"figures": figures, "rows": rows, "markdown": _table(rows)}
 
 
