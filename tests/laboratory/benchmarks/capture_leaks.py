@@ -1,10 +1,6 @@
-"""Captures in a row from the studio's devices: does anything pile up?
+"""Captures in a row from the studio's devices, each folder over the last one: does anything pile up?
 
-python -m tests.laboratory capture_leaks --captures 500 --width 1024 --height 768
-
-One session takes the captures and writes each folder over the last one. Printed are resident memory, threads and open
-descriptors of the process (studio and session together), and their growth from the first tenth to the end.
-"""
+Memory, threads and open descriptors are those of the process, studio and session together."""
 
 import gc
 import shutil

@@ -27,12 +27,7 @@ TIME_LIMIT_S = 1800
 
 
 def run(
-    other: Annotated[Path, "the checkout to compare with"],
-    captures: Sequence[Path],
-    scratch: Path,
-    report: Progress,
-    *,
-    runs: int = 1,
+    other: Annotated[Path, "compared"], captures: Sequence[Path], scratch: Path, report: Progress, *, runs: int = 1
 ) -> dict[str, Any]:
     """Returns for each capture ``<quantity>: [before, now]``."""
     checkouts = {"before": other.resolve(), "now": HERE}
