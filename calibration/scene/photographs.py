@@ -53,8 +53,8 @@ def find_photographs(folder: Path) -> Photographs:
     folders = {safe_name(path.name): listed_pictures(path) for path in beside}
     folders = {name: files for name, files in folders.items() if files}
     if flat and folders:
-        mixed = compose("photographs-beside-folders")
-        raise InputError(folder.name, [mixed])
+        is_result = (root / "report.json").is_file()
+        raise InputError(folder.name, [compose("is-a-result" if is_result else "photographs-beside-folders")])
     files = folders or {safe_name(path.stem): [path] for path in flat}
     faults = [compose("camera-rename", fault=fault) for name in files if (fault := name_fault(name))]
     if len(files) < CAMERAS_LEAST:

@@ -12,7 +12,7 @@ from rig.errors import EigenheadError, InputError
 from rig.messages.message import Message, compose
 from server.batch.captures import BatchCapture
 from server.tasks.settings_file import merged_settings
-from server.tasks.stage_durations import StageDurations
+from server.tasks.stage_durations import StageDurations, megapixels_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ def plan_batch(
         except EigenheadError as error:
             faults.append(compose("located", where=capture.name, fault=error.message))
             continue
-        expected_s = durations.of(chosen)
+        expected_s = durations.of(chosen, megapixels_of(capture.path))
         tasks.append(_task(capture, chosen, model, digest, expected_s))
     if faults:
         raise InputError("settings", faults)

@@ -46,8 +46,8 @@ class SpoilsCapture(EigenheadError):
 class Overwrites(EigenheadError):
     """Reports an output file that exists already while ``--overwrite`` was not given."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(f"{path} is there already; name another place, or replace it with --overwrite")
+    def __init__(self, path: Path, what: str = "place") -> None:
+        super().__init__(f"{path} is there already; choose another {what}, or replace it with --overwrite")
 
 
 def _use_data(folder: Path | None) -> Path | None:

@@ -177,7 +177,7 @@ def _calibrate_board(
     write_report(calibration, page)
     figures = calibration.figures()
     cameras = [f"{name}  {figure['rms_px']:.3f} px" for name, figure in figures["cameras"].items()]
-    total = f"{figures['rms_px']:.3f} px over {figures['used_share']:.1%} of the corners"
+    total = f"{figures['rms_px']:.3f} px over {figures['used_share']:.1%} of the corners: {calibration.verdict().word}"
     answer(calibration.document(), json_out, [str(out), str(page), *cameras, total, *texts_of(calibration.warnings)])
 
 

@@ -1,7 +1,7 @@
 """Implements ``eigenhead compare``, ``register`` and ``measure``: two visits of a person, a head on the surface of a
 CT, and what helmets, masks and spectacles are fitted by."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -12,7 +12,6 @@ from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, file_i
 
 if TYPE_CHECKING:
     from pipeline.applications.clinic.comparison import Comparison
-    from pipeline.applications.clinic.sizes import SizeTable
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -145,21 +144,24 @@ def measure(
     from pipeline.applications.clinic.fitting import ISO_NAMES, MEASURES, Fitted, fitting_measures
     from pipeline.applications.clinic.sizes import choose_size, read_size_tables
     from pipeline.applications.clinic.visit import read_visit
-    from rig.messages.message import documents_of
+    from rig.messages.message import compose, documents_of
 
-    tables = [] if sizes is None else read_size_tables(sizes)
     visit = read_visit(result, model)
-    _check_measures(sizes, tables, {*visit.measurements, *MEASURES})
+    tables = [] if sizes is None else read_size_tables(sizes, {*visit.measurements, *MEASURES, *ISO_NAMES})
     measures = {
         name: Fitted(of.value_mm, of.std_mm, "mm") for name, of in visit.measurements.items() if of.std_mm is not None
     }
     measures |= fitting_measures(visit)
-    _check_measures(sizes, tables, measures.keys())
-    chosen = [choose_size(table, measures[table.measure].value, measures[table.measure].std) for table in tables]
-    for warning in visit.warnings:
+    absent = [
+        compose("size-measure-absent", table=of.name, measure=of.measure) for of in tables if of.measure not in measures
+    ]
+    chosen = [
+        choose_size(of, measures[of.measure].value, measures[of.measure].std) for of in tables if of.measure in measures
+    ]
+    for warning in (*visit.warnings, *absent):
         warn(str(warning))
     document = {
-        "warnings": documents_of(visit.warnings),
+        "warnings": documents_of([*visit.warnings, *absent]),
         "measures": {
             name: {"value": of.value, "std": of.std, "unit": of.unit, "iso": ISO_NAMES.get(name)}
             for name, of in measures.items()
@@ -170,21 +172,6 @@ def measure(
         },
     }
     answer(document, json_out, _measure_lines(document))
-
-
-def _check_measures(path: Path | None, tables: "Sequence[SizeTable]", known: Collection[str]) -> None:
-    """Raises InputError if a table is by a measure that this head does not have."""
-    from rig.errors import InputError
-    from rig.messages.message import compose
-
-    listed = ", ".join(sorted(known))
-    faults = [
-        compose("size-measure-unknown", table=of.name, measure=of.measure, known=listed)
-        for of in tables
-        if of.measure not in known
-    ]
-    if faults and path is not None:
-        raise InputError(path.name, faults)
 
 
 def _measure_lines(document: Mapping[str, Any]) -> list[str]:

@@ -24,7 +24,7 @@ ExportFormat = Literal["glb", "ply", "obj", "usdz", "stl", "3mf", "slicer", "ner
     "--as nerfstudio --result heads/anna --out sets/anna"
 )
 def export(
-    capture: Annotated[
+    source: Annotated[
         Path,
         typer.Argument(
             help="A result folder; for nerfstudio and gaussian-avatars a capture, or a .zip, .tar or .tar.gz of one.",
@@ -59,11 +59,11 @@ def export(
 
     if form in FORMATS:
         outputs = OutputSettings(formats=(form,), template=template, morphs=morphs, albedo="file" if albedo else "none")
-        _export_head(capture, out, outputs, overwrite=overwrite, json_out=json_out)
+        _export_head(source, out, outputs, overwrite=overwrite, json_out=json_out)
     elif form == "slicer":
-        _export_patient(capture, out, axes, plane, marked=marked, overwrite=overwrite, json_out=json_out)
+        _export_patient(source, out, axes, plane, marked=marked, overwrite=overwrite, json_out=json_out)
     else:
-        _export_dataset(capture, out, form, result=result, settings=settings, overwrite=overwrite, json_out=json_out)
+        _export_dataset(source, out, form, result=result, settings=settings, overwrite=overwrite, json_out=json_out)
 
 
 def _export_head(result: Path, out: Path, outputs: "OutputSettings", *, overwrite: bool, json_out: bool) -> None:

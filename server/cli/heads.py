@@ -72,8 +72,8 @@ Method = Annotated[
 Detail = Annotated[
     Literal["span", "kernel", "photo", "fine", "pores"] | None,
     typer.Option(
-        help="How fine the head becomes: span is the head model alone, kernel follows outlines (seconds); photo, fine "
-        "and pores follow photographs (minutes).",
+        help="How fine the head becomes: span is the head model alone, kernel follows outlines (seconds, with "
+        "--surface head); photo, fine and pores follow photographs (minutes).",
         show_default="fine",
     ),
 ]

@@ -57,10 +57,10 @@ def reconstruct_locally(
 def _reconstruct_folder(
     folder: Path, out: Path, *, kept: Path, model: str | None, chosen: "Settings", report: Progress
 ) -> None:
-    from server.tasks.stage_durations import StageDurations
+    from server.tasks.stage_durations import StageDurations, megapixels_of
 
-    durations = StageDurations()
-    progress = JobProgress(durations.of(chosen))
+    durations, megapixels = StageDurations(), megapixels_of(folder)
+    progress = JobProgress(durations.of(chosen, megapixels))
 
     def tell(stage: str, fraction: float) -> None:
         progress.report(stage, fraction)
@@ -70,7 +70,7 @@ def _reconstruct_folder(
         reconstruct_folder(
             context, tell, folder=folder, out=out, kept=kept, model=model, chosen=chosen, preparation=report
         )  # fmt: skip
-    durations.learn(chosen, progress.finish())
+    durations.learn(chosen, progress.finish(), megapixels)
 
 
 def flame_lines(document: "ReportDocument", out: Path) -> list[str]:

@@ -56,7 +56,7 @@ def template_add(
 
     path = new_path(name or file.stem)
     if path.exists() and not overwrite:
-        raise Overwrites(path)
+        raise Overwrites(path, "--name")
     prepare_file(path)
     from pipeline.applications.model_building.correspondence.scans import landmark_file, read_landmarks
     from pipeline.applications.templates.make import make_template, template_picture

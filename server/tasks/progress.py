@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 AGAIN = " again"
 EVERY_S = 0.25  # the shortest time between two progress events of one stage, unless nobody looks so often
 OVERTIME = 0.1  # of a stage's expected time: what is left of one that has taken longer
-PACE_S = 2.0  # of work, before a machine's pace counts as much as the expectation
+PACE_S = 4.0  # of work, before a machine's pace counts as much as the expectation
 FRACTION_LEAST = 0.05  # below it a stage's own fraction says little of its end
 
 Clock = Callable[[], float]

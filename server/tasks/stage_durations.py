@@ -1,114 +1,110 @@
 """Learns how long each stage of a reconstruction takes on this machine, for each kind of job.
 
-The service's workers and the command line share one file, ``cache_folder()/durations.json``. ``FIRST_S`` is expected
-before the first job of a kind.
+A job's seconds follow from what it makes and from the pixels of its photographs (``COSTS_S``); what is learnt is how
+many times longer each stage takes here. The service's workers and the command line share one file,
+``cache_folder()/stage-paces.json``.
 """
 
 import json
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from statistics import median
 
 from pipeline.settings import FINE_LEVELS, PHOTO_LEVELS, Settings
 from rig.atomic_write import write_atomically
 from rig.cache_folder import cache_folder
+from rig.errors import InputError
+from rig.formats.captures.capture_folder import capture_root
+from rig.formats.captures.shot_files import listed_pictures, picture_folder
+from rig.formats.pictures.images import picture_size
+from rig.formats.pictures.work_size import WORK_PIXELS
 
-FIRST_S = {
-    "read": 0.4,
-    "segmentation": 4.3,
-    "faces": 2.0,
-    "alignment": 0.6,
-    "fit": 3.7,
-    "parts": 2.1,
-    "fit again": 7.1,
-    "depth": 40.0,
-    "fine": 9.0,
-    "texture": 1.4,
-    "evidence": 0.8,
-    "bust": 6.0,
-    "write": 3.0,
+COSTS_S: Mapping[str, Mapping[str, tuple[float, float]]] = {
+    "read": {"head": (1.1, 0.03)},
+    "segmentation": {"head": (0.3, 0.4)},
+    "faces": {"head": (1.2, 0.3)},
+    "alignment": {"head": (0.15, 0.0)},
+    "fit": {"head": (0.8, 0.03)},
+    "parts": {"parts": (0.2, 0.06)},
+    "fit again": {"head": (0.1, 0.0), "photo": (3.2, 0.05)},
+    "depth": {"depth": (0.4, 1.0)},
+    "fine": {"head": (0.6, 0.0), "fine": (5.5, 0.0), "bust": (0.0, 0.6)},
+    "texture": {"head": (0.8, 0.09), "bust": (1.0, 0.06)},
+    "evidence": {"head": (0.1, 0.04), "bust": (2.0, 0.17)},
+    "bust": {"bust": (0.4, 0.2)},
+    "write": {"head": (0.7, 0.04), "bust": (0.1, 0.02), "morphs": (15.0, 0.0)},
 }
-"""Seconds of every stage, in their order: `eigenhead reconstruct scan-a --detail fine` on two cores that four
-other processes share; of the bust what is waited for after the head. On idle ones all are three to four times
-shorter, which a job's own pace soon tells."""
-SIMPLEX_S = 200.0  # of the simplex's fit, at the same pace: a minute on idle cores
-LEARNING = 0.3  # weight of the newest job; the first one of its kind counts alone
-LONGEST_S = 86_400.0  # what a damaged file may at most say of a stage
+"""Of every stage, in order, what each part of a job adds: CPU seconds, and CPU seconds a megapixel, as jobs of 3, 11
+and 24 photographs took them on one core (`python -m tests.laboratory remaining-time`)."""
+SIMPLEX_S = 60.0  # of the simplex's fit, on one idle core
+USUAL_MEGAPIXELS = 8.65  # eleven photographs of 1024 x 768: where a capture's own are not known
+LEARNING = 0.3  # weight of a job's stage, beside what was learnt or else the pace of the whole job
+PACE_MOST = 1000.0  # what a damaged file may at most say of a stage
 
 
 def kind_of(settings: Settings) -> str:
     """Returns the kind of a job as text such as "contour photo both": the settings that decide which stages it has and
     how long they take."""
-    return f"{settings.method} {settings.detail or 'fine'} {settings.outputs.surface}"
+    extra = (settings.outputs.morphs and " morphs") or "", (settings.outputs.template and " template") or ""
+    return f"{settings.method} {settings.detail or 'fine'} {settings.outputs.surface}{''.join(extra)}"
 
 
-def first_guess(settings: Settings) -> dict[str, float]:
+def megapixels_of(capture: Path) -> float:
+    """Returns how many megapixels a job reads of a capture's folder, by its first photograph; ``USUAL_MEGAPIXELS`` for
+    an archive, and where that cannot be read."""
+    with suppress(InputError, OSError):
+        if pictures := listed_pictures(picture_folder(capture_root(capture))):
+            width, height = picture_size(pictures[0])
+            return len(pictures) * min(width * height, WORK_PIXELS) / 1e6
+    return USUAL_MEGAPIXELS
+
+
+def first_guess(settings: Settings, megapixels: float = USUAL_MEGAPIXELS) -> dict[str, float]:
     """Returns the seconds expected of each stage of a job with these settings before any job was measured."""
-    photographs = settings.method == "contour" and settings.detail in PHOTO_LEVELS
-    fine, bust = photographs and settings.detail in FINE_LEVELS, settings.outputs.surface != "head"
-    parts = settings.detail in PHOTO_LEVELS or bust
-    left_out = {
-        "parts": not parts,
-        "fit again": not parts,
-        "depth": not (fine or bust),
-        "fine": not fine,
-        "bust": not bust,
-    }
-    seconds = {stage: took for stage, took in FIRST_S.items() if not left_out.get(stage)}
-    if settings.method == "simplex":
-        seconds["fit"] = SIMPLEX_S
-    if parts and not photographs:
-        seconds["fit again"] = 0.0
-    return seconds
-
-
-def pace_of(learnt: Mapping[str, Mapping[str, float]]) -> float:
-    """Returns how many times slower this machine is than ``FIRST_S``, from the measured stages of each kind of job; 1
-    if nothing was measured."""
-    took = guessed = 0.0
-    for kind, stages in learnt.items():
-        simplex = kind.startswith("simplex")
-        known = {stage: seconds for stage, seconds in stages.items() if seconds > 0}
-        took += sum(known.values())
-        guessed += sum(SIMPLEX_S if simplex and stage == "fit" else FIRST_S[stage] for stage in known)
-    return took / guessed if took > 0 and guessed > 0 else 1.0
+    photo = settings.method == "contour" and settings.detail in PHOTO_LEVELS
+    fine, bust = photo and settings.detail in FINE_LEVELS, settings.outputs.surface != "head"
+    has = {"head": True, "photo": photo, "fine": fine, "bust": bust, "parts": photo or bust, "depth": fine or bust}
+    has["morphs"] = settings.outputs.morphs
+    costs = {stage: [cost for part, cost in of.items() if has[part]] for stage, of in COSTS_S.items()}
+    seconds = {stage: sum(fixed + each * megapixels for fixed, each in of) for stage, of in costs.items() if of}
+    return seconds | {"fit": SIMPLEX_S} if settings.method == "simplex" else seconds
 
 
 class StageDurations:
-    """Learns how many seconds each stage of a job takes, and keeps them in ``file``. If the file cannot be written,
-    they are known to this process only."""
+    """Learns how many times longer than the first guess each stage of a job takes, and keeps that in ``file``. If the
+    file cannot be written, it is known to this process only."""
 
     def __init__(self, file: Path | None = None) -> None:
-        self._file = file or cache_folder() / "durations.json"
+        self._file = file or cache_folder() / "stage-paces.json"
         self._learnt: dict[str, dict[str, float]] = {}
 
-    def of(self, settings: Settings) -> dict[str, float]:
+    def of(self, settings: Settings, megapixels: float = USUAL_MEGAPIXELS) -> dict[str, float]:
         """Returns the expected seconds of each stage, in order. For a kind of job that this machine never ran, they are
-        the first guess scaled by the pace of other kinds."""
-        learnt, guess = self._read(), first_guess(settings)
-        known = learnt.get(kind_of(settings))
-        if known is None:
-            known, pace = {}, pace_of(learnt)
-            guess = {stage: pace * seconds for stage, seconds in guess.items()}
-        return {stage: known.get(stage, seconds) for stage, seconds in guess.items()}
+        the first guess at the usual pace of other kinds."""
+        learnt, guess = self._read(), first_guess(settings, megapixels)
+        known, every = learnt.get(kind_of(settings), {}), [pace for of in learnt.values() for pace in of.values()]
+        usual = median(every) if every else 1.0
+        return {stage: known.get(stage, usual) * seconds for stage, seconds in guess.items()}
 
-    def learn(self, settings: Settings, seconds: Mapping[str, float]) -> None:
+    def learn(self, settings: Settings, seconds: Mapping[str, float], megapixels: float = USUAL_MEGAPIXELS) -> None:
         """Mixes the measured seconds of a job's stages into what is expected of its kind, with the weight
         ``LEARNING``."""
-        learnt, before = self._read(), self.of(settings)
-        weight = LEARNING if kind_of(settings) in learnt else 1.0
-        mixed = {stage: (1 - weight) * before[stage] + weight * seconds[stage] for stage in before if stage in seconds}
-        learnt[kind_of(settings)] = {stage: round(took, 3) for stage, took in (before | mixed).items()}
-        self._learnt = learnt
+        learnt, guess = self._read(), first_guess(settings, megapixels)
+        before, stages = learnt.get(kind_of(settings), {}), guess.keys() & seconds.keys()
+        whole = sum(seconds[stage] for stage in stages) / max(sum(guess[stage] for stage in stages), 1e-9)
+        for stage, pace in ((stage, seconds[stage] / guess[stage]) for stage in stages):
+            before[stage] = round((1 - LEARNING) * before.get(stage, whole) + LEARNING * pace, 4)
+        self._learnt = learnt | {kind_of(settings): before}
         with suppress(OSError):
-            write_atomically(self._file, json.dumps(learnt, indent=1).encode())
+            write_atomically(self._file, json.dumps(self._learnt, indent=1).encode())
 
     def _read(self) -> dict[str, dict[str, float]]:
-        """Returns the durations of the file or, without one, those that this process has measured."""
+        """Returns the paces of the file or, without one, those that this process has measured."""
         try:
             document = json.loads(self._file.read_bytes())
             return {
-                str(kind): {stage: float(stages[stage]) for stage in FIRST_S if 0 <= stages.get(stage, -1) <= LONGEST_S}
+                str(kind): {stage: float(stages[stage]) for stage in COSTS_S if 0 <= stages.get(stage, -1) <= PACE_MOST}
                 for kind, stages in document.items()
             }
         except (OSError, ValueError, TypeError, AttributeError):

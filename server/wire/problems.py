@@ -173,6 +173,8 @@ def _fault_of(error: Mapping[str, Any]) -> Message:
     where, fault = ".".join(map(str, error["loc"])), error["msg"]
     if error["loc"] == ("body",) and error["type"] == "model_attributes_type":
         fault = compose("no-json-object")
+    if error["type"] == "extra_forbidden":
+        where, fault = ".".join(map(str, error["loc"][:-1])), compose("setting-unknown", key=error["loc"][-1])
     if error["type"] == "json_invalid":
         where, at = map(str, error["loc"])
         fault = compose("no-json-because", reason=f"{error['ctx']['error']}, character {at}")

@@ -56,7 +56,7 @@ from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import DISK_FULL, ChildProcessPool, WorkerContext, WorkFailed, function_at
 from server.tasks.progress import EVERY_S, JobProgress, ProgressMeter
 from server.tasks.reconstruct import reconstruct_capture
-from server.tasks.stage_durations import StageDurations
+from server.tasks.stage_durations import StageDurations, megapixels_of
 from server.worker.capture_source import CaptureSource
 from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
 from server.worker.engine import dead_workers, engine_config, held_by, take_back, take_over
@@ -260,15 +260,16 @@ class Worker:
 
     def _run_work(self, job_id: str, request: JobRequest, folder: Path, settings: Mapping[str, object]) -> None:
         chosen = settings_from_document(settings)
-        progress = JobProgress(self._durations.of(chosen))
-        meter = ProgressMeter(self.events, job_id, progress, max(EVERY_S, self.settings.poll_s))
-
-        def cancelled() -> bool:
-            meter.tick()  # asked many times a second, also where a stage reports nothing
-            return not self._states.runs(job_id)
-
-        meter.report("read", 0.0)  # a fresh child loads for seconds before it says so itself
         with self._captures.files(job_id, request["capture_id"]) as files, self._children.one() as child:
+            megapixels = megapixels_of(files)
+            progress = JobProgress(self._durations.of(chosen, megapixels))
+            meter = ProgressMeter(self.events, job_id, progress, max(EVERY_S, self.settings.poll_s))
+
+            def cancelled() -> bool:
+                meter.tick()  # asked many times a second, also where a stage reports nothing
+                return not self._states.runs(job_id)
+
+            meter.report("read", 0.0)  # a fresh child loads for seconds before it says so itself
             child.remote(self._work, report=meter.report, cancelled=cancelled)(
                 capture=str(files),
                 result=str(folder),
@@ -277,7 +278,7 @@ class Worker:
                 settings={**settings},
             )
         if self._work is reconstruct_capture:  # how long another work takes says nothing of this one
-            self._durations.learn(chosen, progress.finish())
+            self._durations.learn(chosen, progress.finish(), megapixels)
 
     def calibrate(self, identity: str) -> CalibrationOutcome:
         """Computes one calibration in a child process and returns its outcome. The result is written under a temporary

@@ -60,17 +60,8 @@ def test_a_foreign_capture_through_the_service_and_the_command_line_gives_the_sa
     learnt.append(durations())
     assert {"segmentation", "fit", "texture"} <= set(stages)
     assert error_mm(truth, tmp_path / "service" / "head.ply")["median"] < HULL_MEDIAN_MM
-    command = [
-        sys.executable,
-        "-m",
-        "server.cli",
-        "reconstruct",
-        str(folder),
-        "--out",
-        str(tmp_path / "local"),
-        "--json",
-    ]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
+    words = ["-m", "server.cli", "reconstruct", str(folder), "--out", str(tmp_path / "local"), "--json"]
+    done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stderr
     learnt.append(durations())
     assert learnt[0] != learnt[1] != learnt[2], "service and command line learn how long stages take"

@@ -121,6 +121,7 @@ BENCHMARKS = {
     "capture_leaks": Record("benchmarks.capture_leaks:run", "Takes many captures, and measures what grows."),
     "captures": Record("benchmarks.captures:run", "Measures errors of the shared captures at every level of detail."),
     "described_requests": Record("benchmarks.described_requests:run", "Counts 5xx that schemathesis gets, by scope."),
+    "remaining-time": Record("benchmarks.remaining_time:run", "Judges the remaining time that jobs tell."),
     "scene_calibration": Record("benchmarks.scene_calibration:run", "Judges calibration from photographs alone."),
     "side_by_side": Record("benchmarks.side_by_side:run", "Compares two checkouts on the same captures."),
     "studio_masks": Record("benchmarks.studio_masks:run", "Compares masks of the studio with the truth."),

@@ -66,10 +66,7 @@ def _command_list(commands: TyperGroup) -> str:
     lines += [
         "All take `--threads N` (of compiled loops; all processors by default), `--quiet` (no progress and no warnings,"
     ]
-    lines += [
-        "errors alone) and `--help`; those that answer `--json` (one JSON object on stdout and nothing else).",
-        "",
-    ]
+    lines += ["errors alone) and `--help`; most take `--json` (one JSON object on stdout and nothing else).", ""]
     lines += ["| command | does |", "|---|---|"]
     for page, (_, names) in ROOMS.items():
         for path, command in (entry for name in names for entry in _leaves((name,), commands.commands[name])):

@@ -21,11 +21,11 @@ from pipeline.applications.clinic.anatomical_frame import frankfurt_axes
 from pipeline.applications.clinic.surface import PatientSurface
 from pipeline.applications.clinic.trimmed_fit import Patch, TrimmedFit, trimmed_fit
 from pipeline.applications.clinic.visit import Visit
-from pipeline.applications.model_building.correspondence.scans import plain_name, read_landmarks
+from pipeline.applications.model_building.correspondence.scans import read_landmarks
 from pipeline.geometry.registration.search import ROUNDS, draw_rows, draw_surface_points, search_motions
-from pipeline.head_model.landmarks import NAMES, stacked
+from pipeline.head_model.landmarks import stacked
 from rig.errors import InputError
-from rig.formats.meshes.markups import Axes, read_markups
+from rig.formats.meshes.markups import Axes
 from rig.geometry import RigidTransform, rigid_fit
 from rig.messages.message import compose
 
@@ -149,11 +149,7 @@ def _distances(
 def read_surface_landmarks(path: Path, axes: Axes) -> dict[str, Float[np.ndarray, " 3"]]:
     """Returns landmarks by this project's names, in the surface's axes. A .mrk.json states its own axes; any other form
     is in the surface's. Raises InputError, also for fewer than ``MIN_MARKS`` known ones."""
-    if path.name.lower().endswith(".mrk.json"):
-        named = {plain_name(label): point for label, point in read_markups(path, axes).items()}
-        known = {name: point for name, point in named.items() if name in NAMES}
-    else:
-        known = read_landmarks(path)
+    known = read_landmarks(path, axes)
     if len(known) < MIN_MARKS:
         raise InputError(path.name, [compose("marks-too-few", found=len(known), needed=MIN_MARKS)])
     return known

@@ -14,7 +14,7 @@ Limits are in the measure's unit (mm, or degrees), the lower one inclusive.
 """
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -56,8 +56,8 @@ class SizeChoice:
         return max(self.probabilities, key=lambda size: self.probabilities[size])
 
 
-def read_size_tables(path: Path) -> list[SizeTable]:
-    """Reads a file of tables. Raises InputError naming every fault."""
+def read_size_tables(path: Path, measures: Set[str]) -> list[SizeTable]:
+    """Reads a file of tables by these measures. Raises InputError naming every fault."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -65,7 +65,13 @@ def read_size_tables(path: Path) -> list[SizeTable]:
     entries = document.get("table")
     if document.get("format") != FORMAT or not isinstance(entries, list) or not entries:
         raise InputError(path.name, [compose("sizes-no-table", format=FORMAT)])
-    faults = [fault for number, entry in enumerate(entries, 1) for fault in _faults(number, entry)]
+    faults = [fault for number, entry in enumerate(entries, 1) for fault in _faults(number, entry)] or [
+        compose(
+            "size-measure-unknown", table=entry["name"], measure=entry["measure"], known=", ".join(sorted(measures))
+        )
+        for entry in entries
+        if entry["measure"] not in measures
+    ]
     if faults:
         raise InputError(path.name, faults)
     return [

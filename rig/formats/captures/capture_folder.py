@@ -17,6 +17,7 @@ import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -83,9 +84,11 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
 def judge_lost(lost: Mapping[str, Sequence[Message]], rig: Rig, faults: list[Message]) -> list[Message]:
     """Returns a warning for each camera that takes no part because its pictures cannot be used; ``lost`` says why.
     Where the other cameras do not suffice, all that is wrong is appended to ``faults``."""
-    suffices = len(rig) - len(lost) >= max(CAMERAS_LEAST, REST_LEAST * len(rig))
-    if not suffices:
+    left, needed = len(rig) - len(lost), max(CAMERAS_LEAST, ceil(REST_LEAST * len(rig)))
+    if left < needed:
         faults += [fault for of_camera in lost.values() for fault in of_camera]
+        if left >= CAMERAS_LEAST:
+            faults.append(compose("cameras-too-few-left", left=left, count=len(rig), needed=needed))
         return []
     return [compose("picture-lost", camera=name, faults=of_camera) for name, of_camera in lost.items()]
 

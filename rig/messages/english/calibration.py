@@ -87,6 +87,7 @@ TEMPLATES = {
     "photographs-of-sizes": "are of {sizes} sizes, and one lens makes one size",
     "photograph-size-differs": "{camera}/{shot} is {width} x {height} pixels, its camera's other shots {wanted}",
     "no-folder-of-photographs": "is no folder; give the folder that holds the photographs",
+    "is-a-result": "is the result of a job: give the capture that it was made of",
     "photographs-beside-folders": "photographs beside folders of photographs: put one picture a camera, or one folder a camera",
     "photograph-repeated": "{folder} holds {name} {count} times, with different endings",
     "scale-camera-lost": "cameras: {camera} did not join the others; name two that did",

@@ -53,6 +53,7 @@ TEMPLATES = {
     "picture-large": "is {width} x {height} pixels; at most {most:,} are read",
     "picture-damaged": "is damaged and cannot be decoded: send it again",
     "picture-black": "is black all over: a lens with its cap on, or no light?",
+    "cameras-too-few-left": "{left} of {count} cameras can be used, and {needed} are needed: mend that, or take cameras that took no part out of the cameras' file",
     "picture-lost": "{faults}; mend that, or go on without {camera}, which takes no part",
     "picture-of-kind": "is of the kind {kind}, whatever its name ends in: save it as PNG, JPEG, TIFF, WebP, BMP or PPM",
     "picture-link-broken": "{picture} is a link to a file that is not there: {target}",

@@ -27,12 +27,7 @@ TIME_LIMIT_S = 1800
 
 
 def run(
-    other: Annotated[Path, "the checkout to compare with"],
-    captures: Sequence[Path],
-    scratch: Path,
-    report: Progress,
-    *,
-    runs: int = 1,
+    other: Annotated[Path, "compared"], captures: Sequence[Path], scratch: Path, report: Progress, *, runs: int = 1
 ) -> dict[str, Any]:
     """Returns for each capture ``<quantity>: [before, now]``."""
     checkouts = {"before": other.resolve(), "now": HERE}
@@ -73,9 +68,7 @@ def reconstructed(checkout: Path, capture: Path, out: Path) -> float:
 def measured(capture: Path, out: Path) -> dict[str, float]:
     """Returns the outline's residual, and the distances to the truth if one is beside the capture."""
     report: dict[str, Any] = json.loads((out / "report.json").read_text())
-    figures = {
-        "outline_px": median(camera["contour_rms_px"] for camera in report["cameras"].values() if camera["used"])
-    }
+    figures = {"outline_px": median(of["contour_rms_px"] for of in report["cameras"].values() if of["used"])}
     if capture.with_name(f"{capture.name}.truth").is_dir():
         figures |= surface_error(read_known(capture), read_mesh(out / "head.ply"))
     return figures
@@ -83,7 +76,5 @@ def measured(capture: Path, out: Path) -> dict[str, float]:
 
 def apart_mm(before: Path, now: Path) -> float:
     """Returns the median distance of the vertices of one head to the other's surface."""
-    meshes = [read_mesh(folder / "head.ply") for folder in (before, now)]
-    return round(
-        median(SurfaceIndex(meshes[0].vertices, meshes[0].faces, 1.0).closest(meshes[1].vertices).distances), 4
-    )
+    first, second = (read_mesh(folder / "head.ply") for folder in (before, now))
+    return round(median(SurfaceIndex(first.vertices, first.faces, 1.0).closest(second.vertices).distances), 4)

@@ -11,6 +11,7 @@ import pytest
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.pictures.images import write_image
+from rig.progress import discard_progress
 from tests.laboratory.__main__ import describe, main
 from tests.laboratory.experiments.faults.real import read_real_capture, real
 from tests.laboratory.runner import Record, call, lines_of, parser_of
@@ -25,10 +26,6 @@ NAMES = [
     "shapes", "eyeballs", "gazes", "inner-mouth", "meshes", "wrap", "scaling", "growth", "scale",
     "real"
 ]  # fmt: skip
-
-
-def quiet(stage: str, share: float) -> None:
-    pass
 
 
 def outlines(path: Path, *names: str) -> Path:
@@ -126,13 +123,15 @@ def test_outlines_and_masks_of_a_folder_judge_it(tmp_path: Path) -> None:
     folder = small_capture(tmp_path / "anna")
     write_image(folder / "masks" / "cam00.png", np.pad(np.full((12, 12), 255, np.uint8), 6))
     outlines(folder / "outlines.json", "cam01", "cam07")
-    capture = read_real_capture(folder, tmp_path / "kept", "cam02", None, quiet)
+    capture = read_real_capture(folder, tmp_path / "kept", "cam02", None, discard_progress)
     names = read_rig(folder / "cameras.json").names
     assert (capture.name, capture.front, capture.rig.names) == ("anna", "cam02", names)
     assert set(capture.drawn) == {"cam00", "cam01"}
     assert capture.drawn["cam00"].sum() == 144
     assert capture.drawn["cam01"].sum() == pytest.approx(81, abs=2)
-    other = read_real_capture(folder, tmp_path / "kept", None, outlines(tmp_path / "other.json", "cam02"), quiet)
+    other = read_real_capture(
+        folder, tmp_path / "kept", None, outlines(tmp_path / "other.json", "cam02"), discard_progress
+    )
     assert set(other.drawn) == {"cam00", "cam02"}
     assert not (tmp_path / "kept").exists(), "the cameras were given"
 
@@ -143,7 +142,7 @@ def test_wrong_outlines_are_refused(tmp_path: Path) -> None:
         call(real, {"folders": lambda: [folder, folder]}, outlines=drawn)
     drawn.write_text("{}")
     with pytest.raises(InputError, match=r"outlines\.json"):
-        read_real_capture(folder, tmp_path / "kept", None, drawn, quiet)
+        read_real_capture(folder, tmp_path / "kept", None, drawn, discard_progress)
 
 
 @pytest.mark.slow

@@ -98,6 +98,9 @@ def test_a_measure_comes_with_its_deviation_and_size(result: Path, tmp_path: Pat
     (doubted / "report.json").write_text(json.dumps(report | {"scale_sigma": 0.06, "warnings": [doubt]}))
     done = CliRunner().invoke(app, ["measure", str(doubted)])
     assert "doubted: an assumption" in done.output
-    table.write_text(table.read_text().replace("head_circumference", "hat"))
+    table.write_text(table.read_text().replace("head_circumference", "pupil_distance"))
+    done = CliRunner().invoke(app, ["measure", str(result), "--sizes", str(table)])
+    assert "helmet: left out, since this result has no pupil_distance" in done.output
+    table.write_text(table.read_text().replace("pupil_distance", "hat"))
     refused = CliRunner().invoke(app, ["measure", str(result), "--sizes", str(table)])
-    assert "helmet: hat is no measure of this head" in str(refused.exception)
+    assert "helmet: hat is no measure of a head" in str(refused.exception)

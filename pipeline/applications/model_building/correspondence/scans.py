@@ -1,8 +1,8 @@
 """Reads raw scans and their landmarks: a mesh file (PLY, OBJ, GLB) with a landmark file of the same name beside it.
 
 Landmark files are ``.json`` (``{"points": {"pronasale": [x, y, z]}}``, or the names at the top), MeshLab's picked
-points ``.pp``, and landmarker.io's ``.ljson`` (versions 1 to 3; a label that covers one point names it). Names are the
-26 of landmarks.py; case, blanks and hyphens do not matter."""
+points ``.pp``, landmarker.io's ``.ljson`` (versions 1 to 3; a label that covers one point names it), and 3D Slicer's
+``.mrk.json``. Names are the 26 of landmarks.py; case, blanks and hyphens do not matter."""
 
 import json
 import xml.etree.ElementTree as ElementTree
@@ -16,11 +16,12 @@ from jaxtyping import Float, Int
 
 from pipeline.head_model.landmarks import NAMES
 from rig.errors import InputError
+from rig.formats.meshes.markups import Axes, read_markups
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb")
-LANDMARK_SUFFIXES = (".json", ".pp", ".ljson")
+LANDMARK_SUFFIXES = (".json", ".mrk.json", ".pp", ".ljson")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +40,7 @@ def find_scans(folder: Path) -> list[Path]:
     head."""
     found = sorted(p for p in folder.glob("*") if p.suffix.lower() in MESH_SUFFIXES) if folder.is_dir() else []
     if not found:
-        raise InputError(str(folder), ["holds no .ply, .obj or .glb scans"])
+        raise InputError(str(folder), ["holds no .ply, .obj or .glb scans (for results of jobs give --from-results)"])
     stems = Counter(path.stem for path in found)
     twice = [f"holds more than one scan called {name}: keep one" for name, count in stems.items() if count > 1]
     if twice:
@@ -75,11 +76,14 @@ def welded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]
     return mesh.vertices[first[used]], faces.reshape(-1, 3).astype(np.int32)
 
 
-def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns landmarks by this project's names; other points of the file are ignored. Raises InputError."""
+def read_landmarks(path: Path, axes: Axes = "LPS") -> dict[str, Float[np.ndarray, " 3"]]:
+    """Returns landmarks by this project's names; other points of the file are ignored. A .mrk.json states its own axes
+    and is turned to ``axes``. Raises InputError."""
     readers = {".json": _from_json, ".pp": _from_pp, ".ljson": _from_ljson}
     try:
-        named = readers[path.suffix.lower()](path.read_text(encoding="utf-8-sig"))
+        is_list = path.name.lower().endswith(".mrk.json")
+        read = readers[path.suffix.lower()]
+        named = read_markups(path, axes) if is_list else read(path.read_text(encoding="utf-8-sig"))
         points = {plain_name(name): np.array(point, float) for name, point in named.items()}
     except (ValueError, KeyError, TypeError, AttributeError, ElementTree.ParseError) as fault:
         raise InputError(

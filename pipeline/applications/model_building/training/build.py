@@ -53,7 +53,9 @@ def build_model(
     template = assemble(parts, sha256)
     good, skipped = read_checked(scans_folder, template, report=report)
     if skipped and on_bad == "stop":
-        raise InputError(str(scans_folder), [*skipped.values(), "mend or remove them, or choose to skip bad scans"])
+        raise InputError(
+            str(scans_folder), [*skipped.values(), "mend or remove them, or leave them out with --skip-bad"]
+        )
     if len(good) < FEWEST:
         raise InputError(str(scans_folder), [f"{len(good)} sound scans, needed are {FEWEST}", *skipped.values()])
     heads = corresponded_cages([entry.scan for entry in good], template, matching, report=report)

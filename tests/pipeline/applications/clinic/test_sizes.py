@@ -32,7 +32,7 @@ def test_a_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "sizes.toml"
     path.write_text(TABLE)
     sizes = {"S": (520.0, 550.0), "M": (550.0, 580.0)}
-    assert read_size_tables(path) == [SizeTable("helmet", "head_circumference", sizes, 6.0)]
+    assert read_size_tables(path, {"head_circumference"}) == [SizeTable("helmet", "head_circumference", sizes, 6.0)]
 
 
 @pytest.mark.parametrize(("old", "new", "words"), [
@@ -50,4 +50,4 @@ def test_a_wrong_table_is_refused(tmp_path: Path, old: str, new: str, words: str
     path = tmp_path / "sizes.toml"
     path.write_text(TABLE.replace(old, new) if old != "sizes" else TABLE.replace("sizes = {", "size = {"))
     with pytest.raises(InputError, match=words):
-        read_size_tables(path)
+        read_size_tables(path, set())

@@ -13,6 +13,7 @@ from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.geometry import RigidTransform
+from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import rig_from_directions
 from rig.studio.scene.simulate import simulate
@@ -25,10 +26,6 @@ AWAY = RigidTransform(np.eye(3), np.array([0.0, 0.0, 600.0]))
 CAMERA = Camera("cam00", Intrinsics(320, 240, 400.0, 400.0, 159.5, 119.5), AWAY)
 AROUND = (*((a, e) for a in (-80, -40, 0, 40, 80) for e in (-15, 20)), (0, 40), (20, 0), (-20, 0), (180, 0), (150, 10))
 HEAD_OF_SPAN = Settings(detail="span", outputs=OutputSettings(surface="head"))
-
-
-def quiet(stage: str, share: float) -> None:
-    pass
 
 
 def test_an_outline_that_is_two_pixels_off_is_told_so() -> None:
@@ -73,7 +70,7 @@ def test_a_studio_subject_is_judged_by_the_views_that_were_held_out(renderer: Re
     taken = simulate(drawn_subject(model, rng), rig_from_directions(AROUND).scaled(0.4), CLEAN, rng, renderer=renderer)
     masks = taken.masks
     real_capture = RealCapture("anna", Capture(taken.capture.images, masks=masks), taken.rig, masks, "cam04")
-    row = judge(model, real_capture, renderer=renderer, settings=HEAD_OF_SPAN, report=quiet)
+    row = judge(model, real_capture, renderer=renderer, settings=HEAD_OF_SPAN, report=discard_progress)
     assert (row["views"], row["held_out"], row["surface"]) == (15, 2, "head")
     assert len(row["used"]) == 11
     assert row["outline_px"] < 3.0
@@ -81,4 +78,4 @@ def test_a_studio_subject_is_judged_by_the_views_that_were_held_out(renderer: Re
     assert row["points_mm"] < 3.0
     few = replace(real_capture, rig=taken.rig.subset(taken.rig.names[:11]))
     with pytest.raises(InputError, match="11 views of use on the front side; more than 11 are needed"):
-        judge(model, few, renderer=renderer, settings=HEAD_OF_SPAN, report=quiet)
+        judge(model, few, renderer=renderer, settings=HEAD_OF_SPAN, report=discard_progress)

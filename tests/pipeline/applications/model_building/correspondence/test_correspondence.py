@@ -115,7 +115,9 @@ def test_landmark_files_in_every_form(tmp_path: Path) -> None:
     (tmp_path / "d.ljson").write_text(json.dumps(three))
     one = {"version": 1, "groups": [{"label": "pronasale", "landmarks": [{"point": point}]}]}
     (tmp_path / "e.ljson").write_text(json.dumps(one))
-    for name in ("a.json", "b.pp", "c.ljson", "d.ljson", "e.ljson"):
+    marked = {"coordinateSystem": "RAS", "controlPoints": [{"label": "Pronasale", "position": [-1.5, 2.0, 80.25]}]}
+    (tmp_path / "g.mrk.json").write_text(json.dumps({"markups": [marked]}))  # 3D Slicer's; scans are LPS
+    for name in ("a.json", "b.pp", "c.ljson", "d.ljson", "e.ljson", "g.mrk.json"):
         got = read_landmarks(tmp_path / name)
         assert set(got) == {"pronasale"}, name
         np.testing.assert_allclose(got["pronasale"], point)
