@@ -1,4 +1,4 @@
-"""Compiled loops that find triangles of a mesh that cross each other.
+"""Compiled loops that find triangles of a mesh that are turned over, are folded, or cross each other.
 
 Triangles are sorted into cubic cells by the middles of their boxes. A cell is as wide as the widest box, so that
 triangles that meet lie in neighbouring cells. Two triangles cross if an edge of one passes through the other; merely

@@ -46,8 +46,9 @@ PACE_MOST = 1000.0  # what a damaged file may at most say of a stage
 def kind_of(settings: Settings) -> str:
     """Returns the kind of a job as text such as "contour photo both": the settings that decide which stages it has and
     how long they take."""
-    extra = (settings.outputs.morphs and " morphs") or "", (settings.outputs.template and " template") or ""
-    return f"{settings.method} {settings.detail or 'fine'} {settings.outputs.surface}{''.join(extra)}"
+    words = [settings.method, settings.detail or "fine", settings.outputs.surface]
+    words += ["morphs"] * settings.outputs.morphs + ["template"] * bool(settings.outputs.template)
+    return " ".join(words)
 
 
 def megapixels_of(capture: Path) -> float:
