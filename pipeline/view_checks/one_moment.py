@@ -10,7 +10,7 @@ Enters: the faces found in the photographs. Leaves: the views that differ, each 
 towards a camera or away from it looks the same there, and a mouth seen from the side hardly opens: neither is found.
 """
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +27,8 @@ from rig.rig import Rig
 MAX_SIGMAS = 5.0  # 4.9 in 24 clean studio heads of 410 px, 4.2 in other clean captures; 10 mm aside are 5 to 8 there
 OPEN_MM = 3.0  # between lips: 0.4 to 2.3 of eight shut mouths, 4.3 to 11 of six jaws opened by half and fully
 OPENING_NOISE = 0.15  # of the opening that the other views see, by which lips seen from above or below differ
-MIN_FACING = 0.5  # cosine, of a view that is judged: from the side all mouths look shut, and points lie up to 7 mm off
-MIN_OFFSET_MM = 5.0  # of a head: half of a movement that must be named. A bearded open mouth from below is 4.9 mm off
+MIN_FACING = 0.5  # cosine, of a view whose lips are judged: from the side all mouths look shut
+MIN_OFFSET_MM = 5.0, 10.0  # of a head from the front and aside: clean ones are up to 5.2 mm (at 3.3 deviations) and 7.0
 UPPER_LIP, LOWER_LIP = [0, 37, 267, 13, 82, 312, 81, 311], [17, 84, 314, 14, 87, 317, 178, 402]  # of the 468 points
 
 
@@ -41,32 +41,41 @@ class _Offset(NamedTuple):
 
 
 def judge_moments(subject: SubjectFaces | None, rig: Rig) -> list[ReportWarning]:
-    """Returns a warning for each view that shows another moment or person. The worst view is removed before the next
-    one is sought; of three views, where each may be the wrong one, all that differ are named."""
+    """Returns a warning for each view that shows another moment or person. A view is removed before the next one is
+    sought: that without which the others agree best. Of three, where each may be wrong, all that differ are named."""
     face, odd = None if subject is None else subject.matched, list[_Offset]()
     if subject is None or face is None:
         return []
     in_place = {name: subject.found[name][0] for name in subject.expected if subject.found.get(name)}
     shown = in_place | dict(face.outliers) | dict(face.detections)
     while len(shown) > 2 and 2 * len(odd) < len(shown):
-        agreeing = {name: seen for name, seen in face.detections.items() if name in shown}
-        offsets = [one for name in shown if (one := _offset(name, shown[name], agreeing, rig)) is not None]
-        over = sorted((one for one in offsets if one.sigmas > MAX_SIGMAS), reverse=True)
-        odd += over if len(shown) == 3 else over[:1]
-        if not over or len(shown) == 3:
+        over = _list_differing(shown, face.detections, rig)
+        if len(shown) == 3 or not over:
+            odd += over
             break
-        del shown[over[0].camera]
+        rests = [{name: seen for name, seen in shown.items() if name != one.camera} for one in over]
+        left = [_list_differing(rest, face.detections, rig)[:1] for rest in rests] if len(over) > 1 else [[]]
+        best = left.index(min(left))
+        odd, shown = [*odd, over[best]], rests[best]
     return [compose("moments-differ", camera=one.camera, offset_mm=one.distance_mm) for one in odd]
 
 
-def _offset(name: str, seen: FaceDetection, agreeing: Mapping[str, FaceDetection], rig: Rig) -> _Offset | None:
-    others = {other: detection for other, detection in agreeing.items() if other != name}
-    face = triangulate_face(others, rig) if len(others) > 1 else None
+def _list_differing(shown: Mapping[str, FaceDetection], matched: Container[str], rig: Rig) -> list[_Offset]:
+    """Returns the views that differ from the other matched ones, the worst first; from all, if only one is matched."""
+    offsets = []
+    for name, seen in shown.items():
+        others = {other: face for other, face in shown.items() if other != name}
+        agreeing = {other: face for other, face in others.items() if other in matched}
+        offsets.append(_offset(name, seen, agreeing if len(agreeing) > 1 else others, rig))
+    return sorted((one for one in offsets if one is not None and one.sigmas > MAX_SIGMAS), reverse=True)
+
+
+def _offset(name: str, seen: FaceDetection, others: Mapping[str, FaceDetection], rig: Rig) -> _Offset | None:
+    face = triangulate_face(others, rig)
     if face is None:
         return None
     camera, points = rig[name], face.points.positions_world
-    if direction_from_face(face.world_from_face, camera)[2] < MIN_FACING:
-        return None
+    aside = direction_from_face(face.world_from_face, camera)[2] < MIN_FACING
     pixels, slopes = camera.project_with_jacobian(points)
     missed = unbiased_px(seen, face.world_from_face, camera) - pixels
     unknown = np.einsum("nij,mnj->mni", slopes, shared_modes(face, rig)).mean(axis=1)
@@ -78,7 +87,8 @@ def _offset(name: str, seen: FaceDetection, agreeing: Mapping[str, FaceDetection
     there, seen_there, world = (_lips_apart(each) for each in (pixels, pixels + missed, points))
     lips_px, open_px = float(np.linalg.norm(seen_there - there)), float(np.linalg.norm(there))
     is_open = min(float(np.linalg.norm(world)), float(np.linalg.norm(seen_there)) * mm_per_px) > OPEN_MM
-    head_px, lips_px = head_px * (head_px * mm_per_px > MIN_OFFSET_MM), lips_px * (not is_open)
+    head_px *= head_px * mm_per_px > MIN_OFFSET_MM[int(aside)]
+    lips_px *= not is_open and not aside
     by_head = _Offset(head_px / float(noise_px), head_px * mm_per_px, name)
     by_lips = _Offset(lips_px / float(np.hypot(noise_px, OPENING_NOISE * open_px)), lips_px * mm_per_px, name)
     return max(by_head, by_lips)

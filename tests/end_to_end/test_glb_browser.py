@@ -111,16 +111,8 @@ def our_drawing(mesh: Mesh, colours: np.ndarray, field_deg: float) -> np.ndarray
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the command line makes of photographs of a real head."""
     out = tmp_path_factory.mktemp("result")
-    options = ["--detail", "span", "--formats", "glb,ply,obj"]
-    command = [
-        sys.executable,
-        "-m",
-        "server.cli",
-        "reconstruct",
-        str(shared("data/captures/scan-a")),
-        "--out",
-        str(out),
-    ]
+    options = ["--out", str(out), "--detail", "span", "--formats", "glb,ply,obj"]
+    command = [sys.executable, "-m", "server.cli", "reconstruct", str(shared("data/captures/scan-a"))]
     subprocess.run([*command, *options], check=True, timeout=600)
     return out
 

@@ -1,15 +1,20 @@
 """Photographs of the wedge alone: calibrated once, kept, and taken again when one of them is another."""
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from calibration.adjustment.gauge import image_distance
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.pictures.images import read_image, write_image
+from server.cli.main import app
 from server.tasks.photographs import photographs_alone, read_or_calibrate
+from tests.support.shared_data import shared
 from tests.support.textured_wedge import wedge_rig, write_photographs
 
 
@@ -38,6 +43,34 @@ def test_photographs_alone_become_a_capture_and_are_kept(tmp_path: Path) -> None
     write_image(photos / "cam00.png", np.ascontiguousarray(255 - picture))
     read_or_calibrate(photos, kept, front="cam02", report=lambda stage, share: stages.append(stage))
     assert "structure" in stages
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+@pytest.mark.timeout(600)
+def test_lengths_of_an_assumed_scale_hold_what_they_state(tmp_path: Path) -> None:
+    """Of the same landmarks as with the true cameras, whose head is .1 mm off."""
+    calibrated, reports = shared("data/captures/scan-a"), []
+    shutil.copytree(calibrated, tmp_path / "photos", ignore=lambda *_: ["cameras.json"])
+    for number, folder in enumerate((calibrated, tmp_path / "photos")):
+        words = [
+            "reconstruct",
+            str(folder),
+            "--detail",
+            "span",
+            "--surface",
+            "head",
+            "--out",
+            str(tmp_path / f"{number}"),
+        ]
+        done = CliRunner().invoke(app, words)
+        assert done.exit_code == 0, done.output
+        reports.append(json.loads((tmp_path / f"{number}/report.json").read_text()))
+    true, assumed = reports
+    assert "scale-assumed" in {warning["code"] for warning in assumed["warnings"]}
+    assert len(true["measurements"]) >= 17
+    for name, length in assumed["measurements"].items():
+        assert abs(length["value"] - true["measurements"][name]["value"]) < 1.96 * length["std"], name
 
 
 def test_a_folder_with_cameras_is_read_as_it_is(tmp_path: Path) -> None:
