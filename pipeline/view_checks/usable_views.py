@@ -152,19 +152,15 @@ def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
     is given once."""
     remarks_by_code: dict[str, list[Message]] = {"view-left-out": [], "view": [], "mask-doubtful": []}
     for name, silhouette in silhouettes.items():
-        code = "view" if silhouette.quality.usable else "view-left-out"
-        remarks_by_code[code] += [
-            compose("located", where=name, fault=remark) for remark in silhouette.quality.warnings
-        ]
-        remarks_by_code["mask-doubtful"] += [
-            compose("located", where=name, fault=doubt) for doubt in silhouette.quality.doubts
-        ]
-    once = {
-        code: say_once(remarks, silhouettes, named_most=len(silhouettes)) for code, remarks in remarks_by_code.items()
-    }
-    found = [compose("view-left-out", remark=remark) for remark in once["view-left-out"]]
-    found += [compose("view", remark=remark) for remark in once["view"]]
-    return found + [_doubt(remark) for remark in once["mask-doubtful"]]
+        quality = silhouette.quality
+        of_view = "view" if quality.usable else "view-left-out"
+        for code, faults in ((of_view, quality.warnings), ("mask-doubtful", quality.doubts)):
+            remarks_by_code[code] += [compose("located", where=name, fault=fault) for fault in faults]
+    return [
+        _doubt(remark) if code == "mask-doubtful" else compose(code, remark=remark)
+        for code, remarks in remarks_by_code.items()
+        for remark in say_once(remarks, silhouettes, named_most=len(silhouettes))
+    ]
 
 
 def _doubt(remark: Message) -> ReportWarning:
