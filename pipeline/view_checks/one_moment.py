@@ -26,9 +26,10 @@ from rig.rig import Rig
 
 MAX_SIGMAS = 5.0  # 4.9 in 24 clean studio heads of 410 px, 4.2 in other clean captures; 10 mm aside are 5 to 8 there
 OPEN_MM = 3.0  # between lips: 0.4 to 2.3 of eight shut mouths, 4.3 to 11 of six jaws opened by half and fully
+OPEN_DIFFERENCE = 0.78  # of the larger opening, between views of one open mouth: 0.76 at most in 50
 OPENING_NOISE = 0.15  # of the opening that the other views see, by which lips seen from above or below differ
 MIN_FACING = 0.5  # cosine, of a view whose lips are judged: from the side all mouths look shut
-MIN_OFFSET_MM = 5.0, 10.0  # of a head from the front and aside: clean ones are up to 5.2 mm (at 3.3 deviations) and 7.0
+MIN_OFFSET_MM = 5.0, 30.0  # of a head from the front and aside: clean ones are up to 5.2 mm (3.3 deviations) and 20 off
 UPPER_LIP, LOWER_LIP = [0, 37, 267, 13, 82, 312, 81, 311], [17, 84, 314, 14, 87, 317, 178, 402]  # of the 468 points
 
 
@@ -86,9 +87,11 @@ def _offset(name: str, seen: FaceDetection, others: Mapping[str, FaceDetection],
     head_px = min(float(np.linalg.norm(np.median(each, axis=0))) for each in (missed, missed[upper]))
     there, seen_there, world = (_lips_apart(each) for each in (pixels, pixels + missed, points))
     lips_px, open_px = float(np.linalg.norm(seen_there - there)), float(np.linalg.norm(there))
-    is_open = min(float(np.linalg.norm(world)), float(np.linalg.norm(seen_there)) * mm_per_px) > OPEN_MM
+    seen_px = float(np.linalg.norm(seen_there))
+    both_open = min(float(np.linalg.norm(world)), seen_px * mm_per_px) > OPEN_MM
+    both_open &= lips_px < OPEN_DIFFERENCE * max(open_px, seen_px)
     head_px *= head_px * mm_per_px > MIN_OFFSET_MM[int(aside)]
-    lips_px *= not is_open and not aside
+    lips_px *= not both_open and not aside
     by_head = _Offset(head_px / float(noise_px), head_px * mm_per_px, name)
     by_lips = _Offset(lips_px / float(np.hypot(noise_px, OPENING_NOISE * open_px)), lips_px * mm_per_px, name)
     return max(by_head, by_lips)
