@@ -1,6 +1,6 @@
 """Reconstructs a textured head from a capture (section 4): the order of the stages, for every caller."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from pipeline.evidence.plausibility import refuse
 from pipeline.results.reconstruction import Reconstruction
@@ -9,8 +9,8 @@ from pipeline.stages.bust import colour_bust, fuse_depth, push_out_hair, shape_b
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import measure_depth
 from pipeline.stages.evidence import check_pose, judge_head
-from pipeline.stages.faces import find_faces
-from pipeline.stages.head_fit import HeadFit, fit_head, fit_outlines
+from pipeline.stages.faces import Faces, find_faces
+from pipeline.stages.head_fit import HeadFit, SolvedHead, finish_head, fit_outlines, solve_head
 from pipeline.stages.part_labels import PartLabels, find_worn_cap, label_parts
 from pipeline.stages.recorder import Recorder
 from pipeline.stages.refined_head import refine_head
@@ -19,7 +19,18 @@ from pipeline.stages.views import Views, check_lenses, find_views
 from rig.formats.meshes.usdz import check_usd
 
 
-def fit_shape(run: Recorder, views: Views, alignment: Alignment) -> tuple[PartLabels, HeadFit]:
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservedHead:
+    """Holds the products of the stages that fit the head, before its uncertainty and its fine surface are known."""
+
+    views: Views
+    faces: Faces
+    alignment: Alignment
+    labels: PartLabels
+    solved: SolvedHead
+
+
+def fit_shape(run: Recorder, views: Views, alignment: Alignment) -> tuple[PartLabels, SolvedHead]:
     """Fits the head to the outlines, labels the pixels as skin, hair or clothes, and then fits the head to the
     photographs."""
     with run.stage("alignment") as stage:
@@ -29,7 +40,19 @@ def fit_shape(run: Recorder, views: Views, alignment: Alignment) -> tuple[PartLa
     with run.stage("parts") as stage:
         labels = stage.keep(label_parts(stage.context, views, outlines.model, outlines.mesh_world, cap))
     with run.stage("fit") as stage:
-        return labels, stage.keep(fit_head(stage.context, views, outlines, labels))
+        return labels, stage.keep(solve_head(stage.context, views, outlines, labels))
+
+
+def observe_head(run: Recorder) -> ObservedHead:
+    """Runs the stages up to the fit to the photographs."""
+    with run.stage("segmentation") as stage:
+        views = stage.keep(find_views(stage.context))
+    with run.beside("segmentation", lambda quiet: check_lenses(quiet, views)):
+        with run.stage("faces") as stage:
+            faces = stage.keep(find_faces(stage.context, views.capture))
+        with run.stage("alignment") as stage:
+            alignment = stage.keep(align_head(stage.context, views, faces))
+        return ObservedHead(views, faces, alignment, *fit_shape(run, views, alignment))
 
 
 def reconstruct(context: ReconstructionContext) -> Reconstruction:
@@ -41,14 +64,15 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     if "usdz" in context.settings.outputs.formats:
         check_usd()
     run = Recorder(context)
-    with run.stage("segmentation") as stage:
-        views = stage.keep(find_views(stage.context))
-    with run.beside("segmentation", lambda quiet: check_lenses(quiet, views)):
-        with run.stage("faces") as stage:
-            faces = stage.keep(find_faces(stage.context, views.capture))
-        with run.stage("alignment") as stage:
-            alignment = stage.keep(align_head(stage.context, views, faces))
-        labels, head = fit_shape(run, views, alignment)
+    seen = observe_head(run)
+    with run.stage("fit") as stage:
+        head = finish_head(stage.context, seen.solved)
+    return deliver_head(context, run, seen, head)
+
+
+def deliver_head(context: ReconstructionContext, run: Recorder, seen: ObservedHead, head: HeadFit) -> Reconstruction:
+    """Runs the stages after the fit: the fine surface, colours, evidence and bust. Raises what ``reconstruct`` does."""
+    views, faces, alignment, labels = seen.views, seen.faces, seen.alignment, seen.labels
     with run.stage("depth") as stage:
         depth = stage.keep(measure_depth(stage.context, views, head, labels))
     with (

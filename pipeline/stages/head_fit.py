@@ -1,11 +1,15 @@
 """Fits the head to the outlines (section 4.4) by the solver that the settings name, and then to the photographs.
 
-These are two stages, ``fit_outlines`` and ``fit_head``, since the parts that pixels show are labelled in between.
+These are two stages, ``fit_outlines`` and ``solve_head``, since the parts that pixels show are labelled in between;
+``finish_head`` adds the uncertainty.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
 
 from pipeline.contour_fit.bare_outline import with_bare_outline, with_counted_crown
 from pipeline.contour_fit.cap_outline import CapOutline, cells_of_views, without_cap
@@ -44,6 +48,17 @@ class OutlineFit:
     solution: ContourSolution | Fit
     model: HeadModel  # with the modes that the solution has
     mesh_world: Mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolvedHead:
+    """Holds a fit to one capture before its uncertainty is known; other captures of the person may still change it. The
+    fields are those of ``HeadFit``."""
+
+    solution: ContourSolution | Fit
+    detail: Detail
+    cranium: Cranium | None = None
+    doubtful: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,12 +141,14 @@ def refine_with_likely_face(
     return again, detail_again, doubtful
 
 
-def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit, labels: PartLabels) -> Staged[HeadFit]:
+def solve_head(
+    context: ReconstructionContext, views: Views, outlines: OutlineFit, labels: PartLabels
+) -> Staged[SolvedHead]:
     """Refines the fit with the photographs inside the outlines, to the level of detail that settings and photographs
     allow."""
     settings, model, solved = context.settings, outlines.model, outlines.solution
     if isinstance(solved, Fit):
-        return Staged(HeadFit(solved, model, Detail("span", compose("level-simplex"))))
+        return Staged(SolvedHead(solved, Detail("span", compose("level-simplex"))))
     cranium: Cranium | None = None if labels.cap is None else "cap"
     doubtful = frozenset[int]()
     detail = Detail("span" if settings.detail == "span" else "kernel", compose("level-asked"))
@@ -142,14 +159,24 @@ def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit,
             cranium = "hair" if solved.evidence.noise.bare is None else "bald"
         images = without_highlights(views.capture.images, views.silhouettes, context.rig, outlines.mesh_world)
         solved, detail, doubtful = refine_with_likely_face(solved, images, hair)
-    eigenheads, model = min(settings.fitting.modes, len(model.modes)), solved.problem.model
-    relief_mm = FINE_AMPLITUDE_MM
     if detail.level == "photo":
-        solved = with_expression_evidence(solved, eigenheads)
+        solved = with_expression_evidence(solved, min(settings.fitting.modes, len(model.modes)))
+    return Staged(SolvedHead(solved, detail, cranium, doubtful))
+
+
+def finish_head(
+    context: ReconstructionContext, head: SolvedHead, covariance: Float[np.ndarray, "p p"] | None = None
+) -> HeadFit:
+    """Adds the fit's uncertainty. A ``covariance`` of more evidence than this capture's is that of ``finish``."""
+    solved, detail = head.solution, head.detail
+    if isinstance(solved, Fit):
+        model = model_basis(context.model, context.settings)
+        return HeadFit(solved, model, detail)
+    model, relief_mm = solved.problem.model, FINE_AMPLITUDE_MM
+    eigenheads = min(context.settings.fitting.modes, len(model.modes))
     if detail.level == "span":
-        wider = basis_of(model, eigenheads, kernel=True)
-        return Staged(HeadFit(with_span_misfit(solved, wider, relief_mm=relief_mm), model, detail, cranium, doubtful))
-    if detail.level == "kernel":
-        relief_mm *= RELIEF_OF_OUTLINES
-    fit = with_estimated_prior(model, finish(solved), eigenheads, relief_mm=relief_mm)
-    return Staged(HeadFit(fit, model, detail, cranium, doubtful))
+        fit = with_span_misfit(solved, basis_of(model, eigenheads, kernel=True), relief_mm=relief_mm)
+    else:
+        relief_mm *= RELIEF_OF_OUTLINES if detail.level == "kernel" else 1.0
+        fit = with_estimated_prior(model, finish(solved, covariance), eigenheads, relief_mm=relief_mm)
+    return HeadFit(fit, model, detail, head.cranium, head.doubtful)

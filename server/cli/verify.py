@@ -63,7 +63,7 @@ def verify_captures(
                 report(f"{names[i]}: {stage}", (i + fraction) / len(captures))
 
             report_one("read", 0.0)
-            reconstruct_locally(capture, folder, model=model, settings=_head_alone(settings), report=report_one)
+            reconstruct_locally(capture, folder, model=model, settings=head_alone(settings), report=report_one)
         folders.append(folder)
     report("judge", 1.0)
     identities = {name: identity_of(folder) for name, folder in zip(names, folders, strict=True)}
@@ -107,7 +107,7 @@ def _names(captures: Sequence[Path]) -> list[str]:
     return names
 
 
-def _head_alone(settings: Mapping[str, object]) -> dict[str, object]:
+def head_alone(settings: Mapping[str, object]) -> dict[str, object]:
     """Returns the settings with the bust switched off: only the head is judged, and a capture takes ten seconds
     less."""
     outputs = settings.get("outputs")

@@ -1,0 +1,197 @@
+"""Reconstructs a take: several captures of one person, solved as one.
+
+Each moment runs the stages of a single job up to the fit to its photographs. Then one fit of all moments finds the
+identity that they share (``joint_fit``), and each goes on from there to its fine surface, colours and evidence. The
+heads of all moments have the same vertices; from them follow the neutral head and the person's own shapes
+(``own_shapes``).
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.applications.moments.joint_fit import fit_jointly, joint_covariances
+from pipeline.applications.moments.own_shapes import OwnShapes, estimate_own_shapes
+from pipeline.contour_fit.contour import ContourSolution, finish
+from pipeline.contour_fit.fit import Fit
+from pipeline.head_model.model import HeadModel
+from pipeline.reconstruct import ObservedHead, deliver_head, observe_head
+from pipeline.results.head_files import head_from_world
+from pipeline.results.reconstruction import Reconstruction
+from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.head_fit import finish_head
+from pipeline.stages.recorder import Recorder
+from pipeline.warnings import ReportWarning
+from rig.errors import Cancelled, EigenheadError, InputError
+from rig.geometry import Similarity
+from rig.messages.message import Message, compose
+from rig.progress import Progress, discard_progress
+
+MOMENTS_LEAST = 2
+OTHER_PERSON = 3.0  # RMS of the eigenheads' differences in standard deviations, beyond which a moment is another's
+OBSERVED = ("segmentation", "faces", "alignment", "fit", "parts")
+DELIVERED = ("depth", "fine", "texture", "evidence", "bust")
+JOINT = "identity"  # the stage that solves for it
+SHARES = (0.45, 0.55)  # of a take's time, at which the joint fit begins and ends
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """Holds what a take found of one moment. Arrays are over the model's expressions and the full level's vertices."""
+
+    name: str
+    detail: str  # the level that was reached
+    weights: Float[np.ndarray, " e"]
+    weight_deviation: Float[np.ndarray, " e"]
+    world_from_head: Similarity
+    head: Float[np.ndarray, "v 3"]  # head frame, mm
+    deviation_mm: Float[np.ndarray, " v"]
+    apart: float  # RMS of its own identity's differences from that of all, in standard deviations
+    warnings: tuple[ReportWarning, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Take:
+    """Holds the person of a take: the neutral head with its shapes, and the moments."""
+
+    model: HeadModel
+    own: OwnShapes
+    moments: tuple[Moment, ...]
+    warnings: tuple[Message, ...]
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Raises InputError for names of moments that make no take: fewer than two, or two alike."""
+    if len(names) < MOMENTS_LEAST:
+        raise InputError("take", [compose("take-too-small", count=len(names))])
+    twice = sorted({name for name in names if list(names).count(name) > 1})
+    if twice:
+        raise InputError("take", [compose("take-names-alike", names=twice)])
+
+
+def reconstruct_take(
+    contexts: Mapping[str, ReconstructionContext],
+    deliver: Callable[[str, Reconstruction], None] = lambda name, result: None,
+    *,
+    report: Progress = discard_progress,
+) -> Take:
+    """Reconstructs the moments of one person, by their names.
+
+    Args:
+        contexts: a capture each, with the same model and settings.
+        deliver: receives each moment's finished result, which is not kept.
+        report: receives the progress of the whole; raises Cancelled to stop. The contexts' own hooks are not called.
+
+    Raises InputError for fewer than two moments or the method ``simplex``, and what ``reconstruct`` raises, with the
+    name of the moment.
+    """
+    check_names(list(contexts))
+    progress = _Advance(report, len(contexts))
+    runs: dict[str, Recorder] = {}
+    seen: dict[str, ObservedHead] = {}
+    contexts = {name: replace(each, progress=progress.of(name, k)) for k, (name, each) in enumerate(contexts.items())}
+    for name, context in contexts.items():
+        runs[name] = Recorder(context)
+        with _named(name):
+            seen[name] = observe_head(runs[name])
+    alone = [_contour_solution(each) for each in seen.values()]
+    first = next(iter(contexts.values()))
+    eigenheads = min(first.settings.fitting.modes, len(first.model.modes))
+    joint = fit_jointly(alone, eigenheads, watch=lambda: report(JOINT, SHARES[0]))
+    apart = [differ_by(each, joined, eigenheads) for each, joined in zip(alone, joint, strict=True)]
+    moments = []
+    for k, (name, covariance) in enumerate(zip(contexts, joint_covariances(joint), strict=True)):
+        here = seen.pop(name)
+        with _named(name):
+            head = finish_head(contexts[name], replace(here.solved, solution=joint[k]), covariance)
+            result = deliver_head(contexts[name], runs[name], here, head)
+        moments.append(_moment(name, result, apart[k]))
+        deliver(name, result)
+    warnings = [
+        compose("take-other-person", moment=each.name, sigmas=each.apart)
+        for each in moments
+        if each.apart > OTHER_PERSON
+    ]
+    return Take(first.model, _own_shapes(first.model, joint, moments), tuple(moments), tuple(warnings))
+
+
+def differ_by(alone: ContourSolution, joint: ContourSolution, eigenheads: int) -> float:
+    """Returns how far a moment's own identity is from that of all moments: the RMS of its eigenheads' differences, in
+    standard deviations of its own posterior."""
+    covariance = finish(alone).covariance
+    assert covariance is not None
+    rows = np.arange(eigenheads)
+    apart = (alone.state.coefficients - joint.state.coefficients[: len(alone.state.coefficients)])[rows]
+    return float(np.sqrt(apart @ np.linalg.solve(covariance[np.ix_(rows, rows)], apart) / eigenheads))
+
+
+def _contour_solution(seen: ObservedHead) -> ContourSolution:
+    if isinstance(seen.solved.solution, Fit):
+        raise InputError("take", [compose("take-needs-contour")])
+    return seen.solved.solution
+
+
+@contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Puts the moment's name before what the block refuses."""
+    try:
+        yield
+    except Cancelled:
+        raise
+    except EigenheadError as error:
+        raise EigenheadError(compose("located", where=name, fault=error.message)) from error
+
+
+def _moment(name: str, result: Reconstruction, apart: float) -> Moment:
+    fit, posed = result.head.fit, np.asarray(result.head.model.posed, int)
+    weights, spread = np.zeros(len(result.head.model.expressions)), np.zeros(len(result.head.model.expressions))
+    if len(posed) and fit.covariance is not None:
+        weights, spread = fit.coefficients[posed], np.sqrt(np.diag(fit.covariance)[posed])
+    return Moment(
+        name,
+        result.refined.detail.level,
+        weights,
+        spread,
+        fit.world_from_head,
+        head_from_world(result).apply(result.mesh_world.vertices),
+        result.refined.deviation_mm,
+        apart,
+        result.warnings,
+    )
+
+
+def _own_shapes(model: HeadModel, joint: Sequence[ContourSolution], moments: Sequence[Moment]) -> OwnShapes:
+    longest = max(joint, key=lambda each: len(each.state.coefficients))
+    fitted, scale = longest.problem.model, longest.state.world_from_head.scale
+    coefficients = longest.state.coefficients.copy()
+    coefficients[np.asarray(fitted.posed, int)] = 0.0
+    return estimate_own_shapes(
+        model,
+        scale * fitted.vertices(coefficients),
+        scale,
+        np.stack([each.weights for each in moments]),
+        np.stack([each.head for each in moments]),
+        np.stack([each.deviation_mm for each in moments]),
+    )
+
+
+class _Advance:
+    """Turns progress of the moments' stages into that of the take, which never falls."""
+
+    def __init__(self, report: Progress, count: int) -> None:
+        self._report, self._count, self._most = report, count, 0.0
+
+    def of(self, name: str, number: int) -> Progress:
+        """Returns what the moment ``number`` (0 for the first) reports to."""
+
+        def tell(stage: str, fraction: float) -> None:
+            for stages, (first, last) in ((OBSERVED, (0.0, SHARES[0])), (DELIVERED, (SHARES[1], 1.0))):
+                if stage in stages:
+                    done = (number + (stages.index(stage) + fraction) / len(stages)) / self._count
+                    self._most = max(self._most, first + (last - first) * done)
+            self._report(f"{name} {stage}", self._most)
+
+        return tell

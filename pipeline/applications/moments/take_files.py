@@ -1,0 +1,135 @@
+"""Writes a take.
+
+neutral.ply           the person's head without expression: head frame, mm; quality is its standard deviation
+neutral.glb           the same in metres, with the person's own shapes as morph targets under Apple's 52 names
+shapes.npz            names (n), shapes (n v 3, mm at weight 1) and deviations (n v, mm), in the order of the vertices
+take.npz              moments (k), expressions (e), weights and weight_deviations (k e), rotations (k 3 3),
+                      translations (k 3, mm), scale, heads (k v 3, head frame, mm) and deviations (k v, mm)
+moments/<name>/       the result folder of each moment, with vertices in one order
+report.json           what was found, written last
+"""
+
+import io
+import json
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from pipeline.applications.moments.take import Take
+from pipeline.head_model.expressions import ARKIT
+from pipeline.results.reconstruction import QUALITY, Reconstruction
+from rig.atomic_write import write_atomically
+from rig.formats.meshes.glb import scene_glb_bytes
+from rig.formats.meshes.ply import ply_bytes
+from rig.formats.meshes.scene import Part, Scene
+from rig.mesh import Mesh
+from rig.messages.message import documents_of
+
+FORMAT = "eigenhead-take/1"
+FILES = ("neutral.ply", "neutral.glb", "shapes.npz", "take.npz", "report.json")
+TOLD = 0.02  # a smaller weight is left out of report.json
+
+
+class Colours:
+    """Gathers the colours of the neutral head from the moments: at each vertex those of the moment that most images
+    coloured."""
+
+    def __init__(self) -> None:
+        self.colours: UInt8[np.ndarray, "v 3"] | None = None
+        self.views: UInt8[np.ndarray, " v"] | None = None
+
+    def take_over(self, result: Reconstruction) -> None:
+        """Takes over the colours of a moment where it saw more."""
+        found = result.texturing.vertices
+        if self.colours is None or self.views is None:
+            self.colours, self.views = found.colours.copy(), found.views.copy()
+            return
+        more = found.views > self.views
+        self.colours[more], self.views[more] = found.colours[more], found.views[more]
+
+
+def write_take(folder: Path, take: Take, colours: Colours, digests: Mapping[str, str]) -> dict[str, Any]:
+    """Writes the files of a take beside its moments' folders, each under a temporary name first, report.json last.
+    Returns what that says. ``digests``: SHA-256 of each moment's inputs. Raises OSError."""
+    own, model = take.own, take.model
+    assert colours.colours is not None
+    assert colours.views is not None
+    mesh = Mesh(own.neutral, model.levels["full"].faces, colours.colours)
+    normals = mesh.normals()
+    comments = ["unit mm", "frame head", f"model sha256 {model.sha256}", f"version eigenhead {version('eigenhead')}"]
+    data = ply_bytes(
+        mesh,
+        normals=normals,
+        colours=colours.colours,
+        quality=own.deviation_mm.astype(np.float32),
+        views=colours.views,
+        comments=[*comments, QUALITY],
+    )
+    write_atomically(folder / "neutral.ply", data)
+    morphs = {name: shape for name, shape in zip(ARKIT, own.shapes, strict=True) if shape.any()}
+    extras = {"unit": "m", "frame": "head", "model": {"name": model.name, "sha256": model.sha256}}
+    write_atomically(
+        folder / "neutral.glb", scene_glb_bytes(Scene([Part("head", mesh, normals, None, morphs)]), extras)
+    )
+    _write_arrays(folder / "shapes.npz", names=np.array(ARKIT), shapes=own.shapes, deviations=own.shape_deviation_mm)
+    _write_arrays(
+        folder / "take.npz",
+        moments=np.array([each.name for each in take.moments]),
+        expressions=np.array(model.expressions.names),
+        weights=np.stack([each.weights for each in take.moments]),
+        weight_deviations=np.stack([each.weight_deviation for each in take.moments]),
+        rotations=np.stack([each.world_from_head.rotation for each in take.moments]),
+        translations=np.stack([each.world_from_head.translation for each in take.moments]),
+        scale=np.array(take.moments[0].world_from_head.scale),
+        heads=np.stack([each.head for each in take.moments]).astype(np.float32),
+        deviations=np.stack([each.deviation_mm for each in take.moments]).astype(np.float32),
+    )
+    document = take_document(take, digests)
+    write_atomically(folder / "report.json", json.dumps(document, indent=1, allow_nan=False).encode())
+    return document
+
+
+def take_document(take: Take, digests: Mapping[str, str]) -> dict[str, Any]:
+    """Returns the content of a take's report.json."""
+    names, model = take.model.expressions.names, take.model
+    face = model.levels["full"].face_region
+    return {
+        "format": FORMAT,
+        "version": version("eigenhead"),
+        "model": {"name": model.name, "sha256": model.sha256},
+        "neutral": {"deviation_mm": float(np.sqrt((take.own.deviation_mm[face] ** 2).mean()))},
+        "own_shapes": list(take.own.shown),
+        "moments": [
+            {
+                "name": each.name,
+                "folder": f"moments/{each.name}",
+                "inputs_sha256": digests[each.name],
+                "detail": each.detail,
+                "weights": {
+                    name: {"weight": float(weight), "deviation": float(deviation)}
+                    for name, weight, deviation in zip(names, each.weights, each.weight_deviation, strict=True)
+                    if weight >= TOLD
+                },
+                "world_from_head": {
+                    "scale": each.world_from_head.scale,
+                    "rotation": each.world_from_head.rotation.tolist(),
+                    "translation": each.world_from_head.translation.tolist(),
+                },
+                "deviation_mm": float(np.sqrt((each.deviation_mm[face] ** 2).mean())),
+                "apart_sigmas": each.apart,
+                "warnings": documents_of(each.warnings),
+            }
+            for each in take.moments
+        ],
+        "warnings": documents_of(take.warnings),
+    }
+
+
+def _write_arrays(path: Path, **arrays: Any) -> None:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    write_atomically(path, buffer.getvalue())
