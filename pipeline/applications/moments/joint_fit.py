@@ -24,6 +24,7 @@ from pipeline.contour_fit.problem import POSE, State
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.terms import Linearised, NormalEquations, Problem
 
+COMMON = 0.0
 STEPS = 12  # Levenberg-Marquardt steps at most
 States = tuple[State, ...]
 Rows = Int[np.ndarray, " u"]
@@ -87,7 +88,7 @@ class JointTerm:
             values[: len(shared)] = shared
         counts[-1], values[-1] = len(states), np.log(states[0].world_from_head.scale)
         information = np.append(np.ones(self.layout.identity), SCALE_SPREAD**-2)
-        return LinearisedJointTerm(self, parts, (counts - 1.0) * information, values)
+        return LinearisedJointTerm(self, parts, (1.0 - COMMON) * (counts - 1.0) * information, values)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,8 +202,9 @@ def _with_evidence(
     groups = (diagonal[:eigenheads], diagonal[eigenheads : posed.start], diagonal[posed.start :])
     equations = problem.equations(here)
     matrix, gradient = equations.matrix, equations.gradient
-    matrix[diagonal, diagonal] -= 1.0  # what the evidence says without the priors
-    gradient[diagonal] -= identity
+    priors = 1.0 + COMMON * (len(states) - 1)
+    matrix[diagonal, diagonal] -= priors  # what the evidence says without the priors
+    gradient[diagonal] -= priors * identity
     before = [
         state.coefficients[solved.problem.model.posed.start : solved.problem.model.posed.stop]
         for solved, state in zip(solutions, states, strict=True)
@@ -214,12 +216,12 @@ def _with_evidence(
     room = problem.room(states)
     for _ in range(ROUNDS):
         whole, slope = matrix.copy(), gradient.copy()
-        whole[diagonal, diagonal] += 1.0 / variance
-        slope[diagonal] += identity / variance
+        whole[diagonal, diagonal] += priors / variance
+        slope[diagonal] += priors * identity / variance
         for rows, weights in zip(layout.weights, before, strict=True):
             slope[rows] += weight_slope(np.maximum(weights + step[rows], 0.0))
         step = arrow.least(whole, slope, *room)
-        covariance = arrow.variances(whole)
+        covariance = priors * arrow.variances(whole)
         for group in groups:
             variance[group] = estimated_variance(identity + step[diagonal], covariance, variance, group)
     return problem.after(states, step)
