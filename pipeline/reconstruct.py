@@ -1,6 +1,7 @@
 """Reconstructs a textured head from a capture (section 4): the order of the stages, for every caller."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Generator
+from dataclasses import replace
 
 from pipeline.evidence.plausibility import refuse
 from pipeline.results.reconstruction import Reconstruction
@@ -9,8 +10,8 @@ from pipeline.stages.bust import colour_bust, fuse_depth, push_out_hair, shape_b
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import measure_depth
 from pipeline.stages.evidence import check_pose, judge_head
-from pipeline.stages.faces import Faces, find_faces
-from pipeline.stages.head_fit import HeadFit, SolvedHead, finish_head, fit_outlines, solve_head
+from pipeline.stages.faces import find_faces
+from pipeline.stages.head_fit import HeadFit, fit_head, fit_outlines
 from pipeline.stages.part_labels import PartLabels, find_worn_cap, label_parts
 from pipeline.stages.recorder import Recorder
 from pipeline.stages.refined_head import refine_head
@@ -18,19 +19,10 @@ from pipeline.stages.texturing import texture_head
 from pipeline.stages.views import Views, check_lenses, find_views
 from rig.formats.meshes.usdz import check_usd
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ObservedHead:
-    """Holds the products of the stages that fit the head, before its uncertainty and its fine surface are known."""
-
-    views: Views
-    faces: Faces
-    alignment: Alignment
-    labels: PartLabels
-    solved: SolvedHead
+Steps = Generator[HeadFit, HeadFit, Reconstruction]
 
 
-def fit_shape(run: Recorder, views: Views, alignment: Alignment) -> tuple[PartLabels, SolvedHead]:
+def fit_shape(run: Recorder, views: Views, alignment: Alignment) -> tuple[PartLabels, HeadFit]:
     """Fits the head to the outlines, labels the pixels as skin, hair or clothes, and then fits the head to the
     photographs."""
     with run.stage("alignment") as stage:
@@ -40,19 +32,7 @@ def fit_shape(run: Recorder, views: Views, alignment: Alignment) -> tuple[PartLa
     with run.stage("parts") as stage:
         labels = stage.keep(label_parts(stage.context, views, outlines.model, outlines.mesh_world, cap))
     with run.stage("fit") as stage:
-        return labels, stage.keep(solve_head(stage.context, views, outlines, labels))
-
-
-def observe_head(run: Recorder) -> ObservedHead:
-    """Runs the stages up to the fit to the photographs."""
-    with run.stage("segmentation") as stage:
-        views = stage.keep(find_views(stage.context))
-    with run.beside("segmentation", lambda quiet: check_lenses(quiet, views)):
-        with run.stage("faces") as stage:
-            faces = stage.keep(find_faces(stage.context, views.capture))
-        with run.stage("alignment") as stage:
-            alignment = stage.keep(align_head(stage.context, views, faces))
-        return ObservedHead(views, faces, alignment, *fit_shape(run, views, alignment))
+        return labels, stage.keep(fit_head(stage.context, views, outlines, labels))
 
 
 def reconstruct(context: ReconstructionContext) -> Reconstruction:
@@ -61,18 +41,34 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     Raises EigenheadError where there is no answer (too few usable views, feature points that determine nothing) or a
     warning has a code that ``settings.fail_on`` names, and Cancelled when ``context.progress`` does.
     """
+    steps = start_reconstruction(context)
+    return end_reconstruction(steps, next(steps))
+
+
+def end_reconstruction(steps: Steps, head: HeadFit) -> Reconstruction:
+    """Continues a reconstruction with the fitted ``head``, and returns its result."""
+    try:
+        steps.send(head)
+    except StopIteration as end:
+        return end.value
+    raise AssertionError("it stops once")
+
+
+def start_reconstruction(context: ReconstructionContext) -> Steps:
+    """Runs a reconstruction up to the fitted head, which it yields; the head that is sent back is the one that it goes
+    on with (``end_reconstruction``). Several captures of one person meet there."""
     if "usdz" in context.settings.outputs.formats:
         check_usd()
     run = Recorder(context)
-    seen = observe_head(run)
-    with run.stage("fit") as stage:
-        head = finish_head(stage.context, seen.solved)
-    return deliver_head(context, run, seen, head)
-
-
-def deliver_head(context: ReconstructionContext, run: Recorder, seen: ObservedHead, head: HeadFit) -> Reconstruction:
-    """Runs the stages after the fit: the fine surface, colours, evidence and bust. Raises what ``reconstruct`` does."""
-    views, faces, alignment, labels = seen.views, seen.faces, seen.alignment, seen.labels
+    with run.stage("segmentation") as stage:
+        views = stage.keep(find_views(stage.context))
+    with run.beside("segmentation", lambda quiet: check_lenses(quiet, views)):
+        with run.stage("faces") as stage:
+            faces = stage.keep(find_faces(stage.context, views.capture))
+        with run.stage("alignment") as stage:
+            alignment = stage.keep(align_head(stage.context, views, faces))
+        labels, head = fit_shape(run, views, alignment)
+    head = yield head
     with run.stage("depth") as stage:
         depth = stage.keep(measure_depth(stage.context, views, head, labels))
     with (
@@ -105,7 +101,7 @@ def deliver_head(context: ReconstructionContext, run: Recorder, seen: ObservedHe
         faces=faces,
         alignment=alignment,
         labels=labels,
-        head=head,
+        head=replace(head, solution=None),
         refined=refined,
         texturing=texturing,
         bust=bust,

@@ -1,15 +1,11 @@
 """Fits the head to the outlines (section 4.4) by the solver that the settings name, and then to the photographs.
 
-These are two stages, ``fit_outlines`` and ``solve_head``, since the parts that pixels show are labelled in between;
-``finish_head`` adds the uncertainty.
+These are two stages, ``fit_outlines`` and ``fit_head``, since the parts that pixels show are labelled in between.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
-
-import numpy as np
-from jaxtyping import Float
 
 from pipeline.contour_fit.bare_outline import with_bare_outline, with_counted_crown
 from pipeline.contour_fit.cap_outline import CapOutline, cells_of_views, without_cap
@@ -51,17 +47,6 @@ class OutlineFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SolvedHead:
-    """Holds a fit to one capture before its uncertainty is known; other captures of the person may still change it. The
-    fields are those of ``HeadFit``."""
-
-    solution: ContourSolution | Fit
-    detail: Detail
-    cranium: Cranium | None = None
-    doubtful: frozenset[int] = frozenset()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class HeadFit:
     """Holds a fit with its covariance, the model whose modes it uses, and the level of detail that it reached.
 
@@ -74,6 +59,7 @@ class HeadFit:
     detail: Detail
     cranium: Cranium | None = None
     doubtful: frozenset[int] = frozenset()  # expressions, by their place among the model's, that the fit left out
+    solution: ContourSolution | None = None  # what ``fit`` was made of, for other captures of the same person
 
     @property
     def mesh_world(self) -> Mesh:
@@ -141,14 +127,12 @@ def refine_with_likely_face(
     return again, detail_again, doubtful
 
 
-def solve_head(
-    context: ReconstructionContext, views: Views, outlines: OutlineFit, labels: PartLabels
-) -> Staged[SolvedHead]:
+def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit, labels: PartLabels) -> Staged[HeadFit]:
     """Refines the fit with the photographs inside the outlines, to the level of detail that settings and photographs
     allow."""
     settings, model, solved = context.settings, outlines.model, outlines.solution
     if isinstance(solved, Fit):
-        return Staged(SolvedHead(solved, Detail("span", compose("level-simplex"))))
+        return Staged(HeadFit(solved, model, Detail("span", compose("level-simplex"))))
     cranium: Cranium | None = None if labels.cap is None else "cap"
     doubtful = frozenset[int]()
     detail = Detail("span" if settings.detail == "span" else "kernel", compose("level-asked"))
@@ -159,24 +143,15 @@ def solve_head(
             cranium = "hair" if solved.evidence.noise.bare is None else "bald"
         images = without_highlights(views.capture.images, views.silhouettes, context.rig, outlines.mesh_world)
         solved, detail, doubtful = refine_with_likely_face(solved, images, hair)
+    eigenheads, model = min(settings.fitting.modes, len(model.modes)), solved.problem.model
+    relief_mm = FINE_AMPLITUDE_MM
     if detail.level == "photo":
-        solved = with_expression_evidence(solved, min(settings.fitting.modes, len(model.modes)))
-    return Staged(SolvedHead(solved, detail, cranium, doubtful))
-
-
-def finish_head(
-    context: ReconstructionContext, head: SolvedHead, covariance: Float[np.ndarray, "p p"] | None = None
-) -> HeadFit:
-    """Adds the fit's uncertainty. A ``covariance`` of more evidence than this capture's is that of ``finish``."""
-    solved, detail = head.solution, head.detail
-    if isinstance(solved, Fit):
-        model = model_basis(context.model, context.settings)
-        return HeadFit(solved, model, detail)
-    model, relief_mm = solved.problem.model, FINE_AMPLITUDE_MM
-    eigenheads = min(context.settings.fitting.modes, len(model.modes))
+        solved = with_expression_evidence(solved, eigenheads)
     if detail.level == "span":
-        fit = with_span_misfit(solved, basis_of(model, eigenheads, kernel=True), relief_mm=relief_mm)
-    else:
-        relief_mm *= RELIEF_OF_OUTLINES if detail.level == "kernel" else 1.0
-        fit = with_estimated_prior(model, finish(solved, covariance), eigenheads, relief_mm=relief_mm)
-    return HeadFit(fit, model, detail, head.cranium, head.doubtful)
+        wider = basis_of(model, eigenheads, kernel=True)
+        fit = with_span_misfit(solved, wider, relief_mm=relief_mm)
+        return Staged(HeadFit(fit, model, detail, cranium, doubtful, solved))
+    if detail.level == "kernel":
+        relief_mm *= RELIEF_OF_OUTLINES
+    fit = with_estimated_prior(model, finish(solved), eigenheads, relief_mm=relief_mm)
+    return Staged(HeadFit(fit, model, detail, cranium, doubtful, solved))

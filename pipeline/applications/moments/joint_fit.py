@@ -2,8 +2,12 @@
 
 Enters: the contour solver's solution of every moment, outlines or photographs. Leaves: the same solutions at one
 identity. Its unknowns are those of all moments; the identity's coefficients and the log of scale are one for all of
-them, which makes an arrow of the equations (``arrow``). The cost is the sum of the moments' costs; the prior of what
-they share stands in each of these and counts once.
+them, which makes an arrow of the equations (``arrow``). The cost is the sum of the moments' costs.
+
+The prior of what K moments share stands in each of these costs. If their errors were independent, it would count once.
+But cameras, light, hair and the misfit of the model are the same in all: with the share ``COMMON`` of its variance in
+common, the evidence of K moments is worth K / (1 + COMMON (K - 1)), and so the prior counts 1 + COMMON (K - 1) times.
+Counted once, it left the head of eight moments before three cameras no better than the mean of their own heads.
 
 A moment whose photographs show too little has no fine modes: it speaks for the modes that it has.
 """
@@ -22,9 +26,10 @@ from pipeline.contour_fit.head_problem import weight_bounds
 from pipeline.contour_fit.prior_term import LOG_SCALE, SCALE_SPREAD, weight_slope
 from pipeline.contour_fit.problem import POSE, State
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
-from pipeline.estimation.terms import Linearised, NormalEquations, Problem
+from pipeline.estimation.positive_definite import inverse
+from pipeline.estimation.terms import Linearised, NormalEquations, Problem, Sum
 
-COMMON = 0.0
+COMMON = 0.5  # share of the variance of evidence that all moments have in common
 STEPS = 12  # Levenberg-Marquardt steps at most
 States = tuple[State, ...]
 Rows = Int[np.ndarray, " u"]
@@ -71,11 +76,13 @@ def lay_out(solutions: Sequence[ContourSolution], problems: Sequence[Problem[Sta
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointTerm:
-    """Computes the cost of all moments, each by its own problem. The prior of what they share counts once."""
+    """Computes the cost of all moments, each by its own problem. The prior of what K of them share counts ``1 + common
+    (K - 1)`` times."""
 
     problems: tuple[Problem[State], ...]
     solutions: tuple[ContourSolution, ...]
     layout: Layout
+    common: float
 
     def at(self, states: States) -> "LinearisedJointTerm":
         """Returns the term linearised at one state a moment."""
@@ -88,13 +95,13 @@ class JointTerm:
             values[: len(shared)] = shared
         counts[-1], values[-1] = len(states), np.log(states[0].world_from_head.scale)
         information = np.append(np.ones(self.layout.identity), SCALE_SPREAD**-2)
-        return LinearisedJointTerm(self, parts, (1.0 - COMMON) * (counts - 1.0) * information, values)
+        return LinearisedJointTerm(self, parts, (1.0 - self.common) * (counts - 1.0) * information, values)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedJointTerm:
-    """Holds the moments' costs linearised, and what is taken off: the ``repeated`` information of priors, at the
-    ``values`` of what is shared."""
+    """Holds the moments' costs linearised, and what is taken off: the information of priors that are ``repeated``, at
+    the ``values`` of what is shared."""
 
     term: JointTerm
     parts: tuple[Linearised, ...]
@@ -103,7 +110,7 @@ class LinearisedJointTerm:
 
     @property
     def cost(self) -> float:
-        """Returns the sum of the moments' costs, with the prior of what they share once."""
+        """Returns the sum of the moments' costs, without the repeated priors."""
         return sum(part.cost for part in self.parts) - float(self.repeated @ self.values**2)
 
     def add_to(self, equations: NormalEquations) -> None:
@@ -118,11 +125,11 @@ class LinearisedJointTerm:
         equations.gradient[shared] -= self.repeated * self.values
 
 
-def joint_problem(solutions: Sequence[ContourSolution]) -> tuple[Problem[States], Layout]:
+def joint_problem(solutions: Sequence[ContourSolution], common: float = COMMON) -> tuple[Problem[States], Layout]:
     """Builds the least-squares problem of all moments, from the last stage of each one's solution."""
     problems = tuple(last_problem(each)[0] for each in solutions)
     layout = lay_out(solutions, problems)
-    term = JointTerm(problems, tuple(solutions), layout)
+    term = JointTerm(problems, tuple(solutions), layout, common)
 
     def moved(states: States, step: Float[np.ndarray, " p"]) -> States:
         triples = zip(problems, states, layout.places, strict=True)
@@ -229,12 +236,20 @@ def _with_evidence(
 
 def joint_covariances(solutions: Sequence[ContourSolution]) -> Iterator[Float[np.ndarray, "p p"]]:
     """Yields the covariance of each moment's coefficients, rotation, translation and log scale, given the evidence of
-    all moments: blocks of the inverse of the joint normal matrix, held at bounds as ``finish`` does."""
-    problem, layout = joint_problem(solutions)
-    equations = problem.equations(problem.at(tuple(each.state for each in solutions)))
-    for solved, rows in zip(solutions, layout.places, strict=True):
-        own = NormalEquations(np.zeros((len(rows), len(rows))), equations.gradient[rows])
-        hold_at_bounds(solved, own)
-        equations.matrix[np.ix_(rows, rows)] += own.matrix
-    blocks = tuple(rows[: solved.stage.modes + POSE] for solved, rows in zip(solutions, layout.places, strict=True))
-    yield from layout.arrow.covariances(equations.matrix, blocks)
+    all moments. What is independent in them follows from the joint normal matrix, with the prior once; the share
+    ``COMMON`` stays as it is for the moment alone. Weights at bounds are held as ``finish`` does."""
+    problem, layout = joint_problem(solutions, common=0.0)
+    here = problem.at(tuple(each.state for each in solutions))
+    assert isinstance(here, Sum)
+    (joint,) = here.parts
+    assert isinstance(joint, LinearisedJointTerm)
+    whole, alone = problem.equations(here), []
+    for solved, own_problem, part, rows in zip(solutions, joint.term.problems, joint.parts, layout.places, strict=True):
+        held = NormalEquations(np.zeros((len(rows), len(rows))), whole.gradient[rows])
+        hold_at_bounds(solved, held)
+        whole.matrix[np.ix_(rows, rows)] += held.matrix
+        kept = solved.stage.modes + POSE
+        alone.append(inverse(own_problem.equations(part).matrix + held.matrix)[:kept, :kept])
+    blocks = tuple(rows[: len(own)] for rows, own in zip(layout.places, alone, strict=True))
+    for own, together in zip(alone, layout.arrow.covariances(whole.matrix, blocks), strict=True):
+        yield COMMON * own + (1.0 - COMMON) * together

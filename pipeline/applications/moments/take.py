@@ -17,13 +17,14 @@ from pipeline.applications.moments.joint_fit import fit_jointly, joint_covarianc
 from pipeline.applications.moments.own_shapes import OwnShapes, estimate_own_shapes
 from pipeline.contour_fit.contour import ContourSolution, finish
 from pipeline.contour_fit.fit import Fit
+from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, with_estimated_prior
 from pipeline.head_model.model import HeadModel
-from pipeline.reconstruct import ObservedHead, deliver_head, observe_head
+from pipeline.photometric_fit.refine import FINE_AMPLITUDE_MM
+from pipeline.reconstruct import Steps, end_reconstruction, start_reconstruction
 from pipeline.results.head_files import head_from_world
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.stages.context import ReconstructionContext
-from pipeline.stages.head_fit import finish_head
-from pipeline.stages.recorder import Recorder
+from pipeline.stages.head_fit import HeadFit
 from pipeline.warnings import ReportWarning
 from rig.errors import Cancelled, EigenheadError, InputError
 from rig.geometry import Similarity
@@ -89,26 +90,22 @@ def reconstruct_take(
     name of the moment.
     """
     check_names(list(contexts))
-    progress = _Advance(report, len(contexts))
-    runs: dict[str, Recorder] = {}
-    seen: dict[str, ObservedHead] = {}
-    contexts = {name: replace(each, progress=progress.of(name, k)) for k, (name, each) in enumerate(contexts.items())}
-    for name, context in contexts.items():
-        runs[name] = Recorder(context)
-        with _named(name):
-            seen[name] = observe_head(runs[name])
-    alone = [_contour_solution(each) for each in seen.values()]
+    progress, fitted = _Advance(report, len(contexts)), dict[str, tuple[Steps, HeadFit]]()
+    for k, (name, context) in enumerate(contexts.items()):
+        with named(name):
+            steps = start_reconstruction(replace(context, progress=progress.of(name, k)))
+            fitted[name] = steps, next(steps)
+    alone = [solution_of(head) for _, head in fitted.values()]
     first = next(iter(contexts.values()))
     eigenheads = min(first.settings.fitting.modes, len(first.model.modes))
     joint = fit_jointly(alone, eigenheads, watch=lambda: report(JOINT, SHARES[0]))
-    apart = [differ_by(each, joined, eigenheads) for each, joined in zip(alone, joint, strict=True)]
     moments = []
-    for k, (name, covariance) in enumerate(zip(contexts, joint_covariances(joint), strict=True)):
-        here = seen.pop(name)
-        with _named(name):
-            head = finish_head(contexts[name], replace(here.solved, solution=joint[k]), covariance)
-            result = deliver_head(contexts[name], runs[name], here, head)
-        moments.append(_moment(name, result, apart[k]))
+    for solved, (name, covariance) in zip(joint, zip(contexts, joint_covariances(joint), strict=True), strict=True):
+        steps, head = fitted.pop(name)
+        apart = differ_by(head.fit, solved, eigenheads)
+        with named(name):
+            result = end_reconstruction(steps, joined(head, solved, covariance, eigenheads))
+        moments.append(_moment(name, result, apart))
         deliver(name, result)
     warnings = [
         compose("take-other-person", moment=each.name, sigmas=each.apart)
@@ -118,24 +115,34 @@ def reconstruct_take(
     return Take(first.model, _own_shapes(first.model, joint, moments), tuple(moments), tuple(warnings))
 
 
-def differ_by(alone: ContourSolution, joint: ContourSolution, eigenheads: int) -> float:
+def joined(head: HeadFit, solved: ContourSolution, covariance: Float[np.ndarray, "p p"], eigenheads: int) -> HeadFit:
+    """Returns a moment's fitted head as the solution of all moments has it, with that solution's uncertainty."""
+    fit, level = finish(solved, covariance), head.detail.level
+    if level == "span":
+        fit = replace(fit, misfit_mm=head.fit.misfit_mm, sliding_mm=head.fit.sliding_mm)
+    else:
+        relief_mm = FINE_AMPLITUDE_MM * (RELIEF_OF_OUTLINES if level == "kernel" else 1.0)
+        fit = with_estimated_prior(head.model, fit, eigenheads, relief_mm=relief_mm)
+    return replace(head, fit=fit)
+
+
+def differ_by(alone: Fit, joint: ContourSolution, eigenheads: int) -> float:
     """Returns how far a moment's own identity is from that of all moments: the RMS of its eigenheads' differences, in
     standard deviations of its own posterior."""
-    covariance = finish(alone).covariance
-    assert covariance is not None
-    rows = np.arange(eigenheads)
-    apart = (alone.state.coefficients - joint.state.coefficients[: len(alone.state.coefficients)])[rows]
-    return float(np.sqrt(apart @ np.linalg.solve(covariance[np.ix_(rows, rows)], apart) / eigenheads))
+    assert alone.covariance is not None
+    apart = (alone.coefficients - joint.state.coefficients[: len(alone.coefficients)])[:eigenheads]
+    return float(np.sqrt(apart @ np.linalg.solve(alone.covariance[:eigenheads, :eigenheads], apart) / eigenheads))
 
 
-def _contour_solution(seen: ObservedHead) -> ContourSolution:
-    if isinstance(seen.solved.solution, Fit):
+def solution_of(head: HeadFit) -> ContourSolution:
+    """Returns what a moment's fit was made of. Raises InputError for a fit by the simplex method."""
+    if head.solution is None:
         raise InputError("take", [compose("take-needs-contour")])
-    return seen.solved.solution
+    return head.solution
 
 
 @contextmanager
-def _named(name: str) -> Iterator[None]:
+def named(name: str) -> Iterator[None]:
     """Puts the moment's name before what the block refuses."""
     try:
         yield

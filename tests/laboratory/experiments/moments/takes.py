@@ -18,14 +18,13 @@ from jaxtyping import Float
 
 from pipeline.applications.moments import arrow, joint_fit
 from pipeline.applications.moments.joint_fit import fit_jointly
-from pipeline.applications.moments.take import differ_by
+from pipeline.applications.moments.take import differ_by, solution_of
 from pipeline.contour_fit.contour import ContourSolution
 from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit import depth_search, refine
-from pipeline.reconstruct import observe_head
+from pipeline.reconstruct import start_reconstruction
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
-from pipeline.stages.recorder import Recorder
 from rig.mesh import Mesh, vertex_normals
 from rig.render.renderer import Renderer
 from rig.rig import Rig
@@ -80,7 +79,7 @@ def take_row(model: HeadModel, number: int, cameras: int, count: int, settings: 
     """Photographs one person and returns the errors of single fits and of the take."""
     rng = np.random.default_rng((SEED, number))
     identity, look = rng.standard_normal(len(model.modes)), random_look(rng)
-    alone, drawn = [], []
+    fitted, drawn = [], []
     for k in range(count):
         rng = np.random.default_rng((SEED, number, k))
         drawn.append(drawn_weights(rng, model.expressions.names))
@@ -89,9 +88,8 @@ def take_row(model: HeadModel, number: int, cameras: int, count: int, settings: 
         sitter = Subject(Mesh(head, full.faces), marks, full.face_region, f"{number}-{k}")
         shot = simulate(sitter, rig_of(cameras), PRESET, rng, renderer=renderer, look=look)
         context = ReconstructionContext(replace(shot.capture, features={}), shot.rig, model, settings, renderer)
-        solution = observe_head(Recorder(context)).solved.solution
-        assert isinstance(solution, ContourSolution)
-        alone.append(solution)
+        fitted.append(next(start_reconstruction(context)))
+    alone = [solution_of(head) for head in fitted]
     joint = fit_jointly(alone, settings.fitting.modes)
     truth, heads = model.vertices(identity), [neutral_head(each) for each in alone]
     singles = [neutral_error(model, head, truth) for head in heads]
@@ -101,7 +99,9 @@ def take_row(model: HeadModel, number: int, cameras: int, count: int, settings: 
         "joint": neutral_error(model, neutral_head(joint[0]), truth),
     }
     row: Row = {f"{who}_{name}": float(value) for who, of in found.items() for name, value in of.items()}
-    row["apart"] = [differ_by(one, other, settings.fitting.modes) for one, other in zip(alone, joint, strict=True)]
+    row["apart"] = [
+        differ_by(head.fit, other, settings.fitting.modes) for head, other in zip(fitted, joint, strict=True)
+    ]
     row["weights"] = {
         "true": [[each.get(name, 0.0) for name in model.expressions.names] for each in drawn],
         "single": [weights_of(each).tolist() for each in alone],

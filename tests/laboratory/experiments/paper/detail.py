@@ -39,7 +39,6 @@ from pipeline.settings import Settings, document_from_settings
 from pipeline.stages.alignment import align_head
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.faces import find_faces
-from pipeline.stages.head_fit import finish_head
 from pipeline.stages.recorder import Recorder
 from pipeline.stages.views import find_views
 from pipeline.texturing.vertex_colours import texture
@@ -206,7 +205,7 @@ def every_level(
     for level in levels:
         began = time.perf_counter()
         at_level = replace(context, settings=replace(context.settings, detail=level))
-        head = finish_head(at_level, fit_shape(Recorder(at_level), views, alignment)[1])
+        _, head = fit_shape(Recorder(at_level), views, alignment)
         fitted[level] = Fitted(head.fit, head.model, head.detail.level, time.perf_counter() - began)
     return fitted
 

@@ -81,23 +81,24 @@ def test_moments_share_one_identity_that_is_nearer_than_their_own(alone, joint, 
     assert neutral_error(wide, joint[0], identity) < 0.9 * single
 
 
-def test_the_prior_of_what_is_shared_counts_once(alone) -> None:
-    """Two copies of one moment: twice its evidence, and the prior once."""
+@pytest.mark.parametrize("common", [0.0, 0.25, 1.0])
+def test_the_prior_of_what_is_shared_counts_by_what_is_common(alone, common: float) -> None:
+    """Two copies of one moment: twice its evidence, and the prior once if nothing is common."""
     twice = (alone[1], alone[1])
-    problem, layout = joint_problem(twice)
-    here = problem.at(tuple(each.state for each in twice))
+    problem, layout = joint_problem(twice, common)
+    here, off = problem.at(tuple(each.state for each in twice)), 1.0 - common
     found, (single, there) = problem.equations(here), last_problem(alone[1])
     own, shared = single.equations(there), layout.identity
     rows = np.flatnonzero(layout.places[0] < shared)
     values = alone[1].state.coefficients[rows]
-    assert np.allclose(found.matrix[:shared, :shared], 2.0 * own.matrix[np.ix_(rows, rows)] - np.eye(shared))
-    assert np.allclose(found.gradient[:shared], 2.0 * own.gradient[rows] - values)
+    assert np.allclose(found.matrix[:shared, :shared], 2.0 * own.matrix[np.ix_(rows, rows)] - off * np.eye(shared))
+    assert np.allclose(found.gradient[:shared], 2.0 * own.gradient[rows] - off * values)
     scale = alone[1].stage.modes + LOG_SCALE
-    assert found.matrix[shared, shared] == pytest.approx(2.0 * own.matrix[scale, scale] - SCALE_SPREAD**-2)
+    assert found.matrix[shared, shared] == pytest.approx(2.0 * own.matrix[scale, scale] - off * SCALE_SPREAD**-2)
     assert not found.matrix[np.ix_(layout.free[0], layout.free[1])].any()
     log_scale = np.log(alone[1].state.world_from_head.scale)
     prior = values @ values + (log_scale / SCALE_SPREAD) ** 2
-    assert here.cost == pytest.approx(2.0 * there.cost - prior)
+    assert here.cost == pytest.approx(2.0 * there.cost - off * prior)
 
 
 def test_a_moment_knows_more_of_itself_with_the_others(alone, joint) -> None:
@@ -113,7 +114,8 @@ def test_another_person_is_told_from_the_others(alone, wide, renderer) -> None:
     stranger = photographed(wide, SPREAD * np.random.default_rng(8).standard_normal(EIGENHEADS), {}, 9, renderer)
     among = (*alone[:3], stranger)
     found = [
-        differ_by(one, other, EIGENHEADS) for one, other in zip(among, fit_jointly(among, EIGENHEADS), strict=True)
+        differ_by(finish(one), other, EIGENHEADS)
+        for one, other in zip(among, fit_jointly(among, EIGENHEADS), strict=True)
     ]
     assert found[3] > OTHER_PERSON
     assert found[3] > 2.0 * max(found[:3])
