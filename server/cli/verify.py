@@ -51,7 +51,7 @@ def verify_captures(
     from pipeline.applications.verification.write import write_verification
     from pipeline.head_model.model import load_model
 
-    names = _names(captures)
+    names = capture_names(captures)
     scan = read_reference(reference, landmarks)
     folders: list[Path] = []
     for i, (capture, name) in enumerate(zip(captures, names, strict=True)):
@@ -98,7 +98,7 @@ def lines(document: "VerificationReport", out: Path) -> list[str]:
     return [*visits, str(out / "report.json"), str(out / "certificate.pdf")]
 
 
-def _names(captures: Sequence[Path]) -> list[str]:
+def capture_names(captures: Sequence[Path]) -> list[str]:
     """Returns the captures' names. Raises InputError if two are alike."""
     names = [path.resolve().name.removesuffix(".gz").removesuffix(".tar").removesuffix(".zip") for path in captures]
     twice = [name for name, count in Counter(names).items() if count > 1]

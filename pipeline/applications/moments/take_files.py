@@ -1,4 +1,4 @@
-"""Writes a take.
+"""Makes a take from its captures, and writes it.
 
 neutral.ply           the person's head without expression: head frame, mm; quality is its standard deviation
 neutral.glb           the same in metres, with the person's own shapes as morph targets under Apple's 52 names
@@ -14,24 +14,70 @@ import json
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.applications.moments.take import Take
+from pipeline.applications.moments.take import Take, reconstruct_take
 from pipeline.head_model.expressions import ARKIT
+from pipeline.head_model.model import load_model
 from pipeline.results.reconstruction import QUALITY, Reconstruction
+from pipeline.results.write import write_result
+from pipeline.settings import Settings
+from pipeline.stages.context import ReconstructionContext, Segment
 from rig.atomic_write import write_atomically
+from rig.capture import Capture
+from rig.digest import document_sha256
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.ply import ply_bytes
 from rig.formats.meshes.scene import Part, Scene
 from rig.mesh import Mesh
 from rig.messages.message import documents_of
+from rig.progress import Progress
+from rig.render.renderer import Renderer
+from rig.rig import Rig
 
 FORMAT = "eigenhead-take/1"
 FILES = ("neutral.ply", "neutral.glb", "shapes.npz", "take.npz", "report.json")
 TOLD = 0.02  # a smaller weight is left out of report.json
+
+
+class Shot(NamedTuple):
+    """Holds a capture of a take, and what computes its silhouettes."""
+
+    capture: Capture
+    rig: Rig
+    segment: Segment
+
+
+def make_take(
+    folder: Path, shots: Mapping[str, Shot], *, model: str, settings: Settings, report: Progress
+) -> dict[str, Any]:
+    """Reconstructs a take from its captures, by the moments' names, and writes it into ``folder``. Returns the content
+    of report.json. Raises what ``reconstruct_take`` does, UnknownModel or BadModel, and OSError."""
+    head_model, colours = load_model(model), Colours()
+
+    def deliver(name: str, result: Reconstruction) -> None:
+        write_result(folder / "moments" / name, result, shots[name].capture)
+        colours.take_over(result)
+
+    with Renderer.create() as renderer:
+        contexts = {
+            name: ReconstructionContext(shot.capture, shot.rig, head_model, settings, renderer, segment=shot.segment)
+            for name, shot in shots.items()
+        }
+        found = reconstruct_take(contexts, deliver, report=report)
+    digests = {name: document_sha256(shot.capture.digests) for name, shot in shots.items()}
+    return write_take(folder, found, colours, digests)
+
+
+def warning_lines(document: Mapping[str, Any]) -> list[str]:
+    """Returns the warnings of a take's report.json as lines for people, those of moments with their names."""
+    lines = [f"{each['code']}: {each['message']}" for each in document["warnings"]]
+    for moment in document["moments"]:
+        lines += [f"{moment['name']}: {each['code']}: {each['message']}" for each in moment["warnings"]]
+    return lines
 
 
 class Colours:

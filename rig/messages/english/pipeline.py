@@ -2,7 +2,6 @@
 
 TEMPLATES = {
     "take-too-small": "{count} capture was given, and a take needs two or more of one person: name more folders. | {count} captures were given, and a take needs two or more of one person: name more folders.",
-    "take-names-alike": "More than one capture is called {names}: rename all but one.",
     "take-needs-contour": "A take is solved by the method contour: leave the method simplex out of the settings.",
     "take-other-person": "The head of {moment} differs from that of all moments by {sigmas:.1f} standard deviations: if it is another person, leave it out.",
     "no-bust": "{reason}",

@@ -703,7 +703,6 @@ export default {
   "no-face": "in den Fotos wurde kein Gesicht gefunden, obwohl {views} Kameras vor dem Kopf stehen, wie er angepasst wurde: Seine Lage kommt allein aus Umrissen. Überlagerungen ansehen; wo sie falsch ist, Merkmale setzen oder --front angeben",
   "crown-low": "{camera}: ihre Maske endet {low_mm:.0f} mm unter dem Scheitel, den die übrigen Kameras zeigen; die ganze Maske mitgeben. Sie bleibt außer Betracht, wo drei andere übrig sind",
   "take-too-small": "{count} Aufnahme wurde angegeben, es braucht aber zwei oder mehr derselben Person: weitere Ordner nennen. | {count} Aufnahmen wurden angegeben, es braucht aber zwei oder mehr derselben Person: weitere Ordner nennen.",
-  "take-names-alike": "Mehr als eine Aufnahme heißt {names}: alle bis auf eine umbenennen.",
   "take-needs-contour": "Mehrere Aufnahmen einer Person löst das Verfahren contour: das Verfahren simplex aus den Einstellungen nehmen.",
   "take-other-person": "Der Kopf von {moment} weicht um {sigmas:.1f} Standardabweichungen von dem aller Aufnahmen ab: ist es eine andere Person, diese Aufnahme weglassen.",
   "moments-differ": "{camera} zeigt einen anderen Moment oder eine andere Person: Gesicht oder Lippen liegen {offset_mm:.0f} mm von dort, wo die übrigen Kameras sie sehen. Alle Kameras gleichzeitig auslösen, oder das richtige Bild dorthin legen",
