@@ -2,6 +2,7 @@
 
 from collections.abc import Generator
 from dataclasses import replace
+from typing import Any
 
 from pipeline.evidence.plausibility import refuse
 from pipeline.results.reconstruction import Reconstruction
@@ -19,7 +20,7 @@ from pipeline.stages.texturing import texture_head
 from pipeline.stages.views import Views, check_lenses, find_views
 from rig.formats.meshes.usdz import check_usd
 
-Steps = Generator[HeadFit, HeadFit, Reconstruction]
+Steps = Generator[Any, HeadFit, None]
 
 
 def fit_shape(run: Recorder, views: Views, alignment: Alignment) -> tuple[PartLabels, HeadFit]:
@@ -42,21 +43,12 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     warning has a code that ``settings.fail_on`` names, and Cancelled when ``context.progress`` does.
     """
     steps = start_reconstruction(context)
-    return end_reconstruction(steps, next(steps))
-
-
-def end_reconstruction(steps: Steps, head: HeadFit) -> Reconstruction:
-    """Continues a reconstruction with the fitted ``head``, and returns its result."""
-    try:
-        steps.send(head)
-    except StopIteration as end:
-        return end.value
-    raise AssertionError("it stops once")
+    return steps.send(next(steps))
 
 
 def start_reconstruction(context: ReconstructionContext) -> Steps:
-    """Runs a reconstruction up to the fitted head, which it yields; the head that is sent back is the one that it goes
-    on with (``end_reconstruction``). Several captures of one person meet there."""
+    """Runs a reconstruction up to the fitted head, which it yields; with the head that is sent back it goes on, and
+    yields the result. Several captures of one person meet in between."""
     if "usdz" in context.settings.outputs.formats:
         check_usd()
     run = Recorder(context)
@@ -111,4 +103,4 @@ def start_reconstruction(context: ReconstructionContext) -> Steps:
         warnings=run.warnings,
         seconds=run.seconds(),
     )
-    return result.widen_by_scale(context.rig.scale_sigma) if context.rig.scale_sigma else result
+    yield result.widen_by_scale(context.rig.scale_sigma) if context.rig.scale_sigma else result

@@ -182,15 +182,13 @@ def hold_at_bounds(solved: ContourSolution, equations: NormalEquations) -> None:
         equations.matrix[held, held] += equations.gradient[held] ** 2
 
 
-def finish(solved: ContourSolution, covariance: Float[np.ndarray, "p p"] | None = None) -> Fit:
+def finish(solved: ContourSolution) -> Fit:
     """Returns the fit with its Laplace covariance: the inverse of the last normal matrix, of which the rows and columns
-    of shape and pose are kept. The uncertainty of the cameras is thereby included. A ``covariance`` that is given, of
-    more evidence than the solution's, takes its place."""
+    of shape and pose are kept. The uncertainty of the cameras is thereby included."""
     problem, state, stage = solved.problem, solved.state, solved.stage
-    if covariance is None:
-        equations = normal_equations(solved)
-        hold_at_bounds(solved, equations)
-        covariance = inverse(equations.matrix)[: stage.modes + POSE, : stage.modes + POSE]
+    kept, equations = stage.modes + POSE, normal_equations(solved)
+    hold_at_bounds(solved, equations)
+    covariance = inverse(equations.matrix)[:kept, :kept]
     rim = observed_rim(problem, solved.evidence, state, stage)
     names = problem.views.names
     return Fit(

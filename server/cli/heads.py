@@ -76,7 +76,7 @@ Method = Annotated[
 Detail = Annotated[
     Literal["span", "kernel", "photo", "fine", "pores"] | None,
     typer.Option(
-        help="span is the head model alone, kernel follows outlines (seconds); photo, fine, pores photographs (minutes).",
+        help="span is the model alone, kernel follows outlines (seconds); photo, fine, pores photographs (minutes).",
         show_default="fine",
     ),
 ]

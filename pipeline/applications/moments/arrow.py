@@ -45,15 +45,15 @@ class Eliminated:
 
 @dataclass(frozen=True, eq=False)
 class Arrow:
-    """Holds which of ``size`` unknowns are eliminated: each block's ``own`` ones, whose rows ascend."""
+    """Holds which of ``size`` unknowns are eliminated: those of each of ``blocks``, whose rows ascend."""
 
     size: int
-    own: tuple[Rows, ...]
+    blocks: tuple[Rows, ...]
 
     @cached_property
     def left(self) -> Rows:
         """Returns the rows of the unknowns that are not eliminated, ascending."""
-        return np.setdiff1d(np.arange(self.size), np.concatenate([np.zeros(0, int), *self.own]))
+        return np.setdiff1d(np.arange(self.size), np.concatenate([np.zeros(0, int), *self.blocks]))
 
     def solve(self, matrix: Matrix, right: Vector) -> Vector:
         """Solves the equations ``matrix x = right``. Raises LinAlgError if they are not positive definite."""
@@ -103,7 +103,7 @@ class Arrow:
                 scipy.linalg.cholesky(matrix[np.ix_(rows, rows)], lower=True, check_finite=False),
                 matrix[np.ix_(rows, self.left)],
             )
-            for rows in self.own
+            for rows in self.blocks
         ]
 
     def _rest(self, matrix: Matrix, gone: list[Eliminated]) -> Matrix:

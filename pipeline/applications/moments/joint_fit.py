@@ -64,13 +64,13 @@ def lay_out(solutions: Sequence[ContourSolution], problems: Sequence[Problem[Sta
     for solved, problem in zip(solutions, problems, strict=True):
         modes, posed = solved.stage.modes, np.asarray(solved.problem.model.posed, int)
         shared = np.append(np.setdiff1d(np.arange(modes), posed), modes + LOG_SCALE)
-        own = np.setdiff1d(np.arange(problem.unknowns), shared)
+        local = np.setdiff1d(np.arange(problem.unknowns), shared)
         rows = np.empty(problem.unknowns, int)
-        rows[shared], rows[own] = np.arange(len(shared)), np.arange(size, size + len(own))
-        rows[modes + LOG_SCALE], size = identity, size + len(own)
+        rows[shared], rows[local] = np.arange(len(shared)), np.arange(size, size + len(local))
+        rows[modes + LOG_SCALE], size = identity, size + len(local)
         places.append(rows)
         weights.append(rows[posed])
-        free.append(rows[np.setdiff1d(own, posed)])
+        free.append(rows[np.setdiff1d(local, posed)])
     return Layout(identity, tuple(places), tuple(weights), tuple(free), size)
 
 
@@ -117,9 +117,9 @@ class LinearisedJointTerm:
         """Adds each moment's equations at its rows, in place."""
         layout = self.term.layout
         for part, problem, rows in zip(self.parts, self.term.problems, layout.places, strict=True):
-            own = problem.equations(part)
-            equations.matrix[np.ix_(rows, rows)] += own.matrix
-            equations.gradient[rows] += own.gradient
+            local = problem.equations(part)
+            equations.matrix[np.ix_(rows, rows)] += local.matrix
+            equations.gradient[rows] += local.gradient
         shared = np.arange(layout.identity + 1)
         equations.matrix[shared, shared] -= self.repeated
         equations.gradient[shared] -= self.repeated * self.values
@@ -250,6 +250,6 @@ def joint_covariances(solutions: Sequence[ContourSolution]) -> Iterator[Float[np
         whole.matrix[np.ix_(rows, rows)] += held.matrix
         kept = solved.stage.modes + POSE
         alone.append(inverse(own_problem.equations(part).matrix + held.matrix)[:kept, :kept])
-    blocks = tuple(rows[: len(own)] for rows, own in zip(layout.places, alone, strict=True))
-    for own, together in zip(alone, layout.arrow.covariances(whole.matrix, blocks), strict=True):
-        yield COMMON * own + (1.0 - COMMON) * together
+    blocks = tuple(rows[: len(local)] for rows, local in zip(layout.places, alone, strict=True))
+    for local, together in zip(alone, layout.arrow.covariances(whole.matrix, blocks), strict=True):
+        yield COMMON * local + (1.0 - COMMON) * together

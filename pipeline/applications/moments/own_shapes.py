@@ -69,8 +69,8 @@ def estimate_own_shapes(
     relief = RELIEF_MM**2 * pulled.sum(axis=1)
     left = RELIEF_MM**2 - RELIEF_MM**4 * known.sum(axis=(1, 2))
     moved = np.einsum("ve,ke,vkc->evc", prior, weights, pulled, optimize=True)
-    told = np.einsum("ke,vkj,je->ve", weights, known, weights, optimize=True)
-    variance = np.maximum(prior - prior**2 * told, 0.0).T
+    explained = np.einsum("ke,vkj,je->ve", weights, known, weights, optimize=True)
+    variance = np.maximum(prior - prior**2 * explained, 0.0).T
     # What the model itself leaves open of the neutral head is in all of the heads alike.
     common = COMMON * sigma.min(axis=1) ** 2
     rows = arkit_parts(names)

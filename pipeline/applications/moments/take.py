@@ -15,12 +15,12 @@ from jaxtyping import Float
 
 from pipeline.applications.moments.joint_fit import fit_jointly, joint_covariances
 from pipeline.applications.moments.own_shapes import OwnShapes, estimate_own_shapes
-from pipeline.contour_fit.contour import ContourSolution, finish
+from pipeline.contour_fit.contour import ContourSolution
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, with_estimated_prior
 from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit.refine import FINE_AMPLITUDE_MM
-from pipeline.reconstruct import Steps, end_reconstruction, start_reconstruction
+from pipeline.reconstruct import Steps, start_reconstruction
 from pipeline.results.head_files import head_from_world
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.stages.context import ReconstructionContext
@@ -31,8 +31,8 @@ from rig.geometry import Similarity
 from rig.messages.message import Message, compose
 from rig.progress import Progress, discard_progress
 
-MOMENTS_LEAST = 2
-OTHER_PERSON = 3.0  # RMS of the eigenheads' differences in standard deviations, beyond which a moment is another's
+MIN_MOMENTS = 2
+OTHER_PERSON = 2.0  # RMS of the eigenheads' differences in standard deviations, beyond which a moment is another's
 OBSERVED = ("segmentation", "faces", "alignment", "fit", "parts")
 DELIVERED = ("depth", "fine", "texture", "evidence", "bust")
 JOINT = "identity"  # the stage that solves for it
@@ -59,14 +59,14 @@ class Take:
     """Holds the person of a take: the neutral head with its shapes, and the moments."""
 
     model: HeadModel
-    own: OwnShapes
+    person: OwnShapes
     moments: tuple[Moment, ...]
     warnings: tuple[Message, ...]
 
 
 def check_count(count: int) -> None:
     """Raises InputError for fewer captures than make a take."""
-    if count < MOMENTS_LEAST:
+    if count < MIN_MOMENTS:
         raise InputError("take", [compose("take-too-small", count=count)])
 
 
@@ -101,7 +101,7 @@ def reconstruct_take(
         steps, head = fitted.pop(name)
         apart = differ_by(head.fit, solved, eigenheads)
         with named(name):
-            result = end_reconstruction(steps, joined(head, solved, covariance, eigenheads))
+            result = steps.send(joined(head, solved, covariance, eigenheads))
         moments.append(_moment(name, result, apart))
         deliver(name, result)
     warnings = [
@@ -114,11 +114,18 @@ def reconstruct_take(
 
 def joined(head: HeadFit, solved: ContourSolution, covariance: Float[np.ndarray, "p p"], eigenheads: int) -> HeadFit:
     """Returns a moment's fitted head as the solution of all moments has it, with that solution's uncertainty."""
-    fit, level = finish(solved, covariance), head.detail.level
-    if level == "span":
-        fit = replace(fit, misfit_mm=head.fit.misfit_mm, sliding_mm=head.fit.sliding_mm)
-    else:
+    state, level = solved.state, head.detail.level
+    fit = replace(
+        head.fit,
+        coefficients=state.coefficients,
+        world_from_head=state.world_from_head,
+        evaluations=solved.evaluations,
+        covariance=covariance,
+        camera_shift=dict(zip(solved.problem.views.names, state.camera_shift, strict=True)),
+    )
+    if level != "span":
         relief_mm = FINE_AMPLITUDE_MM * (RELIEF_OF_OUTLINES if level == "kernel" else 1.0)
+        fit = replace(fit, misfit_mm=solved.misfit_mm)
         fit = with_estimated_prior(head.model, fit, eigenheads, relief_mm=relief_mm)
     return replace(head, fit=fit)
 

@@ -101,27 +101,29 @@ class Colours:
 def write_take(folder: Path, take: Take, colours: Colours, digests: Mapping[str, str]) -> dict[str, Any]:
     """Writes the files of a take beside its moments' folders, each under a temporary name first, report.json last.
     Returns what that says. ``digests``: SHA-256 of each moment's inputs. Raises OSError."""
-    own, model = take.own, take.model
+    person, model = take.person, take.model
     assert colours.colours is not None
     assert colours.views is not None
-    mesh = Mesh(own.neutral, model.levels["full"].faces, colours.colours)
+    mesh = Mesh(person.neutral, model.levels["full"].faces, colours.colours)
     normals = mesh.normals()
     comments = ["unit mm", "frame head", f"model sha256 {model.sha256}", f"version eigenhead {version('eigenhead')}"]
     data = ply_bytes(
         mesh,
         normals=normals,
         colours=colours.colours,
-        quality=own.deviation_mm.astype(np.float32),
+        quality=person.deviation_mm.astype(np.float32),
         views=colours.views,
         comments=[*comments, QUALITY],
     )
     write_atomically(folder / "neutral.ply", data)
-    morphs = {name: shape for name, shape in zip(ARKIT, own.shapes, strict=True) if shape.any()}
+    morphs = {name: shape for name, shape in zip(ARKIT, person.shapes, strict=True) if shape.any()}
     extras = {"unit": "m", "frame": "head", "model": {"name": model.name, "sha256": model.sha256}}
     write_atomically(
         folder / "neutral.glb", scene_glb_bytes(Scene([Part("head", mesh, normals, None, morphs)]), extras)
     )
-    _write_arrays(folder / "shapes.npz", names=np.array(ARKIT), shapes=own.shapes, deviations=own.shape_deviation_mm)
+    _write_arrays(
+        folder / "shapes.npz", names=np.array(ARKIT), shapes=person.shapes, deviations=person.shape_deviation_mm
+    )
     _write_arrays(
         folder / "take.npz",
         moments=np.array([each.name for each in take.moments]),
@@ -147,8 +149,8 @@ def take_document(take: Take, digests: Mapping[str, str]) -> dict[str, Any]:
         "format": FORMAT,
         "version": version("eigenhead"),
         "model": {"name": model.name, "sha256": model.sha256},
-        "neutral": {"deviation_mm": float(np.sqrt((take.own.deviation_mm[face] ** 2).mean()))},
-        "own_shapes": list(take.own.shown),
+        "neutral": {"deviation_mm": float(np.sqrt((take.person.deviation_mm[face] ** 2).mean()))},
+        "own_shapes": list(take.person.shown),
         "moments": [
             {
                 "name": each.name,

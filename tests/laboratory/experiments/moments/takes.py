@@ -149,9 +149,11 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
         found[f"{count}_gain"] = 1.0 - found[f"{count}_joint_mean_mm"] / found[f"{count}_single_mean_mm"]
         found[f"{count}_apart_most"] = max(max(row["apart"]) for row in of)
         for who in ("single", "joint"):
-            true, told = (np.concatenate([np.ravel(row["weights"][part]) for row in of]) for part in ("true", who))
-            found[f"{count}_weights_{who}_true"] = float(np.corrcoef(true[true > 0], told[true > 0])[0, 1])
-            found[f"{count}_weights_{who}_all"] = float(np.corrcoef(true, told)[0, 1])
+            true, found_weights = (
+                np.concatenate([np.ravel(row["weights"][part]) for row in of]) for part in ("true", who)
+            )
+            found[f"{count}_weights_{who}_true"] = float(np.corrcoef(true[true > 0], found_weights[true > 0])[0, 1])
+            found[f"{count}_weights_{who}_all"] = float(np.corrcoef(true, found_weights)[0, 1])
     return {name: round(value, 4) for name, value in found.items()}
 
 
@@ -160,8 +162,7 @@ def table(rows: Sequence[Row]) -> str:
     header = ("take", "single mm", "mean of heads", "joint", "gain", "weights single", "joint")
     lines = []
     for row in [*rows]:
-        own = figures([row])
-        lines.append([row["name"], *_cells(own, row["cameras"])])
+        lines.append([row["name"], *_cells(figures([row]), row["cameras"])])
     whole = figures(rows)
     for count in sorted({row["cameras"] for row in rows}):
         lines.append([f"all, {count} cameras", *_cells(whole, count)])

@@ -88,13 +88,17 @@ def test_the_prior_of_what_is_shared_counts_by_what_is_common(alone, common: flo
     problem, layout = joint_problem(twice, common)
     here, off = problem.at(tuple(each.state for each in twice)), 1.0 - common
     found, (single, there) = problem.equations(here), last_problem(alone[1])
-    own, shared = single.equations(there), layout.identity
+    alone_equations, shared = single.equations(there), layout.identity
     rows = np.flatnonzero(layout.places[0] < shared)
     values = alone[1].state.coefficients[rows]
-    assert np.allclose(found.matrix[:shared, :shared], 2.0 * own.matrix[np.ix_(rows, rows)] - off * np.eye(shared))
-    assert np.allclose(found.gradient[:shared], 2.0 * own.gradient[rows] - off * values)
+    assert np.allclose(
+        found.matrix[:shared, :shared], 2.0 * alone_equations.matrix[np.ix_(rows, rows)] - off * np.eye(shared)
+    )
+    assert np.allclose(found.gradient[:shared], 2.0 * alone_equations.gradient[rows] - off * values)
     scale = alone[1].stage.modes + LOG_SCALE
-    assert found.matrix[shared, shared] == pytest.approx(2.0 * own.matrix[scale, scale] - off * SCALE_SPREAD**-2)
+    assert found.matrix[shared, shared] == pytest.approx(
+        2.0 * alone_equations.matrix[scale, scale] - off * SCALE_SPREAD**-2
+    )
     assert not found.matrix[np.ix_(layout.free[0], layout.free[1])].any()
     log_scale = np.log(alone[1].state.world_from_head.scale)
     prior = values @ values + (log_scale / SCALE_SPREAD) ** 2
@@ -103,11 +107,11 @@ def test_the_prior_of_what_is_shared_counts_by_what_is_common(alone, common: flo
 
 def test_a_moment_knows_more_of_itself_with_the_others(alone, joint) -> None:
     for covariance, each in zip(joint_covariances(joint), alone, strict=True):
-        own = finish(each).covariance
-        assert own is not None
-        assert covariance.shape == own.shape == (each.stage.modes + POSE,) * 2
+        before = finish(each).covariance
+        assert before is not None
+        assert covariance.shape == before.shape == (each.stage.modes + POSE,) * 2
         known = np.diag(covariance)[:EIGENHEADS].sum()
-        assert 0.0 < known < np.diag(own)[:EIGENHEADS].sum()
+        assert 0.0 < known < np.diag(before)[:EIGENHEADS].sum()
 
 
 def test_another_person_is_told_from_the_others(alone, wide, renderer) -> None:

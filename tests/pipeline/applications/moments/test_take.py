@@ -66,9 +66,9 @@ def test_the_folder_has_the_person_and_every_moment(done: tuple[Path, dict[str, 
         smile = kept["weights"][1, list(kept["expressions"]).index("mouthSmileLeft")]
     assert apart[model.levels["full"].face_region].mean() < 0.3  # calm is neutral
     assert smile > 0.3
-    told = {each["name"]: each["weights"] for each in document["moments"]}
-    assert told["smile"]["mouthSmileLeft"]["weight"] == pytest.approx(smile)
-    assert sum(of["weight"] for of in told["calm"].values()) < 0.2
+    reported = {each["name"]: each["weights"] for each in document["moments"]}
+    assert reported["smile"]["mouthSmileLeft"]["weight"] == pytest.approx(smile)
+    assert sum(of["weight"] for of in reported["calm"].values()) < 0.2
 
 
 def test_one_capture_is_no_take(shots: Path, tmp_path: Path) -> None:
