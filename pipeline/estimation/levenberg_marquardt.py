@@ -89,7 +89,7 @@ def minimise(
         limits: when to stop.
         solve: solves a symmetric positive definite system. Where the matrix is not definite it raises LinAlgError; the
             step is then tried again with more damping.
-        least: what ``least_within`` does, for steps that meet a bound.
+        least: as ``least_within``, for steps that meet a bound.
         at_start: the problem linearised at ``start``, if the caller has it already.
         watch: called before every step; an exception that it raises ends the search.
     """
@@ -109,7 +109,8 @@ def minimise(
                 predicted = -float(equations.gradient @ step)
                 if problem.room is not None:
                     step, predicted = _within(equations, damping, step, problem.room(now.value), least)
-                tried, evaluations = _place(problem, problem.after(now.value, step)), evaluations + 1
+                value, evaluations = problem.after(now.value, step), evaluations + 1
+                tried = _Place(value, there := problem.at(value), there.cost)
                 if tried.cost < max(recent[-limits.memory :]):  # False for the NaN of a value that makes no sense
                     accepted = tried
                     break
@@ -134,11 +135,6 @@ class _Place(Generic[Value]):
     value: Value
     at: Linearised
     cost: float
-
-
-def _place(problem: Problem[Value], value: Value) -> _Place[Value]:
-    there = problem.at(value)
-    return _Place(value, there, there.cost)
 
 
 def _damped_step(equations: NormalEquations, damping: float, solve: Solve) -> Float[np.ndarray, " p"] | None:

@@ -32,7 +32,7 @@ from rig.messages.message import Message, compose
 from rig.progress import Progress, discard_progress
 
 MIN_MOMENTS = 2
-OTHER_PERSON = 2.0  # RMS of the eigenheads' differences in standard deviations, beyond which a moment is another's
+OTHER_PERSON = 3.0  # RMS of the eigenheads' differences in standard deviations, beyond which a moment is another's
 OBSERVED = ("segmentation", "faces", "alignment", "fit", "parts")
 DELIVERED = ("depth", "fine", "texture", "evidence", "bust")
 JOINT = "identity"  # the stage that solves for it
