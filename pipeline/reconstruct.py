@@ -20,8 +20,6 @@ from pipeline.stages.texturing import texture_head
 from pipeline.stages.views import Views, check_lenses, find_views
 from rig.formats.meshes.usdz import check_usd
 
-Steps = Generator[Any, HeadFit, None]
-
 
 def fit_shape(run: Recorder, views: Views, alignment: Alignment) -> tuple[PartLabels, HeadFit]:
     """Fits the head to the outlines, labels the pixels as skin, hair or clothes, and then fits the head to the
@@ -46,7 +44,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     return steps.send(next(steps))
 
 
-def start_reconstruction(context: ReconstructionContext) -> Steps:
+def start_reconstruction(context: ReconstructionContext) -> Generator[Any, HeadFit, None]:
     """Runs a reconstruction up to the fitted head, which it yields; with the head that is sent back it goes on, and
     yields the result. Several captures of one person meet in between."""
     if "usdz" in context.settings.outputs.formats:

@@ -82,27 +82,14 @@ def fit_outlines(
     if cap is not None:
         bare = without_cap(views.silhouettes, cap, rig, alignment.world_from_head.translation)
     model, features = model_basis(context.model, settings), views.capture.features
+    start, seen, fitting, report = alignment.world_from_head, bare.silhouettes, settings.fitting, context.progress
     solved = solve_contour(
-        model,
-        alignment.world_from_head,
-        bare.silhouettes,
-        rig,
-        settings.fitting,
-        features=features,
-        landmarks=alignment.landmarks,
-        report=context.progress,
+        model, start, seen, rig, fitting, features=features, landmarks=alignment.landmarks, report=report
     )
     if settings.method == "simplex":
         # The simplex never moves the pose, and what seven points leave (3 degrees, 5 mm) would all become shape.
-        fit = fit_simplex(
-            model,
-            solved.state.world_from_head,
-            bare.silhouettes,
-            rig,
-            settings.fitting,
-            renderer=context.renderer,
-            report=context.progress,
-        )
+        pose = solved.state.world_from_head
+        fit = fit_simplex(model, pose, seen, rig, fitting, renderer=context.renderer, report=report)
         return Staged(OutlineFit(fit, model, fitted_mesh(model, fit)))
     if cap is not None:
         solved = with_counted_crown(solved, cells_of_views(bare.cells, solved.problem.views))

@@ -148,12 +148,9 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
     kind = _kind(settings)
     connection = _connected(settings)
     if connection is None:
-        left = [name for name in ("captures", "jobs") if any((settings.data / name).glob("*"))]
+        left = " and ".join(name for name in ("captures", "jobs") if any((settings.data / name).glob("*")))
         if left:
-            return (
-                False,
-                f"{_sqlite(settings)} is not there, but {' and '.join(left)} are: restore its copy beside them",
-            )
+            return False, f"{_sqlite(settings)} is not there, but {left} are: restore its copy beside them"
         return True, f"{_sqlite(settings)}, `eigenhead serve` will make it; no API key"
     with closing(connection):
         if kind == "sqlite" and _rows(connection, "PRAGMA quick_check(1)") != [("ok",)]:
@@ -193,11 +190,8 @@ def _results(settings: ServiceSettings) -> tuple[bool, str]:
         return False, f"changed since their jobs made them: {', '.join(damaged[:5])}; restore them, or restart the jobs"
     if not missing:
         return True, f"of {len(rows)} jobs, all there; the files of {compared} were compared"
-    named = f"{', '.join(missing[:3])}{' ...' if len(missing) > 3 else ''}"
-    return (
-        False,
-        f"of {len(rows)} jobs {len(missing)} are gone ({named}): restore `jobs` from a backup, or restart them",
-    )
+    gone = f"{len(missing)} are gone ({', '.join(missing[:3])}{' ...' if len(missing) > 3 else ''})"
+    return False, f"of {len(rows)} jobs {gone}: restore `jobs` from a backup, or restart them"
 
 
 def _damaged(folder: Path, files: dict[str, dict[str, str]]) -> list[str]:

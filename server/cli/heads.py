@@ -141,11 +141,9 @@ def reconstruct(
     from server.cli.reconstruct_local import flame_lines, reconstruct_locally
     from server.tasks.settings_file import settings_document
 
-    switches = {"normal_map": normal_map, "neutral": neutral, "morphs": morphs, "slicer": slicer}
-    outputs: dict[str, object] = {name: True for name, is_requested in switches.items() if is_requested}
-    words = {"surface": surface, "template": template, "formats": formats.split(",") if formats else None}
-    words["albedo"] = "file" if albedo else None
-    outputs |= {name: word for name, word in words.items() if word}
+    given = {"normal_map": normal_map, "neutral": neutral, "morphs": morphs, "slicer": slicer, "surface": surface}
+    given |= {"template": template, "formats": formats and formats.split(","), "albedo": "file" if albedo else None}
+    outputs: dict[str, object] = {name: value for name, value in given.items() if value}
     options: dict[str, bool | dict[str, object] | None] = {"outputs": outputs or None, "anyway": anyway or None}
     options["texture"] = {"chart": True} if chart else None
     worn = {"colour": cap, "thickness_mm": cap_thickness}
@@ -287,13 +285,10 @@ def demo(
     with progress_bar() as report:
         done = run_demo(out, seed=seed, full=full, report=report)
     error = done["error_mm"]
-    answer(
-        done,
-        json_out,
-        [
-            f"head           {done['ply']}",
-            f"error          {error['median']:.2f} mm median, {error['mean']:.2f} mm mean, {error['max']:.2f} mm max",
-            f"time           {done['seconds']:.1f} s",
-            f"contact sheet  {done['contact_sheet']}",
-        ],
-    )
+    lines = [
+        f"head           {done['ply']}",
+        f"error          {error['median']:.2f} mm median, {error['mean']:.2f} mm mean, {error['max']:.2f} mm max",
+        f"time           {done['seconds']:.1f} s",
+        f"contact sheet  {done['contact_sheet']}",
+    ]
+    answer(done, json_out, lines)

@@ -20,6 +20,7 @@ from pipeline.head_model.model import HeadModel
 
 RELIEF_MM = 1.0  # r: deviation of what the heads have beyond the model's modes
 OWN = 0.3  # deviation of a person's shape from the model's, as a share of its displacement
+SHOWN = 0.1  # least weight in some moment of a shape that the take shows
 COMMON = 0.5  # share of the variance that a take's heads have in common
 
 
@@ -76,7 +77,7 @@ def estimate_own_shapes(
     rows = arkit_parts(names)
     shapes = np.stack([(full + moved)[list(rows[name])].sum(axis=0) for name in ARKIT])
     spread = np.stack([np.sqrt(variance[list(rows[name])].sum(axis=0)) for name in ARKIT])
-    shown = tuple(name for name in ARKIT if rows[name] and weights[:, list(rows[name])].any())
+    shown = tuple(name for name in ARKIT if rows[name] and weights[:, list(rows[name])].max() >= SHOWN)
     return OwnShapes(
         neutral + relief,
         np.sqrt(np.maximum(left, 0.0) + common),

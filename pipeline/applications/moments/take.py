@@ -6,9 +6,10 @@ heads of all moments have the same vertices; from them follow the neutral head a
 (``own_shapes``).
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -20,7 +21,7 @@ from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, with_estimated_prior
 from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit.refine import FINE_AMPLITUDE_MM
-from pipeline.reconstruct import Steps, start_reconstruction
+from pipeline.reconstruct import start_reconstruction
 from pipeline.results.head_files import head_from_world
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.stages.context import ReconstructionContext
@@ -87,7 +88,7 @@ def reconstruct_take(
     name of the moment.
     """
     check_count(len(contexts))
-    progress, fitted = _Advance(report, len(contexts)), dict[str, tuple[Steps, HeadFit]]()
+    progress, fitted = _Advance(report, len(contexts)), dict[str, tuple[Generator[Any, HeadFit, None], HeadFit]]()
     for k, (name, context) in enumerate(contexts.items()):
         with named(name):
             steps = start_reconstruction(replace(context, progress=progress.of(name, k)))
