@@ -141,9 +141,9 @@ def reconstruct(
     from server.cli.reconstruct_local import flame_lines, reconstruct_locally
     from server.tasks.settings_file import settings_document
 
-    given = {"normal_map": normal_map, "neutral": neutral, "morphs": morphs, "slicer": slicer, "surface": surface}
-    given |= {"template": template, "formats": formats and formats.split(","), "albedo": "file" if albedo else None}
-    outputs: dict[str, object] = {name: value for name, value in given.items() if value}
+    requested = {"normal_map": normal_map, "neutral": neutral, "morphs": morphs, "slicer": slicer, "surface": surface}
+    requested |= {"template": template, "formats": formats and formats.split(","), "albedo": "file" if albedo else None}
+    outputs: dict[str, object] = {name: value for name, value in requested.items() if value}
     options: dict[str, bool | dict[str, object] | None] = {"outputs": outputs or None, "anyway": anyway or None}
     options["texture"] = {"chart": True} if chart else None
     worn = {"colour": cap, "thickness_mm": cap_thickness}
