@@ -1,6 +1,8 @@
 """Reconstructs a textured head from a capture (section 4): the order of the stages, for every caller."""
 
+from collections.abc import Generator
 from dataclasses import replace
+from typing import Any
 
 from pipeline.evidence.plausibility import refuse
 from pipeline.results.reconstruction import Reconstruction
@@ -38,6 +40,13 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     Raises EigenheadError where there is no answer (too few usable views, feature points that determine nothing) or a
     warning has a code that ``settings.fail_on`` names, and Cancelled when ``context.progress`` does.
     """
+    steps = start_reconstruction(context)
+    return steps.send(next(steps))
+
+
+def start_reconstruction(context: ReconstructionContext) -> Generator[Any, HeadFit, None]:
+    """Runs a reconstruction up to the fitted head, which it yields; with the head that is sent back it goes on, and
+    yields the result. Several captures of one person meet in between."""
     if "usdz" in context.settings.outputs.formats:
         check_usd()
     run = Recorder(context)
@@ -49,6 +58,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         with run.stage("alignment") as stage:
             alignment = stage.keep(align_head(stage.context, views, faces))
         labels, head = fit_shape(run, views, alignment)
+    head = yield head
     with run.stage("depth") as stage:
         depth = stage.keep(measure_depth(stage.context, views, head, labels))
     with (
@@ -81,7 +91,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         faces=faces,
         alignment=alignment,
         labels=labels,
-        head=head,
+        head=replace(head, solution=None),
         refined=refined,
         texturing=texturing,
         bust=bust,
@@ -91,4 +101,4 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         warnings=run.warnings,
         seconds=run.seconds(),
     )
-    return result.widen_by_scale(context.rig.scale_sigma) if context.rig.scale_sigma else result
+    yield result.widen_by_scale(context.rig.scale_sigma) if context.rig.scale_sigma else result

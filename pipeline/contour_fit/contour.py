@@ -173,17 +173,21 @@ def normal_equations(solved: ContourSolution) -> NormalEquations:
     return whole.equations(there)
 
 
+def hold_at_bounds(solved: ContourSolution, equations: NormalEquations) -> None:
+    """Adds to the equations, in place, what holds expression weights at 0. At a bound a posterior is no Gaussian: it
+    falls exponentially with the slope there, its deviation 1 / slope."""
+    posed = np.asarray(solved.problem.model.posed, int)
+    if len(posed) and posed[-1] < solved.stage.modes:
+        held = posed[(solved.state.coefficients[posed] <= 0.0) & (equations.gradient[posed] > 0.0)]
+        equations.matrix[held, held] += equations.gradient[held] ** 2
+
+
 def finish(solved: ContourSolution) -> Fit:
     """Returns the fit with its Laplace covariance: the inverse of the last normal matrix, of which the rows and columns
     of shape and pose are kept. The uncertainty of the cameras is thereby included."""
     problem, state, stage = solved.problem, solved.state, solved.stage
-    kept = stage.modes + POSE
-    equations = normal_equations(solved)
-    posed = np.asarray(problem.model.posed)
-    if len(posed) and posed[-1] < stage.modes:
-        # At a bound a posterior is no Gaussian: it falls exponentially with the slope there, its deviation 1 / slope.
-        held = posed[(state.coefficients[posed] <= 0.0) & (equations.gradient[posed] > 0.0)]
-        equations.matrix[held, held] += equations.gradient[held] ** 2
+    kept, equations = stage.modes + POSE, normal_equations(solved)
+    hold_at_bounds(solved, equations)
     covariance = inverse(equations.matrix)[:kept, :kept]
     rim = observed_rim(problem, solved.evidence, state, stage)
     names = problem.views.names

@@ -60,7 +60,7 @@ def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> Contou
         now = state.coefficients + step[:count]
         covariance = inverse_diagonal(whole)
         for group in groups:
-            variance[group] = _variance(now, covariance, variance, group)
+            variance[group] = estimated_variance(now, covariance, variance, group)
     return replace(solved, state=apply_step(state, step, solved.stage))
 
 
@@ -83,7 +83,7 @@ def doubtful_weights(model: HeadModel, coefficients: Float[np.ndarray, " m"]) ->
     return frozenset(int(row) for row in np.concatenate(found) if not LIDS.match(model.expressions.names[row]))
 
 
-def _variance(
+def estimated_variance(
     coefficients: Float[np.ndarray, " m"],
     covariance: Float[np.ndarray, " p"],
     before: Float[np.ndarray, " m"],

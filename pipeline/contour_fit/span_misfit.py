@@ -34,12 +34,8 @@ def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_
     stage = Stage(LEVEL, len(wider_model.modes), True, (2.0 * last, last), solved.stage.whole_head, True, STEPS)
     state, evaluations, reason = run_stage(problem, solved.evidence, solved.state, stage, lambda fraction: None)
     wider = finish(ContourSolution(problem, solved.evidence, state, stage, evaluations, reason))
-    return judged_by(
-        wider_model,
-        with_estimated_prior(wider_model, wider, eigenheads, relief_mm=relief_mm),
-        solved.problem.model,
-        fit,
-    )
+    wider = with_estimated_prior(wider_model, wider, eigenheads, relief_mm=relief_mm)
+    return judged_by(wider_model, wider, solved.problem.model, fit)
 
 
 def judged_by(wider_model: HeadModel, wider: Fit, model: HeadModel, fit: Fit) -> Fit:

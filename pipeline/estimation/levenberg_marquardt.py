@@ -77,6 +77,7 @@ def minimise(
     limits: Limits,
     *,
     solve: Solve = cholesky_solve,
+    least: Callable[..., Float[np.ndarray, " p"]] = least_within,
     at_start: Linearised | None = None,
     watch: Callable[[], None] = lambda: None,
 ) -> Solution[Value]:
@@ -88,6 +89,7 @@ def minimise(
         limits: when to stop.
         solve: solves a symmetric positive definite system. Where the matrix is not definite it raises LinAlgError; the
             step is then tried again with more damping.
+        least: as ``least_within``, for steps that meet a bound.
         at_start: the problem linearised at ``start``, if the caller has it already.
         watch: called before every step; an exception that it raises ends the search.
     """
@@ -106,8 +108,9 @@ def minimise(
             if step is not None:
                 predicted = -float(equations.gradient @ step)
                 if problem.room is not None:
-                    step, predicted = _within(equations, damping, step, problem.room(now.value))
-                tried, evaluations = _place(problem, problem.after(now.value, step)), evaluations + 1
+                    step, predicted = _within(equations, damping, step, problem.room(now.value), least)
+                value, evaluations = problem.after(now.value, step), evaluations + 1
+                tried = _Place(value, there := problem.at(value), there.cost)
                 if tried.cost < max(recent[-limits.memory :]):  # False for the NaN of a value that makes no sense
                     accepted = tried
                     break
@@ -134,11 +137,6 @@ class _Place(Generic[Value]):
     cost: float
 
 
-def _place(problem: Problem[Value], value: Value) -> _Place[Value]:
-    there = problem.at(value)
-    return _Place(value, there, there.cost)
-
-
 def _damped_step(equations: NormalEquations, damping: float, solve: Solve) -> Float[np.ndarray, " p"] | None:
     """Returns the step of the damped equations, or None if their matrix is not positive definite."""
     try:
@@ -159,10 +157,11 @@ def _within(
     damping: float,
     step: Float[np.ndarray, " p"],
     room: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
+    least: Callable[..., Float[np.ndarray, " p"]],
 ) -> tuple[Float[np.ndarray, " p"], float]:
     """Returns the step limited to its bounds ``room``, and the fall of the cost that the equations predict for it."""
     if ((step >= room[0]) & (step <= room[1])).all():
         return step, -float(equations.gradient @ step)
     damped = _damped(equations, damping)
-    step = least_within(damped, equations.gradient, *room)
+    step = least(damped, equations.gradient, *room)
     return step, -float(2.0 * equations.gradient @ step + step @ damped @ step)

@@ -59,6 +59,7 @@ class HeadFit:
     detail: Detail
     cranium: Cranium | None = None
     doubtful: frozenset[int] = frozenset()  # expressions, by their place among the model's, that the fit left out
+    solution: ContourSolution | None = None  # what ``fit`` was made of, for other captures of the same person
 
     @property
     def mesh_world(self) -> Mesh:
@@ -81,27 +82,14 @@ def fit_outlines(
     if cap is not None:
         bare = without_cap(views.silhouettes, cap, rig, alignment.world_from_head.translation)
     model, features = model_basis(context.model, settings), views.capture.features
+    start, seen, fitting, report = alignment.world_from_head, bare.silhouettes, settings.fitting, context.progress
     solved = solve_contour(
-        model,
-        alignment.world_from_head,
-        bare.silhouettes,
-        rig,
-        settings.fitting,
-        features=features,
-        landmarks=alignment.landmarks,
-        report=context.progress,
+        model, start, seen, rig, fitting, features=features, landmarks=alignment.landmarks, report=report
     )
     if settings.method == "simplex":
         # The simplex never moves the pose, and what seven points leave (3 degrees, 5 mm) would all become shape.
-        fit = fit_simplex(
-            model,
-            solved.state.world_from_head,
-            bare.silhouettes,
-            rig,
-            settings.fitting,
-            renderer=context.renderer,
-            report=context.progress,
-        )
+        pose = solved.state.world_from_head
+        fit = fit_simplex(model, pose, seen, rig, fitting, renderer=context.renderer, report=report)
         return Staged(OutlineFit(fit, model, fitted_mesh(model, fit)))
     if cap is not None:
         solved = with_counted_crown(solved, cells_of_views(bare.cells, solved.problem.views))
@@ -148,8 +136,9 @@ def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit,
         solved = with_expression_evidence(solved, eigenheads)
     if detail.level == "span":
         wider = basis_of(model, eigenheads, kernel=True)
-        return Staged(HeadFit(with_span_misfit(solved, wider, relief_mm=relief_mm), model, detail, cranium, doubtful))
+        fit = with_span_misfit(solved, wider, relief_mm=relief_mm)
+        return Staged(HeadFit(fit, model, detail, cranium, doubtful, solved))
     if detail.level == "kernel":
         relief_mm *= RELIEF_OF_OUTLINES
     fit = with_estimated_prior(model, finish(solved), eigenheads, relief_mm=relief_mm)
-    return Staged(HeadFit(fit, model, detail, cranium, doubtful))
+    return Staged(HeadFit(fit, model, detail, cranium, doubtful, solved))

@@ -102,15 +102,8 @@ def label_parts(
     if settings.detail not in PHOTO_LEVELS and settings.outputs.surface == "head":
         return Staged(PartLabels({}, cap))
     landmarks_world = {name: head_world.vertices[vertex] for name, vertex in model.landmarks.items()}
-    maps = classify_parts(
-        views.capture.images,
-        views.silhouettes,
-        context.rig,
-        head_world,
-        model.levels["full"].face_region,
-        landmarks_world,
-        report=context.progress,
-    )
+    images, face, rig = views.capture.images, model.levels["full"].face_region, context.rig
+    maps = classify_parts(images, views.silhouettes, rig, head_world, face, landmarks_world, report=context.progress)
     return Staged(PartLabels({name: _with_cap(part, cap) for name, part in maps.items()}, cap))
 
 

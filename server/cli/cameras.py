@@ -202,11 +202,8 @@ def _calibrate_scene(
     total = f"{figures['rms_px']:.3f} px over {figures['points']} points; front camera {calibration.front}"
     for warning in calibration.warnings:
         warn(warning.text)
-    answer(
-        calibration.document(),
-        json_out,
-        [str(out), str(page), *cameras, total, f"scale: {calibration.scale.provenance}"],
-    )
+    lines = [str(out), str(page), *cameras, total, f"scale: {calibration.scale.provenance}"]
+    answer(calibration.document(), json_out, lines)
 
 
 @app.command(epilog="Example: eigenhead refine shots/anna shots/ben shots/cleo shots/dora --out cameras.json")
@@ -239,11 +236,8 @@ def refine(
     write_atomically(page, refinement_page(run).encode())
     verdict = "refined" if run.refinement.kept else "not changed"
     cameras = [f"{name}  {px:.2f} px at the subject" for name, px in run.refinement.change_px.items()]
-    answer(
-        run.document(),
-        json_out,
-        [f"{out}  {verdict}: {run.refinement.reason}", str(page), *cameras, *texts_of(run.warnings)],
-    )
+    lines = [f"{out}  {verdict}: {run.refinement.reason}", str(page), *cameras, *texts_of(run.warnings)]
+    answer(run.document(), json_out, lines)
 
 
 @app.command(epilog="Example: eigenhead convert cameras.json --to colmap --out sparse/0")

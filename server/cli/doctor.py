@@ -7,7 +7,6 @@ import socket
 import sqlite3
 import sys
 import time
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Protocol, TypedDict
@@ -62,31 +61,17 @@ class Finding(TypedDict):
 def examine(settings: ServiceSettings) -> dict[str, Finding]:
     """Runs every check of this machine and returns the findings by name. Only reads: it makes neither folders nor
     tables."""
-    checks: dict[str, Callable[[ServiceSettings], tuple[bool, str]]] = {
-        "python": _python,
-        "egl": _egl,
-        "gpu": _gpu,
-        "model": _model,
-        "cores": _cores,
-        "memory": _memory,
-        "data": _data,
-        "models": _models,
-        "cache": _cache,
-        "database": _database,
-        "retention": _retention,
-        "results": _results,
-        "variables": _variables,
-        "rig": _rig,
-        "stores": _stores,
-        "port": _port,
-    }
+    checks = (
+        *(_python, _egl, _gpu, _model, _cores, _memory, _data, _models, _cache, _database, _retention, _results),
+        *(_variables, _rig, _stores, _port),
+    )
     findings: dict[str, Finding] = {}
-    for name, check in checks.items():
+    for check in checks:
         try:
             ok, detail = check(settings)
         except Exception as error:  # a check that fails is a finding, not the end of the examination
             ok, detail = False, str(error) if isinstance(error, EigenheadError) else f"{type(error).__name__}: {error}"
-        findings[name] = {"ok": ok, "detail": detail}
+        findings[check.__name__.removeprefix("_")] = {"ok": ok, "detail": detail}
     return findings
 
 
@@ -95,23 +80,19 @@ def _python(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _egl(settings: ServiceSettings) -> tuple[bool, str]:
-    child = Child()
-    try:
-        return True, child.remote(try_egl)()
-    except WorkFailed as error:
-        return False, error.message.text
-    finally:
-        child.close()
+    with closing(Child()) as child:
+        try:
+            return True, child.remote(try_egl)()
+        except WorkFailed as error:
+            return False, error.message.text
 
 
 def _gpu(settings: ServiceSettings) -> tuple[bool, str]:
-    child = Child()
-    try:
-        return True, child.remote(try_compute)()
-    except WorkFailed as error:
-        return True, f"none: {error.message.text}"  # no fault: the processor computes instead
-    finally:
-        child.close()
+    with closing(Child()) as child:
+        try:
+            return True, child.remote(try_compute)()
+        except WorkFailed as error:
+            return True, f"none: {error.message.text}"  # no fault: the processor computes instead
 
 
 def _model(settings: ServiceSettings) -> tuple[bool, str]:
@@ -167,12 +148,9 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
     kind = _kind(settings)
     connection = _connected(settings)
     if connection is None:
-        left = [name for name in ("captures", "jobs") if any((settings.data / name).glob("*"))]
+        left = " and ".join(name for name in ("captures", "jobs") if any((settings.data / name).glob("*")))
         if left:
-            return (
-                False,
-                f"{_sqlite(settings)} is not there, but {' and '.join(left)} are: restore its copy beside them",
-            )
+            return False, f"{_sqlite(settings)} is not there, but {left} are: restore its copy beside them"
         return True, f"{_sqlite(settings)}, `eigenhead serve` will make it; no API key"
     with closing(connection):
         if kind == "sqlite" and _rows(connection, "PRAGMA quick_check(1)") != [("ok",)]:
@@ -212,11 +190,8 @@ def _results(settings: ServiceSettings) -> tuple[bool, str]:
         return False, f"changed since their jobs made them: {', '.join(damaged[:5])}; restore them, or restart the jobs"
     if not missing:
         return True, f"of {len(rows)} jobs, all there; the files of {compared} were compared"
-    named = f"{', '.join(missing[:3])}{' ...' if len(missing) > 3 else ''}"
-    return (
-        False,
-        f"of {len(rows)} jobs {len(missing)} are gone ({named}): restore `jobs` from a backup, or restart them",
-    )
+    gone = f"{len(missing)} are gone ({', '.join(missing[:3])}{' ...' if len(missing) > 3 else ''})"
+    return False, f"of {len(rows)} jobs {gone}: restore `jobs` from a backup, or restart them"
 
 
 def _damaged(folder: Path, files: dict[str, dict[str, str]]) -> list[str]:

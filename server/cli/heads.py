@@ -1,5 +1,7 @@
-"""Implements the commands that make and judge heads: check, reconstruct, verify, demo."""
+"""Implements the commands that make and judge heads: reconstruct, take, check, verify, demo."""
 
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,10 +19,12 @@ from server.cli.answers import (
     model_names,
     number,
     prepare_file,
+    prepare_folder,
     progress_bar,
     switch,
     warn,
     warn_of_replacement,
+    wrong_usage,
 )
 
 app = typer.Typer(rich_markup_mode=None)
@@ -72,8 +76,7 @@ Method = Annotated[
 Detail = Annotated[
     Literal["span", "kernel", "photo", "fine", "pores"] | None,
     typer.Option(
-        help="How fine the head becomes: span is the head model alone, kernel follows outlines (seconds, with "
-        "--surface head); photo, fine and pores follow photographs (minutes).",
+        help="span is the model alone, kernel follows outlines (seconds); photo, fine, pores photographs (minutes).",
         show_default="fine",
     ),
 ]
@@ -138,11 +141,9 @@ def reconstruct(
     from server.cli.reconstruct_local import flame_lines, reconstruct_locally
     from server.tasks.settings_file import settings_document
 
-    switches = {"normal_map": normal_map, "neutral": neutral, "morphs": morphs, "slicer": slicer}
-    outputs: dict[str, object] = {name: True for name, is_requested in switches.items() if is_requested}
-    words = {"surface": surface, "template": template, "formats": formats.split(",") if formats else None}
-    words["albedo"] = "file" if albedo else None
-    outputs |= {name: word for name, word in words.items() if word}
+    requested = {"normal_map": normal_map, "neutral": neutral, "morphs": morphs, "slicer": slicer, "surface": surface}
+    requested |= {"template": template, "formats": formats and formats.split(","), "albedo": "file" if albedo else None}
+    outputs: dict[str, object] = {name: value for name, value in requested.items() if value}
     options: dict[str, bool | dict[str, object] | None] = {"outputs": outputs or None, "anyway": anyway or None}
     options["texture"] = {"chart": True} if chart else None
     worn = {"colour": cap, "thickness_mm": cap_thickness}
@@ -157,6 +158,55 @@ def reconstruct(
     names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # in the order of looking at them
     files = [out / name for name in names if (out / name).is_file()]
     answer(written, json_out, [*(str(path) for path in files), *flame_lines(written, out)])
+
+
+@app.command(epilog="Example: eigenhead take shots/anna-calm shots/anna-smile shots/anna-open --out takes/anna")
+def take(
+    captures: Annotated[
+        list[Path], typer.Argument(help="Two or more captures of one person, in different expressions.", exists=True)
+    ],
+    out: Annotated[Path, typer.Option(help="The folder of the take.", file_okay=False)],
+    *,
+    model: Model = None,
+    detail: Detail = None,
+    settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
+    data: Data = None,
+    overwrite: Overwrite = False,
+    json_out: Json = False,
+) -> None:
+    """Solve several captures of one person as one.
+
+    Writes the neutral head with the person's own shapes, and the head of each capture."""
+    from pipeline.applications.moments.take import check_count, named
+    from pipeline.applications.moments.take_files import Shot, make_take, warning_lines
+    from pipeline.settings import settings_from_document
+    from server.cli.reconstruct_local import check_apart
+    from server.cli.verify import capture_names, head_alone
+    from server.tasks.photographs import keep_masks, read_or_calibrate
+    from server.tasks.prepare import prepare_kernels
+    from server.tasks.reconstruct_folder import folder_of
+    from server.tasks.settings_file import settings_document
+
+    with wrong_usage("CAPTURES"):
+        names = capture_names(captures)
+        check_count(len(names))
+    chosen = settings_from_document(head_alone(settings_document(settings, detail=detail)))
+    for capture in captures:
+        check_apart(out, capture)
+    warn_of_replacement(out / "report.json", overwrite)
+    prepare_folder(out)
+    with progress_bar() as report, ExitStack() as stack:
+        prepare_kernels(report, chosen)
+        shots = {}
+        for name, capture in zip(names, captures, strict=True):
+            with named(name):
+                kept, folder = out / "moments" / name, stack.enter_context(folder_of(capture))
+                found = read_or_calibrate(folder, kept, front=chosen.front, report=report)
+            shots[name] = Shot(found.capture, found.rig, partial(keep_masks, kept))
+        document = make_take(out, shots, model=model or "default", settings=chosen, report=report)
+    for line in warning_lines(document):
+        warn(line)
+    answer(document, json_out, [str(out / name) for name in ("neutral.ply", "neutral.glb", "moments")])
 
 
 @app.command(epilog="Example: eigenhead check shots/anna.tar.gz --json")
@@ -235,13 +285,10 @@ def demo(
     with progress_bar() as report:
         done = run_demo(out, seed=seed, full=full, report=report)
     error = done["error_mm"]
-    answer(
-        done,
-        json_out,
-        [
-            f"head           {done['ply']}",
-            f"error          {error['median']:.2f} mm median, {error['mean']:.2f} mm mean, {error['max']:.2f} mm max",
-            f"time           {done['seconds']:.1f} s",
-            f"contact sheet  {done['contact_sheet']}",
-        ],
-    )
+    lines = [
+        f"head           {done['ply']}",
+        f"error          {error['median']:.2f} mm median, {error['mean']:.2f} mm mean, {error['max']:.2f} mm max",
+        f"time           {done['seconds']:.1f} s",
+        f"contact sheet  {done['contact_sheet']}",
+    ]
+    answer(done, json_out, lines)

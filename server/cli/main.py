@@ -14,7 +14,7 @@ from server.cli import batch, cameras, clinic, export, heads, models, rig, servi
 from server.cli.answers import QUIET, fail, use_threads
 
 ROOMS = {  # page below docs/commands: its title, and its commands in the order of a day's work
-    "heads": ("Heads", ("reconstruct", "batch", "check", "export")),
+    "heads": ("Heads", ("reconstruct", "take", "batch", "check", "export")),
     "clinic": ("Clinic", ("compare", "register", "measure")),
     "trials": ("Trials", ("simulate", "demo", "verify")),
     "cameras": ("Cameras", ("board", "calibrate", "refine", "convert")),

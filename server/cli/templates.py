@@ -73,11 +73,8 @@ def template_add(
         write_image(picture, template_picture(template, fitted, head_model))
         save_template(path, template)
     document = {"name": path.stem, "file": str(path), "picture": str(picture), "model": head_model.name}
-    answer(
-        document | {"figures": template.figures},
-        json_out,
-        [f"{path.stem}  {path}", *_registration_lines(template.figures), str(picture)],
-    )
+    lines = [f"{path.stem}  {path}", *_registration_lines(template.figures), str(picture)]
+    answer(document | {"figures": template.figures}, json_out, lines)
 
 
 def _registration_lines(figures: Mapping[str, float]) -> list[str]:

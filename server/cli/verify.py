@@ -51,7 +51,7 @@ def verify_captures(
     from pipeline.applications.verification.write import write_verification
     from pipeline.head_model.model import load_model
 
-    names = _names(captures)
+    names = capture_names(captures)
     scan = read_reference(reference, landmarks)
     folders: list[Path] = []
     for i, (capture, name) in enumerate(zip(captures, names, strict=True)):
@@ -63,7 +63,7 @@ def verify_captures(
                 report(f"{names[i]}: {stage}", (i + fraction) / len(captures))
 
             report_one("read", 0.0)
-            reconstruct_locally(capture, folder, model=model, settings=_head_alone(settings), report=report_one)
+            reconstruct_locally(capture, folder, model=model, settings=head_alone(settings), report=report_one)
         folders.append(folder)
     report("judge", 1.0)
     identities = {name: identity_of(folder) for name, folder in zip(names, folders, strict=True)}
@@ -98,7 +98,7 @@ def lines(document: "VerificationReport", out: Path) -> list[str]:
     return [*visits, str(out / "report.json"), str(out / "certificate.pdf")]
 
 
-def _names(captures: Sequence[Path]) -> list[str]:
+def capture_names(captures: Sequence[Path]) -> list[str]:
     """Returns the captures' names. Raises InputError if two are alike."""
     names = [path.resolve().name.removesuffix(".gz").removesuffix(".tar").removesuffix(".zip") for path in captures]
     twice = [name for name, count in Counter(names).items() if count > 1]
@@ -107,7 +107,7 @@ def _names(captures: Sequence[Path]) -> list[str]:
     return names
 
 
-def _head_alone(settings: Mapping[str, object]) -> dict[str, object]:
+def head_alone(settings: Mapping[str, object]) -> dict[str, object]:
     """Returns the settings with the bust switched off: only the head is judged, and a capture takes ten seconds
     less."""
     outputs = settings.get("outputs")

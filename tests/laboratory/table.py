@@ -53,6 +53,7 @@ EXPERIMENTS = {
     "skulls": Record(
         "experiments.surface.capped:skulls", "Counts heads called bald, and measures craniums under hair."
     ),
+    "moments": Record("experiments.moments.takes:moments", "Measures takes: one person in several moments."),
     "expressions": Record("experiments.people.expressions:expressions", "Measures heads with an expression."),
     "people": Record(
         "experiments.people.people:people",

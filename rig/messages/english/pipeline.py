@@ -1,6 +1,9 @@
 """Sentences of pipeline."""
 
 TEMPLATES = {
+    "take-too-small": "{count} capture was given, and a take needs two or more of one person: name more folders. | {count} captures were given, and a take needs two or more of one person: name more folders.",
+    "take-needs-contour": "A take is solved by the method contour: leave the method simplex out of the settings.",
+    "take-other-person": "The head of {moment} differs from that of all moments by {sigmas:.1f} standard deviations: if it is another person, leave it out.",
     "no-bust": "{reason}",
     "bust-guessed": "{share:.0%} of the face in bust.ply were measured neither by depth nor by the head's fine level, and follow the fitted head: add cameras that see the face, or light with more texture",
     "hair-beyond-head": "the head's vertices reach {share:.0%} of the hair to 2 mm; the rest hangs or stands beyond them: bust.ply shows it whole",

@@ -9,6 +9,7 @@ from rig.messages.message import compose
 from rig.studio.scene.anatomy import Anatomy, Landmarks
 from rig.studio.scene.curls import curled
 from rig.studio.scene.hair import Hair, HairStyle, grow_strands
+from rig.studio.scene.skin_texture import smoothstep
 
 SUNK_MM = 2.0  # below the skin where no beard grows
 
@@ -42,9 +43,9 @@ def beard_share(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.n
     across = (x - mouth[0]) / body.half_breadth
     cheek = mouth[1] + 6.0 + (ears[1] - mouth[1]) * np.minimum(np.abs(across), 1.0) ** 3
     lip = marks["subnasale"][1] - 5.0 - 0.02 * (x - mouth[0]) ** 2  # the moustache's upper edge
-    share = _smoothstep(4.0, -5.0, y - np.maximum(cheek, lip))
-    share *= _smoothstep(-26.0, -12.0, y - body.chin_y - 0.3 * np.abs(x - mouth[0]))
-    share *= _smoothstep(4.0, 14.0, z - ears[2])
+    share = smoothstep(4.0, -5.0, y - np.maximum(cheek, lip))
+    share *= smoothstep(-26.0, -12.0, y - body.chin_y - 0.3 * np.abs(x - mouth[0]))
+    share *= smoothstep(4.0, 14.0, z - ears[2])
     return share * (1.0 - _lips(vertices, marks))
 
 
@@ -54,9 +55,4 @@ def _lips(vertices: Float[np.ndarray, "v 3"], marks: Landmarks) -> Float[np.ndar
     half = (left[0] - right[0]) / 2
     across = (vertices[:, 0] - (left[0] + right[0]) / 2) / (half + 1.0)
     down = (vertices[:, 1] - (top + bottom) / 2) / (0.5 * (top - bottom))
-    return _smoothstep(1.35, 0.9, np.hypot(across, down))
-
-
-def _smoothstep(low: float, high: float, x: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
-    t = np.clip((x - low) / (high - low), 0, 1)
-    return t * t * (3 - 2 * t)
+    return smoothstep(1.35, 0.9, np.hypot(across, down))

@@ -69,7 +69,8 @@ def _mix(paint: Float[np.ndarray, "v 4"], share: Float[np.ndarray, " v"], colour
     paint[:, :3] += share[:, None] * (colour - paint[:, :3])
 
 
-def _smoothstep(low: float, high: float, x: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+def smoothstep(low: float, high: float, x: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+    """Returns 0 where ``x`` is ``low``, 1 where it is ``high``, and a smooth step in between."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
 
@@ -86,8 +87,8 @@ def _blush(paint: Float[np.ndarray, "v 4"], vertices: Vertices, marks: Landmarks
 def _beard(paint: Float[np.ndarray, "v 4"], vertices: Vertices, marks: Landmarks, stubble: float) -> None:
     x, y, z = vertices.T
     mouth, chin = marks["stomion"], marks["gnathion"]
-    share = _smoothstep(14, 2, y - mouth[1] - 0.004 * (x - mouth[0]) ** 2) * _smoothstep(-75, -45, z - chin[2])
-    share *= _smoothstep(-38, -14, y - chin[1]) * stubble
+    share = smoothstep(14, 2, y - mouth[1] - 0.004 * (x - mouth[0]) ** 2) * smoothstep(-75, -45, z - chin[2])
+    share *= smoothstep(-38, -14, y - chin[1]) * stubble
     paint[:, :3] *= 1 - 0.42 * share[:, None]
     paint[:, 3] += 1.6 * share
 
@@ -102,7 +103,7 @@ def _mouth(paint: Float[np.ndarray, "v 4"], vertices: Vertices, marks: Landmarks
     bottom = line[1] + (marks["labiale_inferius"][1] - line[1]) * bow - 3.0 * bow
     inside = np.minimum(np.minimum(top - y, y - bottom), half * (1 - np.abs(across)))
     front = z > min(right[2], left[2]) - 12
-    _mix(paint, 0.75 * front * _smoothstep(-0.9, 0.9, inside), LIP)
+    _mix(paint, 0.75 * front * smoothstep(-0.9, 0.9, inside), LIP)
     seam = np.exp(-(((y - line[1]) / 1.2) ** 2)) * (np.abs(across) < 0.95) * front
     paint[:, :3] *= 1 - 0.55 * seam[:, None]
 
@@ -120,8 +121,8 @@ def _eye(
     )  # 0 at the inner end of the brow, 1 outside
     arch = outer[1] + lift * (1.0 + 1.2 * along * (1 - along) * 1.25 - 0.2 * along)
     width = 4.4 - 2.8 * np.clip(along, 0, 1)
-    inside = _smoothstep(-0.06, 0.06, along) * _smoothstep(1.06, 0.94, along) * (z > outer[2] - 18)
-    brow = inside * _smoothstep(1.0, 0.4, np.abs(y - arch) / width)
+    inside = smoothstep(-0.06, 0.06, along) * smoothstep(1.06, 0.94, along) * (z > outer[2] - 18)
+    brow = inside * smoothstep(1.0, 0.4, np.abs(y - arch) / width)
     _mix(paint, 0.85 * brow, BROW)
     paint[:, 3] += 3.0 * brow
     if eyeballs:
@@ -157,21 +158,21 @@ def _open_eye(paint: Float[np.ndarray, "v 4"], vertices: Vertices, inner: Vector
     """Paints white, iris and pupil between the lids, and the upper lashes."""
     x, y, _ = vertices.T
     gap = eye_gap(vertices, inner, outer, closed)
-    opening = gap.here * _smoothstep(0.6, -0.6, np.abs(gap.off) - gap.height) * (closed < 1.0)
+    opening = gap.here * smoothstep(0.6, -0.6, np.abs(gap.off) - gap.height) * (closed < 1.0)
     _mix(paint, opening, np.array([0.44, 0.40, 0.38]))
     paint[:, 3] *= 1 - 0.8 * opening
     middle = (inner + outer) / 2 + (0, 1.8, 0)
     radius = np.hypot(x - middle[0], y - middle[1])
-    _mix(paint, opening * _smoothstep(6.0, 5.0, radius), np.array([0.09, 0.06, 0.035]))
-    _mix(paint, opening * _smoothstep(2.6, 1.8, radius), np.array([0.008, 0.008, 0.008]))
+    _mix(paint, opening * smoothstep(6.0, 5.0, radius), np.array([0.09, 0.06, 0.035]))
+    _mix(paint, opening * smoothstep(2.6, 1.8, radius), np.array([0.008, 0.008, 0.008]))
     _lashes(paint, gap)
 
 
 def _lashes(paint: Float[np.ndarray, "v 4"], gap: EyeGap) -> None:
     lash = (
         gap.here
-        * _smoothstep(1.5, 0.5, np.abs(gap.off - gap.height - 0.2 * gap.bow))
-        * _smoothstep(0.0, 0.15, gap.along)
-        * _smoothstep(1.0, 0.9, gap.along)
+        * smoothstep(1.5, 0.5, np.abs(gap.off - gap.height - 0.2 * gap.bow))
+        * smoothstep(0.0, 0.15, gap.along)
+        * smoothstep(1.0, 0.9, gap.along)
     )
     paint[:, :3] *= 1 - 0.75 * lash[:, None]

@@ -19,7 +19,7 @@ from rig.studio.scene.beard import grow_beard
 from rig.studio.scene.clothes import shirt
 from rig.studio.scene.eyes import IRIS_TONES, Eye, EyeSurface, eye_centres, look_at_point, opened, surface
 from rig.studio.scene.hair import STRAND_POINTS, Hair, HairStyle, grow
-from rig.studio.scene.headwear import cap, glasses
+from rig.studio.scene.headwear import cap, glasses, joined
 from rig.studio.scene.lights import LAMPS, Lamp, irradiance, lamp_directions
 from rig.studio.scene.long_hair import hang, knot
 from rig.studio.scene.skin_relief import SkinRelief, relieved
@@ -234,7 +234,7 @@ def dress(
         pieces.append(_tight_cap(head, body, appearance.tight_cap, cap_rng))
     placed = [(world_from_head.apply(piece.vertices), piece.faces) for piece in pieces]
     normals = [vertex_normals(*piece) for piece in placed]
-    solid = _joined(placed)
+    solid = joined(placed)
     close_up = None if subject.relief is None else _relieved(pieces[0], pierced.mesh, subject.relief, world_from_head)
     lit = [(v, n) for (v, _), n in zip(placed, normals, strict=True)]
     lit += [] if close_up is None else [(close_up.vertices, close_up.normals)]
@@ -258,7 +258,7 @@ def dress(
     )
     shown = [piece.shows for piece in pieces]
     surfaces = {
-        name: Mesh(*_joined([mesh for mesh, one in zip(placed, shown, strict=True) if one == name]))
+        name: Mesh(*joined([mesh for mesh, one in zip(placed, shown, strict=True) if one == name]))
         for name in dict.fromkeys(("head", *shown))
     }
     bare = parts[0] if pierced is subject else _uncut(parts[0], head)
@@ -388,9 +388,3 @@ def _strand_part(hair: Hair, shell: Part, world_from_head: Similarity, rng: np.r
         grain=replace(shell.grain, gloss=0.0),
         one_sided=False,
     )
-
-
-def _joined(pieces: list[tuple[Float[np.ndarray, "_ 3"], np.ndarray]]) -> tuple[Vertices, np.ndarray]:
-    offsets = np.cumsum([0] + [len(vertices) for vertices, _ in pieces])
-    faces = [faces + offset for (_, faces), offset in zip(pieces, offsets[:-1], strict=True)]
-    return np.concatenate([vertices for vertices, _ in pieces]), np.concatenate(faces)

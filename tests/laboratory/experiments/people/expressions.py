@@ -33,8 +33,7 @@ SEED = 22
 
 
 def expressions(models: Mapping[str, HeadModel], *, renderer: Renderer, bench: Bench, subjects: int = 4) -> Outcome:
-    """Runs this module's experiment. Returns distances by model: ``<model>_posed_median_mm``
-    and so on.
+    """Runs this module's experiment. Returns distances by model: ``<model>_posed_median_mm`` and so on.
 
     Of the expression weights there are the correlation with the true ones (``<model>_weights_correlation_true`` over
     those that are not 0; ``..._all`` over all that are not 0 or reported for any head), the mean error of the true ones

@@ -1,0 +1,255 @@
+"""Solves for the one identity of several moments, with pose, expression and cameras of each moment.
+
+Enters: the contour solver's solution of every moment, outlines or photographs. Leaves: the same solutions at one
+identity. Its unknowns are those of all moments; the identity's coefficients and the log of scale are one for all of
+them, which makes an arrow of the equations (``arrow``). The cost is the sum of the moments' costs.
+
+The prior of what K moments share stands in each of these costs. If their errors were independent, it would count once.
+But cameras, light, hair and the misfit of the model are the same in all: with the share ``COMMON`` of its variance in
+common, the evidence of K moments is worth K / (1 + COMMON (K - 1)), and so the prior counts 1 + COMMON (K - 1) times.
+Counted once, it left the head of eight moments before three cameras no better than the mean of their own heads.
+
+A moment whose photographs show too little has no fine modes: it speaks for the modes that it has.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.applications.moments.arrow import Arrow
+from pipeline.compute.trace import traced
+from pipeline.contour_fit.contour import NON_MONOTONE, TOLERANCE, TRIES, ContourSolution, hold_at_bounds, last_problem
+from pipeline.contour_fit.expression_evidence import ROUNDS, estimated_variance, makes_face
+from pipeline.contour_fit.head_problem import weight_bounds
+from pipeline.contour_fit.prior_term import LOG_SCALE, SCALE_SPREAD, weight_slope
+from pipeline.contour_fit.problem import POSE, State
+from pipeline.estimation.levenberg_marquardt import Limits, minimise
+from pipeline.estimation.positive_definite import inverse
+from pipeline.estimation.terms import Linearised, NormalEquations, Problem, Sum
+
+COMMON = 0.5  # share of the variance of evidence that all moments have in common
+STEPS = 12  # Levenberg-Marquardt steps at most
+States = tuple[State, ...]
+Rows = Int[np.ndarray, " u"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """Holds where each moment's unknowns stand among those of all moments: those of the identity first, then the log of
+    scale, then each moment's own."""
+
+    identity: int  # coefficients
+    places: tuple[Rows, ...]  # by moment: the row of each of its unknowns
+    weights: tuple[Rows, ...]  # by moment: the rows of its expression weights
+    free: tuple[Rows, ...]  # by moment: the rows of its own unknowns without bounds: pose and cameras
+    size: int
+
+    @property
+    def arrow(self) -> Arrow:
+        """Returns the arrow whose shaft is what moments share, and their expression weights."""
+        return Arrow(self.size, self.free)
+
+
+def identity_of(solved: ContourSolution, state: State) -> Float[np.ndarray, " i"]:
+    """Returns the coefficients of a moment's head that are no expression weights."""
+    return np.delete(state.coefficients, np.asarray(solved.problem.model.posed, int))
+
+
+def lay_out(solutions: Sequence[ContourSolution], problems: Sequence[Problem[State]]) -> Layout:
+    """Returns the layout of the moments' unknowns."""
+    identity = max(len(identity_of(each, each.state)) for each in solutions)
+    places, weights, free, size = [], [], [], identity + 1
+    for solved, problem in zip(solutions, problems, strict=True):
+        modes, posed = solved.stage.modes, np.asarray(solved.problem.model.posed, int)
+        shared = np.append(np.setdiff1d(np.arange(modes), posed), modes + LOG_SCALE)
+        local = np.setdiff1d(np.arange(problem.unknowns), shared)
+        rows = np.empty(problem.unknowns, int)
+        rows[shared], rows[local] = np.arange(len(shared)), np.arange(size, size + len(local))
+        rows[modes + LOG_SCALE], size = identity, size + len(local)
+        places.append(rows)
+        weights.append(rows[posed])
+        free.append(rows[np.setdiff1d(local, posed)])
+    return Layout(identity, tuple(places), tuple(weights), tuple(free), size)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointTerm:
+    """Computes the cost of all moments, each by its own problem. The prior of what K of them share counts ``1 + common
+    (K - 1)`` times."""
+
+    problems: tuple[Problem[State], ...]
+    solutions: tuple[ContourSolution, ...]
+    layout: Layout
+    common: float
+
+    def at(self, states: States) -> "LinearisedJointTerm":
+        """Returns the term linearised at one state a moment."""
+        parts = tuple(problem.at(state) for problem, state in zip(self.problems, states, strict=True))
+        counts = np.zeros(self.layout.identity + 1)  # priors too many
+        values = np.zeros(self.layout.identity + 1)
+        for solved, state in zip(self.solutions, states, strict=True):
+            shared = identity_of(solved, state)
+            counts[: len(shared)] += 1.0
+            values[: len(shared)] = shared
+        counts[-1], values[-1] = len(states), np.log(states[0].world_from_head.scale)
+        information = np.append(np.ones(self.layout.identity), SCALE_SPREAD**-2)
+        return LinearisedJointTerm(self, parts, (1.0 - self.common) * (counts - 1.0) * information, values)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearisedJointTerm:
+    """Holds the moments' costs linearised, and what is taken off: the information of priors that are ``repeated``, at
+    the ``values`` of what is shared."""
+
+    term: JointTerm
+    parts: tuple[Linearised, ...]
+    repeated: Float[np.ndarray, " s"]
+    values: Float[np.ndarray, " s"]
+
+    @property
+    def cost(self) -> float:
+        """Returns the sum of the moments' costs, without the repeated priors."""
+        return sum(part.cost for part in self.parts) - float(self.repeated @ self.values**2)
+
+    def add_to(self, equations: NormalEquations) -> None:
+        """Adds each moment's equations at its rows, in place."""
+        layout = self.term.layout
+        for part, problem, rows in zip(self.parts, self.term.problems, layout.places, strict=True):
+            local = problem.equations(part)
+            equations.matrix[np.ix_(rows, rows)] += local.matrix
+            equations.gradient[rows] += local.gradient
+        shared = np.arange(layout.identity + 1)
+        equations.matrix[shared, shared] -= self.repeated
+        equations.gradient[shared] -= self.repeated * self.values
+
+
+def joint_problem(solutions: Sequence[ContourSolution], common: float = COMMON) -> tuple[Problem[States], Layout]:
+    """Builds the least-squares problem of all moments, from the last stage of each one's solution."""
+    problems = tuple(last_problem(each)[0] for each in solutions)
+    layout = lay_out(solutions, problems)
+    term = JointTerm(problems, tuple(solutions), layout, common)
+
+    def moved(states: States, step: Float[np.ndarray, " p"]) -> States:
+        triples = zip(problems, states, layout.places, strict=True)
+        return tuple(problem.after(state, step[rows]) for problem, state, rows in triples)
+
+    def room(states: States) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+        lower, upper = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
+        for solved, state, rows, weights in zip(solutions, states, layout.places, layout.weights, strict=True):
+            least, most = weight_bounds(state, solved.problem, len(rows))
+            posed = np.asarray(solved.problem.model.posed, int)
+            lower[weights], upper[weights] = least[posed], most[posed]
+        return lower, upper
+
+    return Problem((term,), layout.size, moved, room=room), layout
+
+
+def start_at_mean(solutions: Sequence[ContourSolution]) -> States:
+    """Returns each moment's state with the mean identity and scale of all. Of a mode that some moments do not have, the
+    others' mean counts."""
+    identities = [identity_of(each, each.state) for each in solutions]
+    stacked = np.full((len(solutions), max(map(len, identities))), np.nan)
+    for row, identity in zip(stacked, identities, strict=True):
+        row[: len(identity)] = identity
+    mean = np.nanmean(stacked, axis=0)
+    scale = float(np.exp(np.mean([np.log(each.state.world_from_head.scale) for each in solutions])))
+    return tuple(with_identity(each, each.state, mean, scale) for each in solutions)
+
+
+def with_identity(solved: ContourSolution, state: State, identity: Float[np.ndarray, " i"], scale: float) -> State:
+    """Returns a moment's state with another identity (its first coefficients that the moment has) and scale."""
+    coefficients, posed = state.coefficients.copy(), np.asarray(solved.problem.model.posed, int)
+    rows = np.setdiff1d(np.arange(len(coefficients)), posed)
+    coefficients[rows] = identity[: len(rows)]
+    return replace(state, coefficients=coefficients, world_from_head=replace(state.world_from_head, scale=scale))
+
+
+@traced
+def fit_jointly(
+    solutions: Sequence[ContourSolution], eigenheads: int, *, watch: Callable[[], None] = lambda: None
+) -> tuple[ContourSolution, ...]:
+    """Returns the solutions at the one identity that explains all moments best.
+
+    Args:
+        solutions: of at least two moments, with models of one mesh and one basis; some may have fine modes, too.
+        eigenheads: how many of the modes, the first ones, are eigenheads.
+        watch: called before every step; an exception that it raises ends the fit.
+    """
+    problem, layout = joint_problem(solutions)
+    limits, arrow = Limits(STEPS, TOLERANCE, TRIES, NON_MONOTONE), layout.arrow
+    found = minimise(problem, start_at_mean(solutions), limits, solve=arrow.solve, least=arrow.least, watch=watch)
+    states = found.value
+    if any(
+        makes_face(state.coefficients, solved.problem.model.posed)
+        for solved, state in zip(solutions, states, strict=True)
+    ):
+        states = _with_evidence(solutions, problem, layout, states, found.at, eigenheads)
+    return tuple(
+        replace(solved, state=state, evaluations=solved.evaluations + found.evidence.evaluations)
+        for solved, state in zip(solutions, states, strict=True)
+    )
+
+
+def _with_evidence(
+    solutions: Sequence[ContourSolution],
+    problem: Problem[States],
+    layout: Layout,
+    states: States,
+    here: Linearised,
+    eigenheads: int,
+) -> States:
+    """Solves once more for shape and expressions, as ``expression_evidence`` does for one moment: with a prior variance
+    for each group of modes that is estimated from what all moments determine."""
+    longest = max(range(len(states)), key=lambda k: len(states[k].coefficients))
+    posed = solutions[longest].problem.model.posed
+    identity = identity_of(solutions[longest], states[longest])
+    diagonal = np.arange(layout.identity)
+    groups = (diagonal[:eigenheads], diagonal[eigenheads : posed.start], diagonal[posed.start :])
+    equations = problem.equations(here)
+    matrix, gradient = equations.matrix, equations.gradient
+    priors = 1.0 + COMMON * (len(states) - 1)
+    matrix[diagonal, diagonal] -= priors  # what the evidence says without the priors
+    gradient[diagonal] -= priors * identity
+    before = [
+        state.coefficients[solved.problem.model.posed.start : solved.problem.model.posed.stop]
+        for solved, state in zip(solutions, states, strict=True)
+    ]
+    for rows, weights in zip(layout.weights, before, strict=True):
+        gradient[rows] -= weight_slope(np.maximum(weights, 0.0))
+    variance, step, arrow = np.ones(layout.identity), np.zeros(layout.size), layout.arrow
+    assert problem.room is not None
+    room = problem.room(states)
+    for _ in range(ROUNDS):
+        whole, slope = matrix.copy(), gradient.copy()
+        whole[diagonal, diagonal] += priors / variance
+        slope[diagonal] += priors * identity / variance
+        for rows, weights in zip(layout.weights, before, strict=True):
+            slope[rows] += weight_slope(np.maximum(weights + step[rows], 0.0))
+        step = arrow.least(whole, slope, *room)
+        covariance = priors * arrow.variances(whole)
+        for group in groups:
+            variance[group] = estimated_variance(identity + step[diagonal], covariance, variance, group)
+    return problem.after(states, step)
+
+
+def joint_covariances(solutions: Sequence[ContourSolution]) -> Iterator[Float[np.ndarray, "p p"]]:
+    """Yields the covariance of each moment's coefficients, rotation, translation and log scale, given the evidence of
+    all moments. What is independent in them follows from the joint normal matrix, with the prior once; the share
+    ``COMMON`` stays as it is for the moment alone. Weights at bounds are held as ``finish`` does."""
+    problem, layout = joint_problem(solutions, common=0.0)
+    here = problem.at(tuple(each.state for each in solutions))
+    assert isinstance(here, Sum)
+    (joint,) = here.parts
+    assert isinstance(joint, LinearisedJointTerm)
+    whole, alone = problem.equations(here), []
+    for solved, own_problem, part, rows in zip(solutions, joint.term.problems, joint.parts, layout.places, strict=True):
+        held = NormalEquations(np.zeros((len(rows), len(rows))), whole.gradient[rows])
+        hold_at_bounds(solved, held)
+        whole.matrix[np.ix_(rows, rows)] += held.matrix
+        kept = solved.stage.modes + POSE
+        alone.append(inverse(own_problem.equations(part).matrix + held.matrix)[:kept, :kept])
+    blocks = tuple(rows[: len(local)] for rows, local in zip(layout.places, alone, strict=True))
+    for local, together in zip(alone, layout.arrow.covariances(whole.matrix, blocks), strict=True):
+        yield COMMON * local + (1.0 - COMMON) * together

@@ -1,0 +1,87 @@
+"""The neutral head and the person's own shapes, from the heads of a take.
+
+At each vertex, the head of moment k is what the model says of it plus what the model does not know,
+
+    y_k = u + sum_e w_ke d_e + noise,    u ~ N(0, r^2),    d_e ~ N(0, (OWN |S_e|)^2)
+
+with u the relief that all moments have, d_e how far the person's shape e differs from the model's S_e, and w_ke the
+weights. The noise is each head's deviation; the share ``COMMON`` of its variance is the same in all moments (cameras,
+hair, light), and more moments do not remove it. Vertices are independent of each other: neighbours agree since the
+heads are smooth. All of it is Gaussian, so the K x K matrix of the y_k at each vertex gives everything.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from pipeline.head_model.expressions import ARKIT, arkit_parts
+from pipeline.head_model.model import HeadModel
+
+RELIEF_MM = 1.0  # r: deviation of what the heads have beyond the model's modes
+OWN = 0.3  # deviation of a person's shape from the model's, as a share of its displacement
+SHOWN = 0.1  # least weight in some moment of a shape that the take shows
+COMMON = 0.5  # share of the variance that a take's heads have in common
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OwnShapes:
+    """Holds a person's neutral head (head frame, mm) with Apple's 52 shapes as that person makes them. ``shown`` are
+    the names that the take shows: all others are the model's own."""
+
+    neutral: Float[np.ndarray, "v 3"]
+    deviation_mm: Float[np.ndarray, " v"]
+    shapes: Float32[np.ndarray, "n v 3"]  # mm at weight 1, in the order of ``ARKIT``
+    shape_deviation_mm: Float32[np.ndarray, "n v"]  # of each shape, in any direction
+    shown: tuple[str, ...]
+
+
+def estimate_own_shapes(
+    model: HeadModel,
+    neutral: Float[np.ndarray, "v 3"],
+    scale: float,
+    weights: Float[np.ndarray, "k e"],
+    heads: Float[np.ndarray, "k v 3"],
+    deviation_mm: Float[np.ndarray, "k v"],
+) -> OwnShapes:
+    """Returns the neutral head and shapes that explain the heads of a take.
+
+    Args:
+        model: the head model, with its expressions.
+        neutral: the modelled neutral head that all moments share, full level, head frame, mm.
+        scale: of the subject, by which the model's shapes are multiplied.
+        weights: of the model's expressions in each moment, 0 to 1.
+        heads: each moment's head, full level, head frame, mm.
+        deviation_mm: of each moment's vertices along their normals.
+    """
+    operator, names = model.levels["full"].operator, model.expressions.names
+    full = np.zeros((len(names), *neutral.shape), np.float32)
+    for row, shape in enumerate(model.expressions.shapes):
+        full[row] = scale * (operator @ shape)
+    off = heads - neutral - np.einsum("ke,evc->kvc", weights.astype(np.float32), full, optimize=True)
+    prior = (OWN * np.linalg.norm(full, axis=2).T) ** 2  # (v, e)
+    expected = RELIEF_MM**2 + np.einsum("ke,ve,je->vkj", weights, prior, weights, optimize=True)
+    sigma = deviation_mm.T
+    expected += COMMON * sigma[:, :, None] * sigma[:, None, :]
+    diagonal = np.arange(len(heads))
+    expected[:, diagonal, diagonal] += (1.0 - COMMON) * sigma**2
+    known = np.linalg.inv(expected)  # (v, k, k)
+    pulled = np.einsum("vkj,jvc->vkc", known, off, optimize=True)
+    relief = RELIEF_MM**2 * pulled.sum(axis=1)
+    left = RELIEF_MM**2 - RELIEF_MM**4 * known.sum(axis=(1, 2))
+    moved = np.einsum("ve,ke,vkc->evc", prior, weights, pulled, optimize=True)
+    explained = np.einsum("ke,vkj,je->ve", weights, known, weights, optimize=True)
+    variance = np.maximum(prior - prior**2 * explained, 0.0).T
+    # What the model itself leaves open of the neutral head is in all of the heads alike.
+    common = COMMON * sigma.min(axis=1) ** 2
+    rows = arkit_parts(names)
+    shapes = np.stack([(full + moved)[list(rows[name])].sum(axis=0) for name in ARKIT])
+    spread = np.stack([np.sqrt(variance[list(rows[name])].sum(axis=0)) for name in ARKIT])
+    shown = tuple(name for name in ARKIT if rows[name] and weights[:, list(rows[name])].max() >= SHOWN)
+    return OwnShapes(
+        neutral + relief,
+        np.sqrt(np.maximum(left, 0.0) + common),
+        shapes.astype(np.float32),
+        spread.astype(np.float32),
+        shown,
+    )

@@ -1,0 +1,1 @@
+"""Measures takes: one person in several moments."""
