@@ -1,4 +1,4 @@
-"""Describes the calibration board: what is printed, and where its corners lie.
+"""Describes the calibration board: what is printed, where its corners lie, and how a camera sees it.
 
 Board frame: origin at the outer corner of the first square, x along a row of squares, y down its columns, z *into* the
 board (away from the viewer), so that a camera in front of the board sees x to the right when y points down. The frame
@@ -17,10 +17,12 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from fpdf import FPDF
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from rig.atomic_write import write_atomically
+from rig.camera import Camera
 from rig.errors import InputError
+from rig.geometry import RigidTransform, rotation_from_vector
 from rig.messages.message import Message, compose
 
 Kind = Literal["checkerboard", "charuco"]
@@ -35,6 +37,9 @@ PAPERS_MM = {
 MARGIN_MM = 8.0  # what common printers leave blank
 FOOT_MM = 22.0  # ruler and caption
 RULER_MM = 100
+SHEET_PX = 40  # of a square in the drawing that simulated cameras see
+RAY_STEP_PX = 8  # rays are cast that far apart: a cubic spline between them is exact to 1e-4 of a square
+FAN_DEG = 150.0  # azimuths that a simulated board faces in turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,3 +286,52 @@ def _draw_foot(pdf: FPDF, board: Board, page: tuple[float, float]) -> None:
         base - 6.5,
         "Print at 100 % (no scaling). The ruler must measure 100 mm; glue the sheet to a flat, stiff plate.",
     )
+
+
+def board_poses(board: Board, count: int, rng: np.random.Generator) -> list[RigidTransform]:
+    """Draws world_from_board (mm) of a board that somebody turns from one side of the rig to the other, tilted and
+    rolled, about the world's origin."""
+    poses = []
+    for azimuth in np.radians(FAN_DEG * ((np.arange(count) + 0.5) / count - 0.5)):
+        # The board's z points away from the viewer: for a viewer on +z of the world, x right is world x, y down is -y.
+        turn = rotation_from_vector(np.array([0.0, azimuth, 0.0]))
+        tilt = rotation_from_vector(np.radians(rng.uniform(-35, 35, 3)))
+        rotation = turn @ tilt @ np.diag([1.0, -1.0, -1.0])
+        poses.append(RigidTransform(rotation, rng.uniform(-60, 60, 3) - rotation @ board.centre()))
+    return poses
+
+
+def photograph_board(
+    board: Board, world_from_board: RigidTransform, camera: Camera, rng: np.random.Generator, *, blur_px: float = 0.6
+) -> UInt8[np.ndarray, "h w"]:
+    """Simulates a picture of the board before a plain wall, with noise. A camera behind the board sees white paper.
+    OpenCV draws the pattern, not the code that prints it."""
+    from scipy.interpolate import RectBivariateSpline
+
+    k, side = camera.intrinsics, 2  # samples of a pixel's side
+    us, vs = (np.arange(-RAY_STEP_PX, size + 2 * RAY_STEP_PX, RAY_STEP_PX, float) for size in (k.width, k.height))
+    board_from_world = world_from_board.inverse()
+    rays = camera.rays_world(np.stack(np.meshgrid(us, vs), axis=-1).reshape(-1, 2)) @ board_from_world.rotation.T
+    centre = board_from_world.apply(camera.centre_world[None])[0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        hit = centre[:2] - centre[2] / rays[:, 2:] * rays[:, :2]
+    nodes = ((hit / board.square_mm + 1.0) * SHEET_PX - 0.5).reshape(len(vs), len(us), 2)
+    fine = [(np.arange(size * side) + 0.5) / side - 0.5 for size in (k.height, k.width)]
+    x, y = (RectBivariateSpline(vs, us, nodes[..., axis])(*fine).astype(np.float32) for axis in range(2))
+    sheet = _sheet(board) if centre[2] < 0 else np.full_like(_sheet(board), 255)
+    picture = cv2.remap(sheet, x, y, cv2.INTER_AREA, borderMode=cv2.BORDER_CONSTANT, borderValue=120)
+    picture = cv2.resize(picture, (k.width, k.height), interpolation=cv2.INTER_AREA).astype(float)
+    picture = cv2.GaussianBlur(picture, (0, 0), blur_px) if blur_px else picture
+    return np.clip(0.75 * picture + 25 + rng.normal(scale=2.0, size=picture.shape), 0, 255).astype(np.uint8)
+
+
+def _sheet(board: Board) -> UInt8[np.ndarray, "h w"]:
+    """Draws the printed sheet, with a square of paper around the pattern."""
+    size = (board.columns * SHEET_PX, board.rows * SHEET_PX)
+    if board.kind == "charuco":
+        sheet = board.opencv().generateImage(size)
+    else:
+        row, column = np.indices((board.rows, board.columns))
+        sheet = np.kron((row + column) % 2 * 255, np.ones((SHEET_PX, SHEET_PX))).astype(np.uint8)
+    sheet = np.pad(sheet, SHEET_PX, constant_values=255)
+    return 255 - sheet if board.inverted else sheet

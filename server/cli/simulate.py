@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rig.studio.sensor.preset import Preset
 
 MAX_GAZE_DEG = 35.0  # of the studio's eyeballs: lids hide more
+BOARD_SHOTS = 24  # calibrate advises 20 or more
 app = typer.Typer(rich_markup_mode=None)
 
 HairNames = Annotated[
@@ -37,7 +38,7 @@ Faults = Annotated[
 
 @app.command(
     epilog="Example: eigenhead simulate shots/anna --seed 7 --fault bumped:cam03=0.5   "
-    "eigenhead simulate studio --serve --port 8700"
+    "eigenhead simulate studio --serve --port 8700   eigenhead simulate shots --board"
 )
 def simulate(
     out: Annotated[
@@ -61,6 +62,9 @@ def simulate(
     expression: Expressions = None,
     gaze: Gaze = None,
     fault: Faults = None,
+    board: Annotated[
+        bool, typer.Option("--board", help="OUT/CAMERA/SHOT.png of the default board, and board.toml.")
+    ] = False,
     serve: Annotated[
         bool, typer.Option("--serve", help="Keep the studio running as cameras and a trigger box, until Ctrl-C.")
     ] = False,
@@ -88,6 +92,12 @@ def simulate(
         return
     if out is None:
         raise typer.BadParameter("say where the capture goes, or --serve", param_hint="OUT")
+    if board:
+        _make_way(out, overwrite, "board.toml")
+        truth = _photograph_board(out, seed)
+        written = {"images": str(out), "board": str(out / "board.toml"), "truth": str(truth)}
+        answer(written, json_out, list(written.values()))
+        return
     _check_planted(fault or [], expression or [])
     _make_way(out, overwrite)
     from rig.render.renderer import Renderer
@@ -130,10 +140,33 @@ def _check_planted(faults: list[str], expression: list[str]) -> None:
             weights_from_text(expression, load_model().expressions.names)
 
 
-def _make_way(out: Path, overwrite: bool) -> None:
-    """Removes an earlier simulated capture if ``overwrite`` is true. Raises Overwrites and CannotWrite."""
+def _photograph_board(out: Path, seed: int) -> Path:
+    """Writes ``BOARD_SHOTS`` pictures of the default board by each of the studio's cameras as <camera>/<shot>.png, and
+    board.toml. Returns the folder with the true cameras."""
+    import numpy as np
+
+    from calibration.board.board import Board, board_poses, photograph_board, write_board
+    from rig.formats.cameras.cameras_json import write_rig
+    from rig.formats.pictures.images import write_image
+    from rig.studio.scene.layout import default_layout
+
+    board, rng, studio = Board("charuco", 12, 9, 30.0), np.random.default_rng(seed), default_layout()
+    with progress_bar() as report:
+        for shot, pose in enumerate(board_poses(board, BOARD_SHOTS, rng)):
+            report("simulate", shot / BOARD_SHOTS)
+            for camera in studio:
+                write_image(out / camera.name / f"{shot:02}.png", photograph_board(board, pose, camera, rng))
+    write_board(board, out / "board.toml")
+    truth = out.with_name(out.name + ".truth")
+    write_rig(studio, truth / "cameras.json")
+    return truth
+
+
+def _make_way(out: Path, overwrite: bool, sign: str = "cameras.json") -> None:
+    """Removes an earlier simulated capture, which has the file ``sign``, if ``overwrite`` is true. Raises Overwrites
+    and CannotWrite."""
     occupied = out.exists() and (not out.is_dir() or any(out.iterdir()))
-    if occupied and not (overwrite and (out / "cameras.json").is_file()):
+    if occupied and not (overwrite and (out / sign).is_file()):
         raise Overwrites(out)
     prepare_file(out)
     if occupied:

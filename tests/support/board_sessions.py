@@ -1,20 +1,14 @@
-"""Planted truth for the calibration: a rig, board poses, noisy corners, and rendered pictures of the board.
-
-The pictures come from OpenCV's or numpy's drawing of the pattern and ray casting through ``Camera.rays_world``; nothing
-of ``calibration.board.board``'s drawing is used.
-"""
+"""Planted truth for the calibration: a rig, board poses and noisy corners."""
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
 
-from calibration.board.board import Board
+from calibration.board.board import Board, board_poses
 from calibration.board.corners import Found
 from calibration.board.detection import Detections, View
 from rig.camera import Camera, Distortion, Intrinsics
-from rig.geometry import RigidTransform, look_at, rotation_from_vector
+from rig.geometry import RigidTransform, look_at
 from rig.rig import Rig
 
 CHECKERBOARD = Board("checkerboard", 9, 6, 25.0)
@@ -37,21 +31,6 @@ def rig_of(
         aim = rng.normal(scale=15.0, size=3)
         cameras.append(Camera(f"cam{i:02d}", intrinsics, look_at(centre, aim, np.array([0.0, 1.0, 0.0]))))
     return Rig(tuple(cameras))
-
-
-def board_poses(board: Board, count: int, rng: np.random.Generator) -> list[RigidTransform]:
-    """world_from_board: the board's face turned towards azimuths over the whole fan, tilted and rolled."""
-    poses = []
-    for i in range(count):
-        azimuth = np.radians(-75 + 150 * (i + 0.5) / count)
-        # The board's z points away from the viewer: for a viewer on +z of the world, x right is world x, y down is -y.
-        upright = np.diag([1.0, -1.0, -1.0])
-        turn = rotation_from_vector(np.array([0.0, azimuth, 0.0]))
-        tilt = rotation_from_vector(np.radians(rng.uniform(-35, 35, 3)))
-        rotation = turn @ tilt @ upright
-        centre = rng.uniform(-60, 60, 3)
-        poses.append(RigidTransform(rotation, centre - rotation @ board.centre()))
-    return poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,39 +73,3 @@ def visible(camera: Camera, world_from_board: RigidTransform, board: Board) -> t
     if board.kind == "checkerboard" and not inside.all():
         inside[:] = False
     return np.flatnonzero(inside), pixels[inside]
-
-
-def pattern(board: Board, pixels_per_square: int = 40, margin: int = 1) -> np.ndarray:
-    """The printed sheet, with ``margin`` squares of paper around the pattern."""
-    size = (board.columns * pixels_per_square, board.rows * pixels_per_square)
-    if board.kind == "charuco":
-        sheet = board.opencv().generateImage(size)
-    else:
-        row, column = np.indices((board.rows, board.columns))
-        squares = np.where((row + column) % 2 == 0, 0, 255).astype(np.uint8)
-        sheet = np.kron(squares, np.ones((pixels_per_square, pixels_per_square), np.uint8))
-    sheet = np.pad(sheet, margin * pixels_per_square, constant_values=255)
-    return 255 - sheet if board.inverted else sheet
-
-
-def photograph(
-    camera: Camera, world_from_board: RigidTransform, board: Board, rng: np.random.Generator, *, blur_px: float = 0.6
-) -> np.ndarray:
-    """A grey picture (uint8) of the board before a plain wall."""
-    k, scale, side = camera.intrinsics, 40, 2
-    # Rays are cast through every eighth pixel; a cubic spline between them is exact to 1e-4 of a square.
-    us, vs = np.arange(-8.0, k.width + 16, 8), np.arange(-8.0, k.height + 16, 8)
-    pixels = np.stack(np.meshgrid(us, vs), axis=-1).reshape(-1, 2)
-    board_from_world = world_from_board.inverse()
-    rays = camera.rays_world(pixels) @ board_from_world.rotation.T
-    centre = board_from_world.apply(camera.centre_world[None])[0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        hit = centre[:2] - centre[2] / rays[:, 2:] * rays[:, :2]
-    sheet = pattern(board, scale)
-    nodes = ((hit / board.square_mm + 1.0) * scale - 0.5).reshape(len(vs), len(us), 2)
-    fine = [(np.arange(size * side) + 0.5) / side - 0.5 for size in (k.height, k.width)]
-    x, y = (RectBivariateSpline(vs, us, nodes[..., axis])(fine[0], fine[1]).astype(np.float32) for axis in range(2))
-    picture = cv2.remap(sheet, x, y, cv2.INTER_AREA, borderMode=cv2.BORDER_CONSTANT, borderValue=120)
-    picture = cv2.resize(picture, (k.width, k.height), interpolation=cv2.INTER_AREA).astype(float)
-    picture = cv2.GaussianBlur(picture, (0, 0), blur_px) if blur_px else picture
-    return np.clip(0.75 * picture + 25 + rng.normal(scale=2.0, size=picture.shape), 0, 255).astype(np.uint8)

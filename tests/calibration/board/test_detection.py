@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from calibration.adjustment.intrinsics import estimate_lenses
-from calibration.board.board import Board, read_board
+from calibration.board.board import Board, photograph_board, read_board
 from calibration.board.corners import detect
 from calibration.board.detection import WrongBoard, detect_folder, explain
 from rig.errors import InputError
-from tests.support.board_sessions import CHARUCO, CHECKERBOARD, photograph, session, visible
+from tests.support.board_sessions import CHARUCO, CHECKERBOARD, session, visible
 from tests.support.shared_data import shared
 
 EVEN = Board("checkerboard", 8, 6, 25.0)  # both sides even: chiral, and the same when turned by 180 degrees
@@ -23,7 +23,7 @@ def picture(board: Board, index: int = 40, blur_px: float = 0.6) -> tuple[np.nda
     planted = session(seed=2)
     view = planted.detections.views[index]
     camera, pose = planted.rig[view.camera], planted.poses[view.shot]
-    grey = photograph(camera, pose, board, np.random.default_rng(index), blur_px=blur_px)
+    grey = photograph_board(board, pose, camera, np.random.default_rng(index), blur_px=blur_px)
     return grey, *visible(camera, pose, board)
 
 
