@@ -1,7 +1,16 @@
-"""Checks and escapes text from outside before it is stored or sent, and suggests words for mistyped ones."""
+"""Decodes, checks and escapes text from outside before it is stored or sent, and suggests words for mistyped ones."""
 
+import codecs
 import difflib
 from collections.abc import Iterable
+
+MARKS = (  # longest first, since one begins with another
+    (codecs.BOM_UTF32_LE, "utf-32-le"),
+    (codecs.BOM_UTF32_BE, "utf-32-be"),
+    (codecs.BOM_UTF8, "utf-8"),
+    (codecs.BOM_UTF16_LE, "utf-16-le"),
+    (codecs.BOM_UTF16_BE, "utf-16-be"),
+)
 
 
 def is_encodable(text: str) -> bool:
@@ -29,3 +38,11 @@ def suggest(word: str, known: Iterable[str], *, most: int = 1, min_likeness: flo
             letters of five.
     """
     return difflib.get_close_matches(word, list(known), n=most, cutoff=min_likeness)
+
+
+def as_utf8(data: bytes) -> bytes:
+    """Returns the bytes of a text without the mark of its encoding, in UTF-8 if the mark says UTF-16 or UTF-32."""
+    for mark, encoding in MARKS:
+        if data.startswith(mark):
+            return data.removeprefix(mark).decode(encoding).encode()
+    return data

@@ -5,16 +5,29 @@ from contextlib import suppress
 from dataclasses import asdict
 from typing import TypedDict, cast
 
-from rig.acquisition.shot import CameraSyncDocument, FaultDocument, SyncDocument
+from rig.acquisition.shot import CameraSyncDocument, SyncDocument
 from rig.messages.message import MessageDocument, compose, documents_of
 from server.console.page import shared
 from server.console.removal import removals
 from server.errors import NotFound
 from server.services.records import Session
 from server.services.service import Service
-from server.storage.records import CaptureRecord
+from server.storage.records import CaptureRecord, JsonObject
 from server.tasks.simulate import SimulatedCertificate, SimulatedSync
 
+OF_RECORD = (
+    "id",
+    "created",
+    "source",
+    "label",
+    "expression",
+    "front",
+    "features",
+    "bytes",
+    "session",
+    "board",
+    "verdict",
+)
 SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are found on the page Subjects
 
 
@@ -33,41 +46,6 @@ class SyncLine(TypedDict):
     good: bool
 
 
-class CaptureLine(TypedDict):
-    """Holds a capture as a list shows it. ``size``: of the first camera's pictures (px); ``sizes``: width and height by
-    camera; ``jobs``: all its jobs, newest first."""
-
-    id: str
-    created: str
-    source: str
-    label: str
-    expression: str
-    front: str
-    features: bool
-    cameras: list[str]
-    bytes: int
-    session: str | None
-    jobs: list[JobOfCapture]
-    board: bool
-    size: dict[str, str | int]
-    sizes: dict[str, tuple[int, int]]
-    verdict: str | None
-    faults: list[FaultDocument]
-    warnings: list[MessageDocument]
-    sync: SyncLine | None
-    tags: list[str]
-
-
-class SessionLine(TypedDict):
-    """Holds a session as a list shows it. ``captures``: how many it has."""
-
-    id: str
-    created: str
-    label: str
-    consent: str
-    captures: int
-
-
 def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JobOfCapture]]:
     """Returns the jobs of each capture, newest first, with the progress of those that run. Jobs that are being removed
     are left out."""
@@ -82,24 +60,15 @@ def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JobOfCa
     }
 
 
-def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine:
-    """Converts a capture's record to an entry of a list. ``jobs``: the capture's jobs, as ``jobs_of`` returns them."""
+def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> JsonObject:
+    """Converts a capture's record to an entry of a list. ``jobs``: the capture's jobs, as ``jobs_of`` returns them;
+    ``size``: of the first camera's pictures (px); ``sizes``: width and height by camera."""
     return {
-        "id": record.id,
-        "created": record.created,
-        "source": record.source,
-        "label": record.label,
-        "expression": record.expression,
-        "front": record.front,
-        "features": record.features,
+        **{name: getattr(record, name) for name in OF_RECORD},
         "cameras": [camera.name for camera in record.cameras],
-        "bytes": record.bytes,
-        "session": record.session,
         "jobs": jobs,
-        "board": record.board,
         "size": asdict(record.cameras[0]),
         "sizes": {camera.name: (camera.width, camera.height) for camera in record.cameras},
-        "verdict": record.verdict,
         "faults": [fault.document() for fault in record.faults],
         "warnings": documents_of(record.warnings),
         "sync": None if record.shot is None else sync_line(record.shot),
@@ -129,7 +98,7 @@ def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | Sim
     return certificate.get("cameras", {})
 
 
-def sessions_list(service: Service, chosen: str | None = None) -> list[SessionLine]:
+def sessions_list(service: Service, chosen: str | None = None) -> list[JsonObject]:
     """Returns the newest ``SESSIONS_SHOWN`` sessions, newest first, and the session ``chosen`` even if it is older."""
 
     def make() -> list[Session]:
@@ -142,12 +111,6 @@ def sessions_list(service: Service, chosen: str | None = None) -> list[SessionLi
     return [session_line(session) for session in sessions]
 
 
-def session_line(session: Session) -> SessionLine:
-    """Converts a session to an entry of a list. Captures that are being removed do not count."""
-    return {
-        "id": session.id,
-        "created": session.created,
-        "label": session.label,
-        "consent": session.consent,
-        "captures": sum(capture not in removals for capture in session.captures),
-    }
+def session_line(session: Session) -> JsonObject:
+    """Converts a session to an entry of a list. ``captures`` counts them, without those that are being removed."""
+    return asdict(session) | {"captures": sum(capture not in removals for capture in session.captures)}

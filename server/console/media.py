@@ -13,7 +13,7 @@ import threading
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypedDict
+from typing import Annotated, Any, Literal, TypedDict, cast
 
 import cv2
 import numpy as np
@@ -423,13 +423,5 @@ def straightened_face(face: FoundFace, camera: Camera) -> FoundFace:
 def _view(camera: Camera, camera_from_head: RigidTransform) -> CameraView:
     lens, matrix = camera.intrinsics, np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = camera_from_head.rotation, camera_from_head.translation / MM
-    return {
-        "name": camera.name,
-        "width": lens.width,
-        "height": lens.height,
-        "fx": lens.fx,
-        "fy": lens.fy,
-        "cx": lens.cx,
-        "cy": lens.cy,
-        "camera_from_head": matrix.tolist(),
-    }
+    pinhole = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    return cast(CameraView, {"name": camera.name, **pinhole, "camera_from_head": matrix.tolist()})

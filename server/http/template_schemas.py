@@ -1,6 +1,6 @@
 """Defines the JSON documents about templates: meshes in whose vertex order heads are written."""
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from server.http.schemas import Answer
 
@@ -20,32 +20,6 @@ class RegistrationOut(Answer):
 class TemplateOut(Answer):
     """Describes a template: a mesh in whose vertex order a job writes its head if ``settings.outputs.template`` names
     it."""
-
-    model_config = ConfigDict(
-        from_attributes=True,
-        json_schema_extra={
-            "examples": [
-                {
-                    "id": "flame",
-                    "name": "flame",
-                    "source": "flame.obj",
-                    "sha256": "c4" * 32,
-                    "model": "makehuman-138",
-                    "models": ["default", "makehuman-138"],
-                    "vertices": 5023,
-                    "registration": {
-                        "skin_share": 0.78,
-                        "face_covered_share": 0.99,
-                        "unlike_median_mm": 0.31,
-                        "unlike_p95_mm": 1.22,
-                        "off_median_mm": 0.012,
-                        "off_p95_mm": 0.094,
-                    },
-                    "fault": None,
-                }
-            ]
-        },
-    )
 
     id: str = Field(description="what a job calls it")
     name: str

@@ -10,8 +10,8 @@ from rig.geometry import RigidTransform, rotation_from_vector
 from rig.plausibility import rig_faults
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
-from rig.studio.scene.layout import ARRANGEMENTS_DEG, default_layout
-from tests.support.layouts import arrangement
+from rig.studio.scene.layout import default_layout
+from tests.support.layouts import ARRANGEMENTS_DEG, arrangement
 from tests.support.scenes import fan
 
 GL = np.diag([1.0, -1.0, -1.0])

@@ -55,6 +55,7 @@ LENS_MODELS: dict[str, set[str]] = {
     "brown-conrady": {"model", "k1", "k2", "p1", "p2", "k3", "skew"},
     **{model: {"model", "skew", *keys} for model, keys in COEFFICIENTS.items()},
 }
+OWN = r"\A\W*format\W+eigenhead-cameras/"  # with which a cameras.json begins, whatever its name
 TOLD_MOST = 8  # keys named one by one; the others are counted
 
 WRITERS: dict[str, Callable[[Rig, Path], None]] = {
@@ -111,7 +112,7 @@ def rig_files(folder: Path) -> Iterator[Path]:
     In this order: ``cameras.json``; a COLMAP model in ``sparse/0``, ``sparse`` or at the top (``cameras.bin`` or
     ``.txt``); ``camera_array.toml``; any other TOML file with aniposelib's keys; ``transforms.json``; ``intri.yml``;
     any other YAML file of OpenCV's with a ``K_<camera>``; an XML file of Metashape's; RealityCapture's XMP files,
-    beside the pictures or at the top, or its CSV.
+    beside the pictures or at the top, or its CSV; a ``cameras.json`` of another name.
     """
     here = [path for path in sorted(folder.iterdir()) if path.is_file() and not is_junk(path.name)]
     images = entry(folder, "images")
@@ -138,6 +139,7 @@ def rig_files(folder: Path) -> Iterator[Path]:
         of(".xml", mark=r"<chunk\b"),
         of(".xmp", mark="capturingreality", among=[*beside, *here]),
         (path for path in of(".csv") if looks_like_csv(head_of(path))),
+        (path for path in of(".json", ".txt", mark=OWN) if path != native),  # "cameras (1).json", "cameras.json.txt"
     ):
         first = next((path for path in found if path.is_file()), None)
         if first is not None:
@@ -160,7 +162,8 @@ def read_cameras(path: Path) -> CamerasRead:
     try:
         if suffix not in readers:
             raise InputError(path.name, [compose("no-rig-ending", endings=[*readers], formats=FORMATS[:-1])])
-        return _thinned(readers[suffix](path), path.name)
+        reader = _read_json if re.search(OWN, head_of(path)) else readers[suffix]
+        return _thinned(reader(path), path.name)
     except InputError:
         if (program := program_of(path)) is None:
             raise
@@ -205,7 +208,7 @@ def _thinned(read: CamerasRead, file: str) -> CamerasRead:
 def rig_file_parts(path: Path) -> tuple[Path, ...]:
     """Returns all files that ``read_rig_file`` reads for ``path``; most formats have one."""
     suffix = path.suffix.lower()
-    if suffix in (".bin", ".txt"):
+    if suffix in (".bin", ".txt") and path.stem.lower() == "cameras":
         return path, entry(path.parent, f"images{suffix}")
     if suffix == ".xmp":
         return tuple(other for other in sorted(path.parent.iterdir()) if other.suffix.lower() == ".xmp")

@@ -65,8 +65,12 @@ def read_document(path: Path) -> Any:
         return json.loads(path.read_bytes())  # UTF-8, 16 or 32, which json recognises by the first bytes
     except OSError as error:
         raise InputError(path.name, [compose("no-file-read", reason=error.strerror or str(error))]) from error
+    except json.JSONDecodeError as error:
+        raise InputError(
+            path.name, [compose("no-json", reason=f"line {error.lineno}, column {error.colno}")]
+        ) from error
     except (ValueError, RecursionError) as error:
-        raise InputError(path.name, [compose("no-json", reason=str(error))]) from error
+        raise InputError(path.name, [compose("no-json", reason="text in UTF-8 is wanted")]) from error
 
 
 def write_rig(rig: Rig, path: Path) -> None:

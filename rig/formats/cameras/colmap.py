@@ -237,9 +237,11 @@ def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera, faults: l
     focal = parameters.get("f", 0.0)
     fx, fy = parameters.get("fx", focal), parameters.get("fy", focal)
     lens = lens_entry(parameters, name, faults, fisheye="FISHEYE" in camera.model)
-    # A length far from 1 is no rotation; NaN is named by the document's own check.
-    is_unit = 0.9 < math.hypot(*image.pose[:4]) < 1.1
-    rotation = Rotation.from_quat(np.roll(image.pose[:4], -1)).as_matrix() if is_unit else np.full((3, 3), math.nan)
+    # A length far from 1 is no rotation: the matrix is as long, and NaN of none; the document's own check names both.
+    length = math.hypot(*image.pose[:4])
+    size = 1.0 if 0.9 < length < 1.1 else length
+    of_pose = Rotation.from_quat(np.roll(image.pose[:4], -1)).as_matrix() if 0 < length < math.inf else math.nan
+    rotation = size * np.broadcast_to(of_pose, (3, 3))
     intrinsics = fx, fy, parameters["cx"] - 0.5, parameters["cy"] - 0.5
     size = camera.width, camera.height
     return camera_entry(name, size, intrinsics, lens, rotation, np.array(image.pose[4:]))

@@ -1,7 +1,6 @@
 """Holds what all readers of other programs' files share: errors for damaged files, cameras' names, conversion of
 lenses."""
 
-import codecs
 import csv
 import re
 import struct
@@ -18,6 +17,7 @@ from rig.formats.pictures.picture_names import IMAGE_SUFFIXES, entry, picture_st
 from rig.geometry import rotation_from_vector
 from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS, LensModel
+from rig.text import as_utf8
 
 T = TypeVar("T")
 LENS_LOSS_PX = 0.02  # allowed error of a converted lens: a tenth of a calibration's error
@@ -26,15 +26,6 @@ SKEW_LEAST = 1e-6  # in focal lengths; far below a visible error, above the roun
 LENS_KEY = re.compile(r"[kpst]\d")  # coefficients of OpenCV's lenses, among other parameters of a camera
 METRES_MOST = 30.0  # files with all cameras within 30 units of each other are in metres: no rig is 30 mm wide
 BYTES_MOST = 1 << 29  # far above the few megabytes of a rig's sparse model, whose 2D points may be many
-
-
-MARKS = (  # longest first, since one begins with another
-    (codecs.BOM_UTF32_LE, "utf-32-le"),
-    (codecs.BOM_UTF32_BE, "utf-32-be"),
-    (codecs.BOM_UTF8, "utf-8"),
-    (codecs.BOM_UTF16_LE, "utf-16-le"),
-    (codecs.BOM_UTF16_BE, "utf-16-be"),
-)
 
 
 class Malformed(ValueError):
@@ -61,14 +52,6 @@ def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
     except (ValueError, RecursionError, csv.Error) as error:
         reason = error.message if isinstance(error, Malformed) else str(error)[:400]
         raise InputError(path.name, [compose("file-not-understood", reason=reason)]) from error
-
-
-def as_utf8(data: bytes) -> bytes:
-    """Returns the bytes of a text without the mark of its encoding, in UTF-8 if the mark says UTF-16 or UTF-32."""
-    for mark, encoding in MARKS:
-        if data.startswith(mark):
-            return data.removeprefix(mark).decode(encoding).encode()
-    return data
 
 
 def camera_names(files: list[str]) -> list[str]:

@@ -7,9 +7,9 @@ cameras beside them is told that they were not read.
 from fnmatch import fnmatch
 from pathlib import Path
 
-from rig.formats.cameras.foreign import as_utf8
 from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
+from rig.text import as_utf8
 
 HEAD_BYTES = 1 << 16  # the words by which an XMP file is recognised stand near its beginning
 PATTERNS = (
@@ -28,6 +28,10 @@ PATTERNS = (
     ("*.abc", "Alembic: export COLMAP's model or transforms.json"),
     ("*.mat", "MATLAB: write OpenCV's YAML"),
     ("*.p4[dm]", "Pix4D: export its calibrated cameras as OpenCV's YAML"),
+    ("*.qca.txt", "Qualisys: write cameras.json"),
+    ("*.xcp", "Vicon: write cameras.json"),
+    ("*_cam.txt", "MVSNet: export COLMAP's model"),
+    ("*.usd[ac]", "USD: export COLMAP's model or transforms.json"),
     ("*.opk", "positions and omega, phi, kappa without lenses: export Metashape's XML"),
     ("*.chan", "Nuke's camera over time: export one camera a file of a program that is read"),
 )  # fmt: skip
@@ -40,6 +44,9 @@ CONTENTS = (  # endings, words of which a file holds one, and its program
     ((".json",), ('"Calibration"', '"libCalib'), "calib.io: export OpenCV's YAML"),
     ((".json",), ('"intrinsic_matrix"',), "Open3D: write one transforms.json of all cameras"),
     ((".json",), ('"sfm_data_version"',), "OpenMVG: export COLMAP's model"),
+    ((".json",), ('"camera_poses"',), "MultiCal: write OpenCV's YAML"),
+    ((".json",), ('"distCoef"',), "Panoptic Studio: write OpenCV's YAML"),
+    ((".json",), ('"projection_type"',), "OpenSfM: export COLMAP's model"),
 )  # fmt: skip
 
 

@@ -32,7 +32,14 @@ from rig.formats.cameras.reading import CamerasRead
 from rig.formats.cameras.unread_programs import program_of, unread_programs
 from rig.formats.captures.capture_masks import MaskSubjects, mask_subjects
 from rig.formats.captures.features_json import document_from_features, features_from_bytes
-from rig.formats.captures.shot_files import BESIDE_PICTURES, ShotFiles, find_files, listed_pictures, stray_sentence
+from rig.formats.captures.shot_files import (
+    BESIDE_PICTURES,
+    ShotFiles,
+    find_files,
+    listed_pictures,
+    shows_something,
+    stray_sentence,
+)
 from rig.formats.pictures.images import cut_out_alpha, decode_image_file, page_count, picture_size, write_image
 from rig.formats.pictures.picture_names import entry, is_junk
 from rig.formats.pictures.picture_rims import fill_rims
@@ -46,7 +53,7 @@ from rig.rig import Rig
 from rig.text import suggest
 
 SCALE, FEATURES = "scale.json", "features.json"
-RIG_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".toml", ".txt", ".csv", ".npz", ".bin", ".out", ".pkl")
+NOTES = (".md", ".pdf", ".log", ".html")  # what people and programs write beside a capture
 ENCLOSING_MOST = 8  # levels of single folders around a capture, as nested packing leaves them
 REST_LEAST = 0.7  # share of the cameras: 8 of 11 still surround a head
 BLACK = 16  # of 255: a lens with its cap on shows noise below it
@@ -129,14 +136,15 @@ def unread_folders(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
     for path in sorted(folder.iterdir()):
         is_other = path.is_dir() and not {path.name, path.name.lower()} & {*known} and not is_junk(path.name)
         used = any(file.is_relative_to(path) for name in rig.names for _, file in files.of_camera(name))
-        if is_other and not used and listed_pictures(path) and not (path / "report.json").is_file():
+        shows = is_other and any(map(listed_pictures, (path, *sorted(path.iterdir()))))
+        if shows and not used and not (path / "report.json").is_file():
             remarks.append(compose("folder-unread", folder=path.name))
     return remarks
 
 
 def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
     """Returns remarks on files of cameras in the folder that are not read: those of other programs, and further rigs,
-    since only the first of ``rigs`` is read. Beside photographs without a rig any file that may hold cameras counts."""
+    since only the first of ``rigs`` is read; beside photographs without a rig, all files but pictures and notes."""
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and path not in rigs]
     if rigs:
         read, *others = (path.relative_to(folder).as_posix() for path in rigs)
@@ -144,8 +152,8 @@ def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
         remarks = [compose("cameras-unread", file=other, read=read) for other in others]
     else:
         known = {SCALE, FEATURES, "calibration.json"}
-        strange = [path.name for path in files if path.suffix.lower() in RIG_SUFFIXES and program_of(path) is None]
-        strange = [name for name in strange if name.lower() not in known]
+        others = [path for path in files if not (shows_something(path) or is_junk(path.name) or program_of(path))]
+        strange = [path.name for path in others if path.suffix.lower() not in NOTES and path.name.lower() not in known]
         remarks = unread_programs(folder)
         for inner in (path for path in sorted(folder.iterdir()) if path.is_dir() and not is_junk(path.name)):
             if not any((inner / of_a_result).is_file() for of_a_result in ("report.json", "calibration.json")):
@@ -244,6 +252,10 @@ def read_shot(
         for kind, of_set in pictures.items()
         if kind.startswith(TEXTURE_SETS)
     }
+    subjects = mask_subjects(masks, rig, faults, pixels_most=pixels_most, lost=lost)
+    for of_kind in (images, backgrounds, *sets.values()):
+        for name in of_kind.keys() & (lost or {}).keys():
+            del of_kind[name]
     features: Features = {}
     if with_features and entry(folder, FEATURES).is_file():
         data = entry(folder, FEATURES).read_bytes()
@@ -253,7 +265,6 @@ def read_shot(
             point: {n: at for n, at in of.items() if not lost or n not in lost} for point, of in features.items()
         }
         features = work_features(features, rig, work_rig(rig, pixels_most))
-    subjects = mask_subjects(masks, rig, faults, pixels_most=pixels_most)
     if with_cut_outs and images and not masks and not backgrounds and len(images) + len(lost or ()) == len(rig):
         subjects = _cut_outs(folder, [job for job in jobs if job[1] in images], rig, pixels_most) or subjects
     shown, plates, rims = fill_rims(images, backgrounds, subjects.masks)

@@ -33,27 +33,39 @@ class MaskSubjects:
 
 
 def mask_subjects(
-    planes: Mapping[str, tuple[str, Plane]], rig: Rig, faults: list[Message], *, pixels_most: int | None = None
+    planes: Mapping[str, tuple[str, Plane]],
+    rig: Rig,
+    faults: list[Message],
+    *,
+    pixels_most: int | None = None,
+    lost: dict[str, list[Message]] | None = None,
 ) -> MaskSubjects:
     """Reads the masks of one capture, at the size that ``work_rig`` describes for ``pixels_most``. ``planes`` are by
-    camera the file's name and its pixels, of the camera's size; masks that cannot be used are told in ``faults``."""
+    camera the file's name and its pixels, of the camera's size; masks that cannot be used are told in ``faults``, or by
+    camera in ``lost``."""
     readings = read_masks({name: plane for name, (_, plane) in planes.items()})
     files = {name: file for name, (file, _) in planes.items()}
-    faults += _by_cause({files[name]: reading.fault for name, reading in readings.items()})
     usable = {name: reading for name, reading in readings.items() if not reading.fault}
+    unfit = {name: reading.fault for name, reading in readings.items() if reading.fault}
     inverted = inverted_masks({name: reading.share > 127 for name, reading in usable.items()}, _middles(rig))
     masks, soft, specked = {}, {}, list[str]()
     for name, reading in usable.items():
-        whole, lost = _without_specks(255 - reading.share if name in inverted else reading.share)
-        specked += [files[name]] if lost > SPECKS_TOLD else []
+        whole, changed = _without_specks(255 - reading.share if name in inverted else reading.share)
+        specked += [files[name]] if changed > SPECKS_TOLD else []
         share = _in_picture(whole, reading, name, rig, pixels_most)
+        if not (share > 127).any():
+            unfit[name] = compose("mask-empty")
+            continue
         masks[name] = share > 127
         masks[name].setflags(write=False)
-        if not masks[name].any():
-            faults.append(compose("of-file", file=files[name], fault=compose("mask-empty")))
-        elif reading.soft:
+        if reading.soft:
             soft[name] = share
             soft[name].setflags(write=False)
+    if lost is None:
+        faults += _by_cause({files[name]: fault for name, fault in unfit.items()})
+    else:
+        for name, fault in unfit.items():
+            lost.setdefault(name, []).append(compose("of-file", file=files[name], fault=fault))
     grouped = _by_cause({files[name]: reading.remark for name, reading in usable.items()})
     remarks = [compose("mask-undecided", remark=remark) for remark in grouped]
     if specked:

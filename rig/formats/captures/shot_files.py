@@ -86,7 +86,7 @@ def _texture_sets(folder: Path, rig: Rig, names: Sequence[str], faults: list[Mes
     place = entry(folder, TEXTURE_SETS)
     if not place.is_dir():
         return {}
-    if alone := [path.relative_to(folder).as_posix() for path in sorted(place.iterdir()) if _shows_something(path)]:
+    if alone := [path.relative_to(folder).as_posix() for path in sorted(place.iterdir()) if shows_something(path)]:
         faults.append(compose("texture-set-unnamed", pictures=some_of(alone), count=len(alone)))
     folders = _folders(place)
     if len(folders) > SETS_MOST:
@@ -195,11 +195,12 @@ def _strays(place: Path, used: set[Path], names: Sequence[str], kind: str) -> li
         return []
     is_root = kind == "images" and place.name.lower() != "images"
     folders = [place, *(path for path in _folders(place) if not is_root or path.name in names)]
-    here = [path for folder in folders for path in sorted(folder.iterdir()) if _shows_something(path)]
+    here = [path for folder in folders for path in sorted(folder.iterdir()) if shows_something(path)]
     return [path for path in here if path not in used and not (is_root and path.suffix.lower() in (".pdf", ".npy"))]
 
 
-def _shows_something(path: Path) -> bool:
+def shows_something(path: Path) -> bool:
+    """Tells whether a path is a picture, of a kind that is read or not, and no copy of a RAW file."""
     if has_raw_beside(path):
         return False
     return is_picture(path) or (path.suffix.lower() in UNREAD_PICTURES and not is_junk(path.name) and path.is_file())
@@ -234,6 +235,8 @@ def _missing(
             elif link := _broken_link(places["images"], name):
                 where, target = link.relative_to(folder).as_posix(), link.readlink().as_posix()
                 absent[name] = compose("picture-link-broken", picture=where, target=target)
+            elif (places["images"] / name).is_file():
+                absent[name] = compose("picture-kind-unread", picture=f"{inside}{name}", kind="endingless")
             else:
                 absent[name] = compose("picture-missing", picture=f"{inside}{name}.png")
     lacking = [] if alone else [name for name in rig.names if name not in plates and name not in masks]

@@ -6,8 +6,10 @@ them is refused by its name (https://registry.khronos.org/glTF/specs/2.0/glTF-2.
 
 import json
 import logging
+import re
 import struct
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from rig.errors import InputError
 from rig.image import ImageRgb
 from rig.mesh import Mesh
 from rig.messages.message import compose
+from rig.text import as_utf8
 
 MESH_ENDINGS = (".ply", ".obj", ".glb")
 UNDERSTOOD = ("KHR_mesh_quantization", "KHR_texture_transform", "KHR_materials_", "KHR_lights_")
@@ -57,19 +60,37 @@ def read_textured_mesh(path: Path) -> TexturedMesh:
 
 def _loaded(path: Path, endings: tuple[str, ...] = MESH_ENDINGS) -> Any:
     import trimesh
+    from trimesh.resolvers import FilePathResolver
 
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # it would write to the user's terminal
     if path.suffix.lower() not in endings:
         raise InputError(path.name, [compose("no-mesh-ending" if endings == MESH_ENDINGS else "no-surface-ending")])
     if path.suffix.lower() == ".glb":
         _check_glb(path)
+    text = _plain_obj(path) if path.suffix.lower() == ".obj" else None
     try:
-        loaded = trimesh.load(path, force="mesh", process=False)
+        if text is None:
+            loaded = trimesh.load(path, force="mesh", process=False)
+        else:
+            beside = FilePathResolver(str(path))
+            loaded = trimesh.load(text, file_type="obj", resolver=beside, force="mesh", process=False)
     except Exception as error:  # trimesh lets the parsers' own errors through, of any class
-        raise InputError(path.name, [compose("mesh-unread", reason=str(error))]) from error
+        reason = compose("mesh-cut-off", kind=path.suffix[1:].upper())
+        raise InputError(path.name, [compose("mesh-unread", reason=reason)]) from error
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
         raise InputError(path.name, [compose("no-triangles")])
     return loaded
+
+
+def _plain_obj(path: Path) -> StringIO:
+    """Returns an OBJ without what trimesh misreads: the mark of an encoding, line ends of old systems, tabs, and notes
+    behind numbers. Raises InputError if its faces count from 0, which trimesh takes for the last vertex."""
+    text = as_utf8(path.read_bytes()).decode("utf-8", "replace")
+    text = re.sub(r"\r\n?", "\n", text).replace("\t", " ")
+    text = re.sub(r"^((?:v|vt|vn|f) [^#\n]*)#.*", r"\1", text, flags=re.MULTILINE)
+    if re.search(r"^f .*(?<![\d/])0(?!\d)", text, re.MULTILINE):
+        raise InputError(path.name, [compose("mesh-unread", reason=compose("faces-from-zero"))])
+    return StringIO(text)
 
 
 def _check_glb(path: Path) -> None:

@@ -17,7 +17,8 @@ RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", 
 HEIC_SUFFIXES = (".heic", ".heif")
 # Uncompressed files of machine vision software: Windows bitmaps, and Netpbm's grey and colour maps.
 PLAIN_SUFFIXES = (".bmp", ".pbm", ".pgm", ".ppm", ".pnm")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *PLAIN_SUFFIXES, *RAW_SUFFIXES, *HEIC_SUFFIXES)
+JPEG_SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif")
+IMAGE_SUFFIXES = (".png", *JPEG_SUFFIXES, ".tif", ".tiff", ".webp", *PLAIN_SUFFIXES, *RAW_SUFFIXES, *HEIC_SUFFIXES)
 UNREAD_PICTURES = {
     ".gif": "GIF",
     ".exr": "OpenEXR",

@@ -1,5 +1,4 @@
-"""Places cameras: the default rig, the four arrangements of section 5.3, and rows, circles and mountings of other
-studios.
+"""Places cameras: the default rig, and mountings of other studios.
 
 Azimuth is counted from the front towards the subject's left, elevation upwards. The world's origin is in the middle of
 the head, y up, z towards the front camera.
@@ -21,22 +20,6 @@ LENS_SEED = 2003
 DEFAULT_DIRECTIONS_DEG = (
     (0, 0), (0, 38), (0, -36), (-35, 16), (35, 16), (-38, -24), (38, -24), (-65, 4), (65, 4), (-90, 2), (90, 2),
 )  # fmt: skip
-
-# Section 5.3: azimuth 0 to 90 degrees, mirrored, and elevation -40 to 40. The paper shows the four only as pictures.
-ARRANGEMENTS_DEG = {
-    "a": (
-        (0, 0), (-30, 0), (60, 0), (-90, 0), (0, 38), (30, 38), (-60, 38), (90, 38), (0, -38), (45, -38), (-90, -38),
-    ),
-    "b": (
-        (0, 0), (0, 30), (0, -30), (-40, 12), (45, -12), (50, 28), (-45, -28), (85, 6), (-90, -8), (-80, 20), (78, -22),
-    ),
-    "c": (
-        (0, -40), (0, -20), (0, 0), (0, 20), (0, 40), (-20, -30), (20, -10), (-20, 10), (20, 30), (28, 0), (-10, 0),
-    ),
-    "d": (
-        (0, 0), (-30, 0), (50, 20), (-55, -20), (65, 0), (-72, 30), (75, -30), (-80, 8), (85, 25), (-88, -15), (90, 0),
-    ),
-}  # fmt: skip
 
 
 def default_layout() -> Rig:

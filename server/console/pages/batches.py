@@ -19,28 +19,11 @@ from server.services.service import Service
 from server.services.work import ReconstructionRequest
 from server.storage.batches import BatchState
 from server.storage.job_index import JobQuery
+from server.storage.records import JsonObject
 
 SHOWN = 50
 FAILED_SHOWN = 20  # of the batch that is looked at; the page Jobs has all
 ASKED = ("find", "state", "after")
-
-
-class BatchLine(TypedDict):
-    """Holds a batch as an entry of the page's list. The fields are those of ``server.services.records.Batch``."""
-
-    id: str
-    label: str
-    state: str
-    created: str
-    finished: str | None
-    queue: str
-    priority: int
-    model: str | None
-    settings: dict[str, object]
-    total: int
-    counts: dict[str, int]
-    eta_s: float | None
-    notice: MessageDocument | None
 
 
 class FailedJob(TypedDict):
@@ -54,7 +37,7 @@ class FailedJob(TypedDict):
 class BatchesState(TypedDict):
     """Holds one page of the list of batches. ``total`` counts those on all pages."""
 
-    batches: list[BatchLine]
+    batches: list[JsonObject]
     next: str | None
     total: int
 
@@ -63,7 +46,7 @@ class BatchesShown(BatchesState):
     """Holds what the page shows. ``batch``: the selected batch, which may be on another page of the list; ``failed``:
     its newest failed jobs; ``parquet``: whether Parquet tables can be made."""
 
-    batch: BatchLine | None
+    batch: JsonObject | None
     failed: list[FailedJob]
     parquet: bool
 
@@ -103,10 +86,9 @@ def batches_state(service: Service, requested: Mapping[str, str | None]) -> Batc
     return {"batches": [batch_line(batch) for batch in page.items], "next": page.next, "total": page.total}
 
 
-def batch_line(batch: Batch) -> BatchLine:
+def batch_line(batch: Batch) -> JsonObject:
     """Converts a batch to an entry of the page's list."""
-    line = asdict(batch) | {"notice": None if batch.notice is None else batch.notice.document()}
-    return cast(BatchLine, line)
+    return asdict(batch) | {"notice": None if batch.notice is None else batch.notice.document()}
 
 
 def failed_jobs(service: Service, batch: str) -> list[FailedJob]:

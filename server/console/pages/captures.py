@@ -8,7 +8,7 @@ from starlette.responses import RedirectResponse
 
 from pipeline.head_model.model_names import list_models
 from rig.messages.message import Message, compose
-from server.console.capture_lines import CaptureLine, SessionLine, capture_line, jobs_of, sessions_list
+from server.console.capture_lines import capture_line, jobs_of, sessions_list
 from server.console.identity import permit
 from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
 from server.console.removal import removals
@@ -18,6 +18,7 @@ from server.services.bulk import each
 from server.services.service import Service
 from server.services.tags import typed_tags
 from server.storage.library import CaptureOrder, CaptureQuery
+from server.storage.records import JsonObject
 
 SHOWN = 50  # captures of a page
 ASKED = ("find", "session", "verdict", "tag", "sort", "after", "capture")
@@ -27,11 +28,11 @@ class CapturesState(TypedDict):
     """Holds one page of the list of captures. ``chosen``: the selected capture, which may be on another page of the
     list."""
 
-    captures: list[CaptureLine]
-    chosen: CaptureLine | None
+    captures: list[JsonObject]
+    chosen: JsonObject | None
     next: str | None
     total: int
-    sessions: list[SessionLine]
+    sessions: list[JsonObject]
     tags: list[str]
     models: list[str]
     presets: list[PresetLine]

@@ -9,7 +9,6 @@ from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.head_model.model_names import list_models
-from pipeline.results.report_types import CameraReport
 from rig.errors import InputError
 from rig.messages.message import Message, MessageDocument, compose
 from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
@@ -41,27 +40,13 @@ class LogLine(TypedDict):
     text: str
 
 
-class CameraLine(TypedDict):
-    """Holds what report.json says of a camera; None where it has no value. ``view``: whether the picture was usable;
-    ``excluded_share``: share of the rim that hair or clothes hide."""
-
-    name: str
-    view: bool | None
-    used: bool | None
-    iou: float | None
-    contour_rms_px: float | None
-    excluded_share: float | None
-    xor_cost: float | None
-    xor_cost_start: float | None
-
-
 class JobDetail(TypedDict):
-    """Holds the log of a job and, once it has finished, the cameras' residuals, the warnings, and whether there are
-    pictures."""
+    """Holds the log of a job and, once it has finished, what report.json says of each camera, the warnings, and whether
+    there are pictures."""
 
     id: str
     log: list[LogLine]
-    cameras: list[CameraLine]
+    cameras: list[JsonObject]
     warnings: list[MessageDocument]
     seconds: dict[str, float]
     stopped_because: str | None
@@ -204,7 +189,7 @@ def job_detail(service: Service, job_id: str) -> JobDetail:
         return {
             "id": job_id,
             "log": log_lines(events)[-LOG_LINES:],
-            "cameras": [camera_line(name, camera) for name, camera in cameras.items()],
+            "cameras": [{"name": name, **camera} for name, camera in cameras.items()],
             "warnings": [] if report is None else report.get("warnings", []),
             "seconds": {} if report is None else report.get("seconds", {}),
             "stopped_because": None if report is None else report.get("stopped_because"),
@@ -213,21 +198,6 @@ def job_detail(service: Service, job_id: str) -> JobDetail:
         }
 
     return shared.get(("detail", job_id, finished), 3600.0 if finished else 0.4, make)
-
-
-def camera_line(name: str, camera: CameraReport) -> CameraLine:
-    """Reads the figures of one camera from its part of report.json."""
-    view = camera.get("view")
-    return {
-        "name": name,
-        "used": camera.get("used"),
-        "iou": camera.get("iou"),
-        "contour_rms_px": camera.get("contour_rms_px"),
-        "excluded_share": camera.get("excluded_share"),
-        "xor_cost": camera.get("xor_cost"),
-        "xor_cost_start": camera.get("xor_cost_start"),
-        "view": None if view is None else view.get("usable"),
-    }
 
 
 def log_lines(events: list[JobEvent]) -> list[LogLine]:

@@ -1,6 +1,6 @@
 """The page Result: a head in 3D, coloured, measured, compared with others, and its files."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import TypedDict
@@ -9,8 +9,7 @@ from nicegui import ui
 from nicegui.elements import scene
 from starlette.responses import RedirectResponse
 
-from pipeline.results.report_types import Measured, Report
-from rig.messages.message import MessageDocument
+from pipeline.results.report_types import Report
 from server.console.page import Page, shared, show
 from server.console.pages.jobs import ListedJob, listed_jobs
 from server.console.pages.rig import read_report
@@ -20,6 +19,7 @@ from server.services.job_rows import STATUSES
 from server.services.records import Job
 from server.services.service import Service
 from server.storage.job_index import JobQuery
+from server.storage.records import JsonObject
 
 THREE_JS = Path(scene.__file__).with_name("dist")  # NiceGUI's own bundle of three.js
 MOSTLY = 0.25  # of a contour, as on the page Jobs
@@ -27,46 +27,13 @@ SHOWN = 60  # heads to choose from; the search finds the others
 SUBJECTS_HEADS = 100
 
 
-class ResultLine(TypedDict):
-    """Holds a job that has a result. ``capture`` and ``captured``: label and time of its capture; ``subject``: name of
-    the subject."""
-
-    id: str
-    capture: str
-    captured: str | None
-    capture_id: str | None
-    created: str | None
-    finished: str | None
-    settings: Mapping[str, object]
-    model: str | None
-    session: str | None
-    subject: str
-
-
-class Head(ResultLine):
-    """Holds what is shown beside the head. ``clear_views``: how many views see most of the rim, ``contour_px``: their
-    mean residual (px); ``truth``: whether the true head is known; ``files``: size of each file (bytes)."""
-
-    measurements: dict[str, Measured]
-    quality: dict[str, float | None]
-    warnings: list[MessageDocument]
-    seconds: float | None
-    clear_views: int
-    contour_px: float | None
-    method: str | None
-    level: str | None
-    model_name: str | None
-    truth: bool
-    files: dict[str, int]
-
-
 class ResultShown(TypedDict):
     """Holds what the page shows. ``results``: the newest heads that match the search, those of the shown head's
     subject, and the shown head; ``total``: how many match."""
 
-    results: list[ResultLine]
+    results: list[JsonObject]
     total: int
-    job: Head | None
+    job: JsonObject | None
     requested: str | None
 
 
@@ -90,7 +57,7 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
             return {"results": results, "total": total, "job": None, "requested": self.choice.get("job")}
         if self.choice.get("job") is None:  # a head that comes in meanwhile does not take the place of the shown one
             self.choice["job"] = known["id"]
-        theirs: list[ResultLine] = shared.get(
+        theirs: list[JsonObject] = shared.get(
             ("results", "of", known["session"], known["capture_id"]), 1.0, lambda: heads_of_subject(self.service, known)
         )
         heads = {line["id"]: line for line in (known, *theirs, *results)}
@@ -106,13 +73,13 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
             yield "fetch", f"/console/jobs/{job['id']}/head.glb"
 
 
-def newest_heads(service: Service, sought: str) -> tuple[list[ResultLine], int]:
+def newest_heads(service: Service, sought: str) -> tuple[list[JsonObject], int]:
     """Returns the newest ``SHOWN`` succeeded jobs that match a search, and how many match in all."""
     page = service.jobs.page(JobQuery(sought, STATUSES["succeeded"]), SHOWN)
     return result_lines(service, [job for job in page.items if job.id not in removals]), page.total
 
 
-def heads_of_subject(service: Service, head: ResultLine) -> list[ResultLine]:
+def heads_of_subject(service: Service, head: JsonObject) -> list[JsonObject]:
     """Returns the heads of the same capture and of all sessions with the same label, newest first, ``SUBJECTS_HEADS``
     at most."""
     captures = {head["capture_id"] or ""} | set(service.sessions.captures_of_subject(head["session"]))
@@ -121,7 +88,7 @@ def heads_of_subject(service: Service, head: ResultLine) -> list[ResultLine]:
     return result_lines(service, service.jobs.of([job for job in done[:SUBJECTS_HEADS] if job not in removals]))
 
 
-def result_lines(service: Service, jobs: Iterable[Job]) -> list[ResultLine]:
+def result_lines(service: Service, jobs: Iterable[Job]) -> list[JsonObject]:
     """Converts jobs that have a result to entries of the page's list, with the capture and the subject of each."""
     files = []
     for listed in listed_jobs(service, jobs):
@@ -133,26 +100,18 @@ def result_lines(service: Service, jobs: Iterable[Job]) -> list[ResultLine]:
     return files
 
 
-def result_line(listed: ListedJob, subject: str) -> ResultLine:
-    """Converts a job that has a result to an entry of the page's list."""
-    job = listed.job
-    return {
-        "id": job.id,
-        "capture": listed.capture,
-        "captured": listed.captured,
-        "capture_id": job.capture_id,
-        "created": job.created,
-        "finished": job.finished,
-        "settings": job.settings,
-        "model": job.model,
-        "session": listed.session,
-        "subject": subject,
-    }
+def result_line(listed: ListedJob, subject: str) -> JsonObject:
+    """Converts a job that has a result to an entry of the page's list. ``capture`` and ``captured``: label and time of
+    its capture; ``subject``: name of the subject."""
+    names = ("id", "capture_id", "created", "finished", "settings", "model")
+    line = {name: getattr(listed.job, name) for name in names}
+    return line | {name: getattr(listed, name) for name in ("capture", "captured", "session")} | {"subject": subject}
 
 
-def head_of(service: Service, job: ResultLine) -> Head:
-    """Returns what is shown beside a head, from its report.json. Values are empty or None if that is missing. Raises
-    NotFound."""
+def head_of(service: Service, job: JsonObject) -> JsonObject:
+    """Returns what is shown beside a head, from its report.json; values are empty or None if that is missing.
+    ``clear_views``: how many views see most of the rim, ``contour_px``: their mean residual (px); ``truth``: whether
+    the true head is known; ``files``: size of each file (bytes). Raises NotFound."""
     report = read_report(service, job["id"])
     truth = service.store.folder("captures", job["capture_id"] or "") / "truth" / "head.ply"
     residuals = [] if report is None else clear_residuals(report)

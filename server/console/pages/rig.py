@@ -13,7 +13,7 @@ from pipeline.results.report_types import Report
 from rig.acquisition.plates import PlatesVersion
 from rig.acquisition.shot import CameraSyncDocument
 from rig.messages.message import Message, MessageDocument, compose, documents_of
-from server.console.capture_lines import CaptureLine, SessionLine, capture_line, sessions_list, sync_of
+from server.console.capture_lines import capture_line, sessions_list, sync_of
 from server.console.media import live_view
 from server.console.page import Action, Chosen, Page, shared, show
 from server.console.pages.captures import SessionEditForm, SessionForm, discard, edit_consent, new_session
@@ -24,6 +24,7 @@ from server.errors import Conflict, NotFound
 from server.services.captures import CaptureMetadata
 from server.services.records import Calibration
 from server.services.service import Service
+from server.storage.records import JsonObject
 from server.tasks.simulate import SimulatedSync
 
 
@@ -79,7 +80,7 @@ class RigShown(TypedDict):
     faults: list[MessageDocument]
     calibration: str | None
     in_use: InUse | None
-    sessions: list[SessionLine]
+    sessions: list[JsonObject]
     last: LastCapture | None
     plates: PlatesShown | None
     ask_consent: bool
@@ -100,7 +101,7 @@ class RigPageShown(RigShown):
     """Holds what the page shows. ``shot``: the capture taken here on which the operator has not decided; ``job``: the
     job started here last."""
 
-    shot: CaptureLine | None
+    shot: JsonObject | None
     job: JobStrip | None
 
 
@@ -131,7 +132,7 @@ def job_strip(service: Service, identity: str | None) -> JobStrip | None:
     }
 
 
-def shot_taken(service: Service, identity: str | None) -> CaptureLine | None:
+def shot_taken(service: Service, identity: str | None) -> JsonObject | None:
     """Returns the capture about which the operator has not decided yet whether to keep it; None if there is none or it
     was removed."""
     if identity is None or identity in removals:

@@ -41,7 +41,7 @@ def test_a_folder_a_camera(tmp_path: Path) -> None:
         (("a.jpg", "b/1.jpg", "c/1.jpg"), "photographs beside folders"),
         (("a.jpg", "a.png", "b.jpg", "c.jpg"), "holds a 2 times"),
         (("a/1.jpg", "a/1.png", "b/1.jpg", "c/1.jpg"), "a holds 1 2 times"),
-        (("my\u202ehead.jpg", "b.jpg", "c.jpg"), "may hold only"),
+        (("my\u202ehead.jpg", "b.jpg", "c.jpg"), "becomes the name of files"),
         ((), "0 photographs"),
     ],
 )

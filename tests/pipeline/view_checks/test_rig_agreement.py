@@ -15,8 +15,8 @@ from pipeline.view_checks.rig_agreement import are_loose, find_lens_reading, mis
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.plausibility import rig_faults
 from rig.rig import Rig
-from rig.studio.scene.layout import ARRANGEMENTS_DEG, HEIGHT, WIDTH, default_layout
-from tests.support.layouts import arrangement
+from rig.studio.scene.layout import HEIGHT, WIDTH, default_layout
+from tests.support.layouts import ARRANGEMENTS_DEG, arrangement
 from tests.support.subjects import off_by
 
 pytestmark = pytest.mark.gl

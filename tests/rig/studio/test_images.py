@@ -14,7 +14,7 @@ from rig.geometry import Similarity
 from rig.mesh import Mesh
 from rig.rig import Rig
 from rig.studio.devices.folder import simulate_to_folder
-from rig.studio.scene.layout import ARRANGEMENTS_DEG, default_layout
+from rig.studio.scene.layout import default_layout
 from rig.studio.scene.lights import dome
 from rig.studio.scene.simulate import Scene, SimulatedCapture, _rolling, _sway, shoot, simulate
 from rig.studio.scene.subject import Look, Subject, random_look
@@ -23,7 +23,7 @@ from rig.studio.sensor.faults import KINDS, Fault, fault_from_text
 from rig.studio.sensor.preset import CLEAN, PRESET
 from rig.studio.sensor.sensor import Sensor, drift, expose, focus, rolled
 from tests.support import oracles
-from tests.support.layouts import arrangement
+from tests.support.layouts import ARRANGEMENTS_DEG, arrangement
 
 pytestmark = pytest.mark.gl
 

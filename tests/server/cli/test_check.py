@@ -122,12 +122,19 @@ def test_mirrored_pictures_are_refused_by_an_upload_in_the_same_words(
     assert texts_of(refusal.value.faults) == found_in(tmp_path / "shot")["faults"] != []
 
 
+def _paint_mask(folder: Path, value: int) -> None:
+    path = folder / "masks" / "cam03.png"
+    write_image(path, np.full_like(read_image(path), value))
+
+
 HARMS = {
     "is damaged and cannot be decoded: send it again": lambda path: path.write_bytes(path.read_bytes()[:-60]),
     "is damaged or no PNG": lambda path: path.write_bytes(b"no picture"),
     "is black all over": lambda path: write_image(path, 0 * read_image(path)),
     "but its camera is": lambda path: write_image(path, read_image(path)[4:]),
     "is missing": Path.unlink,
+    "is empty": lambda path: _paint_mask(path.parents[1], 0),
+    "is 255 all over": lambda path: _paint_mask(path.parents[1], 255),
 }
 
 
@@ -140,7 +147,7 @@ def test_one_bad_picture_costs_a_view_and_is_named(masked: tuple[Capture, Rig], 
     HARMS[words](folder / "images" / "cam03.png")
     found = found_in(folder)
     (sentence,) = [warning["message"] for warning in found["warnings"] if warning["code"] == "picture-lost"]
-    assert sentence.startswith("images/cam03.png ")
+    assert sentence.startswith(("images/cam03.png ", "masks/cam03.png "))
     assert words in sentence
     assert sentence.endswith("; mend that, or go on without cam03, which takes no part")
     assert (found["faults"], len(found["cameras"])) == ([], len(masked[1]) - 1)

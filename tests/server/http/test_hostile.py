@@ -113,7 +113,7 @@ SPOILT: dict[str, tuple[Callable[[Path], None], str]] = {
     "mirrored rotation": (cameras(of_first("camera_from_world.rotation", np.diag([1, 1, -1]).tolist())), "mirrored"),
     "no rotation at all": (cameras(of_first("camera_from_world.rotation", [[0, 0, 0]] * 3)), "orthonormal"),
     "no translation": (cameras(of_first("camera_from_world.translation", None)), "translation"),
-    "name with a path": (cameras(of_first("name", "../../etc/passwd")), "may hold only"),
+    "name with a path": (cameras(of_first("name", "../../etc/passwd")), "becomes the name of files"),
     "name of a hundred": (cameras(of_first("name", "a" * 100)), "1 to 64"),
     "name twice": (cameras(of_first("name", "cam01")), "occurs 2 times"),
     "width of a billion": (cameras(of_first("width", 10**9)), "whole number of pixels"),

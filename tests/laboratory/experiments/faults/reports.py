@@ -15,13 +15,14 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from pathlib import Path
 from typing import Annotated, Any
 from unittest import mock
 
 import numpy as np
 
+from rig.atomic_write import write_atomically
 from rig.formats.meshes.mesh_file import read_mesh
 from tests.laboratory.experiments.markdown import table
 from tests.support.services import free_port
@@ -47,6 +48,7 @@ def reports(
     cases: Sequence[str] = (),
     *,
     scratch: Path,
+    out: Annotated[Path | None, "keeps the answers: the inputs that are there are not asked again"] = None,
     place: Annotated[Path, "the case folders"] = Path("../shared/reports"),
     base: Annotated[Path | None, "keeps the capture that all cases start from"] = None,
     doors: Annotated[Sequence[str], "these doors alone"] = DOORS,
@@ -57,16 +59,18 @@ def reports(
     os.environ |= {"EIGENHEAD": str(program.absolute()), "BASE": str((base or scratch / "base").resolve())}
     os.environ |= {"CLONE": ".", "EIGENHEAD_DATA": str(scratch / "data")}
     found = sorted(path for path in place.iterdir() if (path / "make.py").is_file())
-    rows, wrong = [], 0
+    kept = (out or scratch) / "answers.json"
+    rows: list[list[str]] = json.loads(kept.read_text()) if kept.is_file() else []
     with _service(scratch) if "upload" in doors else contextlib.nullcontext("") as url:
         for case in (path for path in found if path.name.startswith(tuple(cases or [""]))):
-            for name, answers in _answers(case, scratch / case.name, doors, url, inputs):
+            for name, answers in _answers(case, scratch / case.name, doors, url, inputs, {row[0] for row in rows}):
                 judged = {door: _judged(answer, name) for door, answer in answers.items()}
-                wrong += list(judged.values()).count("wrong")
                 said = next((answers[d][1] for d, j in judged.items() if j == "wrong"), next(iter(answers.values()))[1])
                 said = " ".join(said.replace(str(scratch), "").split())
                 rows.append([name, *(judged.get(door, "-") for door in (*DOORS, "other")), f"{said:.150}"])
                 sys.stderr.write(" | ".join(rows[-1]) + "\n")
+                write_atomically(kept, json.dumps(rows, indent=1).encode())
+    wrong = sum(row.count("wrong") for row in rows)
     lines = table(("input", *DOORS, "other", "said"), rows).splitlines()
     return {"lines": [*lines, f"{wrong} answers of {len(rows)} inputs are wrong"], "figures": {"wrong": wrong}}
 
@@ -83,24 +87,20 @@ def _judged(answer: Answer, name: str) -> str:
 
 
 def _answers(
-    case: Path, out: Path, doors: Sequence[str], url: str, inputs: str
+    case: Path, out: Path, doors: Sequence[str], url: str, inputs: str, known: Set[str]
 ) -> Iterator[tuple[str, dict[str, Answer]]]:
     folders, others = _made(case, out)
     for (command, name), answer in others.items():
-        if re.search(inputs, name):
+        if re.search(inputs, name) and f"{case.name}/{name} ({command})" not in known:
             yield f"{case.name}/{name} ({command})", {"other": answer}
     chosen = {f"{case.name}/{name}": path for name, path in folders.items() if re.search(inputs, name)}
+    chosen = {name: path for name, path in chosen.items() if name not in known}
     batch = _batch(chosen, out) if "batch" in doors and chosen else {}
     for name, (folder, truth) in chosen.items():
-        yield (
-            name,
-            {
-                **({"check": _checked(folder)} if "check" in doors else {}),
-                **({"upload": _uploaded(folder, url)} if "upload" in doors else {}),
-                **({"reconstruct": _reconstructed(folder, truth)} if "reconstruct" in doors else {}),
-                **({"batch": batch[name]} if "batch" in doors else {}),
-            },
-        )
+        answers = {"check": _checked(folder)} if "check" in doors else {}
+        answers |= {"upload": _uploaded(folder, url)} if "upload" in doors else {}
+        answers |= {"reconstruct": _reconstructed(folder, truth)} if "reconstruct" in doors else {}
+        yield name, answers | ({"batch": batch[name]} if "batch" in doors else {})
 
 
 def _made(case: Path, out: Path) -> tuple[dict[str, tuple[Path, Path | None]], dict[tuple[str, str], Answer]]:

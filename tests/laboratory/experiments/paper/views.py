@@ -22,10 +22,11 @@ from pipeline.settings import FittingSettings
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
-from rig.studio.scene.layout import ARRANGEMENTS_DEG, rig_from_directions
+from rig.studio.scene.layout import rig_from_directions
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.paper.limit import UNROBUST_PX, settings_for
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
+from tests.support.layouts import ARRANGEMENTS_DEG
 from tests.support.subjects import (
     Planted,
     exact,

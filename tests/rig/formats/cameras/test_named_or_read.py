@@ -15,6 +15,7 @@ from rig.formats.cameras.cameras_file import find_rig_file, read_cameras, rig_fi
 from rig.formats.cameras.unread_programs import program_of
 from rig.formats.captures.capture_folder import read_capture, unread_files, write_capture
 from rig.formats.captures.shot_files import find_files
+from rig.formats.pictures.images import read_image, write_image
 from rig.formats.pictures.picture_names import entry, match_names, safe_name
 from rig.rig import Rig
 from tests.support.fan_rig import fan
@@ -98,7 +99,9 @@ def test_a_capture_s_folders_are_found_in_any_case(small: str, called: str, tmp_
         ("project.psx", "x", "Metashape"), ("project.rcproj", "x", "RealityCapture"),
         ("rig.fbx", "x", "FBX"), ("cameras.abc", "x", "Alembic"),
         ("stereo.mat", "x", "MATLAB"), ("a.p4d", "x", "Pix4D"),
-        ("stereo.yml", "%YAML:1.0\nM1: 1\n", "OpenCV"),
+        ("stereo.yml", "%YAML:1.0\nM1: 1\n", "OpenCV"), ("a.qca.txt", "x", "Qualisys"), ("a.xcp", "x", "Vicon"),
+        ("calibration.json", '{"cameras": [{"distCoef": []}]}', "Panoptic"),
+        ("a.json", '{"camera_poses": {}}', "MultiCal"),
     ],
 )  # fmt: skip
 def test_the_program_of_a_file_that_is_not_read_is_named(file: str, text: str, program: str, tmp_path: Path) -> None:
@@ -112,9 +115,34 @@ def test_the_program_of_a_file_that_is_not_read_is_named(file: str, text: str, p
 
 
 def test_any_other_file_beside_photographs_is_named_too(tmp_path: Path) -> None:
-    (tmp_path / "studio.txt").write_text("cam00 1 2 3\n")
+    for name in ("studio.txt", "rig.vcal", "notes.md", "cam00.png", "Thumbs.db", "scale.json"):
+        (tmp_path / name).write_text("cam00 1 2 3\n")
     (remark,) = unread_files(tmp_path, [])
-    assert "studio.txt" in remark.text
+    assert remark.text.startswith("rig.vcal, studio.txt: not read")
+
+
+@pytest.mark.parametrize("name", ["cameras (1).json", "cameras.json.txt", "Rig.JSON"])
+def test_our_cameras_are_read_by_their_content_under_another_name(name: str, tmp_path: Path) -> None:
+    write_capture(tmp_path, small_capture(), small_rig())
+    assert [*rig_files(tmp_path)] == [tmp_path / "cameras.json"]
+    (tmp_path / "cameras.json").rename(tmp_path / name)
+    capture, rig = read_capture(tmp_path)
+    close(rig, small_rig())
+    assert name in capture.digests
+
+
+def test_pictures_of_rare_endings_are_read_and_folders_of_plates_named(tmp_path: Path) -> None:
+    write_capture(tmp_path, small_capture(), small_rig())
+    one, two, *_ = sorted((tmp_path / "images").iterdir())
+    write_image(one.with_suffix(".jpg"), read_image(one))
+    one.with_suffix(".jpg").rename(one.with_suffix(".jfif"))
+    one.unlink()
+    shutil.copytree(tmp_path / "images", tmp_path / "clean_plates" / "front")
+    capture, _ = read_capture(tmp_path)
+    assert (one.stem in capture.images, [r.text.split()[0] for r in capture.remarks]) == (True, ["clean_plates/"])
+    two.rename(two.with_suffix(""))
+    with pytest.raises(InputError, match=f"images/{two.stem} is not read: of endingless files"):
+        read_capture(tmp_path)
 
 
 @pytest.mark.parametrize(("file", "said"), [("intri.yml", "%YAML:1.0\nK_a: 1\n"), ("x.nvm", "NVM_V3")])

@@ -1,6 +1,8 @@
 """Mesh files: trimesh reads what we write, bytes are those of docs/capture-format.md, and damage ends in InputError."""
 
+import re
 import struct
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -117,12 +119,32 @@ def test_read_mesh_gives_geometry_and_colours_back(suffix: str, tmp_path: Path) 
         ("cut.glb", glb_bytes(MESH)[:300]),
         ("points.obj", b"v 0 0 0\nv 1 0 0\n"),
         ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+        ("zero.obj", b"v 0 0 1\nv 1 0 0\nv 0 1 0\nf 0 1 2\n"),
+        ("commas.obj", b"v 0,5 0,1 0,2\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+        ("beyond.obj", b"v 0 0 1\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
     ],
 )
 def test_damage_ends_in_input_error(name: str, data: bytes, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(data)
-    with pytest.raises(InputError, match=name):
+    with pytest.raises(InputError, match=name) as refused:
         read_mesh(tmp_path / name)
+    assert not re.search("reshape|unmatched|out of bounds|unexpected length", str(refused.value)), "trimesh's words"
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        lambda data: b"\xef\xbb\xbf" + data,
+        lambda data: data.replace(b"\n", b"\r"),
+        lambda data: data.replace(b"v ", b"v\t"),
+        lambda data: b"usemtl skin#1\n" + data.replace(b"\nf", b" # a note\nf"),
+    ],
+)
+def test_an_obj_in_another_dialect_is_the_same_mesh(changed: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    (tmp_path / "head.obj").write_bytes(changed(obj_bytes(Mesh(MESH.vertices, MESH.faces))))
+    again = read_mesh(tmp_path / "head.obj")
+    np.testing.assert_allclose(again.vertices, MESH.vertices, atol=1e-4)
+    np.testing.assert_array_equal(again.faces, MESH.faces)
 
 
 def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:
