@@ -309,15 +309,15 @@ def photograph_board(
     from scipy.interpolate import RectBivariateSpline
 
     k, side = camera.intrinsics, 2  # samples of a pixel's side
-    us, vs = (np.arange(-RAY_STEP_PX, size + 2 * RAY_STEP_PX, RAY_STEP_PX, float) for size in (k.width, k.height))
+    us, vs = (np.arange(-1.0 * RAY_STEP_PX, size + 2 * RAY_STEP_PX, RAY_STEP_PX) for size in (k.width, k.height))
     board_from_world = world_from_board.inverse()
     rays = camera.rays_world(np.stack(np.meshgrid(us, vs), axis=-1).reshape(-1, 2)) @ board_from_world.rotation.T
     centre = board_from_world.apply(camera.centre_world[None])[0]
     with np.errstate(divide="ignore", invalid="ignore"):
         hit = centre[:2] - centre[2] / rays[:, 2:] * rays[:, :2]
     nodes = ((hit / board.square_mm + 1.0) * SHEET_PX - 0.5).reshape(len(vs), len(us), 2)
-    fine = [(np.arange(size * side) + 0.5) / side - 0.5 for size in (k.height, k.width)]
-    x, y = (RectBivariateSpline(vs, us, nodes[..., axis])(*fine).astype(np.float32) for axis in range(2))
+    down, along = ((np.arange(size * side) + 0.5) / side - 0.5 for size in (k.height, k.width))
+    x, y = (RectBivariateSpline(vs, us, nodes[..., axis])(down, along).astype(np.float32) for axis in range(2))
     sheet = _sheet(board) if centre[2] < 0 else np.full_like(_sheet(board), 255)
     picture = cv2.remap(sheet, x, y, cv2.INTER_AREA, borderMode=cv2.BORDER_CONSTANT, borderValue=120)
     picture = cv2.resize(picture, (k.width, k.height), interpolation=cv2.INTER_AREA).astype(float)

@@ -78,7 +78,7 @@ def model_build(
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Build a head model from raw scans (section 3.2).
+    """Build a head model from raw scans.
 
     Or from delivered heads: results of one model, a result a person, whose deviations say how far each counts."""
     warn_of_replacement(out, overwrite)
@@ -134,7 +134,7 @@ def model_show(
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Draw a model's modes and a correspondence (figures 2 and 3).
+    """Draw a model's modes and a correspondence.
 
     And how compact, general and specific it is."""
     warn_of_replacement(out, overwrite)

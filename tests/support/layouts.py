@@ -10,19 +10,16 @@ from rig.studio.scene.layout import rig_from_directions
 # Section 5.3: azimuth 0 to 90 degrees, mirrored, and elevation -40 to 40. The paper shows the four only as pictures.
 ARRANGEMENTS_DEG = {
     "a": ((0, 0), (-30, 0), (60, 0), (-90, 0), (0, 38), (30, 38), (-60, 38), (90, 38), (0, -38), (45, -38), (-90, -38)),
-    "b": (
-        (0, 0), (0, 30), (0, -30), (-40, 12), (45, -12), (50, 28), (-45, -28), (85, 6), (-90, -8), (-80, 20), (78, -22),
-    ),
+    "b": ((0, 0), (0, 30), (0, -30), (-40, 12), (45, -12), (50, 28), (-45, -28), (85, 6),
+          (-90, -8), (-80, 20), (78, -22)),
     "c": ((0, -40), (0, -20), (0, 0), (0, 20), (0, 40), (-20, -30), (20, -10), (-20, 10), (20, 30), (28, 0), (-10, 0)),
-    "d": (
-        (0, 0), (-30, 0), (50, 20), (-55, -20), (65, 0), (-72, 30), (75, -30), (-80, 8), (85, 25), (-88, -15), (90, 0),
-    ),
+    "d": ((0, 0), (-30, 0), (50, 20), (-55, -20), (65, 0), (-72, 30), (75, -30), (-80, 8),
+          (85, 25), (-88, -15), (90, 0)),
 }  # fmt: skip
 
 
 def arrangement(name: str) -> Rig:
-    """Returns one of the four rigs of section 5.3 of the paper: "a" even, "b" informative, "c" vertical, "d" to the
-    side."""
+    """Returns a rig of section 5.3 of the paper: "a" even, "b" informative, "c" vertical, "d" to the side."""
     return rig_from_directions(ARRANGEMENTS_DEG[name])
 
 

@@ -29,12 +29,11 @@ def test_the_studio_shows_a_board_that_gives_its_cameras(tmp_path: Path, monkeyp
     monkeypatch.setattr("server.cli.simulate.BOARD_SHOTS", 8)
     shots, out = tmp_path / "shots", tmp_path / "cameras.json"
     assert CliRunner().invoke(app, ["simulate", str(shots), "--board", "--seed", "3"]).exit_code == 0
-    for name in ("cam06", "cam07", "cam08", "cam09", "cam10"):  # six cameras show it as well as eleven
-        shutil.rmtree(shots / name)
+    for folder in sorted(shots.glob("cam*"))[6:]:  # six cameras show it as well as eleven
+        shutil.rmtree(folder)
     words = ["calibrate", str(shots), "--board", str(shots / "board.toml"), "--out", str(out), "--anyway"]
     assert CliRunner().invoke(app, words).exit_code == 0
     calibrated, studio = read_rig(out), read_rig(tmp_path / "shots.truth" / "cameras.json")
-    assert len(studio.names) == 11
     true = pdist([studio[name].centre_world for name in calibrated.names])
     # Corners are found to 0.05 px, 0.03 mm at the board; the focal length of 8 views to 0.3 px, 0.2 mm of depth.
     np.testing.assert_allclose(pdist([camera.centre_world for camera in calibrated]), true, atol=1.0)

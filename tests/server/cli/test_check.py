@@ -122,19 +122,13 @@ def test_mirrored_pictures_are_refused_by_an_upload_in_the_same_words(
     assert texts_of(refusal.value.faults) == found_in(tmp_path / "shot")["faults"] != []
 
 
-def _paint_mask(folder: Path, value: int) -> None:
-    path = folder / "masks" / "cam03.png"
-    write_image(path, np.full_like(read_image(path), value))
-
-
 HARMS = {
     "is damaged and cannot be decoded: send it again": lambda path: path.write_bytes(path.read_bytes()[:-60]),
     "is damaged or no PNG": lambda path: path.write_bytes(b"no picture"),
     "is black all over": lambda path: write_image(path, 0 * read_image(path)),
     "but its camera is": lambda path: write_image(path, read_image(path)[4:]),
     "is missing": Path.unlink,
-    "is empty": lambda path: _paint_mask(path.parents[1], 0),
-    "is 255 all over": lambda path: _paint_mask(path.parents[1], 255),
+    "is empty": lambda path: write_image(path.parents[1] / "masks" / path.name, 0 * read_image(path)),
 }
 
 

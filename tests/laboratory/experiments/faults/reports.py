@@ -1,8 +1,8 @@
 """Runs the cases of ``../shared/reports`` through check, upload, reconstruct and batch, and judges what each answers.
 
 A case's make.py makes the inputs alone: its calls of ``check``, ``upload`` and ``reconstruct`` collect folders, which
-all doors see afterwards. Other commands run as they stand. An answer is right if it has the words of ``WANTED``; where
-none are wanted, if it is a success, and a head within ``NEAR_MM`` of the truth where there is one.
+all doors see; other commands run as they stand. An answer is right if it has the words of ``WANTED``; where none are
+wanted, if it is a success, and a head within ``NEAR_MM`` of a known truth.
 """
 
 import contextlib
@@ -70,8 +70,8 @@ def reports(
                 rows.append([name, *(judged.get(door, "-") for door in (*DOORS, "other")), f"{said:.150}"])
                 sys.stderr.write(" | ".join(rows[-1]) + "\n")
                 write_atomically(kept, json.dumps(rows, indent=1).encode())
-    wrong = sum(row.count("wrong") for row in rows)
     lines = table(("input", *DOORS, "other", "said"), rows).splitlines()
+    wrong = sum(row.count("wrong") for row in rows)
     return {"lines": [*lines, f"{wrong} answers of {len(rows)} inputs are wrong"], "figures": {"wrong": wrong}}
 
 
@@ -91,8 +91,8 @@ def _answers(
 ) -> Iterator[tuple[str, dict[str, Answer]]]:
     folders, others = _made(case, out)
     for (command, name), answer in others.items():
-        if re.search(inputs, name) and f"{case.name}/{name} ({command})" not in known:
-            yield f"{case.name}/{name} ({command})", {"other": answer}
+        if re.search(inputs, name) and (called := f"{case.name}/{name} ({command})") not in known:
+            yield called, {"other": answer}
     chosen = {f"{case.name}/{name}": path for name, path in folders.items() if re.search(inputs, name)}
     chosen = {name: path for name, path in chosen.items() if name not in known}
     batch = _batch(chosen, out) if "batch" in doors and chosen else {}

@@ -26,7 +26,7 @@ from rig.studio.scene.layout import rig_from_directions
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.paper.limit import UNROBUST_PX, settings_for
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
-from tests.support.layouts import ARRANGEMENTS_DEG
+from tests.support.layouts import ARRANGEMENTS_DEG, arrangement
 from tests.support.subjects import (
     Planted,
     exact,
@@ -59,8 +59,7 @@ def views(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int =
     ]
     chosen = a_optimal(information, VIEWS, prior(span))
     directions = [CANDIDATES_DEG[k] for k in chosen]
-    rigs = {"planned": rig_from_directions(tuple(directions))}
-    rigs |= {name: rig_from_directions(directions_deg) for name, directions_deg in ARRANGEMENTS_DEG.items()}
+    rigs = {"planned": rig_from_directions(tuple(directions)), **{name: arrangement(name) for name in ARRANGEMENTS_DEG}}
     rows = []
     for i, head in enumerate(heads[CHOSEN_ON:]):
         bench.report(head.name, (CHOSEN_ON + i) / len(heads))
