@@ -34,6 +34,10 @@ Gaze = Annotated[
 Faults = Annotated[
     list[str] | None, typer.Option(help=f"KIND[:CAMERA][=AMOUNT]; may be repeated. Kinds: {', '.join(KINDS)}.")
 ]
+BoardShots = Annotated[bool, typer.Option("--board", help="OUT/CAMERA/SHOT.png of the default board, and board.toml.")]
+Served = Annotated[
+    bool, typer.Option("--serve", help="Keep the studio running as cameras and a trigger box, until Ctrl-C.")
+]
 
 
 @app.command(
@@ -62,12 +66,8 @@ def simulate(
     expression: Expressions = None,
     gaze: Gaze = None,
     fault: Faults = None,
-    board: Annotated[
-        bool, typer.Option("--board", help="OUT/CAMERA/SHOT.png of the default board, and board.toml.")
-    ] = False,
-    serve: Annotated[
-        bool, typer.Option("--serve", help="Keep the studio running as cameras and a trigger box, until Ctrl-C.")
-    ] = False,
+    board: BoardShots = False,
+    serve: Served = False,
     port: Annotated[int, typer.Option(help="--serve: of the cameras; 0 takes a free one.", min=0, max=65535)] = 0,
     fps: Annotated[float, number("--serve: of the live views.", min=0.5, max=30)] = 4.0,
     overwrite: Overwrite = False,
@@ -81,8 +81,7 @@ def simulate(
     chosen |= {"rolling_ms": rolling_ms, "hair": not no_hair, "polarised": polarised}
     chosen["hairstyle"] = tuple(hair.split(",")) if hair else ()
     preset = _studio_preset(realism, **chosen)
-    if gaze is not None and not max(map(abs, gaze)) <= MAX_GAZE_DEG:
-        raise typer.BadParameter(f"at most {MAX_GAZE_DEG} degrees", param_hint="--gaze")
+    _check_use(gaze, served_board=serve and board)
     if serve:
         from server.tasks.subjects import SubjectChoice
 
@@ -93,10 +92,7 @@ def simulate(
     if out is None:
         raise typer.BadParameter("say where the capture goes, or --serve", param_hint="OUT")
     if board:
-        _make_way(out, overwrite, "board.toml")
-        truth = _photograph_board(out, seed)
-        written = {"images": str(out), "board": str(out / "board.toml"), "truth": str(truth)}
-        answer(written, json_out, list(written.values()))
+        _photograph_board(out, seed, overwrite, json_out)
         return
     _check_planted(fault or [], expression or [])
     _make_way(out, overwrite)
@@ -108,6 +104,14 @@ def simulate(
         truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer,
                                 expression=expression or [], gaze_deg=gaze)  # fmt: skip
     answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
+
+
+def _check_use(gaze: tuple[float, float] | None, *, served_board: bool) -> None:
+    """Raises typer.BadParameter for eyes that look too far aside, and for a board of the running studio."""
+    if gaze is not None and not max(map(abs, gaze)) <= MAX_GAZE_DEG:
+        raise typer.BadParameter(f"at most {MAX_GAZE_DEG} degrees", param_hint="--gaze")
+    if served_board:
+        raise typer.BadParameter("is for OUT, not for --serve", param_hint="--board")
 
 
 def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
@@ -140,9 +144,9 @@ def _check_planted(faults: list[str], expression: list[str]) -> None:
             weights_from_text(expression, load_model().expressions.names)
 
 
-def _photograph_board(out: Path, seed: int) -> Path:
+def _photograph_board(out: Path, seed: int, overwrite: bool, json_out: bool) -> None:
     """Writes ``BOARD_SHOTS`` pictures of the default board by each of the studio's cameras as <camera>/<shot>.png, and
-    board.toml. Returns the folder with the true cameras."""
+    board.toml; the true cameras beside them."""
     import numpy as np
 
     from calibration.board.board import Board, board_poses, photograph_board, write_board
@@ -150,6 +154,7 @@ def _photograph_board(out: Path, seed: int) -> Path:
     from rig.formats.pictures.images import write_image
     from rig.studio.scene.layout import default_layout
 
+    _make_way(out, overwrite, "board.toml")
     board, rng, studio = Board("charuco", 12, 9, 30.0), np.random.default_rng(seed), default_layout()
     with progress_bar() as report:
         for shot, pose in enumerate(board_poses(board, BOARD_SHOTS, rng)):
@@ -159,7 +164,8 @@ def _photograph_board(out: Path, seed: int) -> Path:
     write_board(board, out / "board.toml")
     truth = out.with_name(out.name + ".truth")
     write_rig(studio, truth / "cameras.json")
-    return truth
+    written = {"images": str(out), "board": str(out / "board.toml"), "truth": str(truth)}
+    answer(written, json_out, list(written.values()))
 
 
 def _make_way(out: Path, overwrite: bool, sign: str = "cameras.json") -> None:
