@@ -39,6 +39,7 @@ from rig.mesh import Mesh
 
 FORMAT = "eigenhead-shapes/1"
 JAW = "jaw"
+LID_MM = 30.0  # from an eyeball's middle: no other opening is so near
 
 
 def write_template_shapes(folder: Path, result: Reconstruction, template: Template) -> None:
@@ -85,11 +86,22 @@ def write_posed(folder: Path, result: Reconstruction) -> None:
     photographed = PhotographedEyes(head, np.arange(len(opened), len(head.faces)), result.texturing.atlas)
     animated = replace(animated, gazes=_towards_irises(animated, eyes, from_world, photographed))
     skin, colours = head_skin(result, head), result.texturing.vertices.colours
+    shut = [ball.centre for name, ball in animated.added.items() if _is_bridged(name.removeprefix("eye_"), result)]
+    middle = neutral[head.faces[len(opened) :]].mean(axis=1)
+    lids = [np.flatnonzero(np.linalg.norm(middle - centre, axis=1) < LID_MM) + len(opened) for centre in shut]
+    kept = np.concatenate([np.arange(len(opened)), *lids])
     if skin is not None and skin.faces is not None:
-        skin = replace(skin, faces=skin.faces[: len(opened)])
-    scene = animated_scene(animated, opened, colours, blendshape_rig.weights, skin)
+        skin = replace(skin, faces=skin.faces[kept])
+    scene = animated_scene(animated, head.faces[kept], colours, blendshape_rig.weights, skin)
     scene = replace(scene, parts=[_with_picture(part, animated, photographed) for part in scene.parts])
     write_atomically(folder / "posed.glb", scene_glb_bytes(scene, asset_extras(result)))
+
+
+def _is_bridged(side: str, result: Reconstruction) -> bool:
+    """Tells whether an eye is closed without a blink of the model: the strip between its lids is skin."""
+    eye, blendshape_rig = result.faces.eyes.get(side), result.evidence.blendshape_rig
+    blink = 0.0 if blendshape_rig is None else blendshape_rig.weights.get(f"eyeBlink{side.title()}", 0.0)
+    return isinstance(eye, UnseenEye) and eye.cause == "closed" and blink == 0.0
 
 
 def _towards_irises(
