@@ -86,10 +86,14 @@ def write_posed(folder: Path, result: Reconstruction) -> None:
     photographed = PhotographedEyes(head, np.arange(len(opened), len(head.faces)), result.texturing.atlas)
     animated = replace(animated, gazes=_towards_irises(animated, eyes, from_world, photographed))
     skin, colours = head_skin(result, head), result.texturing.vertices.colours
-    shut = [ball.centre for name, ball in animated.added.items() if _is_bridged(name.removeprefix("eye_"), result)]
+    shut = [name for name in animated.added if _is_bridged(name.removeprefix("eye_"), result)]
     middle = neutral[head.faces[len(opened) :]].mean(axis=1)
-    lids = [np.flatnonzero(np.linalg.norm(middle - centre, axis=1) < LID_MM) + len(opened) for centre in shut]
+    lids = [
+        np.flatnonzero(np.linalg.norm(middle - animated.added[name].centre, axis=1) < LID_MM) + len(opened)
+        for name in shut
+    ]
     kept = np.concatenate([np.arange(len(opened)), *lids])
+    animated = replace(animated, added={name: ball for name, ball in animated.added.items() if name not in shut})
     if skin is not None and skin.faces is not None:
         skin = replace(skin, faces=skin.faces[kept])
     scene = animated_scene(animated, head.faces[kept], colours, blendshape_rig.weights, skin)
