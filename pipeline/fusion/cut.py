@@ -24,8 +24,7 @@ THIN_MM, SPARED_MM = 6.0, 4.0  # radius, and by how much a place must stand out:
 BASE_QUANTILE = 0.7  # of the seen points below the head, by height: what lies lower is the base
 FAR_MM = 100.0  # distances count up to this one
 ONE_SIDED = 0.3  # length of the mean direction to the cameras above which nobody stands behind the subject
-BEHIND_QUANTILE, THICK_QUANTILE = 0.998, 0.9  # of seen points, and of their distances to the head: its hair
-CHEST_QUANTILE = 0.01  # of the seen points below the head, from the front: farther ahead is no guess
+BEHIND_QUANTILE, THICK_QUANTILE = 0.998, 0.9  # of seen points (to the front, too), and of their heights: the hair
 EVERY = 4  # vertices of the head stand for the others
 
 
@@ -103,6 +102,6 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
         head_end = (vertices @ back).max() + np.quantile(far[~below], THICK_QUANTILE)
         under = low[nearest(tree, places)[1]]
         beyond = np.maximum(beyond, places @ back - np.where(under, end, head_end))
-        chest = min(np.quantile(seen[below] @ back, CHEST_QUANTILE) - SPARED_MM, (vertices[low] @ back).min())
+        chest = min(np.quantile(seen[below] @ back, 1.0 - BEHIND_QUANTILE), (vertices[low] @ back).min())
         before = np.where(under, chest - places @ back, -np.inf)
     return Cut(box, beyond, base, before)

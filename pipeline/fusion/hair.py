@@ -73,8 +73,7 @@ LIKELY = 0.5  # probability from which on a place counts as a part
 # Share of the pixels about one whose depth must be known, for skin and for clothes to count. Specks amid hair are
 # chance; the face, which shows between the strands, and the shirt below them are known more evenly.
 DENSE_SKIN, DENSE_CLOTHES, WINDOW_MM = 0.5, 0.4, 15.0
-PLAIN_SHARE = 0.25  # of the pixels of clothes with a known depth, below which it is chance: 0.1 of a plain shirt, 0.34
-# and more of others
+PLAIN_SHARE = 0.25  # the same of clothes, below which their depth is chance: 0.1 of a plain shirt, others 0.34 and more
 PIXEL_EVERY = 4  # pixel of a crop, in either direction, is looked at
 SHELL_VIEWS, MAX_PLACES = 3, 25_000  # views that agree on a depth, for it to tell how deep the hair lies
 DEEPEST_MM = 30.0  # inside the hull; farther in a place belongs to something else
@@ -141,14 +140,14 @@ def only_where(kept: Bool[np.ndarray, "h w"], depth_map: DepthMap) -> DepthMap:
 
 
 def without_specks(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> DepthMap:
-    """Returns the depth map, of plain clothes of which hardly anything is known without what is known here and there,
-    there and on the neck above: it is chance, and lies centimetres before the subject."""
-    shown, (height, width) = shown_parts(depth_map, parts, rig), depth_map.depth_mm.shape
-    clothes, hair = (shown[..., part.channel] > LIKELY for part in (Part.CLOTHES, Part.HAIR))
-    if not clothes.any() or depth_map.known[::PIXEL_EVERY, ::PIXEL_EVERY][clothes].mean() > PLAIN_SHARE:
+    """Returns the depth map; before plain clothes, of which hardly anything is known, without what is known here and
+    there of them and of skin: it is chance, and lies centimetres before the subject."""
+    _, hair, clothes = np.moveaxis(shown_parts(depth_map, parts, rig) > LIKELY, 2, 0)
+    known, (height, width) = depth_map.known[::PIXEL_EVERY, ::PIXEL_EVERY], depth_map.depth_mm.shape
+    if not clothes.any() or known[clothes].mean() > PLAIN_SHARE:
         return depth_map
-    speck = (mean_about(depth_map.known, depth_map, shown) < DENSE_CLOTHES) & ~hair
-    return only_where(cv2.resize(speck.view(np.uint8), (width, height)) == 0, depth_map)
+    strands = np.asarray(cv2.resize(hair.view(np.uint8), (width, height))) > 0
+    return only_where(strands | (local_share(depth_map, parts, rig) >= DENSE_CLOTHES), depth_map)
 
 
 def shown_parts(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> Float[np.ndarray, "r c 3"]:
@@ -185,24 +184,14 @@ def loosened(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig, scatte
     return replace(depth_map, deviation_mm=(depth_map.deviation_mm * looser).astype(np.float32))
 
 
-def mean_about(
-    values: Float[np.ndarray, "h w"], depth_map: DepthMap, shown: Float[np.ndarray, "r c 3"]
-) -> Float32[np.ndarray, "r c"]:
-    """Returns the mean of a crop's values over the subject's pixels about every ``PIXEL_EVERY``-th pixel, in either
-    direction. ``shown``: ``shown_parts``."""
-    body = (shown.sum(axis=2) > LIKELY).astype(np.float32)
-    distance_mm = float(np.median(depth_map.depth_mm[depth_map.known])) if depth_map.known.any() else FAR_MM
-    side = max(3, round(WINDOW_MM * depth_map.camera.intrinsics.fx / (PIXEL_EVERY * distance_mm)))
-    held = values[::PIXEL_EVERY, ::PIXEL_EVERY].astype(np.float32) * body
-    return np.asarray(cv2.blur(held, (side, side)) / np.maximum(cv2.blur(body, (side, side)), np.float32(1e-3)))
-
-
 def local_share(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> Float32[np.ndarray, "h w"]:
     """Returns, for each pixel of a crop, the share of the subject's pixels about it whose depth is known."""
-    share, (height, width) = (
-        mean_about(depth_map.known, depth_map, shown_parts(depth_map, parts, rig)),
-        depth_map.depth_mm.shape,
-    )
+    body = (shown_parts(depth_map, parts, rig).sum(axis=2) > LIKELY).astype(np.float32)
+    known = depth_map.known[::PIXEL_EVERY, ::PIXEL_EVERY] * body
+    distance_mm = float(np.median(depth_map.depth_mm[depth_map.known])) if depth_map.known.any() else FAR_MM
+    side = max(3, round(WINDOW_MM * depth_map.camera.intrinsics.fx / (PIXEL_EVERY * distance_mm)))
+    share = cv2.blur(known, (side, side)) / np.maximum(cv2.blur(body, (side, side)), np.float32(1e-3))
+    height, width = depth_map.depth_mm.shape
     return np.asarray(cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
@@ -271,20 +260,16 @@ def parts_over_head(votes: PartVotes, head_world: Mesh, stubble: bool = True) ->
 
 @traced
 def smooth_hair(
-    mesh_world: Mesh,
-    hair: Float[np.ndarray, " v"],
-    seen: SeenVertices,
-    held: Bool[np.ndarray, " v"],
-    noise: Float[np.ndarray, " v"],
+    mesh_world: Mesh, hair: Float[np.ndarray, " v"], seen: SeenVertices, held: Bool[np.ndarray, " v"]
 ) -> Mesh:
     """Returns the mesh with the vertices of hair, and those far from all that is seen, moved to the mean of their
     surroundings.
 
     ``mesh_world``: closed, mm. ``hair``: probability that a vertex shows hair. ``seen``: by a view; the others are what
-    is seen next to them. ``held``: vertices that stay. ``noise``: how far (0 to 1) the relief of others is noise.
+    is seen next to them. ``held``: vertices that stay.
     """
     beside = neighbours(mesh_world.faces, len(hair))
-    share = np.minimum(skin_share(beside, 1.0 - hair, seen), 1.0 - noise)
+    share = skin_share(beside, 1.0 - hair, seen)
     share *= EDGE_MM / np.maximum(seen.guess_deviation_mm(), EDGE_MM)
     share = np.where(held, 1.0, share)[:, None]
     area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / len(hair)

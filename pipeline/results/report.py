@@ -45,7 +45,7 @@ from pipeline.texturing.chart_colours import ChartColours
 from pipeline.texturing.light import HARMONICS, Light
 from pipeline.texturing.pores.relief import LONGEST_MM, SHORTEST_MM
 from pipeline.texturing.pores.skin_maps import MID_CODE, MM_PER_CODE, SkinMaps
-from pipeline.texturing.sets.specular import NORMAL_SHARE, Specular
+from pipeline.texturing.sets.specular import NORMAL_SHARE
 from pipeline.texturing.sets.texture_sets import SetTextures
 from rig.formats.meshes.glb import ROUGHNESS
 from rig.geometry import Similarity
@@ -200,17 +200,15 @@ def _texture(texturing: Texturing) -> TextureReport:
 
 def _sets(sets: SetTextures) -> SetsReport:
     size = max(len(atlas.image) for atlas in sets.atlases.values())
-    specular = None if sets.specular is None else _specular(sets.specular)
+    specular: SpecularReport | None = None
+    if (found := sets.specular) is not None:
+        specular = {
+            "exposure": dict(found.exposure),
+            "negative": found.negative,
+            "strength_one": NORMAL_SHARE,
+            "roughness": ROUGHNESS,
+        }
     return {"names": [*sets.atlases], "size": size, "specular": specular}
-
-
-def _specular(specular: Specular) -> SpecularReport:
-    return {
-        "exposure": dict(specular.exposure),
-        "negative": specular.negative,
-        "strength_one": NORMAL_SHARE,
-        "roughness": ROUGHNESS,
-    }
 
 
 def skin_document(maps: SkinMaps) -> SkinReport:

@@ -86,13 +86,11 @@ def write_posed(folder: Path, result: Reconstruction) -> None:
     photographed = PhotographedEyes(head, np.arange(len(opened), len(head.faces)), result.texturing.atlas)
     animated = replace(animated, gazes=_towards_irises(animated, eyes, from_world, photographed))
     skin, colours = head_skin(result, head), result.texturing.vertices.colours
-    shut = [name for name in animated.added if _is_bridged(name.removeprefix("eye_"), result)]
-    middle = neutral[head.faces[len(opened) :]].mean(axis=1)
-    lids = [
-        np.flatnonzero(np.linalg.norm(middle - animated.added[name].centre, axis=1) < LID_MM) + len(opened)
-        for name in shut
-    ]
-    kept = np.concatenate([np.arange(len(opened)), *lids])
+    shut = {name: ball.centre for name, ball in animated.added.items() if _is_bridged(name, result)}
+    middle = head.vertices[head.faces].mean(axis=1)
+    kept = np.arange(len(head.faces)) < len(opened)
+    for centre in shut.values():  # the strip between such lids is skin
+        kept |= np.linalg.norm(middle - centre, axis=1) < LID_MM
     animated = replace(animated, added={name: ball for name, ball in animated.added.items() if name not in shut})
     if skin is not None and skin.faces is not None:
         skin = replace(skin, faces=skin.faces[kept])
@@ -101,11 +99,11 @@ def write_posed(folder: Path, result: Reconstruction) -> None:
     write_atomically(folder / "posed.glb", scene_glb_bytes(scene, asset_extras(result)))
 
 
-def _is_bridged(side: str, result: Reconstruction) -> bool:
-    """Tells whether an eye is closed without a blink of the model: the strip between its lids is skin."""
-    eye, blendshape_rig = result.faces.eyes.get(side), result.evidence.blendshape_rig
-    blink = 0.0 if blendshape_rig is None else blendshape_rig.weights.get(f"eyeBlink{side.title()}", 0.0)
-    return isinstance(eye, UnseenEye) and eye.cause == "closed" and blink == 0.0
+def _is_bridged(pivot: str, result: Reconstruction) -> bool:
+    """Tells whether an eye is closed without a blink of the model."""
+    side, found = pivot.removeprefix("eye_"), result.evidence.blendshape_rig
+    eye, blink = result.faces.eyes.get(side), f"eyeBlink{side.title()}"
+    return isinstance(eye, UnseenEye) and eye.cause == "closed" and not (found and found.weights.get(blink))
 
 
 def _towards_irises(
