@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.evidence.camera_metrics import CameraFigures
-from pipeline.evidence.expression import BlendshapeRig, Found
+from pipeline.evidence.expression import BlendshapeRig
 from pipeline.evidence.gaze import angles_deg
 from pipeline.evidence.pose import PoseEvidence
 from pipeline.faces.detection import FaceDetection
@@ -22,11 +22,9 @@ from pipeline.results.report_types import (
     FORMAT,
     BustReport,
     CameraReport,
-    ExpressionReport,
     EyeReport,
     FaceReport,
     GazeReport,
-    HairReport,
     MorphsReport,
     PoseReport,
     Report,
@@ -38,8 +36,7 @@ from pipeline.results.report_types import (
     ViewReport,
 )
 from pipeline.settings import document_from_settings
-from pipeline.stages.bust import Bust, HairyHead
-from pipeline.stages.head_fit import HeadFit
+from pipeline.stages.bust import Bust
 from pipeline.stages.texturing import Texturing
 from pipeline.texturing.chart_colours import ChartColours
 from pipeline.texturing.light import HARMONICS, Light
@@ -77,8 +74,11 @@ def report_document(result: Reconstruction) -> Report:
             for name, figures in evidence.cameras.items()
         },
         "pictures": dict(result.views.assignment),
-        "coefficients": _shape_coefficients(head),
-        "expression": [_expression(found) for found in evidence.expression],
+        "coefficients": _numbers(np.delete(head.fit.coefficients, np.asarray(head.model.posed, int))),  # no expressions
+        "expression": [
+            {"name": each.name, "words": each.words, "weight": each.weight, "std": _finite(each.std)}
+            for each in evidence.expression
+        ],
         "morphs": None if evidence.blendshape_rig is None else _morphs(evidence.blendshape_rig),
         "template": None,
         "world_from_head": similarity_document(head.fit.world_from_head),
@@ -103,7 +103,8 @@ def report_document(result: Reconstruction) -> Report:
         "warnings": documents_of(result.warnings),
     }
     if result.hair is not None:
-        document["hair"] = _hair(result.hair)
+        shell = result.hair.shell
+        document["hair"] = {"covered_share": shell.covered, "highest_mm": float(shell.height_mm.max())}
     if result.scale_sigma:
         document["scale_sigma"] = result.scale_sigma
     return document
@@ -162,15 +163,6 @@ def _view(quality: ViewQuality) -> ViewReport:
         "warning_messages": documents_of(quality.warnings),
         "figures": _plain(quality.figures),
     }
-
-
-def _shape_coefficients(head: HeadFit) -> list[float]:
-    """Returns the fit's coefficients without the weights of expressions, in standard deviations."""
-    return _numbers(np.delete(head.fit.coefficients, np.asarray(head.model.posed, int)))
-
-
-def _expression(found: Found) -> ExpressionReport:
-    return {"name": found.name, "words": found.words, "weight": found.weight, "std": _finite(found.std)}
 
 
 def _morphs(blendshape_rig: BlendshapeRig) -> MorphsReport:
@@ -244,10 +236,6 @@ def _light(light: Light) -> dict[str, object]:
         "residual": light.residual,
     }
     return _plain(document)
-
-
-def _hair(hair: HairyHead) -> HairReport:
-    return {"covered_share": hair.shell.covered, "highest_mm": float(hair.shell.height_mm.max())}
 
 
 def _bust(bust: Bust) -> BustReport:

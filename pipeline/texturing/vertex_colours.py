@@ -170,7 +170,7 @@ def texture(
     hidden &= ~(weights > 0).any(axis=0)
     unit = np.ones((len(views), 3)), np.zeros((len(views), 3))
     gains, offsets = balance(weights, colours) if settings.balance else unit
-    weights *= gain_confidence(gains)[:, None]
+    weights *= (1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2))[:, None]  # of noise, or in shadow
     balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
     agreed, seen = blend_views(weights, balanced, outlier)
     if not seen.any():
@@ -213,12 +213,6 @@ def underexposed_views(weights: Weights, colours: Colours, share: float) -> Floa
     chosen = np.take_along_axis(order, rank[None], axis=0)[0]
     found = colours[chosen, np.arange(weights.shape[1])]
     return np.where((passed[-1] > 0)[:, None], found, np.float32(0.0))
-
-
-def gain_confidence(gains: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
-    """Returns the factor, at most 1, by which a camera's weight is lowered because of its gain. An image that was
-    brightened much has more noise, and is often in shadow."""
-    return 1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2)
 
 
 def decide(
