@@ -168,8 +168,8 @@ def finished(
     strands, neck = surface.scatter * shares[:, Part.HAIR.channel], np.zeros(len(seen))
     if head is not None:
         mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured), seen_vertices)
-        neck[seen] = skin[seen] * below_head(head.mesh_world, mesh.vertices[seen])
-        neck *= np.minimum(2.0 / np.maximum(measured.views, 1), 1.0)  # relief is noise where few views agree
+        if seen.any() and np.median(measured.views[seen]) <= MIN_VIEWS:  # the relief of a neck is noise
+            neck[seen] = skin[seen] * below_head(head.mesh_world, mesh.vertices[seen])
     mesh = smooth_hair(mesh, np.maximum(strands, neck), seen_vertices, surface.capped)
     if surface.shell_deviation_mm is None:
         mesh, moved_mm = grown_to_outlines(mesh, strands, silhouettes, rig)
