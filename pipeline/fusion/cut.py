@@ -24,7 +24,7 @@ THIN_MM, SPARED_MM = 6.0, 4.0  # radius, and by how much a place must stand out:
 BASE_QUANTILE = 0.7  # of the seen points below the head, by height: what lies lower is the base
 FAR_MM = 100.0  # distances count up to this one
 ONE_SIDED = 0.3  # length of the mean direction to the cameras above which nobody stands behind the subject
-BEHIND_QUANTILE, THICK_QUANTILE = 0.998, 0.9  # of seen points, and of their distances to the head: its hair
+BEHIND_QUANTILE, THICK_QUANTILE = 0.998, 0.9  # of seen points (to the front, too), and of their heights: the hair
 EVERY = 4  # vertices of the head stand for the others
 
 
@@ -35,6 +35,7 @@ class Cut:
     box: Grid
     beyond_mm: Float[np.ndarray, " n"]
     base: Bool[np.ndarray, " n"]  # nodes in the lowest part of what is seen below the head
+    before_mm: Float[np.ndarray, " n"] | None = None  # how far nodes below the head lie before its chest; else -inf
 
     def distance_mm(self, places: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
         """Returns how far (mm, negative inside) points lie beyond the bust's end."""
@@ -93,6 +94,7 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
     base = places @ down > np.quantile(seen[below] @ down, BASE_QUANTILE)
     base[base] = low[nearest(tree, places[base])[1]]
     towards = views.cameras[:, CENTRE:] - np.median(seen, axis=0)
+    before = None
     back = -(towards / np.linalg.norm(towards, axis=1, keepdims=True)).mean(axis=0)
     if np.linalg.norm(back) > ONE_SIDED:
         back /= np.linalg.norm(back)
@@ -100,4 +102,6 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
         head_end = (vertices @ back).max() + np.quantile(far[~below], THICK_QUANTILE)
         under = low[nearest(tree, places)[1]]
         beyond = np.maximum(beyond, places @ back - np.where(under, end, head_end))
-    return Cut(box, beyond, base)
+        chest = min(np.quantile(seen[below] @ back, 1.0 - BEHIND_QUANTILE), (vertices[low] @ back).min())
+        before = np.where(under, chest - places @ back, -np.inf)
+    return Cut(box, beyond, base, before)

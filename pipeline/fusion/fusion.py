@@ -23,6 +23,7 @@ from pipeline.fusion.hair import (
     smooth_hair,
 )
 from pipeline.fusion.net_kernels import component_of, compose_well
+from pipeline.fusion.prior import below_head
 from pipeline.fusion.refinement import (
     MAX_MM,
     Measured,
@@ -164,10 +165,12 @@ def finished(
         shown = part_codes(votes, mesh.vertices)
         shares = part_shares(votes if head is None else parts_over_head(votes, head.mesh_world), mesh.vertices)
     skin, moved_mm = shares[:, Part.SKIN.channel], np.zeros(len(seen))
-    strands = surface.scatter * shares[:, Part.HAIR.channel]
+    strands, neck = surface.scatter * shares[:, Part.HAIR.channel], np.zeros(len(seen))
     if head is not None:
         mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured), seen_vertices)
-    mesh = smooth_hair(mesh, strands, seen_vertices, surface.capped)
+        if seen.any() and np.median(measured.views[seen]) <= MIN_VIEWS:  # the relief of a neck is noise
+            neck[seen] = skin[seen] * below_head(head.mesh_world, mesh.vertices[seen])
+    mesh = smooth_hair(mesh, np.maximum(strands, neck), seen_vertices, surface.capped)
     if surface.shell_deviation_mm is None:
         mesh, moved_mm = grown_to_outlines(mesh, strands, silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))

@@ -73,6 +73,7 @@ LIKELY = 0.5  # probability from which on a place counts as a part
 # Share of the pixels about one whose depth must be known, for skin and for clothes to count. Specks amid hair are
 # chance; the face, which shows between the strands, and the shirt below them are known more evenly.
 DENSE_SKIN, DENSE_CLOTHES, WINDOW_MM = 0.5, 0.4, 15.0
+PLAIN_SHARE = 0.25  # the same of clothes, below which their depth is chance: 0.1 of a plain shirt, others 0.34 and more
 PIXEL_EVERY = 4  # pixel of a crop, in either direction, is looked at
 SHELL_VIEWS, MAX_PLACES = 3, 25_000  # views that agree on a depth, for it to tell how deep the hair lies
 DEEPEST_MM = 30.0  # inside the hull; farther in a place belongs to something else
@@ -136,6 +137,17 @@ def only_where(kept: Bool[np.ndarray, "h w"], depth_map: DepthMap) -> DepthMap:
         np.where(kept, depth_map.deviation_mm, np.float32(np.inf)),
         np.where(kept, depth_map.views, np.uint8(0)),
     )
+
+
+def without_specks(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> DepthMap:
+    """Returns the depth map; before plain clothes, of which hardly anything is known, without what is known here and
+    there of them and of skin: it is chance, and lies centimetres before the subject."""
+    _, hair, clothes = np.moveaxis(shown_parts(depth_map, parts, rig) > LIKELY, 2, 0)
+    known, (height, width) = depth_map.known[::PIXEL_EVERY, ::PIXEL_EVERY], depth_map.depth_mm.shape
+    if not clothes.any() or known[clothes].mean() > PLAIN_SHARE:
+        return depth_map
+    strands = np.asarray(cv2.resize(hair.view(np.uint8), (width, height))) > 0
+    return only_where(strands | (local_share(depth_map, parts, rig) >= DENSE_CLOTHES), depth_map)
 
 
 def shown_parts(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> Float[np.ndarray, "r c 3"]:

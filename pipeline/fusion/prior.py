@@ -83,3 +83,9 @@ def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndar
     if not len(rim):
         return np.zeros(len(places), bool)
     return nearest(PointTree.of(head_world.vertices[rim]), places, within=RIM_MM)[0] < RIM_MM
+
+
+def below_head(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Tells which points lie beyond the head's open border: of its vertices the nearest is near the border."""
+    vertices = head_world.vertices[::EVERY]
+    return near_rim(head_world, vertices)[nearest(PointTree.of(vertices), places)[1]]

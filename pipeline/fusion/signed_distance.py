@@ -148,7 +148,7 @@ def solve(
     hull_mm, cut = at_points(grid, votes.bound, known), find_cut(grid, views, known, head_world)
     votes = ended(votes, grid, cut)
     weight = np.where(agreed[::THINNED] < VIEWS_SURE, ALONE_FACTOR**-2, 1.0)
-    guess = _prior(grid, votes, head_world, SeenSurface(known, hull_mm, weight))
+    guess = _prior(grid, votes, head_world, SeenSurface(known, hull_mm, weight), cut)
     if hair is not None:
         shell, outside = distance_to_shell(hair, views, grid)  # of hair, where photographs show its outside
         mixed = outside * np.maximum(shell, votes.bound) + (1.0 - outside) * guess
@@ -195,7 +195,7 @@ def _box(
     return low, high - low
 
 
-def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface) -> Field:
+def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface, cut: Cut) -> Field:
     """Returns the first guess of the signed distance: what views see for sure, and elsewhere the visual hull, cut down
     to the fitted head and the hull's usual gap where there is a head."""
     prior = np.maximum(votes.value, votes.bound).astype(float)
@@ -205,6 +205,8 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface)
         hull = np.where(weak, votes.bound, prior)[guessed]
         places = grid.places(guessed)
         guess = distance_to_subject(places, hull, head_world, seen)
+        if cut.before_mm is not None:
+            guess = np.maximum(guess, np.where(weak[guessed], -np.inf, cut.before_mm[guessed]))
         prior[guessed] = np.where(weak[guessed] & np.isneginf(guess), prior[guessed], np.maximum(hull, guess))
     prior[grid.outer] = REACH * grid.step_mm
     return prior.astype(np.float32)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.geometry.raster import picture
@@ -31,6 +31,7 @@ PAPER = (245, 245, 245)
 KEY_PX = 36  # height of a sheet's line that says what its colours mean
 MARGIN_PX = 16  # around a fitted mask: wider than any line that is painted
 
+Box = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
 Resized = UInt8[np.ndarray, "_ _ 3"]  # a picture of any size, whatever others the call has
 
 
@@ -105,22 +106,27 @@ def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]])
 def turntable(
     mesh_head: Mesh, colours: UInt8[np.ndarray, "v 3"], panel: tuple[int, int] = (280, 360)
 ) -> list[ImageRgb]:
-    """Draws the head from each of ``AZIMUTHS_DEG`` around its y axis, supersampled twice. ``panel`` is width and height
-    of each picture, px."""
-    low, high = mesh_head.vertices.min(axis=0), mesh_head.vertices.max(axis=0)
-    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    """Draws the head from each of ``AZIMUTHS_DEG`` around its y axis. ``panel`` is width and height of each picture,
+    px."""
+    box = mesh_head.vertices.min(axis=0), mesh_head.vertices.max(axis=0)
+    return map_in_threads(lambda k: portrait(mesh_head, colours, box, AZIMUTHS_DEG[k], panel), len(AZIMUTHS_DEG))
+
+
+def portrait(
+    mesh: Mesh, colours: UInt8[np.ndarray, "v 3"], box: Box, azimuth_deg: float, panel: tuple[int, int], *,
+    paper: tuple[int, int, int] = PAPER, lift: float = 0.0, share: float = 0.9,
+) -> ImageRgb:  # fmt: skip
+    """Draws a mesh (head frame) from a direction about y and ``lift`` above it, supersampled twice. ``box``:
+    opposite corners of what fills this ``share`` of the ``panel`` (px)."""
+    centre, radius = (box[0] + box[1]) / 2, float(np.linalg.norm(box[1] - box[0])) / 2
     width, height = 2 * panel[0], 2 * panel[1]
-    distance = 6.0 * radius
-    focal = 0.5 * min(width * 1.25, height) * distance / (0.9 * radius)
+    azimuth, distance = np.radians(azimuth_deg), 6.0 * radius
+    eye = centre + distance * np.array([np.sin(azimuth), lift, np.cos(azimuth)])
+    focal = 0.5 * min(width * 1.25, height) * distance / (share * radius)
     lens = Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-
-    def draw(azimuth: float) -> ImageRgb:
-        eye = centre + distance * np.array([np.sin(azimuth), 0.0, np.cos(azimuth)])
-        camera = Camera("turntable", lens, look_at(eye, centre, np.array([0.0, 1.0, 0.0])))
-        drawn = picture(camera, mesh_head.vertices, mesh_head.faces, colours, PAPER)
-        return np.asarray(cv2.resize(drawn, panel, interpolation=cv2.INTER_AREA), np.uint8)
-
-    return map_in_threads(lambda k: draw(np.radians(AZIMUTHS_DEG[k])), len(AZIMUTHS_DEG))
+    camera = Camera("portrait", lens, look_at(eye, centre, np.array([0.0, 1.0, 0.0])))
+    drawn = picture(camera, mesh.vertices, mesh.faces, colours, paper)
+    return np.asarray(cv2.resize(drawn, panel, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def contact_sheet(rows: Sequence[Sequence[tuple[str, Resized]]], key: Sequence[str] = ()) -> Resized:

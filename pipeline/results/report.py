@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.evidence.camera_metrics import CameraFigures
-from pipeline.evidence.expression import BlendshapeRig, Found
+from pipeline.evidence.expression import BlendshapeRig
 from pipeline.evidence.gaze import angles_deg
 from pipeline.evidence.pose import PoseEvidence
 from pipeline.faces.detection import FaceDetection
@@ -22,11 +22,9 @@ from pipeline.results.report_types import (
     FORMAT,
     BustReport,
     CameraReport,
-    ExpressionReport,
     EyeReport,
     FaceReport,
     GazeReport,
-    HairReport,
     MorphsReport,
     PoseReport,
     Report,
@@ -38,14 +36,13 @@ from pipeline.results.report_types import (
     ViewReport,
 )
 from pipeline.settings import document_from_settings
-from pipeline.stages.bust import Bust, HairyHead
-from pipeline.stages.head_fit import HeadFit
+from pipeline.stages.bust import Bust
 from pipeline.stages.texturing import Texturing
 from pipeline.texturing.chart_colours import ChartColours
 from pipeline.texturing.light import HARMONICS, Light
 from pipeline.texturing.pores.relief import LONGEST_MM, SHORTEST_MM
 from pipeline.texturing.pores.skin_maps import MID_CODE, MM_PER_CODE, SkinMaps
-from pipeline.texturing.sets.specular import NORMAL_SHARE, Specular
+from pipeline.texturing.sets.specular import NORMAL_SHARE
 from pipeline.texturing.sets.texture_sets import SetTextures
 from rig.formats.meshes.glb import ROUGHNESS
 from rig.geometry import Similarity
@@ -77,8 +74,11 @@ def report_document(result: Reconstruction) -> Report:
             for name, figures in evidence.cameras.items()
         },
         "pictures": dict(result.views.assignment),
-        "coefficients": _shape_coefficients(head),
-        "expression": [_expression(found) for found in evidence.expression],
+        "coefficients": _numbers(np.delete(head.fit.coefficients, np.asarray(head.model.posed, int))),  # no expressions
+        "expression": [
+            {"name": each.name, "words": each.words, "weight": each.weight, "std": _finite(each.std)}
+            for each in evidence.expression
+        ],
         "morphs": None if evidence.blendshape_rig is None else _morphs(evidence.blendshape_rig),
         "template": None,
         "world_from_head": similarity_document(head.fit.world_from_head),
@@ -103,7 +103,8 @@ def report_document(result: Reconstruction) -> Report:
         "warnings": documents_of(result.warnings),
     }
     if result.hair is not None:
-        document["hair"] = _hair(result.hair)
+        shell = result.hair.shell
+        document["hair"] = {"covered_share": shell.covered, "highest_mm": float(shell.height_mm.max())}
     if result.scale_sigma:
         document["scale_sigma"] = result.scale_sigma
     return document
@@ -164,15 +165,6 @@ def _view(quality: ViewQuality) -> ViewReport:
     }
 
 
-def _shape_coefficients(head: HeadFit) -> list[float]:
-    """Returns the fit's coefficients without the weights of expressions, in standard deviations."""
-    return _numbers(np.delete(head.fit.coefficients, np.asarray(head.model.posed, int)))
-
-
-def _expression(found: Found) -> ExpressionReport:
-    return {"name": found.name, "words": found.words, "weight": found.weight, "std": _finite(found.std)}
-
-
 def _morphs(blendshape_rig: BlendshapeRig) -> MorphsReport:
     used = {name: weight for name, weight in blendshape_rig.weights.items() if weight}
     return {"weights": used, "without_counterpart": list(blendshape_rig.missing)}
@@ -200,17 +192,15 @@ def _texture(texturing: Texturing) -> TextureReport:
 
 def _sets(sets: SetTextures) -> SetsReport:
     size = max(len(atlas.image) for atlas in sets.atlases.values())
-    specular = None if sets.specular is None else _specular(sets.specular)
+    specular: SpecularReport | None = None
+    if (found := sets.specular) is not None:
+        specular = {
+            "exposure": dict(found.exposure),
+            "negative": found.negative,
+            "strength_one": NORMAL_SHARE,
+            "roughness": ROUGHNESS,
+        }
     return {"names": [*sets.atlases], "size": size, "specular": specular}
-
-
-def _specular(specular: Specular) -> SpecularReport:
-    return {
-        "exposure": dict(specular.exposure),
-        "negative": specular.negative,
-        "strength_one": NORMAL_SHARE,
-        "roughness": ROUGHNESS,
-    }
 
 
 def skin_document(maps: SkinMaps) -> SkinReport:
@@ -246,10 +236,6 @@ def _light(light: Light) -> dict[str, object]:
         "residual": light.residual,
     }
     return _plain(document)
-
-
-def _hair(hair: HairyHead) -> HairReport:
-    return {"covered_share": hair.shell.covered, "highest_mm": float(hair.shell.height_mm.max())}
 
 
 def _bust(bust: Bust) -> BustReport:

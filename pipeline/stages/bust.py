@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from pipeline.compute.threads import map_in_threads
 from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
-from pipeline.fusion.hair import find_silent_hair, parts_over_head
+from pipeline.fusion.hair import find_silent_hair, parts_over_head, without_specks
 from pipeline.fusion.signed_distance import NoSurface
 from pipeline.fusion.skin import HeadSkin
 from pipeline.geometry.nearest import PointTree, nearest
@@ -82,7 +83,8 @@ def fuse_depth(
     if settings.outputs.surface == "head":
         return Staged(None)
     parts = None if depth.votes is None else parts_over_head(depth.votes, head_world, stubble=False)
-    hair, maps, scatter = find_silent_hair(depth.maps, labels.maps, parts, context.rig)
+    solid = map_in_threads(lambda k: without_specks(depth.maps[k], labels.maps, context.rig), len(depth.maps))
+    hair, maps, scatter = find_silent_hair(solid, labels.maps, parts, context.rig)
     try:
         surface = fuse(
             maps,

@@ -16,7 +16,7 @@ from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings
 from pipeline.texturing.decision import Decision
-from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, ModelLayout, NoLayout, model_layout
+from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, ModelLayout, NoLayout, model_layout, spread_texels
 from pipeline.texturing.paint_kernels import paint_rows
 from pipeline.texturing.vertex_colours import Texture
 from pipeline.warnings import ReportWarning
@@ -64,12 +64,7 @@ def _coarse(layout: Layout, colours: UInt8[np.ndarray, "v 3"]) -> UInt8[np.ndarr
     _, shown = rasterise(texels, ones, layout.faces, COARSE, COARSE)
     values = np.ascontiguousarray(colours[layout.source, ::-1]).astype(np.float32)
     image = interpolate(shown, texels, ones, layout.faces, values)
-    empty = (shown < 0).view(np.uint8)
-    _, labels = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL)
-    nearest = np.asarray(labels).astype(np.int32)
-    known = np.zeros((int(nearest.max()) + 1, 3), np.uint8)
-    known[nearest[shown >= 0]] = np.rint(image[shown >= 0])
-    return known[nearest]
+    return np.rint(spread_texels(image, shown >= 0)).astype(np.uint8)
 
 
 def texture_size(

@@ -17,7 +17,7 @@ be painted in the colour of the skin around it. Such a patch takes its colours f
 it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -164,13 +164,13 @@ def texture(
         return see_points(camera, image, silhouette, depths[camera.name], mesh_world.vertices, normals), image
 
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
-    weights, colours = _stacked([sight for sight, _ in found])
+    weights, colours = (np.stack([getattr(sight, name) for sight, _ in found]) for name in ("weights", "colours"))
     hidden = np.asarray((weights > 0).any(axis=0))
     weights, parts = (weights, None) if shown is None else shown.weigh(weights, views)
     hidden &= ~(weights > 0).any(axis=0)
     unit = np.ones((len(views), 3)), np.zeros((len(views), 3))
     gains, offsets = balance(weights, colours) if settings.balance else unit
-    weights *= gain_confidence(gains)[:, None]
+    weights *= (1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2))[:, None]  # of noise, or in shadow
     balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
     agreed, seen = blend_views(weights, balanced, outlier)
     if not seen.any():
@@ -215,12 +215,6 @@ def underexposed_views(weights: Weights, colours: Colours, share: float) -> Floa
     return np.where((passed[-1] > 0)[:, None], found, np.float32(0.0))
 
 
-def gain_confidence(gains: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
-    """Returns the factor, at most 1, by which a camera's weight is lowered because of its gain. An image that was
-    brightened much has more noise, and is often in shadow."""
-    return 1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2)
-
-
 def decide(
     views: Rig,
     weights: Weights,
@@ -245,10 +239,6 @@ def decide(
 def usable_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
     """Returns the cameras that have a photograph and a usable silhouette, and may therefore colour the head."""
     return rig.subset(name for name in rig.names if name in capture.images and silhouettes[name].quality.usable)
-
-
-def _stacked(sights: Sequence[Sight]) -> tuple[Weights, Colours]:
-    return np.stack([sight.weights for sight in sights]), np.stack([sight.colours for sight in sights])
 
 
 def _by_name(rig: Rig, values: Float[np.ndarray, "k 3"]) -> dict[str, Rgb]:
@@ -349,7 +339,7 @@ def fill_unobserved_patches(
 ) -> Decision:
     """Returns the decision with a view added at the corners of every wide patch that a camera sees although it sees
     none of the corners, such as a strip that closes an eye; not where hair or clothes lie before ``hidden`` corners."""
-    blind = _blind(decision.weights, mesh_world.faces)
+    blind = ~(decision.weights > 0)[:, mesh_world.faces].all(axis=2).any(axis=0)  # no view sees all corners
     rows = np.flatnonzero(blind if hidden is None else blind & ~hidden[mesh_world.faces].any(axis=1))
     faces, normals, area = _parts(mesh_world, rows)
     rows = rows[_wide(faces, area)]
@@ -403,14 +393,6 @@ def _taken(
         unseen = corners[slots[corners, 0] < 0]
         slots[unseen, 0], shares[unseen, 0] = best, 1.0
     return replace(decision, slots=slots, shares=shares, weights=weights)
-
-
-def _blind(weights: Weights, faces: Faces) -> Bool[np.ndarray, " f"]:
-    """Triangles of which no view sees all corners."""
-    out = np.ones(len(faces), bool)
-    for view in weights:
-        out &= ~(view[faces] > 0).all(axis=1)
-    return out
 
 
 def _patches(faces: Faces) -> Int[np.ndarray, " f"]:

@@ -26,7 +26,6 @@ def narrower(made: Scene, by_px: int) -> ViewStack:
 
 
 def silent(views: ViewStack) -> list[int]:
-    """Pixels of each view without an outline."""
     ends = [*views.starts[1:], len(views.depth_mm)]
     return [
         int((PIXEL_STEP * views.shown[first:last, OUTLINE] == SILENT_PX).sum())

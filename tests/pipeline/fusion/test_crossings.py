@@ -8,7 +8,6 @@ from rig.mesh import Mesh
 
 
 def two_touching_balls() -> Mesh:
-    """Their nearest vertices lie at one place."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
     vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces, np.int32)
     top = vertices[:, 2].argmax()

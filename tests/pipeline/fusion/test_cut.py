@@ -7,6 +7,7 @@ import trimesh
 from pipeline.fusion.cut import FAR_MM, find_cut
 from pipeline.fusion.grid import whole_box
 from pipeline.fusion.view_stack import ViewStack, stack_views
+from pipeline.geometry.nearest import PointTree, nearest
 from rig.mesh import Mesh
 from tests.support.ellipsoid_depths import Ellipsoid, scene
 from tests.support.scenes import fan
@@ -31,6 +32,9 @@ def test_nothing_lies_behind_what_cameras_see_and_the_end_is_a_plane(views: View
     assert cut.distance_mm(across).min() > 20.0
     assert (cut.distance_mm(head.vertices[head.vertices[:, 1] > 0.0]) < 1.0).all()
     assert (cut.distance_mm(seen) < 1.0).all()
+    assert cut.before_mm is not None  # nobody guesses a chest before what is seen of it
+    before = cut.before_mm[nearest(PointTree.of(cut.box.places()), np.array([[0, -90.0, 90], [0, 0, 90]]))[1]]
+    assert before[0] > 25.0 > before[1]
 
 
 def test_bust_ends_where_all_photographs_but_one_end(views: ViewStack) -> None:

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from pipeline.fusion.fusion import finished, fuse
-from pipeline.fusion.hair import Places, distance_to_hull, find_silent_hair, local_share, only_where
+from pipeline.fusion.hair import Places, distance_to_hull, find_silent_hair, local_share, only_where, without_specks
 from pipeline.fusion.view_stack import stack_views
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
@@ -119,6 +119,13 @@ def test_solid_hair_and_a_bald_head_stay_as_they_are(strands: Scene) -> None:
         hair, maps, _ = split(made, above)
         assert hair is None
         assert maps is made.maps
+
+
+def test_chance_depth_of_a_plain_shirt_is_left_out(strands: Scene) -> None:
+    solid, parts = scene([OUTER], strands.rig).maps[0], labels(strands, Part.SKIN)
+    rare = only_where(np.random.default_rng(0).random(solid.known.shape) < 0.1, solid)
+    assert without_specks(solid, parts, strands.rig) is solid
+    assert without_specks(rare, parts, strands.rig).known.sum() < 0.1 * rare.known.sum()
 
 
 def test_share_counts_the_subject_alone(strands: Scene) -> None:

@@ -119,7 +119,6 @@ def hostile(wide_model: HeadModel) -> Displacement:
 
 
 def random_face(model: HeadModel, rng: np.random.Generator) -> np.ndarray:
-    """Coefficients of a random head with a random face, as a fit has it."""
     coefficients = np.clip(rng.standard_normal(len(model.modes)), -2.5, 2.5)
     coefficients[model.posed] = 0.0
     coefficients[rng.choice(model.posed, EXPRESSIONS, replace=False)] = rng.uniform(0.0, 1.0, EXPRESSIONS)

@@ -50,7 +50,6 @@ def result() -> Reconstruction:
 
 @pytest.fixture(scope="module")
 def reduced_result(result: Reconstruction) -> Reconstruction:
-    """Its layout is reduced once, in half a minute of a free core."""
     texturing = result.texturing
     assert texturing.atlas is not None
     reduced = reduced_layout(load_model(), texturing.atlas.layout)
@@ -251,7 +250,6 @@ def test_the_khronos_validator_has_nothing_to_say(
 
 
 def validated(path: Path, validator: Path) -> tuple[int, int, list[Any]]:
-    """Errors, warnings and all messages."""
     command = ["node", str(validator / "validate.js"), str(path)]
     verdict = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout)
     return verdict["numErrors"], verdict["numWarnings"], verdict["messages"]
@@ -259,7 +257,6 @@ def validated(path: Path, validator: Path) -> tuple[int, int, list[Any]]:
 
 @pytest.fixture(scope="session")
 def gltf_validator(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The validator of the Khronos group, from npm."""
     folder = tmp_path_factory.mktemp("validator")
     try:
         command = ["npm", "install", "--no-audit", "--no-fund", "gltf-validator@2.0.0-dev.3.10"]

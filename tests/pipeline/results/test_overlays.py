@@ -9,7 +9,6 @@ from tests.support.scenes import ellipsoid
 
 
 def test_a_pixel_moves_towards_the_colours_of_its_parts() -> None:
-    """Rounded to a grey level: half of one, and single precision's."""
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (12, 17, 3), dtype=np.uint8)
     parts = np.zeros((12, 17, 3), np.float32)

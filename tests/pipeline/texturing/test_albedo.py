@@ -30,7 +30,6 @@ GLOSS = 0.25
 
 
 def skin(points: np.ndarray) -> np.ndarray:
-    """Of a tenth more and less, in blotches."""
     return SKIN * (1 + 0.33 * (pattern(points)[:, :1] - 0.4))
 
 
@@ -66,7 +65,6 @@ def layout(mesh: Mesh) -> Layout:
 
 @pytest.fixture(scope="module")
 def found(mesh: Mesh, layout: Layout) -> dict[str, tuple[Atlas, Albedo, np.ndarray]]:
-    """Texture, albedo and the vertices that were seen, by light."""
     rig, normals = fan(), mesh.normals()
     around = Neighbourhood.of(*neighbours(mesh.faces, len(mesh.vertices)))
     out = {}

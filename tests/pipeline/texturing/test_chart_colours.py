@@ -27,7 +27,6 @@ def grey(value: int) -> np.ndarray:
 
 
 def seen_in(camera: Camera, tint: np.ndarray) -> Chart:
-    """A chart that faces +z, at the world's origin."""
     grid = np.stack(np.meshgrid(np.arange(6) - 2.5, 1.5 - np.arange(4)), axis=-1).reshape(-1, 2) * 46.0
     points = np.column_stack([grid, np.zeros(24)])
     return Chart(camera.project(points), true_colours() @ tint.T)

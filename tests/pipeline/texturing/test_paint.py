@@ -19,7 +19,6 @@ from tests.support.scenes import ellipsoid, pattern
 
 
 def without_neck(mesh: Mesh) -> Mesh:
-    """The ellipsoid, open below."""
     kept = mesh.vertices[mesh.faces][:, :, 1].min(axis=1) > 0.8 * mesh.vertices[:, 1].min()
     used, faces = np.unique(mesh.faces[kept], return_inverse=True)
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32))

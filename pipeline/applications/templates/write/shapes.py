@@ -39,6 +39,7 @@ from rig.mesh import Mesh
 
 FORMAT = "eigenhead-shapes/1"
 JAW = "jaw"
+LID_MM = 30.0  # from an eyeball's middle: no other opening is so near
 
 
 def write_template_shapes(folder: Path, result: Reconstruction, template: Template) -> None:
@@ -85,11 +86,24 @@ def write_posed(folder: Path, result: Reconstruction) -> None:
     photographed = PhotographedEyes(head, np.arange(len(opened), len(head.faces)), result.texturing.atlas)
     animated = replace(animated, gazes=_towards_irises(animated, eyes, from_world, photographed))
     skin, colours = head_skin(result, head), result.texturing.vertices.colours
+    shut = {name: ball.centre for name, ball in animated.added.items() if _is_bridged(name, result)}
+    middle = head.vertices[head.faces].mean(axis=1)
+    kept = np.arange(len(head.faces)) < len(opened)
+    for centre in shut.values():  # the strip between such lids is skin
+        kept |= np.linalg.norm(middle - centre, axis=1) < LID_MM
+    animated = replace(animated, added={name: ball for name, ball in animated.added.items() if name not in shut})
     if skin is not None and skin.faces is not None:
-        skin = replace(skin, faces=skin.faces[: len(opened)])
-    scene = animated_scene(animated, opened, colours, blendshape_rig.weights, skin)
+        skin = replace(skin, faces=skin.faces[kept])
+    scene = animated_scene(animated, head.faces[kept], colours, blendshape_rig.weights, skin)
     scene = replace(scene, parts=[_with_picture(part, animated, photographed) for part in scene.parts])
     write_atomically(folder / "posed.glb", scene_glb_bytes(scene, asset_extras(result)))
+
+
+def _is_bridged(pivot: str, result: Reconstruction) -> bool:
+    """Tells whether an eye is closed without a blink of the model."""
+    side, found = pivot.removeprefix("eye_"), result.evidence.blendshape_rig
+    eye, blink = result.faces.eyes.get(side), f"eyeBlink{side.title()}"
+    return isinstance(eye, UnseenEye) and eye.cause == "closed" and not (found and found.weights.get(blink))
 
 
 def _towards_irises(
