@@ -156,10 +156,13 @@ def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
         of_view = "view" if quality.usable else "view-left-out"
         for code, faults in ((of_view, quality.warnings), ("mask-doubtful", quality.doubts)):
             remarks_by_code[code] += [compose("located", where=name, fault=fault) for fault in faults]
+    once = {
+        code: say_once(remarks, silhouettes, named_most=len(silhouettes)) for code, remarks in remarks_by_code.items()
+    }
     return [
-        _doubt(remark) if code == "mask-doubtful" else compose(code, remark=remark)
-        for code, remarks in remarks_by_code.items()
-        for remark in say_once(remarks, silhouettes, named_most=len(silhouettes))
+        *(compose("view-left-out", remark=remark) for remark in once["view-left-out"]),
+        *(compose("view", remark=remark) for remark in once["view"]),
+        *(_doubt(remark) for remark in once["mask-doubtful"]),
     ]
 
 
