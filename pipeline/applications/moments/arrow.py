@@ -20,7 +20,8 @@ from pipeline.estimation.positive_definite import inverse, inverse_diagonal
 
 Matrix = Float[np.ndarray, "p p"]
 Vector = Float[np.ndarray, " p"]
-Rows = Int[np.ndarray, " b"]
+Rows = Int[np.ndarray, "_"]
+Left = Float[np.ndarray, "r r"]  # of the unknowns that are left
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +38,7 @@ class Eliminated:
         return scipy.linalg.cho_solve((self.root, True), right, check_finite=False)
 
     @property
-    def taken(self) -> Float[np.ndarray, "r r"]:
+    def taken(self) -> Left:
         """Returns what its elimination takes from the matrix of the unknowns that are left."""
         half = scipy.linalg.solve_triangular(self.root, self.across, lower=True, check_finite=False)
         return half.T @ half
@@ -71,7 +72,7 @@ class Arrow:
         found[self.left] = inverse_diagonal(self._rest(matrix, self._eliminated(matrix)))
         return found
 
-    def covariances(self, matrix: Matrix, blocks: tuple[Rows, ...]) -> Iterator[Matrix]:
+    def covariances(self, matrix: Matrix, blocks: tuple[Rows, ...]) -> Iterator[Float[np.ndarray, "_ _"]]:
         """Yields the rows and columns of each of ``blocks`` from the inverse of ``matrix``, exactly symmetric. Raises
         LinAlgError."""
         gone = self._eliminated(matrix)
@@ -106,7 +107,7 @@ class Arrow:
             for rows in self.blocks
         ]
 
-    def _rest(self, matrix: Matrix, gone: list[Eliminated]) -> Matrix:
+    def _rest(self, matrix: Matrix, gone: list[Eliminated]) -> Left:
         rest = matrix[np.ix_(self.left, self.left)]
         for each in gone:
             rest -= each.taken

@@ -32,7 +32,7 @@ from pipeline.estimation.terms import Linearised, NormalEquations, Problem, Sum
 COMMON = 0.5  # share of the variance of evidence that all moments have in common
 STEPS = 12  # Levenberg-Marquardt steps at most
 States = tuple[State, ...]
-Rows = Int[np.ndarray, " u"]
+Rows = Int[np.ndarray, "_"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
