@@ -41,7 +41,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     warning has a code that ``settings.fail_on`` names, and Cancelled when ``context.progress`` does.
     """
     steps = start_reconstruction(context)
-    return steps.send(next(steps))
+    return steps.send(replace(next(steps), solution=None))  # which no later stage needs, and which is large
 
 
 def start_reconstruction(context: ReconstructionContext) -> Generator[Any, HeadFit, None]:
@@ -91,7 +91,7 @@ def start_reconstruction(context: ReconstructionContext) -> Generator[Any, HeadF
         faces=faces,
         alignment=alignment,
         labels=labels,
-        head=replace(head, solution=None),
+        head=head,
         refined=refined,
         texturing=texturing,
         bust=bust,

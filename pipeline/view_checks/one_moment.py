@@ -56,7 +56,7 @@ def judge_moments(subject: SubjectFaces | None, rig: Rig) -> list[ReportWarning]
             break
         rests = [{name: seen for name, seen in shown.items() if name != one.camera} for one in over]
         left = [_list_differing(rest, face.detections, rig)[:1] for rest in rests] if len(over) > 1 else [[]]
-        best = left.index(min(left))
+        best = left.index(min(left))  # by the largest offset that is left
         odd, shown = [*odd, over[best]], rests[best]
     return [compose("moments-differ", camera=one.camera, offset_mm=one.distance_mm) for one in odd]
 

@@ -128,7 +128,7 @@ def joined(head: HeadFit, solved: ContourSolution, covariance: Float[np.ndarray,
         relief_mm = FINE_AMPLITUDE_MM * (RELIEF_OF_OUTLINES if level == "kernel" else 1.0)
         fit = replace(fit, misfit_mm=solved.misfit_mm)
         fit = with_estimated_prior(head.model, fit, eigenheads, relief_mm=relief_mm)
-    return replace(head, fit=fit)
+    return replace(head, fit=fit, solution=None)
 
 
 def differ_by(alone: Fit, joint: ContourSolution, eigenheads: int) -> float:

@@ -67,13 +67,14 @@ def _loaded(path: Path, endings: tuple[str, ...] = MESH_ENDINGS) -> Any:
         raise InputError(path.name, [compose("no-mesh-ending" if endings == MESH_ENDINGS else "no-surface-ending")])
     if path.suffix.lower() == ".glb":
         _check_glb(path)
-    text = _plain_obj(path) if path.suffix.lower() == ".obj" else None
     try:
-        if text is None:
-            loaded = trimesh.load(path, force="mesh", process=False)
-        else:
-            beside = FilePathResolver(str(path))
+        if path.suffix.lower() == ".obj":
+            text, beside = _plain_obj(path), FilePathResolver(str(path))
             loaded = trimesh.load(text, file_type="obj", resolver=beside, force="mesh", process=False)
+        else:
+            loaded = trimesh.load(path, force="mesh", process=False)
+    except InputError:
+        raise
     except Exception as error:  # trimesh lets the parsers' own errors through, of any class
         reason = compose("mesh-cut-off", kind=path.suffix[1:].upper())
         raise InputError(path.name, [compose("mesh-unread", reason=reason)]) from error

@@ -119,6 +119,7 @@ def test_read_mesh_gives_geometry_and_colours_back(suffix: str, tmp_path: Path) 
         ("points.obj", b"v 0 0 0\nv 1 0 0\n"),
         ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
         ("zero.obj", b"v 0 0 1\nv 1 0 0\nv 0 1 0\nf 0 1 2\n"),
+        ("utf16.obj", b"\xff\xfev\x000\x00 "),  # half a letter
         ("commas.obj", b"v 0,5 0,1 0,2\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
         ("beyond.obj", b"v 0 0 1\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
     ],
