@@ -18,7 +18,7 @@ START_CLUTTER_MM = 12.0
 BLOCK_PX = 20.0
 BARE_SLACK_PX = 0.1  # noise of a contour's RMS
 FLOOR_SIGMAS, MAX_FLOOR_PX = 3.0, 6.0
-UNIT_RANGE = (1.0, 40.0)  # px^3: noise of 0.5 px over 4 px; misfit of 2 px over 10 px
+MIN_UNIT = 1.0  # px^3: noise of 0.5 px over 4 px. No upper limit: 40 let long hair before a face pull it 5 mm away
 
 
 def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> StageEvidence:
@@ -79,7 +79,7 @@ def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float |
         means.append((np.bincount(block, length * rim.residual[order]) / np.maximum(total, 1e-9))[total > BLOCK_PX / 2])
     found = np.concatenate(means) if means else np.zeros(0)
     variance = (1.4826 * float(np.median(np.abs(found)))) ** 2 if len(found) > 10 else FIRST_NOISE_PX**2
-    return float(np.clip(BLOCK_PX * variance, *UNIT_RANGE))
+    return max(BLOCK_PX * variance, MIN_UNIT)
 
 
 def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, from_face: State) -> bool:

@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.contour_fit.contour import schedule
 from pipeline.contour_fit.head_problem import apply_step, head_problem
+from pipeline.contour_fit.noise_model import estimated_unit
 from pipeline.contour_fit.posterior import vertex_deviation_mm
 from pipeline.contour_fit.problem import PER_CAMERA, POSE, State, first_evidence, make_problem, widened
 from pipeline.contour_fit.rim_term import observed_rim, rim_rows
@@ -99,6 +100,18 @@ def test_derivatives_predict_the_rim(model, planted):
             before = np.average(rim.residual[one], weights=rim.length[one])
             after = np.average(moved.residual[two], weights=moved.length[two])
             assert after - before == pytest.approx(predicted, abs=0.05 + 0.05 * abs(predicted))
+
+
+@pytest.mark.gl
+def test_an_outline_that_misses_the_head_says_little(model, planted):
+    """Long hair that hangs before a face pulled it 5 mm away while the noise unit had an upper limit of 40 px^3."""
+    rig, coefficients, pose, silhouettes = planted
+    problem = make_problem(model, pose, silhouettes, rig, SETTINGS, {})
+    state = State(coefficients, pose, np.zeros((len(rig), PER_CAMERA)))
+    rim = observed_rim(problem, first_evidence(SETTINGS), state, schedule(SETTINGS, 60)[-1])
+    assert (estimated_unit(problem, rim, 12.0) or 0.0) < 5.0
+    strands = replace(rim, residual=5.0 * np.sin(rim.pixel[:, 0] / 20.0))
+    assert (estimated_unit(problem, strands, 12.0) or 0.0) > 100.0
 
 
 @pytest.mark.gl
