@@ -61,6 +61,7 @@ WARNING_CODES = (
     "unknown-key",
     "view",
     "view-left-out",
+    "view-unlike",
     "views-many",
 )
 """Codes that a result's warnings may have; docs/operator.md says what each means and what to do."""

@@ -16,6 +16,7 @@ from pipeline.head_model.model import HeadModel
 REGIONS = ("face", "eyes", "nose", "mouth", "ears", "neck", "cranium")
 EYE_MARGIN_MM, EYE_HALF_HEIGHT_MM, EYE_DEPTH_MM = 6.0, 13.0, 20.0  # about the line from corner to corner
 NOSE_MARGIN_MM = 4.0
+NOSE_BASE_MM, CHIN_HALF_WIDTH_MM = 5.0, 35.0
 MOUTH_MARGIN_MM, MOUTH_HALF_HEIGHT_MM = 6.0, 16.0
 EAR_BEHIND_MM, EAR_BEFORE_MM, EAR_HALF_HEIGHT_MM, EAR_INSIDE_MM = 36.0, 4.0, 33.0, 12.0
 PINNA_OFF_MM, PINNA_REACH_MM = 4.0, 6.0  # off the innermost vertex so near, seen from the side
@@ -53,6 +54,15 @@ def head_regions(model: HeadModel) -> dict[str, Bool[np.ndarray, " v"]]:
         "neck": neck,
         "cranium": ~(face | ears | neck),
     }
+
+
+def halves_of_face(model: HeadModel) -> tuple[Bool[np.ndarray, " v"], Bool[np.ndarray, " v"]]:
+    """Returns which vertices of the full level belong to the face above the nose's base, which no jaw moves, and to
+    mouth and chin."""
+    vertices, face = model.vertices(np.zeros(0)), model.levels["full"].face_region
+    above = vertices[:, 1] - vertices[model.landmarks["subnasale"], 1]
+    upper, lower = above > NOSE_BASE_MM, above < -NOSE_BASE_MM
+    return face & upper, face & lower & (np.abs(vertices[:, 0]) < CHIN_HALF_WIDTH_MM)
 
 
 @lru_cache(maxsize=2)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from pipeline.geometry.raster import depth_maps
-from pipeline.head_model.regions import pinnae, scalp
+from pipeline.head_model.regions import halves_of_face, pinnae, scalp
 from pipeline.part_labels.codes import Part
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.head_fit import HeadFit
@@ -70,6 +70,7 @@ def texture_head(
             lambda camera: labels.shares(camera, mesh.vertices),
             hairless=pinnae(model),
             face=face,
+            compared=halves_of_face(model),
         ),
     )
     close, pores_warnings = _read_pores(context, views, mesh, vertices, face, chart)

@@ -33,6 +33,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
 from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision, pack_pictures
+from pipeline.texturing.likeness import find_unlike
 from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown
 from pipeline.texturing.paint_kernels import Pictures
 from pipeline.texturing.seam_levelling import level_views
@@ -63,6 +64,7 @@ GREY = 0.22  # linear: what a head gets that no camera saw
 STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
 
 
+MIN_FACING = 0.2  # cosine to where the face looks: hair hangs before it otherwise, seen from behind the cheek
 MIN_SKIN, MIN_MEAN_SKIN = 0.5, 0.7  # of a view, and of all: at a collar's soft edge single views are sure of skin
 GAIN_HALVED = 1.0  # of the light, in powers of two: a camera that differs so much counts half
 
@@ -98,6 +100,7 @@ class Shown:
         hairless: where hair hides the surface, which is a bare head's; None: hair belongs to the surface.
         face: where what is of no part is a mouth or a nostril, and not a backdrop.
         measured: where depth agrees with the surface; None: everywhere.
+        compared: regions of the face over which views of one moment look alike.
     """
 
     likely: UInt8[np.ndarray, " v"]
@@ -105,6 +108,7 @@ class Shown:
     hairless: Bool[np.ndarray, " v"] | None = None
     face: Bool[np.ndarray, " v"] | None = None
     measured: Bool[np.ndarray, " v"] | None = None
+    compared: tuple[Bool[np.ndarray, " v"], ...] = ()
 
     def weigh(self, weights: Weights, views: Rig) -> tuple[Weights, UInt8[np.ndarray, " v"]]:
         """Returns the views' weights, 0 where one of them, or the mean of all, hardly shows the surface; and the parts
@@ -128,6 +132,19 @@ class Shown:
         total = weights.sum(axis=0)
         guessed = np.zeros(len(total), bool) if self.measured is None else ~self.measured
         return guessed & (total < GUESS_SHARE * np.median(total[total > 0]))
+
+    def find_unlike(
+        self, weights: Weights, balanced: Colours, mesh: Mesh, normals: Points, views: Rig
+    ) -> dict[str, float]:
+        """Returns the cameras before the face that show it otherwise than the others, each with its likeness."""
+        if not self.compared:
+            return {}
+        face = np.logical_or.reduce(self.compared)
+        ahead, middle = normals[face].mean(axis=0), mesh.vertices[face].mean(axis=0)
+        towards = np.stack([camera.centre_world for camera in views]) - middle
+        cosines = towards @ ahead / np.linalg.norm(towards, axis=1) / np.linalg.norm(ahead)
+        found = find_unlike(weights * (cosines > MIN_FACING)[:, None], balanced, self.compared)
+        return {views.names[k]: likeness for k, likeness in found.items()}
 
 
 @traced
@@ -172,6 +189,7 @@ def texture(
     gains, offsets = balance(weights, colours) if settings.balance else unit
     weights *= (1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2))[:, None]  # of noise, or in shadow
     balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
+    unlike = {} if shown is None else shown.find_unlike(weights, balanced, mesh_world, normals, views)
     agreed, seen = blend_views(weights, balanced, outlier)
     if not seen.any():
         return _untextured(len(seen))
@@ -187,7 +205,11 @@ def texture(
     codes, by_camera = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8), _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
     dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
-    return Texture(codes, seen, by_camera, _by_name(views, offsets), filled, decision, dim, _gain_warnings(by_camera))
+    warnings = (
+        *_gain_warnings(by_camera),
+        *(compose("view-unlike", camera=name, likeness=likeness) for name, likeness in unlike.items()),
+    )
+    return Texture(codes, seen, by_camera, _by_name(views, offsets), filled, decision, dim, warnings)
 
 
 def wide_doubtful_surface(weights: Weights, mesh_world: Mesh) -> Bool[np.ndarray, " v"]:

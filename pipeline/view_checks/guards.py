@@ -72,6 +72,8 @@ GUARDS = (
           kind="warns"),
     Guard(("moments-differ",), ("landmarks of a view against those of the others",), "a face between two moments",
           kind="warns"),
+    Guard(("view-unlike",), ("colours of a view against the others', on the fitted head",),
+          "a face between two moments", kind="warns"),
     Guard(("lens-doubtful",), ("rays of points on the subject",), "a head bent by a wrong lens", kind="warns"),
     Guard(("mask-loose",), ("tangent planes of one camera",), "a head widened by a loose mask", kind="warns"),
     Guard(("scale-implausible",), ("diameters in the outlines",), "a head of the wrong size", kind="warns"),

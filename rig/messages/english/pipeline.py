@@ -189,6 +189,7 @@ TEMPLATES = {
     "no-face": "no face was found in the photographs, though {views} cameras stand before the head as it was fitted: its pose comes from outlines alone. Look at the overlays; give feature points or --front where it is wrong",
     "crown-low": "{camera}: its mask ends {low_mm:.0f} mm below the crown that the other cameras show; give its whole mask. It takes no part where three others are left",
     "moments-differ": "{camera} shows another moment or another person: its face, or its lips, lie {offset_mm:.0f} mm from where the other cameras see them. Trigger all cameras at once, or put the right picture there",
+    "view-unlike": "{camera} shows the face otherwise than the other cameras do (likeness {likeness:.2f} of 1): another moment, expression or person, or the camera has moved. Trigger all cameras at once, or put the right picture there",
     "pose-doubtful": "{finding}",
     "refusal-overruled": "without --anyway this capture would have been refused, and the head may be wrong: {refusal}",
     "outline-size-but-face": "{size}, and the face in the photographs has a head's size: masks show a part of the head or more than it, so look at the overlays",

@@ -705,6 +705,7 @@ export default {
   "take-too-small": "{count} Aufnahme wurde angegeben, es braucht aber zwei oder mehr derselben Person: weitere Ordner nennen. | {count} Aufnahmen wurden angegeben, es braucht aber zwei oder mehr derselben Person: weitere Ordner nennen.",
   "take-needs-contour": "Mehrere Aufnahmen einer Person löst das Verfahren contour: das Verfahren simplex aus den Einstellungen nehmen.",
   "take-other-person": "Der Kopf von {moment} weicht um {sigmas:.1f} Standardabweichungen von dem aller Aufnahmen ab: ist es eine andere Person, diese Aufnahme weglassen.",
+  "view-unlike": "{camera} zeigt das Gesicht anders als die übrigen Kameras (Ähnlichkeit {likeness:.2f} von 1): ein anderer Moment, Ausdruck oder Mensch, oder die Kamera wurde bewegt. Alle Kameras gleichzeitig auslösen, oder das richtige Bild dorthin legen",
   "moments-differ": "{camera} zeigt einen anderen Moment oder eine andere Person: Gesicht oder Lippen liegen {offset_mm:.0f} mm von dort, wo die übrigen Kameras sie sehen. Alle Kameras gleichzeitig auslösen, oder das richtige Bild dorthin legen",
   "pose-doubtful": "{finding}",
   "refusal-overruled": "ohne --anyway wäre diese Aufnahme abgelehnt worden, und der Kopf ist vielleicht falsch: {refusal}",
