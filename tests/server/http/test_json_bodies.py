@@ -14,7 +14,7 @@ from fastapi.routing import APIRoute
 from pydantic import BaseModel
 from starlette.types import Message
 
-from server.http.json_bodies import JsonBodies
+from server.http.app import JsonBodies
 from server.services.keys import Keys
 from server.settings import ServiceSettings
 from server.storage.database import open_database

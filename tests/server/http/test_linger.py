@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from starlette.types import Message, Receive, Scope, Send
 
-from server.http.linger import DrainRequestBody
+from server.http.app import DrainRequestBody
 from tests.support.services import RunningService
 
 BYTES = 8 << 20  # more than both sockets hold: some of it is still to be written when the answer is out

@@ -19,10 +19,10 @@ from rig.messages.message import texts_of
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from rig.studio.scene.layout import default_layout
 from server.errors import Conflict, NotFound, Unavailable
-from server.services.rigs.opening import open_rig
 from server.services.rigs.previews import jpeg, reduced
 from server.services.rigs.real import RealRig
 from server.services.rigs.simulated import SimulatedRig
+from server.services.service import open_rig
 from server.settings import ServiceSettings
 from tests.rig.acquisition.test_session import flat_rig
 from tests.support.textured_studio import NAMES, FlatStudio

@@ -8,7 +8,7 @@ from dbos import DBOS
 from server.settings import ServiceSettings
 from server.storage.database import now_sql, open_database, workers
 from server.storage.job_index import engine_jobs
-from server.worker.engine import take_over
+from server.worker.worker import take_over
 
 ALIVE = {"machine": "m", "host": "h", "pid": 1, "pid_started": 1, "queue": "cpu", "concurrency": 1, "version": "0"}
 

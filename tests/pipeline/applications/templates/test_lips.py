@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float, Int
 
-from pipeline.applications.templates.lips import PRESS_MM, shut_lips
+from pipeline.applications.templates.animated import PRESS_MM, shut_lips
 from pipeline.geometry.raster import depth_map
 from pipeline.head_model.model import load_model
 from pipeline.head_model.subdivision import opened_faces

@@ -7,10 +7,9 @@ import pytest
 
 from pipeline.applications.templates.likeness import SurfaceMarks
 from pipeline.applications.templates.template_file import Template
-from pipeline.applications.wrapping.fitting import drawn_onto, surface_of
 from pipeline.applications.wrapping.scan import raw_scan
 from pipeline.applications.wrapping.sighting import nearest_axis, unit_of
-from pipeline.applications.wrapping.wrap import PlacedScan, place_scan
+from pipeline.applications.wrapping.wrap import PlacedScan, drawn_onto, place_scan, surface_of
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from rig.errors import InputError
