@@ -45,16 +45,16 @@ from server.processes import process_identity, process_started
 from server.services import calibrations
 from server.services.deliveries import DELIVERIES_QUEUE, enqueue_delivery
 from server.services.failures import SERIALIZER, JobFailed, restored
-from server.services.job_rows import APPLICATION, APPLICATION_VERSION, DELIVERY, WORKFLOW
+from server.services.job_rows import APPLICATION, APPLICATION_VERSION, DELIVERY, WORKFLOW, request_of
 from server.services.results import Results
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
 from server.storage.capture_blobs import open_capture_blobs
-from server.storage.database import AWAY, now_sql, open_database, workers
-from server.storage.events import EventLog
+from server.storage.database import AWAY, events, now_sql, open_database, workers
+from server.storage.events import END, EventLog
 from server.storage.folders import move_durably
 from server.storage.job_index import RUNNING, engine_jobs
-from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, WebhookMessage
+from server.storage.records import CalibrationOutcome, EventDocument, FileEntry, JobRequest, JobWebhook, WebhookMessage
 from server.storage.store import Store
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import DISK_FULL, ChildProcessPool, WorkerContext, WorkFailed, function_at
@@ -63,14 +63,14 @@ from server.tasks.reconstruct import reconstruct_capture
 from server.tasks.stage_durations import StageDurations, megapixels_of
 from server.worker.capture_source import CaptureSource
 from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
-from server.worker.outcome import Outcomes
 from server.worker.pauses import WorkerStopped, insist, pause
-from server.worker.result_files import add_warning, described
+from server.worker.result_files import add_warning, described, warnings_of
 
 LOST_S = 10.0  # between the end of a workflow and its row, which takes milliseconds
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
 
 log = structlog.get_logger()
+SET_ASIDE = "MAX_RECOVERY_ATTEMPTS_EXCEEDED"
 
 
 class Worker:
@@ -496,3 +496,47 @@ def _put_back(engine: sa.Engine, job: sa.TableClause, which: sa.ColumnElement[bo
     with engine.begin() as connection:
         changed = change.values(**back, updated_at=sa.cast(now_sql(connection) * 1000, sa.BigInteger))
         return [*connection.scalars(changed.returning(job.c.workflow_uuid))]
+
+
+class Outcomes:
+    """Writes how one worker's jobs ended: the last event, the count of failures, and messages to webhooks.
+
+    All of it may be done again, since a worker may be killed before the job engine knows that the job has ended; and it
+    waits for a database that is away, since a job whose end nobody wrote would seem to run."""
+
+    def __init__(self, engine: sa.Engine, store: Store, webhooks: Webhooks, stop: threading.Event) -> None:
+        self._engine, self._store, self._webhooks, self._stop = engine, store, webhooks, stop
+        self._events = EventLog(engine)
+
+    def publish(
+        self, job_id: str, state: str, webhook: JobWebhook | None = None, *, failure: str | None = None
+    ) -> None:
+        """Writes how a job ended, with the warnings that an operator must act on, and queues messages to the webhooks
+        of the service and of the job. ``failure``: the kind of a failed job. Raises WorkerStopped."""
+        warnings = warnings_of(self._store.folder("jobs", job_id) / "result" / "report.json")
+        for warning in warnings:
+            log.warning(warning["message"], code=warning["code"])
+        moved = [warning["message"] for warning in warnings if warning["code"] == "camera-moved"]
+        document: EventDocument = {"state": state, "camera_moved": moved} if moved else {"state": state}
+        insist(self._stop, lambda: self._events.end(job_id, document, failure=failure))
+        self._announce(job_id, state, webhook)
+
+    def publish_set_aside(self) -> list[str]:
+        """Writes the end of each job that took down as many workers as it may, which no worker lives to write. Returns
+        their ids."""
+        status, event = engine_jobs(self._engine).c, events.c
+        ended = sa.select(event.job_id).where(
+            event.job_id == status.workflow_uuid, event.seq == END, event.document.contains('"failed"')
+        )
+        query = sa.select(status.workflow_uuid).where(status.name == WORKFLOW, status.status == SET_ASIDE)
+        with self._engine.connect() as connection:
+            ids = [*connection.scalars(query.where(~ended.exists()))]
+        for row in DBOS.list_workflows(workflow_ids=ids, load_output=False) if ids else []:
+            request = request_of(row)
+            self._events.replace_end(row.workflow_id, {"state": "failed"})
+            self._announce(row.workflow_id, "failed", request.get("webhook") if request else None)
+        return ids
+
+    def _announce(self, job_id: str, state: str, webhook: JobWebhook | None) -> None:
+        enqueue: Callable[..., object] = DBOS.enqueue_workflow_with_options
+        insist(self._stop, lambda: self._webhooks.announce(job_id, state, enqueue, job_webhook=webhook))

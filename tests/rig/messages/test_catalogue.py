@@ -30,7 +30,7 @@ RAW = {
     "server/cli/client.py": 7,
     "server/cli/demo.py": 1,
     "server/cli/doctor.py": 2,
-    "server/cli/refine.py": 2,
+    "server/tasks/refine.py": 2,
     "server/cli/studio.py": 1,
     "server/cli/verify.py": 4,
     "server/tasks/photographs.py": 3,
