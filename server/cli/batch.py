@@ -127,7 +127,7 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
     from server.batch.folder import BatchFolder
     from server.batch.run import BatchRun, free_memory, threads_of_worker, usable_cores, worker_count
     from server.batch.summary import write_summary
-    from server.batch.table_files import has_parquet
+    from server.batch.table import has_parquet
 
     share_tasks = [task for task in tasks if share.takes(task.capture.name)]
     folder, cores = BatchFolder(out), usable_cores()

@@ -11,8 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from rig.messages.message import Message
 from server.http.openapi import SETTINGS
-from server.services.tags import TAG_MOST, TAGS_MOST
-from server.services.texts import PLAIN, TEXT_MOST
+from server.services.texts import PLAIN, TAG_MOST, TAGS_MOST, TEXT_MOST
 from server.storage.records import JsonObject
 
 Id = Annotated[str, Field(pattern="^[0-9a-f]{28}$", description="28 hex digits")]

@@ -13,6 +13,7 @@ resume_workflow takes a job from whoever has it by now, revives a cancelled one 
 took down; its recovery is private, and begins only when jobs are taken already.
 """
 
+import json
 import os
 import platform
 import resource
@@ -36,8 +37,9 @@ from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import PHOTO_LEVELS, settings_from_document
+from rig.atomic_write import write_atomically
 from rig.errors import Cancelled, InputError
-from rig.messages.message import compose
+from rig.messages.message import Message, MessageDocument, compose
 from rig.progress import Progress
 from server.errors import UNWRITABLE, unusable_input
 from server.problem_types import type_of_failure
@@ -54,6 +56,7 @@ from server.storage.database import AWAY, events, now_sql, open_database, worker
 from server.storage.events import END, EventLog
 from server.storage.folders import move_durably
 from server.storage.job_index import RUNNING, engine_jobs
+from server.storage.objects import sha256_of
 from server.storage.records import CalibrationOutcome, EventDocument, FileEntry, JobRequest, JobWebhook, WebhookMessage
 from server.storage.store import Store
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
@@ -64,7 +67,6 @@ from server.tasks.stage_durations import StageDurations, megapixels_of
 from server.worker.capture_source import CaptureSource
 from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
 from server.worker.pauses import WorkerStopped, insist, pause
-from server.worker.result_files import add_warning, described, warnings_of
 
 LOST_S = 10.0  # between the end of a workflow and its row, which takes milliseconds
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
@@ -540,3 +542,27 @@ class Outcomes:
     def _announce(self, job_id: str, state: str, webhook: JobWebhook | None) -> None:
         enqueue: Callable[..., object] = DBOS.enqueue_workflow_with_options
         insist(self._stop, lambda: self._webhooks.announce(job_id, state, enqueue, job_webhook=webhook))
+
+
+def warnings_of(report: Path) -> list[MessageDocument]:
+    """Returns the warnings in a report.json; none if it is missing or holds none."""
+    try:
+        return json.loads(report.read_bytes())["warnings"]
+    except (OSError, ValueError, KeyError, TypeError):  # no result, or another kind of work
+        return []
+
+
+def add_warning(report: Path, warning: Message) -> None:
+    """Adds a warning to a report.json; does nothing where another kind of work wrote none."""
+    with suppress(FileNotFoundError):
+        document = json.loads(report.read_bytes())
+        document["warnings"] = [*document["warnings"], warning.document()]
+        write_atomically(report, json.dumps(document, indent=1, ensure_ascii=False).encode())
+
+
+def described(folder: Path) -> dict[str, FileEntry]:
+    """Returns size and SHA-256 of every file below ``folder``, by its relative name."""
+    files: dict[str, FileEntry] = {}
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        files[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
+    return files

@@ -34,8 +34,7 @@ from server.services.bulk import each
 from server.services.captures import CaptureMetadata
 from server.services.imports import fetch_stored_capture
 from server.services.keys import Caller
-from server.services.tags import checked_tags
-from server.services.texts import PLAIN, TEXT_MOST
+from server.services.texts import PLAIN, TEXT_MOST, checked_tags
 from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.object_places import is_object_url

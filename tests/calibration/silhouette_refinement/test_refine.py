@@ -7,13 +7,14 @@ import pytest
 
 from calibration.adjustment.gauge import align_world, gauge_projection, image_distance, moved, world_motions
 from calibration.silhouette_refinement.refine import (
+    Heads,
     TooFewCaptures,
     find_frontier,
     gauge_free,
     minimise_tangencies,
     refine,
+    rim_equations,
 )
-from calibration.silhouette_refinement.rims import Heads, rim_equations
 from calibration.silhouette_refinement.tangency_term import (
     PackedTangencies,
     tangency_jacobian,

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from rig.drivers import opencv
-from rig.drivers.base import CameraLost, CameraNotFound, GrabTimeout
-from rig.drivers.registry import driver_for
+from rig.drivers.base import CameraLost, CameraNotFound, GrabTimeout, driver_for
 from rig.formats.rig_toml import CameraConfig
 from tests.support.frames import grab_frame
 

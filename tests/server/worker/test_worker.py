@@ -25,8 +25,7 @@ from server.storage.job_index import engine_jobs
 from server.storage.records import CaptureRecord, DeliveryRequest, FileEntry, JobRequest
 from server.storage.store import Store, new_id
 from server.tasks.child import WorkFailed
-from server.worker.result_files import described, warnings_of
-from server.worker.worker import Worker, take_over
+from server.worker.worker import Worker, described, take_over, warnings_of
 from tests.support.services import small_capture
 
 JOB = "0123456789ab" + 16 * "c"
