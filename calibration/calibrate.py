@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.adjustment.bundle import CAUCHY, HUBER, BundleSolution, Free, adjust, corner_sigma
-from calibration.adjustment.gauge import effective_pose, gauge_projection, image_sigma, subject_points
+from calibration.adjustment.gauge import effective_pose, gauge_projection, image_sigma, in_world_frame, subject_points
 from calibration.adjustment.intrinsics import Lens, estimate_lenses
 from calibration.adjustment.lens_prior import LensPrior, weak_prior
 from calibration.adjustment.pose_graph import Graph, build_graph
@@ -24,7 +24,6 @@ from calibration.adjustment.state import (
     residuals,
 )
 from calibration.adjustment.timing import TimeOffsets, board_velocities, estimate_offsets
-from calibration.adjustment.world import in_world_frame
 from calibration.board.board import Board
 from calibration.board.detection import Detections, View, WrongBoard, detect_folder, ignore_progress
 from calibration.board.picture_files import list_pictures

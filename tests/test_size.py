@@ -7,7 +7,7 @@ from tests.tools.counts import count_all, list_single_importers, list_solver_loo
 
 CEILINGS = Path(__file__).with_name("ceilings.toml")
 SOLVER_LOOPS = {
-    "pipeline.faces.limbus_fit.fitted": "its edges are searched anew at each reach: no two steps have a cost in common",
+    "pipeline.faces.irises.fitted": "its edges are searched anew at each reach: no two steps have a cost in common",
     "pipeline.multiview.triangulation.triangulate_many": "takes the steps of thousands of points at once",
     "pipeline.texturing.light.fit_light": "its bounds are inequalities over a sphere, which each step states anew",
     "rig.camera.remove": "inverts the lens for all pixels at once; rig knows no estimator",

@@ -5,7 +5,11 @@ the images of the subject's region move least. Let ``W`` (6 C x 6 C, block-diago
 on a sphere of the subject's size, with ``J`` the derivative of a pixel by a left perturbation of camera_from_world, and
 let ``A`` (6 C x 6) be the motions of all cameras under a motion of the world. Then the projection is ``S = I - A (A^T W
 A)^-1 A^T W`` (an S-transformation: W. Baarda, 1973; Triggs et al., "Bundle Adjustment: A Modern Synthesis", section
-9)."""
+9).
+
+The world frame of a calibrated rig has x to the subject's left, y up, z towards the front camera. Up is the direction
+perpendicular to the cameras' image rows: a camera that is not rolled has a horizontal x axis at any elevation. The
+origin is the point nearest to all optical axes."""
 
 from dataclasses import dataclass, replace
 
@@ -15,7 +19,9 @@ from jaxtyping import Float
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.terms import Problem, Residuals
 from rig.camera import Camera, lens_jacobians
+from rig.errors import InputError
 from rig.geometry import RigidTransform, cross_matrix, nearest_rotation, rotation_from_vector
+from rig.messages.message import compose
 from rig.rig import Rig
 
 SUBJECT_RADIUS_MM = 110.0  # of a sphere as large as a head
@@ -187,3 +193,32 @@ def image_sigma(rig: Rig, covariance: Float[np.ndarray, "c 15 c 15"]) -> Float[n
     images = images - basis @ (basis.T @ images)
     squares = (images**2).sum(axis=1).reshape(count, -1, 2).sum(axis=2)
     return np.sqrt(squares.mean(axis=1))
+
+
+def up_direction(rig: Rig) -> Float[np.ndarray, " 3"]:
+    """Returns the unit vector that points up, in the rig's present frame."""
+    rights = np.stack([camera.camera_from_world.rotation[0] for camera in rig])
+    ups = -np.stack([camera.camera_from_world.rotation[1] for camera in rig])
+    values, vectors = np.linalg.eigh(rights.T @ rights)
+    mean = ups.mean(axis=0)
+    # Two small eigenvalues: all rows are parallel, so a whole plane of directions is perpendicular to them.
+    spread = vectors[:, :1] if values[1] > 0.05 * values[2] else vectors[:, :2]
+    up = spread @ (spread.T @ mean)
+    return up / np.linalg.norm(up)
+
+
+def in_world_frame(rig: Rig, front: str | None = None) -> Rig:
+    """Returns the same rig in the project's world frame. ``front`` names the front camera; by default it is the middle
+    one.
+
+    Covariances are those of left perturbations and do not change. Raises InputError if ``front`` is no camera of the
+    rig."""
+    if front is not None and front not in rig:
+        raise InputError("front camera", [compose("front-of-other-rig", front=f"{front!r}", cameras=rig.names)])
+    origin, up = rig.centre_world(), up_direction(rig)
+    forward = rig[front or rig.front_camera()].centre_world - origin
+    forward = forward - up * (up @ forward)
+    forward /= np.linalg.norm(forward)
+    new_from_old = np.stack([np.cross(up, forward), up, forward])
+    old_from_new = RigidTransform(new_from_old.T, origin)
+    return Rig(tuple(replace(camera, camera_from_world=camera.camera_from_world @ old_from_new) for camera in rig))

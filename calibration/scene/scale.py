@@ -5,10 +5,13 @@ known lengths are those of ``scale.json``. Without one, the face in the photogra
 adult's. Where no two views show one, the points around the point that the cameras see are assumed to be a head, as far
 from their middle as the model's mean head is from its own; hair, a neck and the table distort that. Both are marked as
 an assumption wherever they are shown.
+
+The cameras of another program, whose unit is unknown, are brought to millimetres by a known length, too. Those that
+agree with the length within its uncertainty are not changed, since a calibration board is more precise.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,10 +22,11 @@ from calibration.scene.structure import Structure
 from pipeline.faces.networks import load_networks
 from pipeline.faces.subject import SearchEffort, find_subject
 from pipeline.multiview.triangulation import NoPoint, TriangulatedPoint, triangulate
+from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.cameras.scale_json import CameraDistance, KnownLength, PointDistance, TagSize, dictionaries
 from rig.formats.pictures.images import decode_image_file
-from rig.formats.pictures.work_size import WORK_PIXELS, work_rig, work_share
+from rig.formats.pictures.work_size import WORK_PIXELS, work_features, work_rig, work_share
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
@@ -32,6 +36,10 @@ HEAD_SHARE = 0.2  # standard deviation of what the size of a head tells
 FACE_SHARE = 0.06  # of a face's: adults' differ by .05 (ANSUR II: breadth and height), the network's points by .03
 ASSUMED = ("face-size", "head-size")
 HALF_PIXEL = 0.5
+AGREES_SHARES = 3.0  # standard deviations of the known length
+AGREES_LEAST = 0.002  # and at least this share: half a millimetre of a head
+
+
 """AprilTag's edge lines count from a pixel's corner. They leave sides unbiased; OpenCV's own corners, refined below a
 pixel, lie 0.15 px inside each way: 1 % of a tag of 35 px."""
 TAG_MISS_PX = 3.0  # beyond it a corner of another tag was taken for it, or the tag was moved
@@ -227,3 +235,61 @@ def _looked_at(structure: Structure) -> Float[np.ndarray, "p 3"]:
 
 def _median_radius(points: Float[np.ndarray, "p 3"]) -> float:
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+
+
+def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> tuple[Rig, list[Message]]:
+    """Scales a rig so that a known length is right (mm). Returns the rig and a message of what was done. If the rig
+    agrees with the length within the length's uncertainty, it is returned unchanged, without a message.
+
+    Args:
+        capture: pictures as ``rig`` took them.
+        rig: the cameras, perhaps of pictures that were read at a smaller size.
+        full: the cameras of the original files, in whose pixels points were picked.
+        known: the length.
+
+    Raises InputError if the pictures do not show the length.
+    """
+    scale = _scale(capture, rig, full, known)
+    if abs(np.log(scale.factor)) <= max(AGREES_LEAST, AGREES_SHARES * scale.share):
+        return replace(rig, scale_sigma=min(rig.scale_sigma, scale.share)), []
+    return replace(times(rig, scale.factor), scale_sigma=scale.share), [
+        compose("cameras-scaled", factor=scale.factor, scale=scale.provenance)
+    ]
+
+
+def times(rig: Rig, factor: float) -> Rig:
+    """Returns the rig with all its lengths multiplied by ``factor`` and its covariances scaled accordingly."""
+    grows = np.diag([1.0, 1.0, 1.0, factor, factor, factor])
+    return replace(
+        rig,
+        cameras=tuple(
+            replace(
+                camera,
+                camera_from_world=replace(
+                    camera.camera_from_world, translation=camera.camera_from_world.translation * factor
+                ),
+                covariance=None if camera.covariance is None else grows @ camera.covariance @ grows,
+            )
+            for camera in rig
+        ),
+    )
+
+
+def _scale(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> Scale:
+    if isinstance(known, CameraDistance):
+        return scale_from_cameras(rig, known)
+    if isinstance(known, PointDistance):
+        ends = {"first": known.first, "second": known.second}
+        pixels = work_features(
+            {end: {name: _undistorted(full, name, at) for name, at in views.items()} for end, views in ends.items()},
+            full,
+            rig,
+        )
+        return scale_from_points(rig, PointDistance(pixels["first"], pixels["second"], known.distance_mm))
+    return scale_from_tags(rig, known, find_tags_of_shot(capture.images, known))
+
+
+def _undistorted(full: Rig, name: str, pixel: np.ndarray) -> np.ndarray:
+    """Returns the position of a file's pixel in the picture as it is read."""
+    lens = full[name].recorded
+    return pixel if lens is None else lens.undistorted(pixel[None], full[name].intrinsics.matrix())[0]

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from calibration.adjustment.world import in_world_frame
+from calibration.adjustment.gauge import in_world_frame
 from calibration.result import CalibrationRefused
 from calibration.scene.covariance import uncertainty
 from calibration.scene.matching import Matches, match_photographs

@@ -3,23 +3,37 @@ subject.
 
 The residual and its derivative by the cameras are in ``tangency_term``. Each step of Levenberg-Marquardt finds the
 tangencies anew: the first uses the outer ones of ``pipeline.multiview.tangency``, which cannot be confused, the others
-all frontier points. With a head model, the rims of fitted heads are added at the end
-(``calibration.silhouette_refinement.rims``). The calibration's covariance is the prior; the gauge is that of
-``calibration.adjustment.gauge``. Silhouettes do not determine a rig's scale, so the board's is kept.
+all frontier points. With a head model, the rims of fitted heads are added at the end. The calibration's covariance is
+the prior; the gauge is that of ``calibration.adjustment.gauge``. Silhouettes do not determine a rig's scale, so the
+board's is kept.
+
+Frontier points are points where an epipolar plane touches the subject, seen on the silhouettes of two cameras. Consider
+the angle of a contour's rays about the line through both camera centres. At a local extreme of the angle the epipolar
+plane touches the subject, and unless something hides that point, the other contour has an extreme at the same angle.
+``pipeline.multiview.tangency`` uses the two outermost extremes of a pair; a head with hair and shoulders has several
+more. Only convex extremes count: where two parts of an outline cross (a T-junction) the contour has a concave corner
+that is no point of the subject. Extremes are paired by their angles, so the cameras must be accurate to about
+``GATE_PX`` already.
+
+The rims of a head fitted to one capture are turned into equations for the cameras alone: the contour solver's (section
+4.4, ``pipeline.contour_fit.contour``) normal equations at the solution, over (shape, pose, cameras), are reduced to the
+cameras by the Schur complement, so that the uncertainty of the head's shape is accounted for. The equations of several
+captures add up: each has a head of its own, and all share the cameras.
 
 Enters: silhouettes of several captures, and the rig. Leaves: the rig, refined if held-out captures agree.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import combinations
 
+import cv2
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from calibration.adjustment.gauge import align_world, gauge_projection, image_distance
-from calibration.silhouette_refinement.frontier import find_frontier
-from calibration.silhouette_refinement.rims import Heads, rim_equations
 from calibration.silhouette_refinement.tangency_term import (
     ROBUST_SIGMAS,
     PackedTangencies,
@@ -28,13 +42,30 @@ from calibration.silhouette_refinement.tangency_term import (
     per_camera,
     tangency_residuals,
 )
-from pipeline.contour_fit.problem import camera_information
+from pipeline.contour_fit.contour import solve_contour
+from pipeline.contour_fit.head_problem import head_problem
+from pipeline.contour_fit.problem import PER_CAMERA, camera_information
 from pipeline.estimation.levenberg_marquardt import MIN_DAMPING, Limits, Solution, minimise
 from pipeline.estimation.robust import GemanMcClure
 from pipeline.estimation.terms import NormalEquations, Problem, Quadratic, Term
+from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.tangency import Tangency, find_tangencies
+from pipeline.multiview.tangency import (
+    BORDER_PX,
+    LONGEST_SPAN,
+    MIN_SLOPE,
+    Tangency,
+    angle_slopes,
+    epipolar_plane_axes,
+    find_tangencies,
+    on_contour,
+    rays_about,
+    tangency,
+)
+from pipeline.settings import FittingSettings
+from rig.camera import Camera
 from rig.errors import EigenheadError
+from rig.geometry import Similarity
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig
@@ -51,6 +82,12 @@ FOLDS = 5
 GAIN_SIGMAS = 2.0  # the mean cost of held-out residuals must fall by so many of its standard deviations
 
 Pairs = Callable[[tuple[str, str]], bool]  # whether the tangencies of two cameras take part
+GATE_PX = 2.5  # largest distance of two extremes that count as one frontier point
+REACH = 15  # contour pixels to either side among which an extreme must be the largest
+PROMINENCE_PX = 0.3  # by so much: an outline straighter than a radius of 400 px does not locate an extreme
+SMOOTH_PX = 1.0  # smoothing along the contour; it shifts a bend of radius r by 1 / (2 r) px
+INSIDE_PX = 4.0  # at this distance behind a convex extreme the mask must show the subject
+HELD_PX = 0.01  # prior that keeps cameras fixed in the fit: a tenth of the errors sought
 
 
 class TooFewCaptures(EigenheadError):
@@ -58,6 +95,20 @@ class TooFewCaptures(EigenheadError):
 
     def __init__(self, captures: int) -> None:
         super().__init__(compose("refinement-too-few-captures", count=captures))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Heads:
+    """Holds a model for the heads of all captures, and the pose at which the fit of each capture's head starts
+    (``world_from_head``)."""
+
+    model: HeadModel
+    starts: Sequence[Similarity]
+    settings: FittingSettings = field(default_factory=FittingSettings)
+
+    def subset(self, chosen: Sequence[int]) -> "Heads":
+        """Returns the heads of the captures with the indices ``chosen``."""
+        return replace(self, starts=[self.starts[i] for i in chosen])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -332,3 +383,115 @@ def _projection(rig: Rig, *, focal: bool) -> Float[np.ndarray, "p p"]:
     matrix = np.eye(per_camera(focal=focal) * len(rig))
     matrix[np.ix_(poses, poses)] = gauge_projection(rig)
     return matrix
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contour:
+    """Holds the longest closed outline of a silhouette, in order: sub-pixel positions, unit rays in the world frame,
+    and which pixels are ``whole`` (not at the picture's border)."""
+
+    camera: Camera
+    mask: Bool[np.ndarray, "h w"]
+    pixels: Float[np.ndarray, "n 2"]
+    rays: Float[np.ndarray, "n 3"]
+    whole: Bool[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, camera: Camera, silhouette: Silhouette) -> "Contour":
+        """Extracts the outline of a silhouette, smoothed by ``SMOOTH_PX``."""
+        outlines, _ = cv2.findContours(silhouette.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        chain = max(outlines, key=len).reshape(-1, 2).astype(float)
+        pixels = gaussian_filter1d(on_contour(chain, silhouette.distance), SMOOTH_PX, axis=0, mode="wrap")
+        far = np.array([camera.intrinsics.width, camera.intrinsics.height]) - 1.0
+        margin = np.minimum(chain, far - chain).min(axis=1)
+        whole = -maximum_filter1d(-margin, 2 * REACH + 1, mode="wrap") >= BORDER_PX
+        return cls(camera, silhouette.mask, pixels, camera.rays_world(pixels), whole)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Extremes:
+    """Holds the local extremes of the angle along one contour: angle (rad), +1 for maxima and -1 for minima, pixel, and
+    the angle's change per pixel."""
+
+    angle: Float[np.ndarray, " e"]
+    side: Float[np.ndarray, " e"]
+    pixels: Float[np.ndarray, "e 2"]
+    slopes: Float[np.ndarray, "e 2"]
+
+
+def find_frontier(silhouettes: Mapping[str, Silhouette], rig: Rig, gate_px: float = GATE_PX) -> list[Tangency]:
+    """Returns the frontier points of every pair of cameras that both contours show without ambiguity. ``rig`` must
+    contain only cameras with a usable silhouette."""
+    contours = [Contour.of(camera, silhouettes[camera.name]) for camera in rig]
+    frontier = []
+    for one, two in combinations(contours, 2):
+        frontier += _pair(one, two, gate_px)
+    return frontier
+
+
+def _pair(one: Contour, two: Contour, gate_px: float) -> list[Tangency]:
+    u, v = epipolar_plane_axes(one.camera, two.camera, one.rays.mean(axis=0) + two.rays.mean(axis=0))
+    angles = [np.arctan2(contour.rays @ v, contour.rays @ u) for contour in (one, two)]
+    if max(np.ptp(angle) for angle in angles) > LONGEST_SPAN:
+        return []
+    first, second = (_extremes(c, angle, u, v) for c, angle in zip((one, two), angles, strict=True))
+    if not len(first.angle) or not len(second.angle):
+        return []
+    steepness = np.linalg.norm(first.slopes, axis=1)
+    other_steepness = np.linalg.norm(second.slopes, axis=1)
+    apart = (
+        np.abs(first.angle[:, None] - second.angle[None, :])
+        / np.hypot(steepness[:, None], other_steepness[None, :])
+        * np.sqrt(2.0)
+    )
+    apart[first.side[:, None] != second.side[None, :]] = np.inf
+    frontier = []
+    for i, j in zip(*np.nonzero(apart < gate_px), strict=True):
+        rivals = np.concatenate([np.delete(apart[i], j), np.delete(apart[:, j], i)])
+        if len(rivals) and rivals.min() < 2.0 * gate_px:
+            continue
+        names, pixels = (one.camera.name, two.camera.name), (first.pixels[i], second.pixels[j])
+        difference = float(first.angle[i] - second.angle[j])
+        frontier.append(tangency(names, pixels, (first.slopes[i], second.slopes[j]), difference, float(first.side[i])))
+    return frontier
+
+
+def _extremes(contour: Contour, angle: Float[np.ndarray, " n"], u: np.ndarray, v: np.ndarray) -> _Extremes:
+    tops = maximum_filter1d(angle, 2 * REACH + 1, mode="wrap") == angle
+    bottoms = maximum_filter1d(-angle, 2 * REACH + 1, mode="wrap") == -angle
+    at = np.flatnonzero((tops | bottoms) & contour.whole)
+    side = np.where(tops[at], 1.0, -1.0)
+    pixels = contour.pixels[at]
+    slopes = angle_slopes(rays_about(contour.camera, pixels), u, v)
+    steep = np.linalg.norm(slopes, axis=1)
+    ends = np.maximum(side * angle[at - REACH], side * angle[(at + REACH) % len(angle)])
+    behind = pixels - INSIDE_PX * (side / np.maximum(steep, 1e-12))[:, None] * slopes
+    height, width = contour.mask.shape
+    x, y = np.rint(np.clip(behind, 0, [width - 1, height - 1])).astype(int).T
+    good = (steep > MIN_SLOPE) & (side * angle[at] - ends > PROMINENCE_PX * steep) & contour.mask[y, x]
+    return _Extremes(angle[at][good], side[good], pixels[good], slopes[good])
+
+
+def rim_equations(
+    silhouettes: Mapping[str, Silhouette], rig: Rig, heads: Heads, start: Similarity
+) -> tuple[Float[np.ndarray, "c6 c6"], Float[np.ndarray, " c6"]]:
+    """Returns normal matrix and gradient of the rims' cost over the left perturbations (rad, mm) of all cameras.
+
+    They are zero for cameras without a usable silhouette. Raises ValueError if no silhouette is usable."""
+    bare = Rig(tuple(replace(camera, covariance=None) for camera in rig))  # the caller adds the prior
+    solved = solve_contour(heads.model, start, silhouettes, bare, replace(heads.settings, calibration_px=HELD_PX))
+    problem = replace(solved.problem, camera_information=np.zeros_like(solved.problem.camera_information))
+    stage = replace(solved.stage, cameras=True)
+    scale_px = max(stage.scales_px[-1], solved.evidence.noise.floor_px)
+    whole = head_problem(problem, solved.evidence, stage, scale_px)
+    equations = whole.equations(whole.at(solved.state))
+    matrix, gradient = equations.matrix, equations.gradient
+    head_size = len(gradient) - PER_CAMERA * len(problem.views.names)
+    head = scipy.linalg.cho_factor(matrix[:head_size, :head_size])
+    across = matrix[head_size:, :head_size]
+    reduced = matrix[head_size:, head_size:] - across @ scipy.linalg.cho_solve(head, across.T)
+    slope = gradient[head_size:] - across @ scipy.linalg.cho_solve(head, gradient[:head_size])
+    at = np.concatenate([PER_CAMERA * rig.names.index(name) + np.arange(PER_CAMERA) for name in problem.views.names])
+    full, full_slope = np.zeros((PER_CAMERA * len(rig),) * 2), np.zeros(PER_CAMERA * len(rig))
+    full[np.ix_(at, at)], full_slope[at] = 0.5 * (reduced + reduced.T), slope
+    return full, full_slope

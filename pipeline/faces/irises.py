@@ -4,33 +4,31 @@ Enters: the subject's face in the views with the points of the eyes' network, th
 by eye: centre and radius of the iris, the direction of the gaze, each with its deviation; or why the eye is not seen.
 The gaze is the limbus' normal, the eye's optical axis; the line of sight lies about 5 degrees nearer to the nose.
 
-Each eye is fitted alone (``limbus_fit``) and, where both do not look alike, again from where the other eye looks, and
+Each eye is fitted alone and, where both do not look alike, again from where the other eye looks, and
 from where both look; what most edges speak for is kept. Priors: the radius is 5.85 mm (deviation 0.25; a visible iris
 of 11.7 mm, Ruefer et al. 2005). The eyeball lies 10.5 mm behind the iris and 5 mm behind the corners of the eye, to 4
 mm in each direction. Both eyes look at one point: elevations are the same to 1 degree, and the lines meet as for a
 point half a metre away or farther; where the two eyes contradict that clearly (a squint), each is left as it was found.
+
+Edges of the limbus and pupils are looked for about the circle, the circle is fitted to them, and so on, nearer and
+nearer. The pupil lies on the circle's axis; how far before the circle is found, too: an iris lies behind the cornea,
+which lifts it, and a model's may be painted on the cornea. The pupil is the darkest disc in the iris, of the same size
+in all views. Pixels that mirror a lamp are left out. Brightness is taken by its square root, so that noise is alike in
+bright and dark.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import product
 from typing import Literal
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float32
 
 from pipeline.faces.eyes import LIDS
-from pipeline.faces.limbus import eye_view
-from pipeline.faces.limbus_fit import (
-    BEHIND_MM,
-    CENTRE_STD_MM,
-    MIN_VIEWS,
-    RADIUS_MM,
-    EyeSight,
-    LimbusCircle,
-    LimbusFit,
-    fitted,
-)
+from pipeline.faces.limbus import EyeView, eye_view, limbus_offsets
 from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.points import LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS
 from rig.geometry import cross_matrix, nearest_to_rays, rotation_from_vector
@@ -55,6 +53,288 @@ MAX_BETWEEN_DEG = 12.0  # of two gazes: a point 0.3 m away. More is a squint or,
 MAX_ALONE_DEG = 20.0  # off ahead, of an eye that the other does not confirm: whoever looks farther turns the head
 Cause = Literal["closed", "few-views", "coarse", "unclear"]
 IRISES = {"right": 0, "left": 5}  # rows of ``FaceDetection.irises_px``: the centre
+STEP_MM, HALF_MM, IRIS_MM = 0.2, 5.0, 4.5  # of the patch about the pupil, and the iris' inner part
+REACH_MM = 2.4  # how far off the pupil may lie
+RADII_MM = np.arange(1.0, 3.7, 0.3)
+RING_MM, BETWEEN_MM = 0.9, 0.1  # a pupil is darker than the ring about it; neither has its edge
+GLARE = 1.3  # by the iris' median: brighter than any of its fibres
+MIN_DISC, MIN_RING = 0.5, 0.4  # shares that no highlight covers
+MIN_CONTRAST = 0.2  # between ring and disc, by the iris' median; shade under lids has less
+ALONG_MM = np.arange(-HALF_MM, HALF_MM + 1e-9, STEP_MM)
+LACKING = -1.0  # contrast where there is none to be measured
+Contrasts = Float32[np.ndarray, "r n n"]
+
+RADIUS_MM, RADIUS_STD_MM = 5.85, 0.25
+EYEBALL_MM = 12.0
+BEHIND_MM = float(np.sqrt(EYEBALL_MM**2 - RADIUS_MM**2))  # from the iris' centre to the eyeball's
+CENTRE_STD_MM = 4.0
+AHEAD_MM, AHEAD_STD_MM = 1.0, 2.0  # of a pupil: 3 mm behind the cornea's apex, -0.4; painted on a cornea, 2.4
+RAYS = 96
+NEAR = 0.25  # reach of a search, by the circle's radius, that is near enough to look for pupils
+MIN_FACING = 0.5  # cosine between gaze and view
+CORNEA = np.array([0.656, 0.755])  # its normal at the limbus (7.8 mm of radius): along the gaze, and outwards
+MIN_SEEN = 0.25  # cosine between that and the view: the cornea hides, or bends, the limbus behind it
+MIN_VIEWS = 2
+MIN_RAYS = 6  # with an edge, of a view that counts
+ENDS = (0.2, 0.5)  # weights of an arc's last two rays: lids shade the white there and draw the edge inwards
+ROBUST_PX, MIN_NOISE_PX = 0.4, 0.15
+PUPIL_PX = 0.8  # deviation of a pupil in a view: highlights eat into it
+SHARED = 9.0  # edges of a view err together (they are averaged, lids' shade, highlights): so many count as one
+AGREED_PX = 0.35  # scale of an edge that speaks for a circle
+MAX_NETWORK_OFF = 0.6  # between a view's network and the circle's centre, by the iris' radius
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EyeSight:
+    """Holds one view of an eye, and where the network puts the iris in it."""
+
+    name: str
+    view: EyeView
+    network_px: Float[np.ndarray, " 2"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LimbusCircle:
+    """Holds a limbus (world, mm), and how far before it the pupil lies. ``up`` is the face's, so that the result does
+    not depend on the world's axes."""
+
+    centre: Float[np.ndarray, " 3"]
+    gaze: Float[np.ndarray, " 3"]
+    up: Float[np.ndarray, " 3"]
+    radius: float = RADIUS_MM
+    ahead: float = AHEAD_MM
+
+    def axes(self) -> Float[np.ndarray, "2 3"]:
+        """Returns two unit vectors across the gaze."""
+        across = np.cross(self.up, self.gaze)
+        across /= np.linalg.norm(across)
+        return np.stack([across, np.cross(self.gaze, across)])
+
+    def after(self, step: Float[np.ndarray, " 7"]) -> "LimbusCircle":
+        """Returns the circle after a step: of the centre, of the gaze about ``axes``, of the radius, and of the
+        pupil."""
+        turn = rotation_from_vector(step[3:5] @ self.axes())
+        radius, ahead = self.radius + float(step[5]), self.ahead + float(step[6])
+        return LimbusCircle(self.centre + step[:3], turn @ self.gaze, self.up, radius, ahead)
+
+    def on_axis(self, ahead: float) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 7"]]:
+        """Returns a point on the axis before the centre, and its derivative by a step (which keeps ``ahead``)."""
+        slopes = np.zeros((3, 7))
+        slopes[:, :3] = np.eye(3)
+        slopes[:, 3:5] = ahead * np.stack([np.cross(axis, self.gaze) for axis in self.axes()], axis=1)
+        return self.centre + ahead * self.gaze, slopes
+
+    def radius_px(self, view: EyeView) -> float:
+        """Returns how large an iris is in a view."""
+        _, slopes = view.camera.project_with_jacobian(self.centre[None])
+        return RADIUS_MM * float(np.linalg.svd(slopes[0], compute_uv=False)[0])
+
+    def faces(self, seen: EyeSight) -> bool:
+        """Tells whether an eye looks towards a view."""
+        towards = seen.view.camera.centre_world - self.centre
+        return bool(towards @ self.gaze > MIN_FACING * np.linalg.norm(towards))
+
+    def agrees(self, seen: EyeSight) -> bool:
+        """Tells whether the network sees the iris where the circle is."""
+        pixel = seen.view.camera.project(self.centre[None])[0]
+        return bool(np.linalg.norm(pixel - seen.network_px) < MAX_NETWORK_OFF * self.radius_px(seen.view))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LimbusEdges:
+    """Holds how far beyond the circle a view has its edges (px), the derivatives of the circle's image along these rays
+    by a step, weights, and their deviation (px)."""
+
+    offsets: Float[np.ndarray, " n"]
+    slopes: Float[np.ndarray, "n 7"]
+    weights: Float[np.ndarray, " n"]
+    noise: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LimbusFit:
+    """Holds a circle, the inverse of its covariance (of a step), and the edges it was fitted to, by view."""
+
+    circle: LimbusCircle
+    information: Float[np.ndarray, "7 7"]
+    edges: Mapping[str, LimbusEdges]
+
+    @property
+    def offsets(self) -> Float[np.ndarray, " n"]:
+        """Returns how far beyond the circle all edges lie (px)."""
+        return np.concatenate([edges.offsets for edges in self.edges.values()])
+
+    @property
+    def agreement(self) -> float:
+        """Returns how many edges speak for the circle."""
+        return float((1.0 / (1.0 + (self.offsets / AGREED_PX) ** 2) ** 2).sum())
+
+
+def fitted(
+    seen: Sequence[EyeSight], circle: LimbusCircle, eyeball: Float[np.ndarray, " 3"], reaches: Sequence[float]
+) -> LimbusFit | None:
+    """Returns the circle that views agree on, None where too few do.
+
+    Args:
+        seen: the views.
+        circle: the one to begin with.
+        eyeball: where the centre of the eyeball may lie, to ``CENTRE_STD_MM``.
+        reaches: of the search about the circle, by its radius, one after the other.
+    """
+    out, pupils = None, None
+    for reach in reaches:
+        about = [sight for sight in seen if circle.faces(sight) and circle.agrees(sight)]
+        edges = {sight.name: found for sight in about if (found := _edges(circle, sight.view, reach)) is not None}
+        if len(edges) < MIN_VIEWS:
+            return None
+        if pupils is None and reach <= NEAR:
+            pupils = _pupils(circle, about)
+        matrix, right = _normal_equations(circle, edges, pupils or [], eyeball)
+        circle = circle.after(np.linalg.solve(matrix, right))
+        out = LimbusFit(circle, matrix, edges)
+    return out
+
+
+def _edges(circle: LimbusCircle, view: EyeView, reach: float) -> LimbusEdges | None:
+    """Returns the edges of a limbus in a view, None where there are too few."""
+    angles = np.arange(RAYS) * 2.0 * np.pi / RAYS
+    axes = circle.axes()
+    spokes = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ axes
+    points, slopes = view.camera.project_with_jacobian(circle.centre + circle.radius * spokes)
+    tangents = np.einsum("nij,nj->ni", slopes, np.cross(circle.gaze, spokes))
+    outwards = np.stack([tangents[:, 1], -tangents[:, 0]], axis=1)
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    radial = np.einsum("nij,nj->ni", slopes, spokes)
+    outwards *= np.sign((outwards * radial).sum(axis=1))[:, None]
+    offsets = limbus_offsets(view, points, outwards, reach * circle.radius_px(view))
+    towards = view.camera.centre_world - circle.centre
+    bulge = CORNEA[0] * circle.gaze + CORNEA[1] * spokes
+    there = np.isfinite(offsets) & (bulge @ towards > MIN_SEEN * np.linalg.norm(towards))
+    if np.count_nonzero(there) < MIN_RAYS:
+        return None
+    by_point = np.einsum("ni,nij->nj", outwards, slopes)[there]
+    turns = [np.cross(axis, circle.radius * spokes[there]) for axis in axes]
+    columns = [by_point, *(np.einsum("ni,ni->n", by_point, turn)[:, None] for turn in turns)]
+    columns += [np.einsum("ni,ni->n", by_point, spokes[there])[:, None], np.zeros((len(by_point), 1))]
+    found = offsets[there]
+    noise = max(1.4826 * float(np.median(np.abs(found))), MIN_NOISE_PX)
+    return LimbusEdges(found, np.concatenate(columns, axis=1), _end_weights(there)[there], noise)
+
+
+def _end_weights(there: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Returns smaller weights for the last two rays of each arc of the circle."""
+    inner = there & np.roll(there, 1) & np.roll(there, -1)
+    innermost = inner & np.roll(inner, 1) & np.roll(inner, -1)
+    return np.where(innermost, 1.0, np.where(inner, ENDS[1], ENDS[0]))
+
+
+def _pupils(circle: LimbusCircle, seen: Sequence[EyeSight]) -> list[tuple[EyeView, Float[np.ndarray, " 2"]]]:
+    """Returns the views that show the pupil, and where."""
+    centre, _ = circle.on_axis(AHEAD_MM)
+    found = pupils_px([sight.view for sight in seen], centre, circle.axes())
+    return [(sight.view, pixel) for sight, pixel in zip(seen, found, strict=True) if pixel is not None]
+
+
+def _normal_equations(
+    circle: LimbusCircle,
+    edges: Mapping[str, LimbusEdges],
+    pupils: Sequence[tuple[EyeView, Float[np.ndarray, " 2"]]],
+    eyeball: Float[np.ndarray, " 3"],
+) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, " 7"]]:
+    """Returns matrix and right side of the step that edges, pupils and priors ask for."""
+    matrix, right = np.zeros((7, 7)), np.zeros(7)
+    for view in edges.values():
+        scale = max(ROBUST_PX, 2.0 * view.noise)
+        weights = view.weights / (1.0 + (view.offsets / scale) ** 2) ** 2 / (SHARED * view.noise**2)
+        matrix += view.slopes.T @ (weights[:, None] * view.slopes)
+        right += view.slopes.T @ (weights * view.offsets)
+    pupil, moves = circle.on_axis(circle.ahead)
+    moves[:, 6] = circle.gaze
+    for view, pixel in pupils:
+        at, by_point = view.camera.project_with_jacobian(pupil[None])
+        off, slopes = pixel - at[0], by_point[0] @ moves
+        weight = 1.0 / (1.0 + off @ off / (2.0 * PUPIL_PX) ** 2) ** 2 / PUPIL_PX**2
+        matrix += weight * slopes.T @ slopes
+        right += weight * slopes.T @ off
+    behind, moves = circle.on_axis(-BEHIND_MM)
+    matrix += moves.T @ moves / CENTRE_STD_MM**2
+    right += moves.T @ (eyeball - behind) / CENTRE_STD_MM**2
+    priors = ((5, RADIUS_MM - circle.radius, RADIUS_STD_MM), (6, AHEAD_MM - circle.ahead, AHEAD_STD_MM))
+    for row, off, std in priors:
+        matrix[row, row] += 1.0 / std**2
+        right[row] += off / std**2
+    return matrix, right
+
+
+def pupils_px(
+    views: Sequence[EyeView], centre: Float[np.ndarray, " 3"], axes: Float[np.ndarray, "2 3"]
+) -> list[Float[np.ndarray, " 2"] | None]:
+    """Returns the pupil's centre in each view (px of the picture), None where it is not clear.
+
+    Args:
+        views: of one eye.
+        centre: where the pupil is looked for, world, to ``REACH_MM``.
+        axes: two unit vectors in its plane.
+    """
+    contrasts = [_contrasts(view, centre, axes) for view in views]
+    if not contrasts:
+        return []
+    size = int(np.sum([of.max(axis=(1, 2)) for of in contrasts], axis=0).argmax())
+    out: list[Float[np.ndarray, " 2"] | None] = []
+    for view, of in zip(views, contrasts, strict=True):
+        place = _peak(of[size])
+        out.append(None if place is None else view.camera.project((centre + place @ axes)[None])[0])
+    return out
+
+
+def _contrasts(view: EyeView, centre: Float[np.ndarray, " 3"], axes: Float[np.ndarray, "2 3"]) -> Contrasts:
+    """Returns by how much each disc, by its radius and place, is darker than the ring about it, by the iris."""
+    across, up = np.meshgrid(ALONG_MM, ALONG_MM)
+    places = centre + across.reshape(-1, 1) * axes[0] + up.reshape(-1, 1) * axes[1]
+    x, y = (view.camera.project(places) - view.origin_px).T.astype(np.float32).reshape(2, *across.shape)
+    patch = cv2.remap(view.brightness, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    level = np.sqrt(np.maximum(patch, 0.0))
+    off = np.hypot(across, up)
+    iris = max(float(np.median(level[off < IRIS_MM])), 1e-3)
+    glare = cv2.dilate((level > GLARE * iris).astype(np.uint8), np.ones((5, 5), np.uint8))
+    plain = 1.0 - glare.astype(np.float32)
+    out = np.full((len(RADII_MM), *off.shape), LACKING, np.float32)
+    for number, (disc, ring) in enumerate(_kernels()):
+        (dark, inside), (bright, around) = (
+            [cv2.filter2D(of, cv2.CV_32F, kernel, borderType=cv2.BORDER_CONSTANT) for of in (plain * level, plain)]
+            for kernel in (disc, ring)
+        )
+        clear = (inside > MIN_DISC * disc.sum()) & (around > MIN_RING * ring.sum()) & (off <= REACH_MM)
+        contrast = bright / np.maximum(around, 1.0) - dark / np.maximum(inside, 1.0)
+        out[number][clear] = contrast[clear] / iris
+    return out
+
+
+@lru_cache(maxsize=1)
+def _kernels() -> list[tuple[Float32[np.ndarray, "k k"], Float32[np.ndarray, "k k"]]]:
+    """Returns a disc of each radius and the ring about it."""
+    out = []
+    for radius in RADII_MM:
+        count = int((radius + RING_MM) / STEP_MM) + 1
+        off = np.hypot(*np.meshgrid(*[np.arange(-count, count + 1) * STEP_MM] * 2))
+        ring = (off > radius + BETWEEN_MM) & (off <= radius + RING_MM)
+        out.append(((off <= radius - BETWEEN_MM).astype(np.float32), ring.astype(np.float32)))
+    return out
+
+
+def _peak(contrast: Float32[np.ndarray, "n n"]) -> Float[np.ndarray, " 2"] | None:
+    """Returns the place of the highest contrast (mm along both axes) between cells; None at the border of what could be
+    measured, and where it is low."""
+    row, column = np.unravel_index(contrast.argmax(), contrast.shape)
+    about = contrast[row - 1 : row + 2, column - 1 : column + 2]
+    if contrast[row, column] < MIN_CONTRAST or about.shape != (3, 3):
+        return None
+    lines = np.stack([about[1], about[:, 1]]).astype(float)
+    bend = lines[:, 0] - 2.0 * lines[:, 1] + lines[:, 2]
+    if (lines == LACKING).any() or (bend >= 0.0).any():
+        return None
+    shift = 0.5 * (lines[:, 0] - lines[:, 2]) / bend
+    return ALONG_MM[[column, row]] + STEP_MM * shift
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,7 +28,7 @@ from rig.formats.cameras.dataset_json import (
     picture_names,
     points_ply,
 )
-from rig.formats.meshes.flame_param import FlameParam, canonical, encoded
+from rig.formats.meshes.flame_param import FlameParam, canonical, encode_flame_param
 from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.rig import Rig
@@ -75,8 +75,8 @@ def write_view_dataset(folder: Path, dataset: ViewDataset, form: DatasetFormat) 
         points = points_ply(head.vertices / 1000.0, head.normals(), np.asarray(colours, np.uint8))
         write_atomically(folder / LAYOUTS[form].points, points)
     if dataset.flame is not None:
-        write_atomically(folder / FLAME_MOMENT, encoded(dataset.flame))
-        write_atomically(folder / FLAME_CANONICAL, encoded(canonical(dataset.flame)))
+        write_atomically(folder / FLAME_MOMENT, encode_flame_param(dataset.flame))
+        write_atomically(folder / FLAME_CANONICAL, encode_flame_param(canonical(dataset.flame)))
     documents = dataset_documents(pinholes, form, with_points=head is not None, with_flame=dataset.flame is not None)
     for name, document in documents.items():
         write_atomically(folder / name, document)

@@ -22,7 +22,7 @@ from rig.acquisition.session import MakeDriver, RigSession
 from rig.acquisition.shot import Fault, Shot, ShotFailed
 from rig.atomic_write import write_atomically
 from rig.capture import Capture
-from rig.drivers.registry import driver_for
+from rig.drivers.base import driver_for
 from rig.errors import EigenheadError, InputError
 from rig.formats.captures.capture_folder import write_capture
 from rig.formats.pictures.images import write_image

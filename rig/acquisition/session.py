@@ -22,9 +22,8 @@ from rig.acquisition.plate_checks import PlatesRefused, occupied, plate_faults
 from rig.acquisition.plates import Plates, keep_plates, read_plates, use_plates, write_plates
 from rig.acquisition.shot import Fault, Shot, ShotFailed, Timing, certify
 from rig.acquisition.trigger import Fired, TriggerBox, TriggerError
-from rig.drivers.base import Driver, DriverError, Frame
+from rig.drivers.base import Driver, DriverError, Frame, driver_for
 from rig.drivers.feed import CameraFeed, FeedState
-from rig.drivers.registry import driver_for
 from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.rig_toml import CameraConfig, RigConfig
 from rig.image import ImageRgb

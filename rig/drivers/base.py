@@ -1,12 +1,15 @@
-"""Defines the interface of camera drivers, and their errors.
+"""Defines the interface of camera drivers and their errors, and finds the driver that rig.toml names for a camera: its
+module, and with it any vendor's library, is imported only then.
 
 ``grab`` waits for the camera's next frame and returns when it arrived; ``retrieve`` decodes that frame. They are two
 calls because most frames of a stream are never used, and decoding them all would make the arrival times late.
 A driver belongs to one thread at a time (``rig.drivers.feed``).
 """
 
+import importlib
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from pathlib import Path
+from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -111,3 +114,15 @@ class DriverMissing(DriverError):
 def upright(image: ImageRgb, rotation_deg: int) -> UInt8[np.ndarray, "_ _ 3"]:
     """Returns the picture turned clockwise by ``rotation_deg``, a multiple of 90 degrees."""
     return np.ascontiguousarray(np.rot90(image, -rotation_deg // 90)) if rotation_deg else image
+
+
+@runtime_checkable
+class _DriverModule(Protocol):
+    def make(self, camera: CameraConfig, folder: Path) -> Driver: ...
+
+
+def driver_for(camera: CameraConfig, folder: Path) -> Driver:
+    """Returns the driver that rig.toml names for a camera, not yet opened. ``folder`` is the folder of rig.toml. Raises
+    DriverMissing."""
+    module = cast(_DriverModule, importlib.import_module(f".{camera.driver}", __package__))
+    return module.make(camera, folder)

@@ -1,19 +1,252 @@
 """Provides the renderer, which its owner creates, passes on, and closes; and draws depth maps with it, for visibility
-(section 4.5: is a vertex occluded in an image?) and for shadows."""
+(section 4.5: is a vertex occluded in an image?) and for shadows.
 
-from collections.abc import Sequence
+Silhouettes of the model are drawn in all cameras, and their boundary-weighted XOR with the input's is computed (section
+4.3, eqs. 4 and 5). All cameras share one atlas, which a single instanced draw fills. The sum of ``w |S - Sm|`` is taken
+in two steps: the GPU adds blocks of 8 x 8 pixels in single precision, in a fixed order; the blocks' sums are read back
+and added in double precision. So the relative error of a cost is below 64 * 2^-24 = 4e-6, equal masks cost exactly 0,
+and the same input always gives the same number. Blocks that the model cannot reach cost what they cost an empty model.
+
+Measured on two cores with Mesa's llvmpipe, eleven views of 512 x 384 and 4,900 triangles: 8 ms to draw, 2 ms to add.
+Atomic additions (in a varying order), a compute shader over a copied mask, and mipmaps were slower or no better.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import moderngl
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
+from rig.camera import lens_image
+from rig.errors import InputError
 from rig.mesh import Mesh
+from rig.messages.message import compose
 from rig.render.colour import UNLIT, Light, draw_colour
 from rig.render.context import GlContext, Owned
 from rig.render.photograph import Gallery, Part, draw_photographs, draw_vertex_radiance
-from rig.render.silhouettes import SilhouetteSet
-from rig.render.tile_packing import INSTANCE_FORMAT, INSTANCE_NAMES, Page, box_points, depth_range, instances, pack
+from rig.render.tile_packing import (
+    BLOCK_PX,
+    INSTANCE_FORMAT,
+    INSTANCE_NAMES,
+    NEAR_MM,
+    Page,
+    box_points,
+    depth_range,
+    instances,
+    lens_limit,
+    pack,
+)
 from rig.rig import Rig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Surface:
+    """Holds what the GPU has of one page: the mask to draw into, the weights, and the block sums."""
+
+    page: Page
+    mask: moderngl.Framebuffer
+    blocks: moderngl.Framebuffer
+    mask_texture: moderngl.Texture
+    weights: moderngl.Texture
+    block_sums: moderngl.Texture
+    boxes: moderngl.Buffer
+    draw: moderngl.VertexArray
+    reduce: moderngl.VertexArray
+
+
+class SilhouetteSet:
+    """Prepares cameras and triangles for many evaluations in which only the vertices change. Close it, or use
+    ``with``."""
+
+    def __init__(self, context: GlContext, rig: Rig, faces: Int[np.ndarray, "f 3"]) -> None:
+        """``rig`` at the resolution to draw in."""
+        self.rig = rig
+        self._context = context
+        self._faces = np.ascontiguousarray(faces, np.int32)
+        self._vertices_needed = int(faces.max()) + 1 if len(faces) else 0
+        self._culls = is_closed(faces)
+        self._owned = Owned()
+        self._origin = rig.centre_world()
+        self._limits = [lens_limit(camera) for camera in rig]
+        self._empty_sums: list[Float[np.ndarray, "_ _"]] = []
+        with context.current() as gl:
+            self._indices = self._owned(gl.buffer(self._faces.tobytes())) if len(faces) else None
+            self._positions = self._owned(gl.buffer(reserve=max(12 * self._vertices_needed, 12)))
+            self._surfaces = [self._surface(page) for page in pack(rig.cameras, context.largest_texture)]
+
+    def __enter__(self) -> "SilhouetteSet":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Frees the GPU's memory."""
+        with self._context.current():
+            self._owned.close()
+        self._surfaces = []
+
+    def masks(self, vertices_world: Float[np.ndarray, "v 3"]) -> dict[str, Bool[np.ndarray, "_ _"]]:
+        """Returns the mask of the mesh in each camera: which pixel centres it covers."""
+        silhouettes = {}
+        with self._context.current():
+            self._draw(vertices_world)
+            for surface in self._surfaces:
+                page = surface.page
+                raw = surface.mask.read(components=1, alignment=1)
+                image = np.frombuffer(raw, np.uint8).reshape(page.height, page.width) > 0
+                for position, index in enumerate(page.cameras):
+                    silhouettes[index] = page.cut(image, position).copy()
+        return {camera.name: silhouettes[index] for index, camera in enumerate(self.rig)}
+
+    def set_inputs(
+        self, masks: Mapping[str, Bool[np.ndarray, "_ _"]], weights: Mapping[str, Float[np.ndarray, "_ _"]]
+    ) -> None:
+        """Uploads the input silhouettes and the weight of each pixel, ``1 / d^2`` of eq. (5); done once for a capture.
+
+        Raises InputError if a camera of the rig has no mask or weights of its size.
+        """
+        check_images(self.rig, masks, "mask")
+        check_images(self.rig, weights, "weight")
+        self._empty_sums = []
+        with self._context.current():
+            for surface in self._surfaces:
+                page = surface.page
+                signed = np.zeros((page.height, page.width), np.float32)
+                for position, index in enumerate(page.cameras):
+                    name = self.rig.cameras[index].name
+                    page.cut(signed, position)[:] = np.where(masks[name], -weights[name], weights[name])
+                surface.weights.write(signed.tobytes())
+                sums = np.stack([_block_sums(np.maximum(-signed, 0)), _block_sums(np.maximum(signed, 0))], axis=2)
+                surface.block_sums.write(sums.astype(np.float32).tobytes())
+                self._empty_sums.append(sums[:, :, 0])
+
+    def xor_costs(self, vertices_world: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " k"]:
+        """Returns ``sum w |S - Sm|`` for each camera, in the order of the rig. ``set_inputs`` must have been called."""
+        if not self._empty_sums:
+            raise InputError("xor_costs", [compose("no-input-silhouettes")])
+        costs = np.zeros(len(self.rig))
+        with self._context.current():
+            boxes = self._draw(vertices_world)
+            for surface, empty in zip(self._surfaces, self._empty_sums, strict=True):
+                page = surface.page
+                blocks = np.array([boxes[index] for index in page.cameras]) + np.tile(page.tiles[:, :2] // BLOCK_PX, 2)
+                sums = self._reduce(surface, blocks)
+                for position, index in enumerate(page.cameras):
+                    left, top, right, bottom = blocks[position]
+                    tile = _block_tile(page, position)
+                    reached = np.s_[top:bottom, left:right]
+                    costs[index] = empty[tile].sum() + (sums[reached] - empty[reached]).sum()
+        return costs
+
+    def _draw(self, vertices: Float[np.ndarray, "v 3"]) -> Int[np.ndarray, "k 4"]:
+        """Draws every page's masks; returns the boxes that the model can reach, per camera, in blocks of its tile."""
+        if len(vertices) < self._vertices_needed:
+            few = compose("vertices-few", held=len(vertices), wanted=self._vertices_needed)
+            raise InputError("vertices", [few])
+        if not self._vertices_needed:
+            boxes, in_front = np.zeros((len(self.rig), 4), int), True
+        else:
+            boxes, in_front = self._reach(vertices[: self._vertices_needed])
+            relative = (vertices[: self._vertices_needed] - self._origin).astype(np.float32)
+            self._positions.write(relative.tobytes())
+        for surface in self._surfaces:
+            page = surface.page
+            with self._context.drawing(surface.mask, cull=self._culls and in_front):
+                surface.mask.clear()
+                if self._vertices_needed:
+                    surface.draw.program["atlas_size"] = (float(page.width), float(page.height))
+                    surface.draw.render(instances=len(page.cameras))
+        return boxes
+
+    def _reach(self, vertices: Float[np.ndarray, "v 3"]) -> tuple[Int[np.ndarray, "k 4"], bool]:
+        """Returns the blocks (left, top, right, bottom) that the model may touch, by camera, and if all is in front."""
+        box = box_points(vertices)
+        boxes, all_in_front = [], True
+        for camera, limit in zip(self.rig, self._limits, strict=True):
+            k = camera.intrinsics
+            whole = np.array([0, 0, -(-k.width // BLOCK_PX), -(-k.height // BLOCK_PX)])
+            points = camera.camera_from_world.apply(box)
+            in_front = bool(points[:, 2].min() > 2 * NEAR_MM)
+            all_in_front &= in_front
+            normalised = points[:, :2] / points[:, 2:] if in_front else np.full((1, 2), np.inf)
+            if (normalised**2).sum(axis=1).max() < limit**2:  # else the lens may bend the box's edges any way
+                pixels = lens_image(points, k.values())
+                low, high = np.floor((pixels.min(axis=0) - 2) / BLOCK_PX), np.ceil((pixels.max(axis=0) + 3) / BLOCK_PX)
+                low, high = np.clip(low, 0, whole[2:]), np.clip(high, 0, whole[2:])
+                boxes.append(np.concatenate([low, high]).astype(int))
+            else:
+                boxes.append(whole)
+        return np.array(boxes), all_in_front
+
+    def _reduce(self, surface: _Surface, blocks: Int[np.ndarray, "k 4"]) -> Float[np.ndarray, "h w"]:
+        surface.boxes.write(blocks.astype(np.float32).tobytes())
+        surface.mask_texture.use(0)
+        surface.weights.use(1)
+        surface.block_sums.use(2)
+        surface.reduce.program["target_size"] = (float(surface.blocks.width), float(surface.blocks.height))
+        with self._context.drawing(surface.blocks, clip=False):
+            surface.reduce.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(blocks))
+        raw = surface.blocks.read(components=1, dtype="f4")
+        return np.frombuffer(raw, np.float32).reshape(surface.blocks.height, surface.blocks.width).astype(float)
+
+    def _surface(self, page: Page) -> _Surface:
+        gl, owned = self._context.gl, self._owned
+        size, block_size = (page.width, page.height), (page.width // BLOCK_PX, page.height // BLOCK_PX)
+        mask = owned(gl.texture(size, 1, alignment=1))
+        blocks = owned(gl.framebuffer([owned(gl.texture(block_size, 1, dtype="f4"))]))
+        weights, block_sums = owned(gl.texture(size, 1, dtype="f4")), owned(gl.texture(block_size, 2, dtype="f4"))
+        cameras = owned(gl.buffer(instances(self.rig.cameras, page, self._origin).tobytes()))
+        boxes = owned(gl.buffer(reserve=16 * len(page.cameras)))
+        drawing = self._context.program("silhouette.vert", "silhouette.frag")
+        reducing = self._context.program("box.vert", "xor.frag")
+        for unit, name in enumerate(("model", "signed_weight", "block_sums")):
+            reducing[name] = unit
+        content = [(self._positions, "3f", "position"), (cameras, INSTANCE_FORMAT, *INSTANCE_NAMES)]
+        draw = owned(gl.vertex_array(drawing, content, index_buffer=self._indices))
+        reduce = owned(gl.vertex_array(reducing, [(boxes, "4f/i", "box")]))
+        return _Surface(page, owned(gl.framebuffer([mask])), blocks, mask, weights, block_sums, boxes, draw, reduce)
+
+
+def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
+    """Tells whether a mesh is closed: every edge has its counterpart. Its front faces alone then make the whole
+    silhouette.
+
+    Along any line such a surface is entered as often as it is left, so that where a back face covers a pixel a front
+    face does, too.
+    """
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    base = int(edges.max(initial=0)) + 1
+    return np.array_equal(np.sort(edges[:, 0] * base + edges[:, 1]), np.sort(edges[:, 1] * base + edges[:, 0]))
+
+
+def check_images(rig: Rig, images: Mapping[str, np.ndarray], kind: str) -> None:
+    """Raises InputError if the image of a camera is missing or not of the camera's size. ``kind`` names the images in
+    messages."""
+    faults = []
+    for camera in rig:
+        wanted = (camera.intrinsics.height, camera.intrinsics.width)
+        if camera.name not in images:
+            faults.append(compose("camera-without-image", what=kind, camera=camera.name))
+        elif images[camera.name].shape[:2] != wanted:
+            shape = str(images[camera.name].shape)
+            faults.append(compose("image-shape", what=kind, camera=camera.name, shape=shape, wanted=f"{wanted}"))
+    if faults:
+        raise InputError("silhouettes", faults)
+
+
+def _block_sums(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h8 w8"]:
+    height, width = image.shape
+    return image.reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX).sum(axis=(1, 3), dtype=float)
+
+
+def _block_tile(page: Page, position: int) -> tuple[slice, slice]:
+    left, top, width, height = page.tiles[position]
+    return (
+        slice(top // BLOCK_PX, -(-(top + height) // BLOCK_PX)),
+        slice(left // BLOCK_PX, -(-(left + width) // BLOCK_PX)),
+    )
 
 
 def draw_depth(

@@ -1,10 +1,15 @@
 """Finds the captures of a batch below a folder, or reads them from a list with subject, session and settings.
 
 A capture's name is the path of its result below ``OUT``. A list is a text file with one capture a line (``#`` begins a
-comment), or a CSV file whose first row names its columns; relative paths start at the list's folder."""
+comment), or a CSV file whose first row names its columns; relative paths start at the list's folder.
+A batch is divided among machines that do not communicate by a stable hash of the captures' names. The
+SHA-256 of a capture tells a later run whether its result is up to date."""
 
 import csv
+import hashlib
 import json
+import os
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -25,6 +30,7 @@ MIN_PICTURES = 3  # in a folder of photographs without cameras: fewer are no cap
 TAKEN_NAMES = ("heads.csv", "heads.parquet", "sheet.html", "sheet.pdf")  # files of OUT, which no capture may be called
 MORE = "more"  # key of a row: how many cells it has beyond the columns
 NO_SETTINGS: Mapping[str, object] = MappingProxyType({})
+SHARDS_MOST = 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,3 +217,67 @@ def _name_faults(captures: list[BatchCapture], places: list[str]) -> list[Messag
         parents = [outer for count in range(1, len(parts)) if (outer := "/".join(parts[:count])) in folded]
         faults += [compose("batch-name-within", name=name, outer=parent) for parent in parents]
     return faults
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """Holds one share of a batch, to be made by one machine: ``number`` (from 1) of ``count`` shares."""
+
+    number: int
+    count: int
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.count}"
+
+    def takes(self, name: str) -> bool:
+        """Returns whether the capture with this name belongs to this share. Each capture belongs to exactly one."""
+        digest = hashlib.sha256(name.encode()).digest()
+        return int.from_bytes(digest[:8], "big") % self.count == self.number - 1
+
+
+WHOLE = Shard(1, 1)
+
+
+def read_shard(text: str) -> Shard:
+    """Reads a share from the text K/N, where K is from 1 to N. Raises InputError."""
+    parts = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text.strip())
+    number, count = (int(parts[1]), int(parts[2])) if parts else (0, 0)
+    if not 1 <= number <= count <= SHARDS_MOST:
+        raise InputError("shard", [compose("batch-shard-wrong", text=f"{text!r:.40}", most=SHARDS_MOST)])
+    return Shard(number, count)
+
+
+def capture_sha256(path: Path) -> str:
+    """Computes the SHA-256 of a capture: of an archive's bytes, or of the names and bytes of all files in a folder.
+    Raises OSError."""
+    if not path.is_dir():
+        return _file_sha256(path)
+    return files_sha256({name: _file_sha256(file) for name, file in _files(path, "", frozenset())})
+
+
+def files_sha256(files: Mapping[str, str]) -> str:
+    """Computes one SHA-256 of a whole folder from the SHA-256 of each of its files, by name."""
+    digest = hashlib.sha256()
+    for name, file_digest in sorted(files.items()):
+        digest.update(f"{name}\0{file_digest}\n".encode("utf-8", "surrogateescape"))
+    return digest.hexdigest()
+
+
+def _files(folder: Path, prefix: str, within: frozenset[tuple[int, int]]) -> Iterator[tuple[str, Path]]:
+    """Yields the files below a capture with their paths, following links. ``within`` are the enclosing folders, to stop
+    at circular links."""
+    state = folder.stat()
+    if (here := (state.st_dev, state.st_ino)) in within:
+        return
+    for found in os.scandir(folder):
+        if is_junk(found.name):
+            continue
+        if found.is_dir():
+            yield from _files(Path(found.path), f"{prefix}{found.name}/", within | {here})
+        elif found.is_file():
+            yield f"{prefix}{found.name}", Path(found.path)
+
+
+def _file_sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -21,7 +21,7 @@ from typing import IO, Any
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError
 from rig.messages.message import Message, compose, documents_of, read_message
-from server.batch.shards import Shard
+from server.batch.captures import Shard
 from server.storage.result_folder import RESULT_FILE
 
 RECORD = "batch.json"

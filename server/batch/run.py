@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING, Concatenate, Literal, Protocol
 from rig.errors import Cancelled, EigenheadError, InputError
 from rig.messages.message import Message, compose
 from rig.progress import Progress
-from server.batch.digests import capture_sha256
+from server.batch.captures import WHOLE, Shard, capture_sha256
 from server.batch.folder import BatchFolder, FailureRecord, Origin
-from server.batch.shards import WHOLE, Shard
 from server.tasks.child import DISK_FULL, Child, WorkerContext, WorkFailed
 from server.tasks.progress import JobProgress
 from server.tasks.reconstruct_folder import reconstruct_beside

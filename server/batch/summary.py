@@ -13,8 +13,7 @@ from server.batch.captures import BatchCapture
 from server.batch.folder import BatchFolder, FailureRecord, Origin
 from server.batch.plan import BatchTask
 from server.batch.sheet import Card, figures_of, sheet_html
-from server.batch.table import Column, Row, columns_of, row_of
-from server.batch.table_files import write_table
+from server.batch.table import Column, Row, columns_of, row_of, write_table
 
 SHEET, SHEET_PDF = "sheet.html", "sheet.pdf"
 

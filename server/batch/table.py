@@ -1,23 +1,31 @@
 """Builds the table of a batch: one row for each capture, with the columns of ``columns_of``.
 
 Enters: reports of results and records of failures. Leaves: plain values. Lengths are mm, in the world frame; there are
-no angles. A cell is None if the capture has no such value.
+no angles. A cell is None if the capture has no such value. The table is written as CSV and, if pyarrow is installed, as
+Parquet with units.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+import csv
+import io
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.evidence.gaze import PUPIL_DISTANCE
 from pipeline.evidence.measurements import DISTANCES
 from pipeline.head_model.landmarks import NAMES
+from rig.atomic_write import write_atomically
 from rig.digest import document_sha256
+from rig.text import printable
 from server.batch.captures import BatchCapture
 from server.batch.folder import FailureRecord, Origin
 
 Value = str | float | int | bool | None
 Row = dict[str, Value]
 AXES = ("x", "y", "z")
+CSV, PARQUET = "heads.csv", "heads.parquet"
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,3 +189,66 @@ def _expression(report: Mapping[str, Any], columns: Sequence[Column]) -> Row:
 def _rms(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return (sum(value**2 for value in known) / len(known)) ** 0.5 if known else None
+
+
+def write_table(folder: Path, columns: Sequence[Column], rows: Sequence[Row]) -> list[Path]:
+    """Writes the table as CSV and, if pyarrow is installed, as Parquet. Returns the files. Raises OSError."""
+    files = [folder / CSV]
+    write_atomically(files[0], csv_bytes(columns, rows))
+    if has_parquet():
+        files.append(folder / PARQUET)
+        write_atomically(files[1], parquet_bytes(columns, rows))
+    else:
+        (folder / PARQUET).unlink(missing_ok=True)  # an earlier run's would contradict the CSV
+    return files
+
+
+def has_parquet() -> bool:
+    """Returns whether Parquet files can be written here, which needs pyarrow."""
+    try:
+        import pyarrow.parquet  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def csv_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
+    """Returns the table as CSV (RFC 4180, UTF-8), with all digits of every number. A missing value is an empty cell."""
+    return b"".join(csv_lines(columns, rows))
+
+
+def csv_lines(columns: Sequence[Column], rows: Iterable[Row]) -> Iterator[bytes]:
+    """Yields the lines of ``csv_bytes`` one by one, the names of the columns first."""
+    cells = ([_cell(row[column.name]) for column in columns] for row in rows)
+    for line in itertools.chain([[column.name for column in columns]], cells):
+        stream = io.StringIO(newline="")
+        csv.writer(stream).writerow(line)
+        yield stream.getvalue().encode()
+
+
+def parquet_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
+    """Returns the table as a Parquet file. The metadata of each field has its unit and description. Needs pyarrow."""
+    import pyarrow
+    import pyarrow.parquet
+
+    kinds = {"text": pyarrow.string(), "number": pyarrow.float64(), "count": pyarrow.int64(), "flag": pyarrow.bool_()}
+    fields = [
+        pyarrow.field(column.name, kinds[column.kind], metadata={"unit": column.unit, "description": column.words})
+        for column in columns
+    ]
+    cells = [[_encodable(row[column.name]) for row in rows] for column in columns]
+    arrays = [pyarrow.array(values, kinds[column.kind]) for values, column in zip(cells, columns, strict=True)]
+    sink = pyarrow.BufferOutputStream()
+    pyarrow.parquet.write_table(pyarrow.table(arrays, pyarrow.schema(fields)), sink)
+    return sink.getvalue().to_pybytes()
+
+
+def _cell(value: Value) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return "" if value is None else repr(value) if isinstance(value, float) else str(_encodable(value))
+
+
+def _encodable(value: Value) -> Value:
+    """Escapes text that UTF-8 cannot encode, since names of files need not be UTF-8."""
+    return printable(value) if isinstance(value, str) else value

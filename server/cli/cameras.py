@@ -227,7 +227,7 @@ def refine(
     from calibration.silhouette_refinement.report import refinement_page
     from rig.atomic_write import write_atomically
     from rig.formats.cameras.cameras_json import write_rig
-    from server.cli.refine import refine_locally
+    from server.tasks.refine import refine_locally
 
     page = out.with_suffix(".html")
     with progress_bar() as report:

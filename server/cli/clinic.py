@@ -99,9 +99,8 @@ def register(
     if (out / "registration.json").exists() and not overwrite:
         raise Overwrites(out / "registration.json")
     from pipeline.applications.clinic.patient_files import write_registration
-    from pipeline.applications.clinic.registration import read_surface_landmarks
+    from pipeline.applications.clinic.registration import read_surface, read_surface_landmarks
     from pipeline.applications.clinic.registration import register as register_head
-    from pipeline.applications.clinic.surface import read_surface
     from pipeline.applications.clinic.visit import read_visit
 
     patient = read_surface(surface, axes)

@@ -1,12 +1,17 @@
 """Implements the commands that make and judge heads: reconstruct, take, check, verify, demo."""
 
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from datetime import date
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from rig.errors import EigenheadError, InputError
+from rig.progress import Progress
 from server.cli.answers import (
     Anyway,
     Data,
@@ -27,7 +32,23 @@ from server.cli.answers import (
     wrong_usage,
 )
 
+if TYPE_CHECKING:
+    from pipeline.applications.verification.limits import Limits
+    from pipeline.applications.verification.report import VerificationReport
+
 app = typer.Typer(rich_markup_mode=None)
+
+
+class LimitsMissed(EigenheadError):
+    """Reports that a figure exceeds its limit. Report and certificate have been written by then."""
+
+    def __init__(self, document: "VerificationReport", out: Path) -> None:
+        missed = [
+            f"{name} is {check['value']:.3g}, the limit is {check['limit']:g}"
+            for name, check in document["checks"].items()
+            if check["passed"] is False and check["value"] is not None
+        ]
+        super().__init__(f"not passed: {'; '.join(missed)} ({out / 'certificate.pdf'} says where)")
 
 
 def _templates() -> tuple[str, ...]:
@@ -181,7 +202,6 @@ def take(
     from pipeline.applications.moments.take_files import Shot, make_take, warning_lines
     from pipeline.settings import settings_from_document
     from server.cli.reconstruct_local import check_apart
-    from server.cli.verify import capture_names, head_alone
     from server.tasks.photographs import keep_masks, read_or_calibrate
     from server.tasks.prepare import prepare_kernels
     from server.tasks.reconstruct_folder import folder_of
@@ -254,7 +274,6 @@ def verify(
     """Judge a rig by a mannequin of known shape.
 
     Status 1 where a limit is missed."""
-    from server.cli.verify import LimitsMissed, lines, read_limits, verify_captures
     from server.tasks.settings_file import settings_document
 
     wanted, chosen = read_limits(limits), settings_document(settings)
@@ -265,7 +284,7 @@ def verify(
             captures, out, reference=reference, landmarks=landmarks, model=model, settings=chosen, limits=wanted,
             report=report,
         )  # fmt: skip
-    answer(verification, json_out, lines(verification, out))
+    answer(verification, json_out, verification_lines(verification, out))
     if not verification["passed"]:
         raise LimitsMissed(verification, out)
 
@@ -292,3 +311,91 @@ def demo(
         f"contact sheet  {done['contact_sheet']}",
     ]
     answer(done, json_out, lines)
+
+
+def verify_captures(
+    captures: Sequence[Path],
+    out: Path,
+    *,
+    reference: Path,
+    landmarks: Path | None,
+    model: str | None,
+    settings: Mapping[str, object],
+    limits: "Limits",
+    report: Progress,
+) -> "VerificationReport":
+    """Judges captures of a mannequin, or their results, by the scan ``reference``. Writes report.json and
+    certificate.pdf into ``out``, and results of captures into ``out/results``.
+
+    The reference is checked before anything is reconstructed. Raises InputError, also if results were made with
+    different models, and the errors of the pipeline.
+    """
+    from pipeline.applications.verification.judgement import judge
+    from pipeline.applications.verification.measured import identity_of, is_result, read_measured
+    from pipeline.applications.verification.reference import read_reference
+    from pipeline.applications.verification.report import Occasion
+    from pipeline.applications.verification.write import write_verification
+    from pipeline.head_model.model import load_model
+    from server.cli.reconstruct_local import reconstruct_locally
+
+    names = capture_names(captures)
+    scan = read_reference(reference, landmarks)
+    folders: list[Path] = []
+    for i, (capture, name) in enumerate(zip(captures, names, strict=True)):
+        folder = capture
+        if not is_result(capture):
+            folder = out / "results" / name
+
+            def report_one(stage: str, fraction: float, i: int = i) -> None:
+                report(f"{names[i]}: {stage}", (i + fraction) / len(captures))
+
+            report_one("read", 0.0)
+            reconstruct_locally(capture, folder, model=model, settings=head_alone(settings), report=report_one)
+        folders.append(folder)
+    report("judge", 1.0)
+    identities = {name: identity_of(folder) for name, folder in zip(names, folders, strict=True)}
+    identity = identities[names[0]]
+    others = [name for name, of in identities.items() if of != identity]
+    if others:
+        raise InputError("captures", [f"{name} was made with another model than {names[0]}" for name in others])
+    chosen = load_model(model or identity.model)
+    measured = [read_measured(folder, chosen, name) for folder, name in zip(folders, names, strict=True)]
+    judgement = judge(measured, scan, limits)
+    occasion = Occasion(date.today().isoformat(), identity, limits)
+    return write_verification(out, measured[0], scan, judgement, occasion)
+
+
+def read_limits(path: Path | None) -> "Limits":
+    """Reads limits from a TOML or JSON file. Those that it omits, or all without a file, have their defaults. Raises
+    InputError."""
+    from pipeline.applications.verification.limits import limits_from_document
+    from server.tasks.settings_file import settings_document
+
+    return limits_from_document(settings_document(path), path.name if path else "limits")
+
+
+def verification_lines(document: "VerificationReport", out: Path) -> list[str]:
+    """Returns lines for people: each figure beside its limit, then the paths of report and certificate."""
+    verdicts = {None: "not judged", True: "met", False: "missed"}
+    visits = [
+        f"{name:<20} {'-' if check['value'] is None else format(check['value'], '.4g'):>8}   "
+        f"limit {check['limit']:<6g} {verdicts[check['passed']]}"
+        for name, check in document["checks"].items()
+    ]
+    return [*visits, str(out / "report.json"), str(out / "certificate.pdf")]
+
+
+def capture_names(captures: Sequence[Path]) -> list[str]:
+    """Returns the captures' names. Raises InputError if two are alike."""
+    names = [path.resolve().name.removesuffix(".gz").removesuffix(".tar").removesuffix(".zip") for path in captures]
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise InputError("captures", [f"more than one is called {name}: rename one" for name in twice])
+    return names
+
+
+def head_alone(settings: Mapping[str, object]) -> dict[str, object]:
+    """Returns the settings with the bust switched off: only the head is judged, and a capture takes ten seconds
+    less."""
+    outputs = settings.get("outputs")
+    return {**settings, "outputs": {"surface": "head", **(outputs if isinstance(outputs, Mapping) else {})}}

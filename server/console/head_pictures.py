@@ -3,9 +3,10 @@ that they are removed with the job.
 
 The page Result shows ``first-view.jpg`` (some 30 kB) until the browser has loaded and drawn the 3 MB of the head.
 Position, lens and light are those of ``pages/result.js`` and ``static/views.js``: three-quarter view, light "studio",
-texture.
+texture. Lists tell people and heads apart at a glance by ``portrait.jpg``.
 """
 
+import json
 import threading
 from contextlib import suppress
 from functools import cache
@@ -18,14 +19,16 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.geometry.raster import picture
+from pipeline.results.clay import clay
 from rig.camera import Camera, Intrinsics
 from rig.errors import EigenheadError
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.formats.meshes.ply import read_head_ply, write_ply
 from rig.formats.pictures.images import write_image
-from rig.geometry import look_at
+from rig.geometry import RigidTransform, look_at
 from rig.mesh import Mesh, vertex_normals
 from rig.messages.message import compose
-from server.console.portrait import placed, portrait
+from server.console.comparison import ply_property
 from server.errors import Conflict, NotFound
 from server.services.service import Service
 
@@ -41,6 +44,11 @@ HeadPicture = Literal["portrait.jpg", "first-view.jpg"]
 QUALITY = 87
 
 _drawing = threading.Lock()
+PANEL = (240, 300)  # width, height
+PAPER = (23, 27, 33)
+AZIMUTH_DEG = 22.0
+DARKEST = 0.55
+MARGIN = 1.12  # of the head's box, for hair
 
 
 def result_folder(service: Service, job_id: str) -> Path:
@@ -134,6 +142,31 @@ def lit(mesh: Mesh) -> UInt8[np.ndarray, "v 3"]:
         light += power * np.clip(normals @ whence, 0.0, None)
     colours = np.full((len(normals), 3), 255.0) if mesh.colours is None else mesh.colours.astype(float)
     return np.clip(colours * (light[:, None] / np.pi) ** (1.0 / GAMMA), 0.0, 255.0).astype(np.uint8)
+
+
+def portrait(result: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """Draws a small picture (RGB) of a result's bust, or else its head, turned by ``AZIMUTH_DEG``, in the colours of
+    the photographs. Raises FileNotFoundError if there is no head."""
+    name = "bust.ply" if (result / "bust.ply").is_file() else "head.ply"
+    head_from_world = placed(result)
+    head = head_from_world.apply(read_mesh(result / "head.ply").vertices)
+    mesh = read_mesh(result / name)
+    colours = np.stack([ply_property(result / name, part) for part in ("red", "green", "blue")], axis=1)
+    middle, half = (head.min(axis=0) + head.max(axis=0)) / 2, MARGIN * (head.max(axis=0) - head.min(axis=0)) / 2
+    shown = Mesh(head_from_world.apply(mesh.vertices), mesh.faces)
+    box = (middle - half, middle + half)
+    rgb = colours.astype(np.uint8)
+    return clay(shown, colours=rgb, azimuth_deg=AZIMUTH_DEG, panel=PANEL, box=box, paper=PAPER, darkest=DARKEST)
+
+
+def placed(result: Path) -> RigidTransform:
+    """Returns the rigid transform head_from_world of a result's report; the identity if the report has none."""
+    try:
+        pose = json.loads((result / "report.json").read_text())["world_from_head"]
+    except (FileNotFoundError, KeyError):
+        return RigidTransform(np.eye(3), np.zeros(3))
+    shift = np.array(pose["translation"]) * pose["scale"]
+    return RigidTransform(np.array(pose["rotation"]), shift).inverse()
 
 
 DRAWN = {"portrait.jpg": portrait, "first-view.jpg": first_view}

@@ -15,8 +15,7 @@ from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 from server.console.live_frame import LiveFrame
-from server.services.rigs.backend import RigBackend
-from server.services.rigs.previews import jpeg, reduced
+from server.services.rigs.backend import RigBackend, jpeg, reduced
 from server.services.service import Service
 from server.tasks.child import Child, WorkerContext
 from server.wire.problems import problem_from

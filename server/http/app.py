@@ -10,7 +10,7 @@ from importlib.metadata import version
 from weakref import WeakValueDictionary
 
 import structlog
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 from fastapi.middleware.cors import CORSMiddleware
 from fastapi.routing import APIRoute
 from starlette.datastructures import Headers
@@ -18,9 +18,7 @@ from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rig.messages.message import compose
-from server.http.auth import FairShares
-from server.http.json_bodies import JsonBodies
-from server.http.linger import DrainRequestBody
+from server.http.auth import FairShares, check_caller
 from server.http.openapi import CHANGES, describe, operation_name
 from server.http.routes import batches, calibrations, captures, jobs, operations, rig, sessions, storage, uploads
 from server.metrics import Metrics
@@ -30,7 +28,8 @@ from server.services.service import Service, open_service
 from server.settings import ServiceSettings
 from server.storage.store import new_id
 from server.wire import problems
-from server.wire.problems import Problem
+from server.wire.patience import IDLE_TIMEOUT_S, within
+from server.wire.problems import Problem, problem_from
 
 LAG_EVERY_S = 0.02
 BATCHES_AGAIN_S = 5.0
@@ -48,6 +47,9 @@ MODULES = (captures, calibrations, jobs, batches, sessions, uploads, rig, storag
 MountPages = Callable[[FastAPI, ServiceSettings], None]
 
 log = structlog.get_logger()
+JSON_BYTES = 4 << 20  # the largest legitimate body, feature points of all cameras, has 0.3 MB
+PATIENCE_S = 2.0  # enough for the rest of a short upload; the sender of gigabytes is answered after that
+LINGER_S = 10.0  # a proxy closes within milliseconds of a complete answer; a client that sends on gets no longer
 
 
 def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None) -> FastAPI:
@@ -236,3 +238,122 @@ async def _measure_lag(metrics: Metrics) -> None:
         began = loop.time()
         await asyncio.sleep(LAG_EVERY_S)
         metrics.lag.observe(max(0.0, loop.time() - began - LAG_EVERY_S))
+
+
+class JsonBodies:
+    """Guards the routes that take a JSON body: identifies the caller, reads the body, at most ``most`` bytes, and
+    passes the request on. It answers others with a problem document: 401 or 403 for the caller, 413 for the size, 415
+    for a form.
+
+    FastAPI reads the whole body of a route that declares one before it runs the route's dependencies, so a dependency
+    comes too late. Routes that read their body themselves, above all uploads, are passed through: their dependencies
+    run first, and they have limits of their own."""
+
+    def __init__(
+        self, app: ASGIApp, routes: Sequence[APIRoute], most: int = JSON_BYTES, body_s: float = IDLE_TIMEOUT_S
+    ) -> None:
+        """Wraps ``app``. ``routes`` are all of its routes in their order."""
+        self._app, self._routes, self._most, self._body_s = app, routes, most, body_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles one ASGI connection. What is no request with a JSON body is passed on unread."""
+        fitting = (route for route in self._routes if route.matches(scope)[0] is Match.FULL)
+        route = next(fitting, None) if scope["type"] == "http" else None
+        if route is None or route.body_field is None:
+            await self._app(scope, receive, send)
+            return
+        try:
+            request = Request(scope, receive)
+            await check_caller(request)
+            messages = await self._read(request)
+        except Exception as error:
+            scope["route"] = route  # the router did not run; log and metrics need the route
+            await problem_from(error).response()(scope, receive, send)
+            return
+
+        async def receive_again() -> Message:
+            return messages.pop(0) if messages else await receive()
+
+        await self._app(scope, receive_again, send)
+
+    async def _read(self, request: Request) -> list[Message]:
+        """Returns the ASGI messages of the body, up to its end or the client's disconnection.
+
+        Raises a 413 problem for a body that is too large, 408 for one that takes longer than ``body_s`` seconds, and
+        415 for a form: that is an archive sent to the wrong address."""
+        if request.headers.get("content-type", "").casefold().startswith("multipart/"):
+            detail = compose("json-wanted-here")
+            raise Problem(415, "unsupported-media-type", detail)
+        announced = request.headers.get("content-length", "")
+        self._check(int(announced) if announced.isascii() and announced.isdigit() else 0)
+        messages: list[Message] = []
+        received, more = 0, True
+        async with within(self._body_s):
+            while more:
+                messages.append(message := await request.receive())
+                received += len(message.get("body", b""))
+                self._check(received)
+                more = message["type"] == "http.request" and message.get("more_body", False)
+        return messages
+
+    def _check(self, length: int) -> None:
+        if length > self._most:
+            raise Problem(413, "body-too-large", compose("json-body-too-large", bytes=self._most))
+
+
+class DrainRequestBody:
+    """Reads and drops the rest of a request's body when the connection will be closed after the answer.
+
+    The answer begins once the body has ended or after ``patience_s`` seconds. It ends once the body has ended or after
+    another ``linger_s`` seconds.
+
+    uvicorn closes a connection that is not kept alive as soon as the answer is sent. Bytes that arrive afterwards reset
+    the connection, and a sender such as nginx loses the answer: its client saw 502 in place of 401 or 422. So the
+    remaining bytes are read and dropped before the answer ends, as nginx's own lingering_close does. The rest of a
+    short upload is dropped before the answer begins: where an answer overtakes the body, nginx closes the connection to
+    its client although it promised to keep it, and the client's next request fails.
+    """
+
+    def __init__(self, app: ASGIApp, *, patience_s: float = PATIENCE_S, linger_s: float = LINGER_S) -> None:
+        self._app, self._patience_s, self._linger_s = app, patience_s, linger_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles one ASGI connection. What is no HTTP request, or will be kept alive, is passed on as it is."""
+        if scope["type"] != "http" or not _closes(scope):
+            await self._app(scope, receive, send)
+            return
+        coming, held = _has_body(scope), False
+
+        async def receive_noting() -> Message:
+            nonlocal coming
+            message = await receive()
+            coming = message["type"] == "http.request" and message.get("more_body", False)
+            return message
+
+        async def drop_for(seconds: float) -> None:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(seconds):
+                    while coming:
+                        await receive_noting()
+
+        async def send_holding(message: Message) -> None:
+            nonlocal held
+            if message["type"] == "http.response.start":
+                await drop_for(self._patience_s)
+            held = coming and message["type"] == "http.response.body" and not message.get("more_body", False)
+            await send({**message, "more_body": True} if held else message)
+
+        await self._app(scope, receive_noting, send_holding)
+        if held:
+            await drop_for(self._linger_s)
+            await send({"type": "http.response.body"})
+
+
+def _closes(scope: Scope) -> bool:
+    connection = b",".join(value for name, value in scope["headers"] if name == b"connection").lower()
+    return b"close" in connection or (scope["http_version"] == "1.0" and b"keep-alive" not in connection)
+
+
+def _has_body(scope: Scope) -> bool:
+    names = {name: value for name, value in scope["headers"]}
+    return b"transfer-encoding" in names or names.get(b"content-length", b"0") != b"0"

@@ -42,7 +42,7 @@ def require(scope: str) -> Callable[..., Caller]:
     problem for one without ``scope``.
 
     It runs before an upload is read. FastAPI reads JSON bodies before dependencies, so routes with such a body are
-    guarded by ``check_caller`` (server.http.json_bodies).
+    guarded by ``check_caller`` (``JsonBodies`` of server.http.app).
     """
 
     def authenticate(

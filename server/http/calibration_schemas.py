@@ -4,8 +4,7 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field, model_validator
 
-from server.http.message_schemas import MessageOut, Texts
-from server.http.schemas import EXAMPLE_ID, Answer, Id, JobError, Moment, Received, State, Text
+from server.http.schemas import EXAMPLE_ID, Answer, Id, JobError, MessageOut, Moment, Received, State, Text, Texts
 from server.storage.records import JsonObject
 
 

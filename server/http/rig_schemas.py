@@ -4,8 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from server.http.message_schemas import MessageOut, Texts
-from server.http.schemas import Answer, Moment, Received
+from server.http.schemas import Answer, MessageOut, Moment, Received, Texts
 
 
 class CameraOut(Answer):

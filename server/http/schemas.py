@@ -1,17 +1,17 @@
-"""Defines what the JSON documents of HTTP have in common, and those of captures, sessions, jobs and results."""
+"""Defines what the JSON documents of HTTP have in common (messages appear as English text, and beside it as code and
+parameters), and those of captures, sessions, jobs, results, lists and actions on many things."""
 
 import base64
 import binascii
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from fastapi import Header
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, WithJsonSchema
+from fastapi import Header, Query
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 from pydantic_core import PydanticCustomError
 
-from server.http.message_schemas import MessageOut, TextOf, Texts, WarningOut
+from rig.messages.message import Message
 from server.http.openapi import SETTINGS
-from server.services.tags import TAG_MOST, TAGS_MOST
-from server.services.texts import PLAIN, TEXT_MOST
+from server.services.texts import PLAIN, TAG_MOST, TAGS_MOST, TEXT_MOST
 from server.storage.records import JsonObject
 
 Id = Annotated[str, Field(pattern="^[0-9a-f]{28}$", description="28 hex digits")]
@@ -23,6 +23,35 @@ JobSettings = Annotated[JsonObject, WithJsonSchema(SETTINGS)]
 Idempotency = Annotated[str | None, Header(alias="Idempotency-Key", min_length=1, max_length=200)]
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 EXAMPLE_ID = "0198c0de" + 20 * "0"
+TextOf = Annotated[str, BeforeValidator(lambda shown: shown.text if isinstance(shown, Message) else shown)]
+Texts = list[TextOf]
+Limit = Annotated[int, Query(ge=1, le=1000)]
+Cursor = Annotated[str | None, Query(max_length=2000, description="``next`` of the page before, in the same order")]
+Key = Annotated[str | None, Query(max_length=64, pattern=PLAIN)]
+WithTag = Annotated[
+    str | None, Query(max_length=200, pattern=PLAIN, description="only what bears this tag, in whatever case")
+]
+Sought = Annotated[str, Query(max_length=200, pattern=PLAIN, description="words that must all be found")]
+
+
+class MessageOut(BaseModel):
+    """Holds a message of the service as data. A program can show it in another language by its ``code`` and
+    ``parameters``."""
+
+    code: str = Field(description="stable; decides what parameters there are")
+    message: str = Field(description="in English")
+    parameters: JsonObject = Field(default_factory=dict, description="what stands in the message, by name")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_message(cls, value: Any) -> Any:
+        return value.document() if isinstance(value, Message) else value
+
+
+class WarningOut(MessageOut):
+    """Holds a warning with its code and parameters, as report.json has it."""
+
+    code: str = Field(description="as in docs/operator.md, among them scale-assumed, view-left-out, views-many")
 
 
 class Received(BaseModel):
@@ -297,3 +326,125 @@ class JobOut(Answer):
     finished: Moment | None
     files: dict[str, FileOut]
     delivery: DeliveryOut | None = None
+
+
+class Listed(Answer):
+    """Holds one page of a list."""
+
+    next: str | None = Field(None, description="cursor of the page after this one; null on the last")
+    total: int = Field(ge=0, description="how many all pages hold")
+
+
+class CaptureList(Listed):
+    """Holds one page of captures."""
+
+    captures: list[CaptureOut]
+
+
+class SessionList(Listed):
+    """Holds one page of sessions."""
+
+    sessions: list[SessionOut]
+
+
+class PersonOut(Answer):
+    """Describes a person whose sessions have the same name. ``captures`` counts captures, ``heads`` jobs that made a
+    head."""
+
+    id: str = Field(description="of the newest session")
+    label: str
+    created: Moment
+    sessions: list[str]
+    captures: int
+    heads: int
+    running: int = Field(description="jobs that are queued or running")
+    head: str | None = Field(description="newest job with a result")
+    capture: str | None = Field(description="newest capture")
+    consent: bool = Field(description="whether every session has a note of it")
+    tags: list[str] = Field(description="of their captures")
+
+
+class SubjectList(Listed):
+    """Holds one page of people."""
+
+    subjects: list[PersonOut]
+
+
+class JobList(Listed):
+    """Holds one page of jobs."""
+
+    jobs: list[JobOut]
+
+
+class JobBatch(Answer):
+    """Holds the jobs that one request has queued, one for each capture."""
+
+    jobs: list[JobOut]
+
+
+class RefusedOne(Answer):
+    """Describes why an action was refused for one of the ids in a request."""
+
+    id: str
+    type: str = Field(description="as of a problem document")
+    detail: TextOf
+    detail_message: MessageOut = Field(validation_alias="detail")
+
+
+class BulkOut(Answer):
+    """Holds the result of an action on many things. Each id is in one of the two lists."""
+
+    done: list[str]
+    refused: list[RefusedOne]
+
+
+Ids = Annotated[list[Id], Field(min_length=1, max_length=1000)]
+
+
+class CaptureBulk(Received):
+    """Requests one action on many captures. Each of them succeeds or is refused by itself."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"action": "remove", "ids": [EXAMPLE_ID]}]})
+
+    action: Literal["remove", "erase", "reconstruct", "move", "tag", "untag"] = Field(
+        description="remove: pictures go, heads stay; erase: nothing stays; reconstruct: a job each; move: to a "
+        "session; tag, untag: adds or takes away tags"
+    )
+    ids: Ids
+    session: Id | None = Field(None, description="of move; null: out of any")
+    tags: Tags = Field(default_factory=list, description="of tag and untag")
+    model: str | None = Field(None, max_length=200, description="of reconstruct")
+    settings: JobSettings | None = Field(None, description="of reconstruct")
+
+
+class JobBulk(Received):
+    """Requests one action on many jobs. Each of them succeeds or is refused by itself."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"action": "cancel", "ids": [EXAMPLE_ID]}]})
+
+    action: Literal["cancel", "restart", "remove"]
+    ids: Ids
+
+
+class NewExport(Received):
+    """Requests a job's head in another format."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"as": "obj"}]})
+
+    form: Literal["glb", "ply", "obj", "usdz", "stl", "3mf"] = Field(alias="as")
+    template: str | None = Field(None, description="also head-NAME.obj, in this template's vertex order", max_length=40)
+    morphs: bool = Field(False, description="also posed.glb, with shapes, eyes and teeth")
+    albedo: bool = Field(False, description="also texture/albedo.png")
+
+    def outputs(self) -> dict[str, object]:
+        """Returns the settings of the pipeline's outputs that say the same."""
+        albedo = "file" if self.albedo else "none"
+        return {"formats": [self.form], "template": self.template, "morphs": self.morphs, "albedo": albedo}
+
+
+class NewDelivery(Received):
+    """Requests that a job's result is delivered to an object store."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"to": "s3://studio/heads/"}]})
+
+    to: DeliverTo | None = Field(None, description=f"{DELIVER_TO}; left out, the one that the job was submitted with")

@@ -10,8 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from pipeline.head_model.model_names import UnknownModel
-from server.batch.captures import BatchCapture
-from server.batch.digests import files_sha256
+from server.batch.captures import BatchCapture, files_sha256
 from server.batch.folder import REPORT, FailureRecord, Origin
 from server.batch.sheet import Card, sheet_lines
 from server.batch.summary import Outcome, expressions_of, sheet_card, table_row

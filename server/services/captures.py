@@ -25,8 +25,7 @@ from server.services.jobs import Jobs
 from server.services.records import Found
 from server.services.rigs.backend import SHOT_BYTES, RigBackend
 from server.services.rigs.simulated import SimulatedRig
-from server.services.tags import checked_tags, typed_tags
-from server.services.texts import check_texts
+from server.services.texts import check_texts, checked_tags, typed_tags
 from server.services.work import refuse_board
 from server.settings import ServiceSettings
 from server.storage.library import CaptureQuery, Library

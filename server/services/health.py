@@ -17,7 +17,7 @@ from server.errors import Refused
 from server.metrics import QueueFigures, StoreFigures
 from server.services.service import Check, Service
 from server.storage.database import alive_workers, slots_by_queue
-from server.storage.failure_counts import failure_counts
+from server.storage.events import failure_counts
 from server.storage.folders import STOPPED
 from server.storage.job_index import Queued
 from server.storage.records import JsonObject

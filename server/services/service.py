@@ -19,7 +19,8 @@ from server.services.jobs import Jobs, migrate
 from server.services.keys import Keys
 from server.services.records import Calibration, Job, RigState
 from server.services.rigs.backend import RigBackend
-from server.services.rigs.opening import open_rig
+from server.services.rigs.real import RealRig
+from server.services.rigs.simulated import SimulatedRig
 from server.services.sessions import Sessions
 from server.services.storage_use import StorageCount
 from server.services.threads import Threads
@@ -173,3 +174,10 @@ def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
         metrics=metrics,
         known={},
     )
+
+
+def open_rig(settings: ServiceSettings) -> RigBackend:
+    """Returns the simulated studio, or the real rig if the settings name a rig.toml. No camera is opened yet. Raises
+    InputError naming every fault of rig.toml."""
+    calibration = settings.data / "rig" / "cameras.json"
+    return SimulatedRig(calibration) if settings.rig is None else RealRig(settings.rig, calibration)

@@ -1,4 +1,7 @@
-"""Stores what happened to each job, in order: the source of progress, remaining time and the event stream of HTTP."""
+"""Stores what happened to each job, in order: the source of progress, remaining time and the event stream of HTTP.
+
+Failed jobs are counted by kind for the metrics; the counts stay when retention removes the jobs, so that alerts can use
+them."""
 
 import json
 from dataclasses import dataclass
@@ -8,8 +11,7 @@ import structlog
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import IntegrityError
 
-from server.storage.database import AWAY, events, now_sql
-from server.storage.failure_counts import note_failure
+from server.storage.database import AWAY, events, failures, now_sql
 from server.storage.records import EventDocument
 
 END = 2**31 - 1  # the number of a job's end, the largest of the column: the table's key holds that a job has one
@@ -104,3 +106,17 @@ class EventLog:
         insert = sqlite.insert if self._engine.dialect.name == "sqlite" else postgresql.insert
         row = {"job_id": job_id, "seq": END, "document": json.dumps(document), "at": now_sql(self._engine)}
         return insert(events).values(**row)
+
+
+def note_failure(connection: sa.Connection, kind: str) -> None:
+    """Adds one to the count of a kind of failure in the caller's transaction."""
+    insert = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
+    first = insert(failures).values(kind=kind, count=1)
+    more = {"count": failures.c["count"] + 1}
+    connection.execute(first.on_conflict_do_update(index_elements=["kind"], set_=more))
+
+
+def failure_counts(engine: sa.Engine) -> dict[str, int]:
+    """Returns the number of failures by kind."""
+    with engine.connect() as connection:
+        return {row[0]: row[1] for row in connection.execute(sa.select(failures.c.kind, failures.c["count"]))}

@@ -2,7 +2,7 @@
 
 An object is visible only when it is whole, and what is read is compared with its checksum. A key is a relative path
 with slashes. ``ObjectStore`` has two implementations: ``FolderObjects`` here, ``S3Objects`` in
-``server.storage.s3_objects``.
+``server.storage.object_places``.
 """
 
 import hashlib

@@ -27,6 +27,7 @@ from rig.formats.cameras.scale_json import read_scale
 from rig.formats.captures.capture_folder import (
     SCALE,
     capture_root,
+    full_size_reader,
     has_known_length,
     read_capture,
     read_rig_of,
@@ -34,7 +35,6 @@ from rig.formats.captures.capture_folder import (
     unread_files,
     unread_pictures,
 )
-from rig.formats.captures.full_size import full_size_reader
 from rig.formats.captures.shot_files import find_files, picture_folder
 from rig.formats.pictures.images import is_picture, picture_size, write_image
 from rig.formats.pictures.picture_names import entry
@@ -102,7 +102,7 @@ def read_scaled_capture(folder: Path, *, pixels_most: int | None = WORK_PIXELS) 
     rig_file = find_rig_file(root)
     if rig_file is None or not has_known_length(root):
         return capture, rig
-    from calibration.scene.rig_scale import scaled_by_length
+    from calibration.scene.scale import scaled_by_length
 
     scaled, remarks = scaled_by_length(capture, rig, read_rig_file(rig_file), read_scale(entry(root, SCALE), rig.names))
     if faults := rig_faults(scaled):

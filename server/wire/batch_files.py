@@ -19,7 +19,7 @@ CLOSED = "sandbox allow-popups; default-src 'none'; style-src 'unsafe-inline'; i
 def send_table(service: Service, batch_id: str, form: TableFormat) -> Response:
     """Returns the response that carries the table of a batch. Raises NotFound, and Conflict for Parquet if pyarrow is
     not installed."""
-    from server.batch.table_files import CSV, PARQUET, csv_lines, has_parquet, parquet_bytes
+    from server.batch.table import CSV, PARQUET, csv_lines, has_parquet, parquet_bytes
     from server.services.batch_table import batch_columns, batch_rows
 
     batch = service.batches.get(batch_id)

@@ -7,9 +7,13 @@ worker, so it does no harm if two workers do the same step.
 
 Every worker writes a heartbeat row. A worker that finds another dead (stopped, its process gone on the same machine, or
 silent for ``silent_s``) puts its jobs back into their queue. The engine changes only rows that still belong to the dead
-worker, so several workers may do this at once.
+worker, so several workers may do this at once. One statement on the table of the job engine (DBOS) does it, before a
+new worker takes its first job: so an interrupted job keeps its place. The engine's own ways do not serve:
+resume_workflow takes a job from whoever has it by now, revives a cancelled one and forgets how many workers the job
+took down; its recovery is private, and begins only when jobs are taken already.
 """
 
+import json
 import os
 import platform
 import resource
@@ -19,7 +23,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.metadata import version
@@ -28,29 +32,32 @@ from typing import Concatenate
 
 import sqlalchemy as sa
 import structlog
-from dbos import DBOS, PortableWorkflowError
+from dbos import DBOS, DBOSConfig, PortableWorkflowError
 from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import PHOTO_LEVELS, settings_from_document
+from rig.atomic_write import write_atomically
 from rig.errors import Cancelled, InputError
-from rig.messages.message import compose
+from rig.messages.message import Message, MessageDocument, compose
 from rig.progress import Progress
 from server.errors import UNWRITABLE, unusable_input
 from server.problem_types import type_of_failure
-from server.processes import process_identity
+from server.processes import process_identity, process_started
 from server.services import calibrations
 from server.services.deliveries import DELIVERIES_QUEUE, enqueue_delivery
-from server.services.failures import JobFailed, restored
-from server.services.job_rows import DELIVERY, WORKFLOW
+from server.services.failures import SERIALIZER, JobFailed, restored
+from server.services.job_rows import APPLICATION, APPLICATION_VERSION, DELIVERY, WORKFLOW, request_of
 from server.services.results import Results
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
 from server.storage.capture_blobs import open_capture_blobs
-from server.storage.database import AWAY, now_sql, open_database, workers
-from server.storage.events import EventLog
+from server.storage.database import AWAY, events, now_sql, open_database, workers
+from server.storage.events import END, EventLog
 from server.storage.folders import move_durably
-from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, WebhookMessage
+from server.storage.job_index import RUNNING, engine_jobs
+from server.storage.objects import sha256_of
+from server.storage.records import CalibrationOutcome, EventDocument, FileEntry, JobRequest, JobWebhook, WebhookMessage
 from server.storage.store import Store
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import DISK_FULL, ChildProcessPool, WorkerContext, WorkFailed, function_at
@@ -59,15 +66,13 @@ from server.tasks.reconstruct import reconstruct_capture
 from server.tasks.stage_durations import StageDurations, megapixels_of
 from server.worker.capture_source import CaptureSource
 from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
-from server.worker.engine import dead_workers, engine_config, held_by, take_back, take_over
-from server.worker.outcome import Outcomes
 from server.worker.pauses import WorkerStopped, insist, pause
-from server.worker.result_files import add_warning, described
 
 LOST_S = 10.0  # between the end of a workflow and its row, which takes milliseconds
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
 
 log = structlog.get_logger()
+SET_ASIDE = "MAX_RECOVERY_ATTEMPTS_EXCEEDED"
 
 
 class Worker:
@@ -429,3 +434,135 @@ def _stop_at_eof(stop: Callable[[], None]) -> None:
     while sys.stdin.buffer.read(4096):
         pass
     stop()
+
+
+def engine_config(settings: ServiceSettings, executor_id: str) -> DBOSConfig:
+    """Returns the job engine's configuration for the worker ``executor_id``."""
+    return {
+        "name": APPLICATION,
+        "system_database_url": settings.url,
+        "application_version": APPLICATION_VERSION,
+        "executor_id": executor_id,
+        "enable_otlp": False,
+        "log_level": "WARNING",
+        "notification_listener_polling_interval_sec": 1.0,
+        "serializer": SERIALIZER,
+    }
+
+
+def dead_workers(engine: sa.Engine, silent_s: float, except_id: str = "") -> list[str]:
+    """Lists the ids of dead workers: those that stopped, whose process on this machine is gone, or that sent no
+    heartbeat for ``silent_s`` seconds. ``except_id`` is never listed."""
+    machine = process_identity()[0]
+    with engine.connect() as connection:
+        silent = (workers.c.seen < now_sql(connection) - silent_s).label("silent")
+        rows = connection.execute(sa.select(workers, silent).where(workers.c.id != except_id)).all()
+    return [
+        row.id
+        for row in rows
+        if row.stopped is not None
+        or row.silent
+        or (row.machine == machine and process_started(row.pid) != row.pid_started)
+    ]
+
+
+def take_over(engine: sa.Engine, dead: Collection[str]) -> list[str]:
+    """Puts the running workflows of dead workers, and of those that have no row any more, back into their queues.
+    Workflows that another worker has taken meanwhile are left alone. Returns the ids of those put back."""
+    job = engine_jobs(engine)
+    with engine.connect() as connection:
+        holders = {*connection.scalars(sa.select(job.c.executor_id).where(job.c.status == RUNNING).distinct())}
+        known = {*connection.scalars(sa.select(workers.c.id))}  # asked second: a worker that begins now is no stray
+    gone = {*dead, *holders - known} & holders
+    return _put_back(engine, job, job.c.executor_id.in_(gone)) if gone else []
+
+
+def take_back(engine: sa.Engine, executor_id: str, lost: Collection[str]) -> list[str]:
+    """Puts workflows of a living worker, in which nothing runs any more, back into their queues, as ``take_over``."""
+    job = engine_jobs(engine)
+    which = sa.and_(job.c.executor_id == executor_id, job.c.workflow_uuid.in_(lost))
+    return _put_back(engine, job, which) if lost else []
+
+
+def held_by(engine: sa.Engine, executor_id: str, names: Collection[str]) -> list[str]:
+    """Lists the ids of the running workflows of these names that a worker holds."""
+    job = engine_jobs(engine).c
+    query = sa.select(job.workflow_uuid).where(job.status == RUNNING, job.executor_id == executor_id)
+    with engine.connect() as connection:
+        return [*connection.scalars(query.where(job.name.in_(names)))]
+
+
+def _put_back(engine: sa.Engine, job: sa.TableClause, which: sa.ColumnElement[bool]) -> list[str]:
+    back = {"status": "ENQUEUED", "owner_xid": None, "started_at_epoch_ms": None}
+    change = sa.update(job).where(job.c.status == RUNNING, which)
+    with engine.begin() as connection:
+        changed = change.values(**back, updated_at=sa.cast(now_sql(connection) * 1000, sa.BigInteger))
+        return [*connection.scalars(changed.returning(job.c.workflow_uuid))]
+
+
+class Outcomes:
+    """Writes how one worker's jobs ended: the last event, the count of failures, and messages to webhooks.
+
+    All of it may be done again, since a worker may be killed before the job engine knows that the job has ended; and it
+    waits for a database that is away, since a job whose end nobody wrote would seem to run."""
+
+    def __init__(self, engine: sa.Engine, store: Store, webhooks: Webhooks, stop: threading.Event) -> None:
+        self._engine, self._store, self._webhooks, self._stop = engine, store, webhooks, stop
+        self._events = EventLog(engine)
+
+    def publish(
+        self, job_id: str, state: str, webhook: JobWebhook | None = None, *, failure: str | None = None
+    ) -> None:
+        """Writes how a job ended, with the warnings that an operator must act on, and queues messages to the webhooks
+        of the service and of the job. ``failure``: the kind of a failed job. Raises WorkerStopped."""
+        warnings = warnings_of(self._store.folder("jobs", job_id) / "result" / "report.json")
+        for warning in warnings:
+            log.warning(warning["message"], code=warning["code"])
+        moved = [warning["message"] for warning in warnings if warning["code"] == "camera-moved"]
+        document: EventDocument = {"state": state, "camera_moved": moved} if moved else {"state": state}
+        insist(self._stop, lambda: self._events.end(job_id, document, failure=failure))
+        self._announce(job_id, state, webhook)
+
+    def publish_set_aside(self) -> list[str]:
+        """Writes the end of each job that took down as many workers as it may, which no worker lives to write. Returns
+        their ids."""
+        status, event = engine_jobs(self._engine).c, events.c
+        ended = sa.select(event.job_id).where(
+            event.job_id == status.workflow_uuid, event.seq == END, event.document.contains('"failed"')
+        )
+        query = sa.select(status.workflow_uuid).where(status.name == WORKFLOW, status.status == SET_ASIDE)
+        with self._engine.connect() as connection:
+            ids = [*connection.scalars(query.where(~ended.exists()))]
+        for row in DBOS.list_workflows(workflow_ids=ids, load_output=False) if ids else []:
+            request = request_of(row)
+            self._events.replace_end(row.workflow_id, {"state": "failed"})
+            self._announce(row.workflow_id, "failed", request.get("webhook") if request else None)
+        return ids
+
+    def _announce(self, job_id: str, state: str, webhook: JobWebhook | None) -> None:
+        enqueue: Callable[..., object] = DBOS.enqueue_workflow_with_options
+        insist(self._stop, lambda: self._webhooks.announce(job_id, state, enqueue, job_webhook=webhook))
+
+
+def warnings_of(report: Path) -> list[MessageDocument]:
+    """Returns the warnings in a report.json; none if it is missing or holds none."""
+    try:
+        return json.loads(report.read_bytes())["warnings"]
+    except (OSError, ValueError, KeyError, TypeError):  # no result, or another kind of work
+        return []
+
+
+def add_warning(report: Path, warning: Message) -> None:
+    """Adds a warning to a report.json; does nothing where another kind of work wrote none."""
+    with suppress(FileNotFoundError):
+        document = json.loads(report.read_bytes())
+        document["warnings"] = [*document["warnings"], warning.document()]
+        write_atomically(report, json.dumps(document, indent=1, ensure_ascii=False).encode())
+
+
+def described(folder: Path) -> dict[str, FileEntry]:
+    """Returns size and SHA-256 of every file below ``folder``, by its relative name."""
+    files: dict[str, FileEntry] = {}
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        files[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
+    return files

@@ -1,19 +1,27 @@
 """The rig's commands against the studio that ``eigenhead simulate --serve`` keeps running, as operators type them."""
 
 import json
+import signal
 import socket
 import subprocess
+import sys
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rig.formats.captures.capture_folder import read_capture
 from rig.studio.scene.layout import default_layout
-from tests.support.served_studio import command, served_studio
+from tests.support import fork_server
 
 NAMES = tuple(f"cam{i:02}" for i in range(11))
+ROOT = Path(__file__).resolve().parents[2]
+CLI = [sys.executable, "-m", "server.cli"]
+START_S, STOP_S = 180.0, 20.0
 
 
 @pytest.mark.slow
@@ -70,3 +78,36 @@ def test_where_the_capture_goes_must_be_said_or_served(tmp_path: Path) -> None:
         command("simulate")
     assert failed.value.returncode == 2
     assert "--serve" in failed.value.stderr
+
+
+@contextmanager
+def served_studio(folder: Path, *options: str) -> Iterator[dict[str, Any]]:
+    """What ``--json`` prints once the studio is open. At the end it gets the signal of Ctrl-C and must end well."""
+    process = fork_server.Popen(
+        [*CLI, "simulate", str(folder), "--serve", "--json", *options], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()
+        assert line, f"the studio ended with status {process.wait()} before it opened"
+        yield json.loads(line)
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        try:
+            status = process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            raise
+        finally:
+            process.stdout.close()
+    assert status == 0
+
+
+def command(*arguments: str, timeout_s: float = 600.0) -> dict[str, Any]:
+    """What an ``eigenhead`` command prints with --json. Raises CalledProcessError, its words in stderr."""
+    done = fork_server.run([*CLI, *arguments, "--json"], cwd=ROOT, timeout_s=timeout_s)
+    if done.returncode:
+        raise subprocess.CalledProcessError(done.returncode, arguments, done.stdout, done.stderr)
+    return json.loads(done.stdout)

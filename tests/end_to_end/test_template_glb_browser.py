@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.applications.templates.animated import AnimatedMesh, animated_mesh
-from pipeline.applications.templates.write.shapes import animated_scene
+from pipeline.applications.templates.write.writers import animated_scene
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.head_model.model import load_model
 from pipeline.head_model.visemes import VISEMES

@@ -1,4 +1,4 @@
-"""What tests of the pipeline share: the shipped head model, and one photographed capture."""
+"""What tests of the pipeline share: the shipped head model, the networks of faces, and one photographed capture."""
 
 from typing import TYPE_CHECKING
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 if TYPE_CHECKING:  # pytest may load this file before it checks what is imported (tests/conftest.py)
+    from pipeline.faces.networks import FaceNetworks
     from pipeline.head_model.model import HeadModel
     from rig.render.renderer import Renderer
     from rig.studio.scene.simulate import SimulatedCapture
@@ -17,6 +18,13 @@ def model() -> "HeadModel":
     from pipeline.head_model.model import load_model
 
     return load_model()
+
+
+@pytest.fixture(scope="session")
+def networks() -> "FaceNetworks":
+    from pipeline.faces.networks import load_networks
+
+    return load_networks()
 
 
 @pytest.fixture(scope="session")

@@ -11,11 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from server.batch.captures import find_captures
+from server.batch.captures import WHOLE, Shard, find_captures, read_shard
 from server.batch.folder import BatchFolder
 from server.batch.plan import BatchTask, plan_batch
 from server.batch.run import BatchRun, Outcome
-from server.batch.shards import WHOLE, Shard, read_shard
 from server.batch.summary import write_summary
 from tests.support.pinned_work import work
 

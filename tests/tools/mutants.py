@@ -20,10 +20,6 @@ PACKAGES = ("rig", "pipeline", "calibration", "server")
 TESTS = {
     "pipeline/geometry/registration/procrustes.py": ["tests/pipeline/alignment/test_landmarks.py"],
     "pipeline/simplex/xor_objective.py": ["tests/pipeline/simplex/test_xor_objective.py"],
-    "rig/formats/captures/archive.py": [
-        "tests/rig/formats/captures/test_archive.py",
-        "tests/rig/formats/captures/test_archive_rules.py",
-    ],
     "rig/geometry.py": ["tests/rig/test_geometry.py"],
     "server/http/auth.py": ["tests/server/http/test_callers.py"],
 }

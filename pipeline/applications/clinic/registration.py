@@ -1,4 +1,5 @@
-"""Lays a head on the surface of the same person's CT or CBCT, given as a mesh in mm in LPS or RAS.
+"""Lays a head on the surface of the same person's CT or CBCT, given as a mesh in mm in LPS or RAS,
+with or without skull and airways in it.
 
 The motion is rigid: photographs and CT both measure millimetres, and what a scale would take up is an error that should
 be seen. It starts from landmarks where the surface has some, else from the head in the Frankfurt plane, for a patient
@@ -8,6 +9,7 @@ which most of the face lies on the surface wins: soft tissue of another day, a c
 the forehead, and the surfaces of skull and airways contradict the rest.
 """
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,15 +20,17 @@ from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
 
 from pipeline.applications.clinic.anatomical_frame import frankfurt_axes
-from pipeline.applications.clinic.surface import PatientSurface
 from pipeline.applications.clinic.trimmed_fit import Patch, TrimmedFit, trimmed_fit
 from pipeline.applications.clinic.visit import Visit
-from pipeline.applications.model_building.correspondence.scans import read_landmarks
+from pipeline.applications.model_building.correspondence.scans import read_landmarks, welded
+from pipeline.applications.verification.reference import Reference
 from pipeline.geometry.registration.search import ROUNDS, draw_rows, draw_surface_points, search_motions
 from pipeline.head_model.landmarks import stacked
 from rig.errors import InputError
-from rig.formats.meshes.markups import Axes
+from rig.formats.meshes.markups import AXES, Axes
+from rig.formats.meshes.mesh_file import SURFACE_ENDINGS, read_mesh
 from rig.geometry import RigidTransform, rigid_fit
+from rig.mesh import Mesh
 from rig.messages.message import compose
 
 TURNS_DEG = {"x": (-25.0, 0.0, 25.0), "z": (-30.0, 0.0, 30.0)}  # nodding and turning; tilts are found by the way
@@ -40,6 +44,32 @@ MIN_MARKS = 3
 MIN_KEPT = 0.3  # share of the face, below which it is not this head
 NOT_THIS_MM = 2.0
 SAME_MM = 1.0  # near enough to the surface to count for a start
+HEADER_BYTES = 4096  # in which SPACE stands: a comment of a PLY or OBJ, the 80 bytes of an STL
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatientSurface:
+    """Holds the surface and the axes of its coordinates. ``stated`` tells whether its file states them."""
+
+    reference: Reference
+    axes: Axes
+    stated: bool
+
+
+def read_surface(path: Path, axes: Axes | None = None) -> PatientSurface:
+    """Reads a .ply, .obj, .glb or .stl. Axes are ``axes``, else those that the file's header states (``SPACE=RAS``, as
+    3D Slicer writes it), else LPS. Raises InputError naming every fault."""
+    vertices, faces = welded(read_mesh(path, SURFACE_ENDINGS))
+    found = _stated_axes(path)
+    data = path.read_bytes()
+    reference = Reference.of(Mesh(vertices, faces), {}, path.name, hashlib.sha256(data).hexdigest())
+    return PatientSurface(reference, axes or found or "LPS", axes is None and found is not None)
+
+
+def _stated_axes(path: Path) -> Axes | None:
+    with path.open("rb") as file:
+        header = file.read(HEADER_BYTES)
+    return next((axes for axes in AXES if f"SPACE={axes}".encode() in header), None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

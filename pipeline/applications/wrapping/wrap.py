@@ -1,29 +1,57 @@
-"""Composes the wrapping of a scan: placed by its face, fitted, drawn, measured."""
+"""Composes the wrapping of a scan: placed by its face, fitted, drawn, measured.
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+The face is found on renders, whatever the scan's unit and axes. The scan is drawn from all sides until one picture
+shows a face (the finder takes it in any roll). Its points are lifted onto the scan; their size tells the unit, their
+order in space the axes. Then the scan is drawn from seven directions in front of that face, as photographs of a rig,
+and the face is found in these as in any capture.
+
+Then the model is fitted, as for a template's registration (``templates``), with the scan in the template's place. At
+last the template's own vertices are drawn, as ``geometry.registration.nonrigid`` does, with exact closest points of the
+scan's triangles.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.spatial import KDTree
 
-from pipeline.applications.templates.likeness import CANDIDATES, Likeness, SurfaceMarks
+from pipeline.applications.templates.likeness import (
+    CANDIDATES,
+    Likeness,
+    MetSurface,
+    Stage,
+    SurfaceMarks,
+    fit_model_to_mesh,
+)
 from pipeline.applications.templates.placement import Surface, outward, place_by_landmarks
+from pipeline.applications.templates.registration import components, weld
 from pipeline.applications.templates.template_file import Template
-from pipeline.applications.wrapping.fitting import fit_template
 from pipeline.applications.wrapping.scan import RawScan
-from pipeline.applications.wrapping.sighting import ScanSighting, nearest_axis, sight_scan, unit_of
+from pipeline.faces.detection import CERTAIN_SCORE, FaceDetection, find_faces
 from pipeline.faces.landmark_map import landmark_map
-from pipeline.faces.networks import load_networks
+from pipeline.faces.matching import MatchedFaces
+from pipeline.faces.networks import FaceNetworks, load_networks
 from pipeline.faces.points import RIGHT_EYE_OUTLINE, point_table
+from pipeline.faces.subject import find_subject
+from pipeline.fusion.untangling import topology_of, untangled
+from pipeline.geometry.registration.nonrigid import draw_to_matches
 from pipeline.geometry.registration.procrustes import procrustes
 from pipeline.geometry.surface_index import Hits, SurfaceIndex
-from pipeline.head_model.model import HeadModel
+from pipeline.head_model.model import HeadModel, with_expressions
+from pipeline.multiview.triangulation import NoPoint, triangulate_many
+from rig.camera import Camera, Intrinsics
 from rig.errors import InputError
-from rig.geometry import Similarity
-from rig.mesh import vertex_normals
+from rig.geometry import Similarity, look_at
+from rig.image import ImageRgb
+from rig.mesh import Mesh, face_normals, vertex_normals
 from rig.messages.message import compose
 from rig.progress import Progress
+from rig.render.colour import HEADLIGHT, UNLIT, Light
 from rig.render.renderer import Renderer
+from rig.rig import Rig
 
 # Deviation of a found point, an axis: the network errs by 1 to 2 mm, but all points of a region together. With 2 mm the
 # landmarks of a known head came 2.0 mm off, with 10 mm 1.0 (the laboratory's `wrap`, draw-b): the surface knows better.
@@ -32,6 +60,281 @@ LID_MM = (20.0, 0.5, 3.0)  # the same of the eyes' network along x, y, z of the 
 EDGES = np.array([3, 4, 5, 11, 12, 13])  # of ``lids_mm``, an eye: middles of the lids; near corners they end early
 LIDS = np.array(RIGHT_EYE_OUTLINE)[EDGES]
 LIDS = np.r_[LIDS, point_table().mirror_images[LIDS]]  # of the 468 points, right and left
+# Of each step of the drawing, and how far off (mm) a place of the scan still draws: from the fit's own error to less
+# than vertices lie apart.
+STIFFNESS = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.03, 0.01, 0.01)
+REACH_MM = (6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0)
+# The prior stays stronger than for a template: the template's own vertices follow the scan to the end.
+STAGES = (
+    Stage(5, 10, 25.0, 12.0, 2.0),
+    Stage(5, 40, 15.0, 12.0, 1.5),
+    Stage(6, None, 10.0, 12.0, 1.0),
+    Stage(6, None, 5.0, 0.0, 0.5),
+)
+CARRYING = 0.02  # stiffness of the template's own shape while the model's head carries it
+FOLLOWING = 0.1  # weight there of what follows the skin outside of the face, shoulders, beside 1 of skin
+FACE_MM = 20.0  # of the model's face: what is no skin of the template there lies inside
+UNITS_MM = {"mm": 1.0, "cm": 10.0, "in": 25.4, "dm": 100.0, "m": 1000.0}
+SIZE_RANGE = 0.72, 1.4  # of the mean adult's face: children's to large ones, and narrower than the steps between units
+SEARCH_PX, SEARCH_RADIUS = 640, 150.0  # of the pictures from all sides; there the scan has this radius
+OUTLYING = 0.5  # percent of the triangles at either end of an axis that a stray part may have
+FRONT_PX, FRONT_MM, FRONT_SHOWN_MM = 768, 800.0, 330.0  # of the pictures before the face: size, distance, breadth
+FRONT_DEG = ((0, 0), (-22, 0), (22, 0), (-45, 0), (45, 0), (0, 20), (0, -20))  # to the subject's left, and up
+BACKGROUND = (120, 125, 130)
+MIN_LIFTED = 200  # of the 468 points that must hit the scan
+ROUNDS = 3  # of a mean face fitted to points that were lifted, some past the scan's edge
+NEAR_MM = 8.0  # of a mean adult: a lifted point that differs by this weighs a quarter
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanSighting:
+    """Holds the face found on a scan."""
+
+    scan: RawScan  # turned over where its triangles looked inwards
+    unit: str | None  # of ``UNITS_MM``; None where no unit makes it a head, and an adult's size was assumed
+    mm_per_unit: float
+    turned_over: bool
+    face: MatchedFaces  # in mm: the scan's own axes and origin, times ``mm_per_unit``
+    lids_mm: Float[np.ndarray, "32 3"] | None  # edges of the lids, as ``FaceDetection.lids_px``; None: not found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Glance:
+    """Holds a face in one picture, lifted onto the scan (its own unit)."""
+
+    detection: FaceDetection
+    scan_from_face: Similarity  # of a mean adult's points, mm
+    from_outside: bool  # a mask seen from behind shows a face, too, whose nose is farthest away
+
+
+def sight_scan(scan: RawScan, networks: FaceNetworks, renderer: Renderer) -> ScanSighting:
+    """Finds the face of a scan, its unit and its axes. Raises InputError if no picture shows a face."""
+    mesh = scan.drawable()
+    lights = (UNLIT, HEADLIGHT) if scan.is_coloured else (HEADLIGHT,)
+    glance = next((found for light in lights if (found := _search(mesh, light, networks, renderer))), None)
+    if glance is None:
+        raise InputError(scan.name, [compose("scan-no-face")])
+    unit, factor = unit_of(glance.scan_from_face.scale)
+    inward = _looks_inwards(mesh, glance.scan_from_face)
+    if inward:
+        scan, mesh = scan.turned_over(), Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.colours)
+    large = Mesh(mesh.vertices * factor, mesh.faces, mesh.colours)
+    placed = replace(
+        glance.scan_from_face,
+        scale=glance.scan_from_face.scale * factor,
+        translation=glance.scan_from_face.translation * factor,
+    )
+    rig = front_rig(placed)
+    matched = None
+    for light in lights:
+        subject = find_subject(_pictures(rig, large, light, renderer), rig, networks, eye_distance_mm=None)
+        if subject.matched is not None and len(subject.matched.detections) > 1:
+            matched = subject.matched
+            break
+    if matched is None:
+        raise InputError(scan.name, [compose("scan-no-face")])
+    return ScanSighting(scan, unit, factor, inward, matched, _lids(matched, rig))
+
+
+def unit_of(scale: float) -> tuple[str | None, float]:
+    """Returns the unit and its millimetres in which a face has a head's size, from its size in the scan's unit by a
+    mean adult's in mm. Returns None, and what makes it a mean adult, if no unit does."""
+    for unit, factor in UNITS_MM.items():
+        if SIZE_RANGE[0] < scale * factor < SIZE_RANGE[1]:
+            return unit, factor
+    return None, 1.0 / scale
+
+
+def front_rig(world_from_face: Similarity) -> Rig:
+    """Returns cameras before a face (mm), which look at its middle."""
+    turn, middle = world_from_face.rotation, world_from_face.translation
+    lens = _lens(FRONT_PX, FRONT_PX * FRONT_MM / FRONT_SHOWN_MM)
+    cameras = []
+    for number, (left_deg, up_deg) in enumerate(FRONT_DEG):
+        left, up = np.radians([left_deg, up_deg])
+        towards = turn @ np.array([np.cos(up) * np.sin(left), np.sin(up), np.cos(up) * np.cos(left)])
+        cameras.append(Camera(f"front{number}", lens, look_at(middle + FRONT_MM * towards, middle, turn[:, 1])))
+    return Rig(tuple(cameras))
+
+
+def _lens(size: int, focal_px: float) -> Intrinsics:
+    return Intrinsics(size, size, focal_px, focal_px, (size - 1) / 2, (size - 1) / 2)
+
+
+def _search(mesh: Mesh, light: Light, networks: FaceNetworks, renderer: Renderer) -> _Glance | None:
+    """Returns the best face of the pictures from all sides: first those along the axes, then, unless one of these is
+    beyond doubt, those between."""
+    centres = mesh.vertices[mesh.faces].mean(axis=1)
+    low, high = np.percentile(centres, [OUTLYING, 100.0 - OUTLYING], axis=0)
+    middle, factor = (low + high) / 2, SEARCH_RADIUS / max(float(np.linalg.norm(high - low)) / 2, 1e-12)
+    small = Mesh((mesh.vertices - middle) * factor, mesh.faces, mesh.colours)
+    small_from_scan = Similarity(factor, np.eye(3), -factor * middle)
+    best: _Glance | None = None
+    for rig in _round_rigs():
+        pictures, depths = _pictures(rig, small, light, renderer), renderer.depth(rig, small.vertices, small.faces)
+        for camera in rig:
+            for face in find_faces(pictures[camera.name], networks)[:1]:
+                glance = _lifted(face, camera, depths[camera.name], small_from_scan)
+                if glance and glance.from_outside and (best is None or face.score > best.detection.score):
+                    best = glance
+        if best is not None and best.detection.score >= CERTAIN_SCORE:
+            return best
+    return best
+
+
+def _round_rigs() -> Iterator[Rig]:
+    """Returns cameras that look at the origin along the axes, then along the diagonals."""
+    focal = 0.5 * SEARCH_PX * 6.0 * SEARCH_RADIUS / (1.02 * SEARCH_RADIUS)
+    directions = [np.array(d, float) for d in product((-1, 0, 1), repeat=3) if any(d)]
+    for diagonal in (False, True):
+        cameras = []
+        for direction in directions:
+            if (np.count_nonzero(direction) > 1) != diagonal:
+                continue
+            eye = 6.0 * SEARCH_RADIUS * direction / np.linalg.norm(direction)
+            up = np.array([0.0, 1.0, 0.0]) if not (direction[0] == direction[2] == 0) else np.array([0.0, 0.0, 1.0])
+            name = "".join("-0+"[int(step) + 1] for step in direction)
+            cameras.append(Camera(name, _lens(SEARCH_PX, focal), look_at(eye, np.zeros(3), up)))
+        yield Rig(tuple(cameras))
+
+
+def _pictures(rig: Rig, mesh: Mesh, light: Light, renderer: Renderer) -> dict[str, ImageRgb]:
+    drawn = renderer.colour(rig, mesh, light=light)
+    return {name: _before_grey(image) for name, image in drawn.items()}
+
+
+def _before_grey(image: np.ndarray) -> ImageRgb:
+    share = image[..., 3:].astype(float) / 255.0
+    return np.rint(share * image[..., :3] + (1.0 - share) * np.array(BACKGROUND)).astype(np.uint8)
+
+
+def _lifted(
+    face: FaceDetection, camera: Camera, depth: Float[np.ndarray, "h w"], small_from_scan: Similarity
+) -> _Glance | None:
+    """Lifts the points of a face onto the scan. Returns None if too few of them lie on it."""
+    columns, rows = np.clip(np.rint(face.landmarks_px).astype(int), 0, SEARCH_PX - 1).T
+    away = depth[rows, columns].astype(float)
+    hit = np.isfinite(away)
+    if np.count_nonzero(hit) < MIN_LIFTED:
+        return None
+    rays = np.column_stack([camera.undistort(face.landmarks_px[hit]), np.ones(np.count_nonzero(hit))])
+    points = camera.camera_from_world.inverse().apply(rays * away[hit, None])
+    shape, weights = point_table().shape_mm[hit], np.ones(len(points))
+    placed = procrustes(shape, points, weights)
+    for _ in range(ROUNDS):
+        off = np.linalg.norm(placed.apply(shape) - points, axis=1) / placed.scale
+        weights = (1.0 + (off / NEAR_MM) ** 2) ** -2
+        placed = procrustes(shape, points, weights)
+    bulges = np.corrcoef(shape[:, 2], away[hit])[0, 1] < 0.0  # what stands out of the face is nearer
+    outside = float(placed.rotation[:, 2] @ camera.axis_world) < 0.0 and bool(bulges)
+    return _Glance(face, small_from_scan.inverse() @ placed, outside)
+
+
+def _looks_inwards(mesh: Mesh, scan_from_face: Similarity) -> bool:
+    """Tells whether the triangles in front of the face look into the head."""
+    face_from_scan = scan_from_face.inverse()
+    middles = face_from_scan.apply(mesh.vertices[mesh.faces].mean(axis=1))
+    shape = point_table().shape_mm
+    inside: Bool[np.ndarray, " f"] = ((middles > shape.min(axis=0)) & (middles < shape.max(axis=0) + 30.0)).all(axis=1)
+    ahead = face_normals(mesh.vertices, mesh.faces[inside]) @ scan_from_face.rotation[:, 2]
+    return bool(ahead.sum() < 0.0)
+
+
+def nearest_axis(direction: Float[np.ndarray, " 3"]) -> str:
+    """Returns the axis nearest to a direction, as "+y"."""
+    largest = int(np.abs(direction).argmax())
+    return ("+" if direction[largest] > 0 else "-") + "xyz"[largest]
+
+
+def _lids(face: MatchedFaces, rig: Rig) -> Float[np.ndarray, "32 3"] | None:
+    """Triangulates the edges of the lids as the eyes' network sees them, also those of closed eyes."""
+    seen = {name: found.lids_px for name, found in face.detections.items() if found.lids_px is not None}
+    if len(seen) < 2:
+        return None
+    pixels = np.stack([*seen.values()])
+    try:
+        return triangulate_many(pixels, [rig[name] for name in seen], np.ones(pixels.shape[:2])).positions_world
+    except NoPoint:
+        return None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """Holds a template on a scan, in the frame of the model's mean head (its scale too)."""
+
+    likeness: Likeness  # the model on the scan
+    carried: Float[np.ndarray, "t 3"]  # the template as that head carries it
+    vertices: Float[np.ndarray, "t 3"]  # and on the scan
+    met: Bool[np.ndarray, " t"]  # vertices that lie on the scan; others continue the shape
+
+
+def fit_template(
+    template: Template, model: HeadModel, scan: Surface, marks: SurfaceMarks | None, report: Progress
+) -> Fitted:
+    """Fits the model with its expressions to a scan (head frame), carries the template with it, and draws the template
+    onto the scan."""
+    report("fitting the model", 0.3)
+    like = fit_model_to_mesh(with_expressions(model), scan, marks, STAGES)
+    carried = template.surface_binding.on(like.vertices, model.levels["full"].faces)
+    report("drawing the template", 0.6)
+    vertices, met = drawn_onto(carried, template, model, scan)
+    return Fitted(like, carried, vertices, met)
+
+
+def drawn_onto(
+    carried: Float[np.ndarray, "t 3"], template: Template, model: HeadModel, scan: Surface
+) -> tuple[Float[np.ndarray, "t 3"], Bool[np.ndarray, " t"]]:
+    """Draws a template onto a scan near it. Returns all vertices, and which of them lie on the scan.
+
+    The parts that have skin are drawn as one surface, from the shape in which the template was registered, so that lips
+    and lids stay as smooth as they are there; what lies deeper in them follows by its stiffness. All other parts follow
+    the skin (``SurfaceBinding.with_skin``)."""
+    binding, target = template.surface_binding, MetSurface(scan)
+    welded, joined = weld(surface_of(binding.rest, template.mesh.triangles()))
+    first = np.unique(joined, return_index=True)[1]  # a row of the file for every joined vertex
+    is_skin = np.zeros(len(welded.vertices), bool)
+    is_skin[joined[binding.skin]] = True
+    parts = components(welded)
+    rows = np.flatnonzero(np.isin(parts, np.unique(parts[is_skin])))
+    place = np.full(len(parts), -1)
+    place[rows] = np.arange(len(rows))
+    faces = place[welded.faces[(place[welded.faces] >= 0).all(axis=1)]].astype(np.int32)
+    start, goal, skin = welded.vertices[rows], carried[first][rows], is_skin[rows]
+    outside = skin | ~_near_face(start, model)
+
+    known = np.where(skin, 1.0, np.where(outside, FOLLOWING, 0.0))
+    start = draw_to_matches(start, faces, lambda shape: (goal, known), (CARRYING,))
+    weight = np.zeros(len(rows))
+    reaches = iter(REACH_MM)
+
+    def match(shape: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+        nonlocal weight
+        stage = Stage(1, None, next(reaches), 0.0, 0.0)
+        met, planes, _, weight = target.meet(shape, vertex_normals(shape, faces), stage)
+        weight = np.where(outside, weight, 0.0)
+        along = np.einsum("nx,nx->n", met - shape, planes)
+        return shape + along[:, None] * planes, weight
+
+    drawn = draw_to_matches(start, faces, match, STIFFNESS)
+    drawn = untangled(drawn, topology_of(faces, len(drawn)))
+    whole, met = np.zeros((len(parts), 3)), np.zeros(len(parts), bool)
+    whole[rows], met[rows] = drawn, weight > 0.0
+    out = binding.with_skin(whole[joined[binding.skin]])
+    in_parts = place[joined] >= 0
+    out[in_parts] = whole[joined[in_parts]]
+    return out, met[joined]
+
+
+def surface_of(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> Surface:
+    """Returns a surface with its normals."""
+    return Surface(vertices, faces, vertex_normals(vertices, faces))
+
+
+def _near_face(points: Float[np.ndarray, "n 3"], model: HeadModel) -> Bool[np.ndarray, " n"]:
+    """Tells which points of a registered template lie near the face of the mean head: points there that are no skin lie
+    in the mouth, the nose or the sockets."""
+    mean = model.vertices(np.zeros(0))
+    return KDTree(mean[model.levels["full"].face_region]).query(points)[0] < FACE_MM
 
 
 @dataclass(frozen=True, slots=True, eq=False)

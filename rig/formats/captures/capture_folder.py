@@ -9,7 +9,8 @@ texture_sets/<set>/<camera>.<ext>  optional: further photographs by the same cam
 
 Without background/ and masks/ the subject is the opaque part if every picture was cut out; otherwise it is segmented
 from the photographs. Without images/ the pictures lie beside cameras.json. ``shot_files`` decides which file
-belongs to which camera where names differ.
+belongs to which camera where names differ. Pictures are reduced (``rig.formats.pictures.work_size``); pores need all
+pixels, so pictures can be read once more, one at a time, at the size of their files.
 """
 
 import hashlib
@@ -24,7 +25,7 @@ import numpy as np
 
 from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
-from rig.capture import TEXTURE_SETS, Capture, Features
+from rig.capture import TEXTURE_SETS, Capture, Features, ReadImage
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import find_rig_file, no_rig_fault, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras.cameras_json import CAMERAS_LEAST, write_rig
@@ -45,7 +46,7 @@ from rig.formats.pictures.picture_names import entry, is_junk
 from rig.formats.pictures.picture_rims import fill_rims
 from rig.formats.pictures.picture_samples import WHOLE_BITS, measure_samples
 from rig.formats.pictures.work_size import work_features, work_rig, work_share
-from rig.image import is_grey
+from rig.image import ImageRgb, is_grey
 from rig.messages.fault_groups import say_once, some_of
 from rig.messages.message import Message, compose
 from rig.plausibility import rig_faults
@@ -439,3 +440,22 @@ def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> Message:
     if abs(size[1] - share * k.height) <= 1.0:
         return compose("picture-scaled", fault=fault)
     return fault
+
+
+def full_size_reader(folder: Path, rig: Rig, left_out: Sequence[str] = ()) -> ReadImage:
+    """Returns a function that reads the picture of a camera of ``rig`` from a capture's own folder, undistorted as
+    ``read_capture`` does it. ``left_out`` are cameras of its file that are not in the rig."""
+    files = find_files(folder, rig, left_out)
+    paths = {name: path for name in rig.names for kind, path in files.of_camera(name) if kind == "images"}
+    bits = measure_samples([*paths.values()]).bits or WHOLE_BITS
+
+    def read(name: str) -> ImageRgb:
+        if name not in paths:
+            raise InputError("capture", [compose("picture-gone", camera=name)])
+        pixels, _, fault = decode_picture(folder, "images", name, paths[name], rig=rig, pixels_most=None, bits=bits)
+        if pixels is None:
+            assert fault is not None, "no pixels without a fault"
+            raise InputError("capture", [fault])
+        return pixels
+
+    return read

@@ -44,7 +44,7 @@ def canonical(parameters: FlameParam) -> FlameParam:
     return out | {"jaw_pose": np.array([[CANONICAL_JAW_RAD, 0.0, 0.0]], np.float32)}
 
 
-def encoded(parameters: FlameParam) -> bytes:
+def encode_flame_param(parameters: FlameParam) -> bytes:
     """Encodes the arrays as the file's bytes."""
     packed = io.BytesIO()
     arrays: dict[str, Any] = dict(parameters)

@@ -9,7 +9,7 @@ from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from rig.messages.message import Message, MessageDocument, compose, documents_of
-from server.batch.table_files import has_parquet
+from server.batch.table import has_parquet
 from server.console.page import Action, Chosen, Page, shared, show
 from server.console.pages.jobs import listed_jobs
 from server.services.batches import BatchRequest, Selection

@@ -11,9 +11,8 @@ from starlette.responses import RedirectResponse
 from rig.errors import InputError
 from rig.messages.message import Message, MessageDocument, compose, documents_of
 from server.console.coverage import Corners, Coverage, advice, detect_shot, summary
-from server.console.page import Action, Chosen, Page, remove_later, shared, show
+from server.console.page import Action, Chosen, Page, remove_later, shared, show, shown_failure
 from server.console.removal import removals
-from server.console.shown_messages import shown_failure
 from server.errors import Conflict, InvalidInput
 from server.services.captures import CaptureMetadata
 from server.services.records import Calibration

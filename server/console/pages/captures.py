@@ -16,7 +16,7 @@ from server.console.work_form import PresetLine, TemplateLine, WorkForm, chosen_
 from server.errors import InvalidInput
 from server.services.bulk import each
 from server.services.service import Service
-from server.services.tags import typed_tags
+from server.services.texts import typed_tags
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.records import JsonObject
 

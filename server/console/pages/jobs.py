@@ -11,10 +11,9 @@ from starlette.responses import RedirectResponse
 from pipeline.head_model.model_names import list_models
 from rig.errors import InputError
 from rig.messages.message import Message, MessageDocument, compose
-from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
+from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show, shown_failure
 from server.console.pages.rig import read_report
 from server.console.removal import removals
-from server.console.shown_messages import shown_failure
 from server.errors import Conflict, InvalidInput
 from server.services.bulk import each
 from server.services.job_rows import FINISHED, STATUSES

@@ -15,10 +15,9 @@ from rig.acquisition.shot import CameraSyncDocument
 from rig.messages.message import Message, MessageDocument, compose, documents_of
 from server.console.capture_lines import capture_line, sessions_list, sync_of
 from server.console.media import live_view
-from server.console.page import Action, Chosen, Page, shared, show
+from server.console.page import Action, Chosen, Page, shared, show, shown_detail
 from server.console.pages.captures import SessionEditForm, SessionForm, discard, edit_consent, new_session
 from server.console.removal import removals
-from server.console.shown_messages import shown_detail
 from server.console.work_form import WorkForm, chosen_work
 from server.errors import Conflict, NotFound
 from server.services.captures import CaptureMetadata

@@ -8,19 +8,23 @@ from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field
 
 from server.http.auth import ServiceOf, require
-from server.http.list_schemas import Cursor, Limit, Listed, Sought
-from server.http.message_schemas import MessageOut, TextOf
 from server.http.schemas import (
     DELIVER_TO,
     EXAMPLE_ID,
     Answer,
+    Cursor,
     DeliverTo,
     Id,
     Idempotency,
     JobSettings,
+    Limit,
+    Listed,
+    MessageOut,
     Moment,
     Received,
+    Sought,
     Text,
+    TextOf,
 )
 from server.services.batches import PRIORITY, BatchRequest, Selection
 from server.services.keys import Caller

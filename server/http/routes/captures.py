@@ -12,15 +12,29 @@ from rig.errors import InputError
 from rig.messages.message import compose
 from server.errors import Forbidden
 from server.http.auth import ServiceOf, require
-from server.http.list_schemas import BulkOut, CaptureBulk, CaptureList, Cursor, Key, Limit, Sought, WithTag
 from server.http.rig_schemas import CaptureChecks, HoldingsOut
-from server.http.schemas import CaptureEdit, CaptureOut, Idempotency, JobOut, NewCapture, NewFeatures, NewImport
+from server.http.schemas import (
+    BulkOut,
+    CaptureBulk,
+    CaptureEdit,
+    CaptureList,
+    CaptureOut,
+    Cursor,
+    Idempotency,
+    JobOut,
+    Key,
+    Limit,
+    NewCapture,
+    NewFeatures,
+    NewImport,
+    Sought,
+    WithTag,
+)
 from server.services.bulk import each
 from server.services.captures import CaptureMetadata
 from server.services.imports import fetch_stored_capture
 from server.services.keys import Caller
-from server.services.tags import checked_tags
-from server.services.texts import PLAIN, TEXT_MOST
+from server.services.texts import PLAIN, TEXT_MOST, checked_tags
 from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.object_places import is_object_url

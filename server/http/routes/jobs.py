@@ -15,19 +15,25 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from rig.errors import InputError
 from rig.messages.message import compose
 from server.http.auth import ServiceOf, require
-from server.http.list_schemas import (
+from server.http.schemas import (
     BulkOut,
     Cursor,
+    Idempotency,
     JobBatch,
     JobBulk,
     JobList,
+    JobOut,
     Key,
     Limit,
     NewDelivery,
     NewExport,
+    NewJob,
+    NewSessionJobs,
+    Restart,
+    ResultList,
     Sought,
+    State,
 )
-from server.http.schemas import Idempotency, JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
 from server.services.bulk import each
 from server.services.job_rows import FINISHED, STATUSES
 from server.services.keys import Caller

@@ -1,41 +1,174 @@
 """Declares the routes of health, readiness, metrics, models, templates, keys and webhooks, and the page that shows the
-API."""
+API; and their documents."""
 
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Response
 from fastapi.responses import FileResponse
+from pydantic import ConfigDict, Field
 
 from rig.messages.message import compose
 from server.http.auth import ServiceOf, require
-from server.http.operation_schemas import (
-    CheckOut,
-    Health,
-    InfoOut,
-    KeyList,
-    KeyOut,
-    ModelList,
-    NewKey,
-    NewKeyOut,
-    NewWebhook,
-    NewWebhookOut,
-    Ready,
-    WebhookList,
-    WebhookOut,
-)
-from server.http.template_schemas import TemplateList, TemplateOut
+from server.http.schemas import Answer, JobSettings, MessageOut, Received, TextOf
 from server.metrics import MEDIA_TYPE
 from server.services.health import about, exposition, readiness
 from server.services.keys import Caller
 from server.services.templates import templates_at_hand
+from server.services.texts import PLAIN
 from server.wire.problems import Problem, documented
 
 router = APIRouter()
 Reader = Annotated[Caller, Depends(require("read"))]
 Admin = Annotated[Caller, Depends(require("admin"))]
 DOCS = Path(__file__).parents[1] / "static" / "docs.html"
+
+
+class NewWebhook(Received):
+    """Adds an address to which the service announces the end of every job and batch."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"url": "https://lab.example/hooks/heads"}]})
+
+    url: str = Field(pattern="^https?://[^\\x00-\\x1f\\x7f]*$", max_length=2000)
+
+
+class NewKey(Received):
+    """Requests an API key with scopes. ``admin`` includes the other scopes."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"name": "console", "scopes": ["read", "capture", "submit"]}]}
+    )
+
+    name: str = Field(min_length=1, max_length=200, pattern=PLAIN)
+    scopes: list[Literal["read", "capture", "submit", "erase", "admin"]] = Field(min_length=1, max_length=5)
+
+
+class ModelOut(Answer):
+    """Describes a head model that a job may name; ``bytes`` is the size of its file."""
+
+    id: str
+    name: str
+    bytes: int
+    default: bool
+
+
+class ModelList(Answer):
+    """Holds the head models that a job may name."""
+
+    models: list[ModelOut]
+
+
+class WebhookOut(Answer):
+    """Describes a webhook without its secret."""
+
+    id: str
+    url: str
+
+
+class NewWebhookOut(WebhookOut):
+    """Describes a webhook that was just added, with its secret."""
+
+    secret: str = Field(description="shown this once; signs the messages (standardwebhooks.com)")
+
+
+class WebhookList(Answer):
+    """Holds all webhooks, oldest first."""
+
+    webhooks: list[WebhookOut]
+
+
+class KeyOut(Answer):
+    """Describes an API key without its secret."""
+
+    id: str
+    name: str
+    scopes: list[str]
+
+
+class KeyList(Answer):
+    """Holds all API keys, oldest first."""
+
+    keys: list[KeyOut]
+
+
+class NewKeyOut(Answer):
+    """Holds an API key that was just made, with its secret."""
+
+    id: str
+    key: str = Field(description="shown this once")
+
+
+class Health(Answer):
+    """States that the process runs, and its version."""
+
+    status: Literal["ok"]
+    version: str
+
+
+class InfoOut(Answer):
+    """Describes the service: version, load, limits, and the default settings of a job."""
+
+    version: str
+    cores: int = Field(description="that this service may use; its workers may run elsewhere")
+    queued: int = Field(description="jobs")
+    running: int = Field(description="jobs")
+    cameras_least: int = Field(description="of a capture")
+    cameras_most: int = Field(description="of a capture")
+    body_bytes_most: int = Field(description="of an upload")
+    image_pixels_most: int = Field(description="of one image")
+    jobs_per_key_most: int = Field(description="queued and running")
+    settings: JobSettings = Field(description="what a job has where it gives none; its schema says what it may give")
+
+
+class CheckOut(Answer):
+    """Holds one check of the service: whether it passed and, if not, what to do. ``starting``: it will pass soon by
+    itself."""
+
+    ok: bool
+    detail: TextOf
+    starting: bool
+    detail_message: MessageOut = Field(validation_alias="detail")
+
+
+class Ready(Answer):
+    """States whether the service can take work: every check, and whether all passed."""
+
+    ready: bool
+    checks: dict[str, CheckOut]
+
+
+class RegistrationOut(Answer):
+    """Describes how well a template was fitted to its model. Distances are in mm: the median, and the value that 95 %
+    of vertices stay below (``p95``)."""
+
+    skin_share: float = Field(ge=0, le=1, description="of its vertices, on the model's skin; the others follow it")
+    face_covered_share: float = Field(ge=0, le=1, description="of the model's face, that it shows")
+    unlike_median_mm: float = Field(description="between the mesh as it came and the nearest head of the model")
+    unlike_p95_mm: float
+    off_median_mm: float = Field(description="between the mesh drawn onto that head and the head")
+    off_p95_mm: float
+
+
+class TemplateOut(Answer):
+    """Describes a template: a mesh in whose vertex order a job writes its head if ``settings.outputs.template`` names
+    it."""
+
+    id: str = Field(description="what a job calls it")
+    name: str
+    source: str | None = Field(description="file of the mesh")
+    sha256: str | None = Field(description="of that file")
+    model: str | None = Field(description="that it was registered to; a job with another one is refused")
+    models: list[str] = Field(description="names of that model at /v1/models; none where it is not at hand")
+    vertices: int | None
+    registration: RegistrationOut | None
+    fault: str | None = Field(description="why it cannot be used, and nothing else is known of it; null: it can")
+
+
+class TemplateList(Answer):
+    """Holds the templates at hand, sorted by name."""
+
+    templates: list[TemplateOut]
 
 
 @router.get("/docs", include_in_schema=False)

@@ -5,8 +5,18 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Response
 
 from server.http.auth import ServiceOf, require
-from server.http.list_schemas import Cursor, Limit, PersonOut, SessionList, Sought, SubjectList, WithTag
-from server.http.schemas import NewSession, SessionEdit, SessionOut
+from server.http.schemas import (
+    Cursor,
+    Limit,
+    NewSession,
+    PersonOut,
+    SessionEdit,
+    SessionList,
+    SessionOut,
+    Sought,
+    SubjectList,
+    WithTag,
+)
 from server.services.keys import Caller
 from server.storage.library import SubjectOrder
 from server.wire.problems import documented

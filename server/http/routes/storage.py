@@ -1,17 +1,60 @@
-"""Declares the routes that show what the data folder holds and what retention removes from it."""
+"""Declares the routes that show what the data folder holds and what retention removes from it, and their documents."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends
+from pydantic import Field
 
 from server.http.auth import ServiceOf, require
-from server.http.storage_schemas import RetentionOut, StorageOut, UpcomingOut
+from server.http.schemas import Answer, Moment
 from server.services.keys import Caller
 from server.services.retention import upcoming
 from server.wire.problems import documented
 
 router = APIRouter(prefix="/v1", tags=["operations"])
 Reader = Annotated[Caller, Depends(require("read"))]
+
+
+class KindOut(Answer):
+    """Describes how much disk space one kind of data takes."""
+
+    kind: str
+    bytes: int
+    things: int = Field(description="captures, jobs, ...: what lies directly in the kind's folders")
+
+
+class StorageOut(Answer):
+    """Describes how the disk of the data folder is used."""
+
+    free: int = Field(description="bytes of the disk")
+    total: int = Field(description="bytes of the disk")
+    spare: int = Field(description="bytes that uploads and jobs leave free")
+    failed: int = Field(description="jobs that failed or were cancelled")
+    kinds: list[KindOut] | None = Field(description="null while the data folder is looked through for the first time")
+    at: float | None = Field(description="when it was looked through, seconds since 1970")
+
+
+class UpcomingOut(Answer):
+    """Describes a capture or finished job that retention will remove."""
+
+    kind: Literal["job", "capture"]
+    id: str
+    label: str
+    goes: Moment | None = Field(description="null where that hangs on the disk or on what comes")
+    why: str = Field(description="the setting that takes it")
+
+
+class RetentionOut(Answer):
+    """Describes how long captures, results and caches are kept, and what is removed next."""
+
+    keep_captures_days: float | None = Field(description="null: for ever")
+    keep_results_days: float | None = Field(description="null: for ever")
+    keep_jobs: int | None = Field(description="finished jobs; null: all")
+    make_room: bool = Field(description="whether the oldest results go when the disk is full")
+    free_bytes: int
+    cache_bytes: int
+    upload_hours: float
+    upcoming: list[UpcomingOut] = Field(description="what goes next if nothing comes, jobs first")
 
 
 @router.get("/storage", responses=documented())

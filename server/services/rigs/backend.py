@@ -4,6 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
+import cv2
+import numpy as np
+
 from rig.acquisition.plates import PlatesVersion
 from rig.acquisition.shot import ShotDocument
 from rig.image import ImageRgb
@@ -14,6 +17,8 @@ from server.services.records import CameraSettings, CleanPlates, RigCamera, RigS
 from server.tasks.simulate import SimulatedCertificate
 
 SHOT_BYTES = 64 << 20  # that a shot may take on the disk
+PREVIEW_WIDTH = 640  # pixels
+PREVIEW_QUALITY = 80  # of JPEG, 0 to 100
 
 
 class RigBackend(Protocol):
@@ -99,3 +104,19 @@ def rig_state(
     """Returns the state of a rig, which is ready if it has no fault and no camera is missing."""
     ready = not faults and all(camera.state != "missing" for camera in cameras)
     return RigState(identity, kind, ready, tuple(cameras), tuple(faults), calibration)
+
+
+def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:
+    """Encodes an RGB image as a JPEG file. An image wider than ``width`` pixels is reduced to that width."""
+    small = reduced(image, width)
+    done, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])
+    assert done
+    return data.tobytes()
+
+
+def reduced(image: ImageRgb, width: int) -> ImageRgb:
+    """Returns an image no wider than ``width`` pixels; its proportions stay. A smaller image is returned as it is."""
+    if image.shape[1] <= width:
+        return image
+    size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)

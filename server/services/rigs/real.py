@@ -24,8 +24,7 @@ from rig.messages.message import compose, message_of
 from rig.rig import Rig
 from server.errors import Conflict, NotFound, Unavailable
 from server.services.records import CameraSettings, CleanPlates, RigCamera, RigState
-from server.services.rigs.backend import check_names, rig_state
-from server.services.rigs.previews import jpeg
+from server.services.rigs.backend import check_names, jpeg, rig_state
 from server.storage.records import RIG_ADJUSTMENT, RigAdjustment
 
 

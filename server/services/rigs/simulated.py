@@ -11,8 +11,7 @@ from rig.messages.message import compose
 from rig.rig import Rig
 from server.errors import Conflict, NotFound, Unavailable
 from server.services.records import CameraSettings, CleanPlates, RigCamera, RigState
-from server.services.rigs.backend import check_names, rig_state
-from server.services.rigs.previews import jpeg
+from server.services.rigs.backend import check_names, jpeg, rig_state
 from server.tasks.child import Child, WorkFailed
 from server.tasks.simulate import SimulatedCertificate, look, simulated
 

@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from calibration.board.board import Board
-from calibration.board.detection import WrongBoard, detect_folder, explain
-from calibration.board.markers import board_of, find_layout, find_markers, is_april_grid
+from calibration.board.detection import (
+    WrongBoard,
+    board_of,
+    detect_folder,
+    explain,
+    find_layout,
+    find_markers,
+    is_april_grid,
+)
 from rig.messages.message import texts_of
 
 TOLD = Board("charuco", 8, 6, 25.0, 0.75, "DICT_4X4_50")

@@ -1,11 +1,16 @@
-"""What a calibration from the scene says of itself."""
+"""What a calibration from the scene says of itself; its verdict is that of the weakest camera, never good on an assumed
+scale."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from calibration.scene.result import judge_scene
+from calibration.scene.scale import ASSUMED
 from rig.formats.cameras.cameras_json import rig_from_document
+from rig.messages.message import texts_of, verbatim
 from tests.support.textured_wedge import solved
 
 
@@ -26,3 +31,21 @@ def test_the_figures_are_those_of_the_residuals() -> None:
     counts = {name: row["points"] for name, row in figures["cameras"].items()}
     assert sum(counts.values()) == figures["observations"] == len(squares)
     assert 0.3 < figures["used_share"] <= 1.0
+
+
+def test_a_calibration_from_a_scene_is_judged_by_what_it_does_not_know() -> None:
+    found = solved()
+    sharp = np.full(len(found.rig), 0.3)
+    sound = replace(found, uncertainty=replace(found.uncertainty, pose_sigma_px=sharp))
+    assert judge_scene(sound).word == "good"
+    guessed = judge_scene(
+        replace(sound, scale=replace(found.scale, source=ASSUMED[0], provenance=verbatim("an ASSUMPTION")))
+    )
+    assert (guessed.word, texts_of(guessed.missing)) == ("usable", ["the scale is an ASSUMPTION"])
+    apart = judge_scene(replace(sound, left_out={"dark": verbatim("only 3 distinct points in it")}))
+    assert (apart.word, texts_of(apart.missing)) == ("usable", ["dark: only 3 distinct points in it"])
+    for px, word in ((0.8, "usable"), (1.4, "poor")):
+        loose = replace(found.uncertainty, pose_sigma_px=np.where(np.arange(len(sharp)) == 2, px, sharp))
+        judged = judge_scene(replace(found, uncertainty=loose))
+        assert judged.word == word
+        assert judged.missing[0].text.startswith(f"{found.rig.names[2]}: pose looser than")

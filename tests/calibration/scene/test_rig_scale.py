@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.scene.rig_scale import scaled_by_length, times
+from calibration.scene.scale import scaled_by_length, times
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from calibration.scene.photographs import Photographs, find_photographs
-from calibration.scene.rig_scale import times
 from calibration.scene.scale import (
     ASSUMED,
     FACE_SHARE,
@@ -16,6 +15,7 @@ from calibration.scene.scale import (
     scale_from_face,
     scale_from_head,
     scale_from_tags,
+    times,
 )
 from calibration.scene.scene import transformed
 from calibration.scene.structure import Structure

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 from calibration.adjustment.gauge import align_world, gauge_projection, image_distance, moved, world_motions
-from calibration.silhouette_refinement.frontier import find_frontier
-from calibration.silhouette_refinement.refine import TooFewCaptures, gauge_free, minimise_tangencies, refine
-from calibration.silhouette_refinement.rims import Heads, rim_equations
+from calibration.silhouette_refinement.refine import (
+    Heads,
+    TooFewCaptures,
+    find_frontier,
+    gauge_free,
+    minimise_tangencies,
+    refine,
+    rim_equations,
+)
 from calibration.silhouette_refinement.tangency_term import (
     PackedTangencies,
     tangency_jacobian,

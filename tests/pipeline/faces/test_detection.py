@@ -9,11 +9,6 @@ from pipeline.faces.networks import FaceNetworks, load_networks
 from tests.support.drawn_faces import OUTER_EYE_CORNERS, drawn_face, turned_about
 
 
-@pytest.fixture(scope="module")
-def networks() -> FaceNetworks:
-    return load_networks()
-
-
 @pytest.mark.parametrize("roll", [0.0, 30.0, 90.0, 135.0, 180.0, 250.0, -45.0])
 def test_a_face_is_found_however_it_is_turned(networks: FaceNetworks, roll: float) -> None:
     (face,) = find_faces(drawn_face(roll_deg=roll), networks)

@@ -9,17 +9,12 @@ from pipeline.faces.crops import make_pyramid
 from pipeline.faces.detection import FaceDetection, find_faces
 from pipeline.faces.eyes import eye_openings, find_eyes
 from pipeline.faces.matching import MatchedFaces
-from pipeline.faces.networks import FaceNetworks, load_networks
+from pipeline.faces.networks import FaceNetworks
 from pipeline.faces.points import point_table
 from rig.camera import Camera, Intrinsics
 from rig.geometry import Similarity, look_at
 from rig.rig import Rig
 from tests.support.drawn_faces import drawn_face, turned_about
-
-
-@pytest.fixture(scope="module")
-def networks() -> FaceNetworks:
-    return load_networks()
 
 
 def test_irises_and_lids_are_where_they_are_drawn(networks: FaceNetworks) -> None:

@@ -8,8 +8,7 @@ import pytest
 from jaxtyping import Float
 
 from pipeline.faces.detection import FaceDetection
-from pipeline.faces.irises import Iris, UnseenEye, believed, find_irises, looking_together
-from pipeline.faces.limbus_fit import BEHIND_MM, EYEBALL_MM
+from pipeline.faces.irises import BEHIND_MM, EYEBALL_MM, Iris, UnseenEye, believed, find_irises, looking_together
 from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.points import LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS
 from rig.camera import Camera, Intrinsics

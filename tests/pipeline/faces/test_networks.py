@@ -14,11 +14,6 @@ from tests.support.drawn_faces import drawn_face
 MIDDLE, SCALE = (95.5, 95.5), 0.69  # the points of a face this large fill two thirds of a crop
 
 
-@pytest.fixture(scope="module")
-def networks() -> FaceNetworks:
-    return load_networks()
-
-
 def crop() -> np.ndarray:
     return np.ascontiguousarray(drawn_face(192, 192, (MIDDLE,), scale=SCALE))
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from pipeline.faces.irises import pupils_px
 from pipeline.faces.limbus import EyeView
-from pipeline.faces.limbus_fit import pupils_px
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 

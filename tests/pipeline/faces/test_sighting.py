@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from pipeline.faces.networks import FaceNetworks, load_networks
+from pipeline.faces.networks import FaceNetworks
 from pipeline.faces.sighting import GLANCE, _turned, file_pixels, has_front, reduce_picture, sight_face
 from pipeline.faces.subject import find_subject
 from rig.acquisition.face_sighting import FaceSighting
@@ -16,11 +16,6 @@ from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.support.drawn_studio import drawn_pictures, drawn_studio, hidden_from
-
-
-@pytest.fixture(scope="module")
-def networks() -> FaceNetworks:
-    return load_networks()
 
 
 def glance(pictures: Mapping[str, ImageRgb], networks: FaceNetworks, rig: Rig | None = None) -> FaceSighting:

@@ -24,11 +24,6 @@ HEAD = Similarity(1.0, rotation_from_vector(np.array([0.05, 0.1, 0.0])), np.arra
 POSTER = Similarity(1.2, np.eye(3), np.array([-150.0, 60.0, -250.0]))
 
 
-@pytest.fixture(scope="module")
-def networks() -> FaceNetworks:
-    return load_networks()
-
-
 def studio(roll_deg: float = 0.0) -> Rig:
     """Five cameras around the front, every second one turned by ``roll_deg``, and one behind."""
     cameras = []

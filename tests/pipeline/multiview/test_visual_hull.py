@@ -4,7 +4,7 @@ import pytest
 from pipeline.geometry.raster import depth_map
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.multiview.visual_hull import NoHull, hull_extent, visual_hull
-from pipeline.segmentation.view_consistency import judge_agreement
+from pipeline.segmentation.segment import judge_agreement
 from rig.formats.captures.capture_folder import read_capture
 from rig.formats.pictures.images import read_image
 from rig.mesh import boundary_edges

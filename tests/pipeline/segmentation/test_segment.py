@@ -20,16 +20,13 @@ from rig.errors import InputError
 from rig.formats.captures.capture_folder import read_capture
 from rig.formats.pictures.images import read_image
 from rig.messages.message import texts_of
+from rig.progress import discard_progress
 from rig.rig import Rig
 from tests.support.composites import Scene, compose
 from tests.support.noisy_captures import noisier
 from tests.support.shared_data import shared
 
 BACKDROP = (0.20, 0.30, 0.35)
-
-
-def quiet(_stage: str, _fraction: float) -> None:
-    pass
 
 
 def errors(silhouette: Silhouette, truth: np.ndarray) -> tuple[float, np.ndarray]:
@@ -148,7 +145,7 @@ def contour_offsets(silhouette: Silhouette, mask: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("folder", ["scan-a", "draw-b"])
 def test_masks_of_another_renderer_are_met(folder: str) -> None:
     capture, rig = read_capture(shared(f"data/captures/{folder}"))
-    silhouettes = segment(capture, rig, report=quiet)
+    silhouettes = segment(capture, rig, report=discard_progress)
     rms, bias = [], []
     for name in rig.names:
         mask = true_mask(name, folder)
@@ -193,7 +190,7 @@ def test_a_fault_in_one_view_is_named_by_the_others(
 ) -> None:
     capture, rig = scan
     edited = edit(capture.images[name], capture.backgrounds[name][0], true_mask(name))
-    silhouettes = segment(replace(capture, images={**capture.images, name: edited}), rig, report=quiet)
+    silhouettes = segment(replace(capture, images={**capture.images, name: edited}), rig, report=discard_progress)
     said = " ".join(texts_of(silhouettes[name].quality.warnings))
     assert any(part in said for part in word.split("|")), said
     mask = true_mask(name)
@@ -208,7 +205,9 @@ def test_operator_masks_override_and_need_no_plate(scan: tuple[Capture, Rig]) ->
     capture, rig = scan
     operator_mask = true_mask("cam02")
     backgrounds = {name: plates for name, plates in capture.backgrounds.items() if name != "cam02"}
-    silhouettes = segment(replace(capture, backgrounds=backgrounds, masks={"cam02": operator_mask}), rig, report=quiet)
+    silhouettes = segment(
+        replace(capture, backgrounds=backgrounds, masks={"cam02": operator_mask}), rig, report=discard_progress
+    )
     np.testing.assert_array_equal(silhouettes["cam02"].mask, operator_mask)
     assert silhouettes["cam02"].quality.usable
 
@@ -217,7 +216,7 @@ def test_a_camera_with_neither_plate_nor_mask_is_refused(scan: tuple[Capture, Ri
     capture, rig = scan
     backgrounds = {name: plates for name, plates in capture.backgrounds.items() if name not in ("cam02", "cam04")}
     with pytest.raises(InputError) as caught:
-        segment(replace(capture, backgrounds=backgrounds), rig, report=quiet)
+        segment(replace(capture, backgrounds=backgrounds), rig, report=discard_progress)
     assert len(caught.value.faults) == 2
 
 

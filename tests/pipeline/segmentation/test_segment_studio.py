@@ -12,8 +12,7 @@ import pytest
 
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.segmentation.segment import segment
-from pipeline.segmentation.view_consistency import judge_agreement
+from pipeline.segmentation.segment import judge_agreement, segment
 from pipeline.view_checks.usable_views import view_warnings
 from rig.capture import Capture
 from rig.mesh import Mesh

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.segmentation.view_consistency import judge_agreement
+from pipeline.segmentation.segment import judge_agreement
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.rig import Rig

@@ -18,8 +18,7 @@ from pipeline.simplex.xor_objective import SilhouetteObjective, face_pixels, lid
 from rig.camera import Camera, Intrinsics
 from rig.errors import Cancelled
 from rig.geometry import Similarity, look_at, rotation_from_vector
-from rig.render.renderer import Renderer
-from rig.render.silhouettes import is_closed
+from rig.render.renderer import Renderer, is_closed
 from rig.rig import Rig
 from tests.support.oracles import camera_depth
 

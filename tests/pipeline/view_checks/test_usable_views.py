@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.scene.rig_scale import times
+from calibration.scene.scale import times
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.segmentation.segment import _mask_quality

@@ -12,9 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rig.drivers.base import CameraLost, CameraNotFound, Driver, DriverMissing, GrabTimeout
+from rig.drivers.base import CameraLost, CameraNotFound, Driver, DriverMissing, GrabTimeout, driver_for
 from rig.drivers.opencv import VideoCaptureDriver
-from rig.drivers.registry import driver_for
 from rig.drivers.simulated import SimulatedDriver
 from rig.formats.rig_toml import CameraConfig
 from rig.studio.devices.serve import StudioDevices

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rig.drivers.base import Arrival, DriverError
+from rig.drivers.base import Arrival, DriverError, driver_for
 from rig.drivers.feed import CameraFeed
-from rig.drivers.registry import driver_for
 from rig.drivers.simulated import SimulatedDriver
 from rig.formats.rig_toml import CameraConfig
 from rig.messages.message import Message, verbatim

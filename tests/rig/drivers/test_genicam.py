@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rig.drivers.base import CameraNotFound, GrabTimeout
-from rig.drivers.registry import driver_for
+from rig.drivers.base import CameraNotFound, GrabTimeout, driver_for
 from rig.formats.rig_toml import CameraConfig
 from tests.rig.drivers.test_drivers import drain
 

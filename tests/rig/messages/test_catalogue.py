@@ -30,9 +30,9 @@ RAW = {
     "server/cli/client.py": 7,
     "server/cli/demo.py": 1,
     "server/cli/doctor.py": 2,
-    "server/cli/refine.py": 2,
+    "server/cli/heads.py": 4,
+    "server/tasks/refine.py": 2,
     "server/cli/studio.py": 1,
-    "server/cli/verify.py": 4,
     "server/tasks/photographs.py": 3,
     "server/tasks/simulate.py": 1,
 }

@@ -9,8 +9,7 @@ import pytest
 
 from rig.acquisition.commands import capture_with, check, take_plates
 from rig.acquisition.session import RigSession
-from rig.drivers.base import CameraNotFound
-from rig.drivers.registry import driver_for
+from rig.drivers.base import CameraNotFound, driver_for
 from rig.formats.captures.capture_folder import read_capture
 from rig.formats.meshes.ply import write_ply
 from rig.formats.rig_toml import CameraConfig, read_rig_config

@@ -1,13 +1,17 @@
-"""Captures below a folder and in lists, and every fault of a list at once."""
+"""Captures below a folder and in lists, every fault of a list at once; shares are one whole, alike everywhere; a
+capture's digest is of its names and bytes."""
 
+import os
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rig.errors import InputError
 from rig.formats.captures.archive import pack_folder
 from rig.messages.message import texts_of
-from server.batch.captures import BatchCapture, find_captures, read_list
+from server.batch.captures import WHOLE, BatchCapture, Shard, capture_sha256, find_captures, read_list, read_shard
 from tests.support.services import small_capture
 
 
@@ -146,3 +150,80 @@ def test_names_that_would_be_other_files_are_refused(tmp_path: Path, name: str) 
 def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "study.csv").write_bytes(b"\xff\xfe\x00")
     assert "cannot be read" in faults_of(tmp_path / "study.csv")[0]
+
+
+@given(st.text(), st.integers(1, 50))
+def test_each_name_is_of_exactly_one_share(name: str, count: int) -> None:
+    assert sum(Shard(number, count).takes(name) for number in range(1, count + 1)) == 1
+    assert WHOLE.takes(name)
+
+
+def test_the_hash_stays_what_it_is() -> None:
+    """A batch that is half done goes on with a later version: the shares must not move."""
+    assert [[k for k in range(20) if Shard(number, 3).takes(f"s{k:02}")] for number in (1, 2, 3)] == [
+        [3, 7, 12, 14, 15],
+        [0, 4, 6, 9, 16, 19],
+        [1, 2, 5, 8, 10, 11, 13, 17, 18],
+    ]
+
+
+def test_shares_are_about_equal() -> None:
+    counts = [sum(Shard(number, 8).takes(f"capture-{k}") for k in range(4000)) for number in range(1, 9)]
+    # Binomial(4000, 1/8): 500 with a standard deviation of 21
+    assert max(abs(count - 500) for count in counts) < 4 * 21
+
+
+@pytest.mark.parametrize(("text", "shard"), [("1/1", WHOLE), ("3/8", Shard(3, 8)), (" 8/8 ", Shard(8, 8))])
+def test_a_share_is_read(text: str, shard: Shard) -> None:
+    assert read_shard(text) == shard
+    assert read_shard(str(shard)) == shard
+
+
+@pytest.mark.parametrize("text", ["", "0/8", "9/8", "1/0", "a/b", "1", "1/8/2", "-1/8", "1.5/2", "٣/8", "1/1000000"])
+def test_what_is_no_share_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="is no share such as 2/8"):
+        read_shard(text)
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    for name in ("images/cam00.png", "images/cam01.png", "cameras.json"):
+        (tmp_path / "anna" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "anna" / name).write_text(name)
+    return tmp_path / "anna"
+
+
+def test_names_and_bytes_count_and_times_and_junk_do_not(capture: Path) -> None:
+    before = capture_sha256(capture)
+    os.utime(capture / "cameras.json", (0, 0))
+    (capture / ".DS_Store").write_text("junk")
+    (capture / "images" / "Thumbs.db").write_text("junk")
+    assert capture_sha256(capture) == before
+    (capture / "images" / "cam00.png").rename(capture / "images" / "cam02.png")
+    renamed = capture_sha256(capture)
+    (capture / "cameras.json").write_text("other")
+    assert len({before, renamed, capture_sha256(capture)}) == 3
+
+
+def test_where_bytes_are_cut_between_files_counts(tmp_path: Path) -> None:
+    for name, first, second in (("a", "xy", "z"), ("b", "x", "yz")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "1").write_text(first)
+        (tmp_path / name / "2").write_text(second)
+    assert capture_sha256(tmp_path / "a") != capture_sha256(tmp_path / "b")
+
+
+def test_files_behind_links_count_and_a_circle_ends(capture: Path, tmp_path: Path) -> None:
+    before = capture_sha256(capture)
+    (capture / "images").rename(tmp_path / "elsewhere")
+    (capture / "images").symlink_to(tmp_path / "elsewhere")
+    assert capture_sha256(capture) == before
+    (capture / "images" / "again").symlink_to(capture)
+    assert capture_sha256(capture) == before
+
+
+def test_an_archive_is_its_bytes(tmp_path: Path) -> None:
+    (tmp_path / "a.zip").write_bytes(b"abc")
+    assert capture_sha256(tmp_path / "a.zip") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    with pytest.raises(FileNotFoundError):
+        capture_sha256(tmp_path / "gone")

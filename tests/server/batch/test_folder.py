@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from rig.messages.message import compose
+from server.batch.captures import WHOLE, Shard
 from server.batch.folder import BatchFolder, FailureRecord, ForeignFiles, Origin, ShareTaken, file_name
-from server.batch.shards import WHOLE, Shard
 
 ORIGIN = Origin("11" * 32, "22" * 32, "33" * 32, "0.1.0")
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from server.batch.captures import Shard
 from server.batch.folder import ShareTaken
 from server.batch.run import WORKER_BYTES, free_memory, threads_of_worker, usable_cores, worker_count
-from server.batch.shards import Shard
 from tests.support.pinned_batch import Silent, everything_in, pinned_capture, pinned_captures, run_pinned
 from tests.support.pinned_work import LOG, SECONDS
 from tests.support.services import ROOT, await_true

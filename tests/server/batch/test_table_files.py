@@ -11,8 +11,7 @@ import pytest
 
 from pipeline.head_model.model_file import expression_names
 from pipeline.head_model.model_names import model_path
-from server.batch.table import Column, Row, columns_of
-from server.batch.table_files import csv_bytes, has_parquet, parquet_bytes, write_table
+from server.batch.table import Column, Row, columns_of, csv_bytes, has_parquet, parquet_bytes, write_table
 
 COLUMNS = (
     Column("capture", "text", "", "its name"),

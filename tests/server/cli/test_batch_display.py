@@ -8,7 +8,7 @@ import pytest
 from rig.messages.message import compose
 from server.batch.folder import FailureRecord
 from server.batch.run import Outcome
-from server.cli.batch_display import BatchDisplay, BatchProgress, told_time
+from server.cli.batch import BatchDisplay, BatchProgress, told_time
 
 FAILURE = FailureRecord("input", compose("batch-list-empty"), (), None)
 

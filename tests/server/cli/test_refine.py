@@ -17,7 +17,7 @@ from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.captures.capture_folder import write_capture
 from rig.messages.message import verbatim
 from rig.studio.scene.layout import default_layout
-from server.cli.refine import refine_locally
+from server.tasks.refine import refine_locally
 from tests.server.cli.test_main import run
 from tests.support.silhouette_subjects import captures_of, disturbed, rms
 

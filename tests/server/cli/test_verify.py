@@ -15,7 +15,7 @@ from rig.errors import InputError
 from rig.formats.meshes.ply import write_ply
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
-from server.cli.verify import read_limits, verify_captures
+from server.cli.heads import read_limits, verify_captures
 from tests.support.glb import obj_bytes
 from tests.support.landmark_files import write_landmarks
 from tests.support.measured_heads import mannequin

@@ -26,10 +26,9 @@ from server.console.live_frame import LiveFrame
 from server.console.mount import path_below
 from server.console.pages.jobs import SettingsForm, chosen_settings, log_lines
 from server.console.removal import Removals
-from server.console.work_form import chosen_work
+from server.console.work_form import chosen_work, settings_of
 from server.errors import Conflict, Forbidden, NotFound, Unauthenticated
 from server.services.keys import Keys
-from server.services.presets import settings_of
 from server.services.work import ReconstructionRequest
 from server.settings import ServiceSettings
 from server.storage.events import JobEvent

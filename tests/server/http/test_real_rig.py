@@ -15,7 +15,7 @@ from rig.formats.rig_toml import read_rig_config
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from server.console.live import RigSource
 from server.console.pages.rig import sync_of
-from server.services.rigs.opening import open_rig
+from server.services.service import open_rig
 from server.settings import ServiceSettings
 from tests.rig.acquisition.test_session import flat_rig
 from tests.support.board_pictures import BoardPictures

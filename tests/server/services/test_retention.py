@@ -120,6 +120,9 @@ def test_a_result_that_somebody_changed_or_removed_is_told_and_never_sent(tmp_pa
                 refused = client.get(f"/v1/jobs/{job}/result/{name}")
                 assert (refused.status_code, refused.json()["type"]) == (500, "urn:eigenhead:problem:file-damaged")
                 assert "head.ply" in refused.json()["detail"]
+        head.write_bytes(whole)
+        await_readiness(client, "results", "all there")  # a sweep that met the damage has set the file's time
+        head.write_bytes(damaged)
         os.utime(head, ns=times)  # as where the disk itself changed it
         await_readiness(client, "results", f"{job}/head.ply")
         assert client.get(f"/v1/jobs/{job}/result/head.ply").status_code == 500

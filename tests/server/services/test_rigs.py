@@ -9,8 +9,7 @@ import pytest
 
 from rig.acquisition.commands import take_plates
 from rig.acquisition.session import RigSession
-from rig.drivers.base import Driver
-from rig.drivers.registry import driver_for
+from rig.drivers.base import Driver, driver_for
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import read_rig, write_rig
 from rig.formats.captures.capture_folder import read_capture
@@ -19,10 +18,10 @@ from rig.messages.message import texts_of
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from rig.studio.scene.layout import default_layout
 from server.errors import Conflict, NotFound, Unavailable
-from server.services.rigs.opening import open_rig
-from server.services.rigs.previews import jpeg, reduced
+from server.services.rigs.backend import jpeg, reduced
 from server.services.rigs.real import RealRig
 from server.services.rigs.simulated import SimulatedRig
+from server.services.service import open_rig
 from server.settings import ServiceSettings
 from tests.rig.acquisition.test_session import flat_rig
 from tests.support.textured_studio import NAMES, FlatStudio

@@ -14,8 +14,7 @@ from sqlalchemy.exc import OperationalError
 
 from server.settings import ServiceSettings
 from server.storage.database import open_database
-from server.storage.events import END, EventLog
-from server.storage.failure_counts import failure_counts
+from server.storage.events import END, EventLog, failure_counts
 from server.tasks.progress import JobProgress, ProgressMeter
 from tests.support.at_once import run_at_once
 from tests.support.postgres import running_postgres

@@ -12,14 +12,11 @@ from calibration.adjustment.gauge import image_distance
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.pictures.images import read_image, write_image
+from rig.progress import discard_progress
 from server.cli.main import app
 from server.tasks.photographs import photographs_alone, read_or_calibrate
 from tests.support.shared_data import shared
 from tests.support.textured_wedge import wedge_rig, write_photographs
-
-
-def quiet(stage: str, share: float) -> None:
-    pass
 
 
 @pytest.mark.slow
@@ -78,7 +75,7 @@ def test_a_folder_with_cameras_is_read_as_it_is(tmp_path: Path) -> None:
     assert photographs_alone(tmp_path)
     write_rig(wedge_rig(), tmp_path / "cameras.json")
     assert not photographs_alone(tmp_path)
-    found = read_or_calibrate(tmp_path, tmp_path / "out", front=None, report=quiet)
+    found = read_or_calibrate(tmp_path, tmp_path / "out", front=None, report=discard_progress)
     assert found.warnings == ()
     assert image_distance(found.rig, wedge_rig(), scale=False).max() < 1e-6
     assert not (tmp_path / "out").exists()
@@ -88,7 +85,7 @@ def test_too_few_photographs_are_refused_by_name(tmp_path: Path) -> None:
     rig = wedge_rig()
     write_photographs(tmp_path, rig.subset(rig.names[:2]))
     with pytest.raises(InputError, match="2 photographs; at least 3"):
-        read_or_calibrate(tmp_path, tmp_path / "out", front=None, report=quiet)
+        read_or_calibrate(tmp_path, tmp_path / "out", front=None, report=discard_progress)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """A worker's steps one by one, without the engine around them: what each leaves on disk and in the job's events. What
-SIGKILL may not do to them is driven in ``test_durability.py``."""
+SIGKILL may not do to them is driven in ``test_durability.py``. Jobs of dead workers go back into their queues, and no
+others: on the engine's table as its own release makes it."""
 
 import hashlib
 import json
@@ -18,16 +19,17 @@ from sqlalchemy.exc import OperationalError
 from rig.errors import Cancelled, InputError
 from server.services.failures import JobFailed
 from server.settings import ServiceSettings
-from server.storage.database import workers
-from server.storage.failure_counts import failure_counts
+from server.storage.database import now_sql, open_database, workers
+from server.storage.events import failure_counts
+from server.storage.job_index import engine_jobs
 from server.storage.records import CaptureRecord, DeliveryRequest, FileEntry, JobRequest
 from server.storage.store import Store, new_id
 from server.tasks.child import WorkFailed
-from server.worker.result_files import described, warnings_of
-from server.worker.worker import Worker
+from server.worker.worker import Worker, described, take_over, warnings_of
 from tests.support.services import small_capture
 
 JOB = "0123456789ab" + 16 * "c"
+ALIVE = {"machine": "m", "host": "h", "pid": 1, "pid_started": 1, "queue": "cpu", "concurrency": 1, "version": "0"}
 
 
 class Engine:
@@ -276,3 +278,31 @@ def test_a_worker_that_stops_ends_what_waits_and_fails_nothing(
     thread.join(2.0)
     assert not thread.is_alive()
     assert not isinstance(ended[0], Exception), "the engine would note it as a failure"
+
+
+def test_jobs_of_the_dead_and_of_strays_go_back_to_their_places(tmp_path: Path) -> None:
+    settings = ServiceSettings(data=tmp_path)
+    DBOS.migrate(system_database_url=settings.url)
+    engine = open_database(settings)
+    table = sa.Table("workflow_status", sa.MetaData(), autoload_with=engine)
+    rows = [("a", "PENDING", "dead"), ("b", "PENDING", "stray"), ("c", "PENDING", "alive"), ("d", "CANCELLED", "dead")]
+    with engine.begin() as connection:
+        for job, status, holder in rows:
+            row = {"workflow_uuid": job, "status": status, "executor_id": holder, "queue_name": "cpu", "priority": 7}
+            row |= {"recovery_attempts": 1, "started_at_epoch_ms": 5, "owner_xid": "x", "name": "reconstruct"}
+            connection.execute(sa.insert(table).values(**row))
+        for name in ("alive", "dead"):
+            beat = {"started": now_sql(engine), "seen": now_sql(engine)}
+            connection.execute(sa.insert(workers).values(id=name, **ALIVE, **beat))
+        before = {row.workflow_uuid: row for row in connection.execute(sa.select(table))}
+    assert sorted(take_over(engine, ["dead"])) == ["a", "b"]
+    assert take_over(engine, ["dead"]) == []
+    with engine.connect() as connection:
+        after = {row.workflow_uuid: row for row in connection.execute(sa.select(table))}
+    assert {job: row.status for job, row in after.items()} == {
+        "a": "ENQUEUED", "b": "ENQUEUED", "c": "PENDING", "d": "CANCELLED"
+    }  # fmt: skip
+    assert (after["a"].owner_xid, after["a"].started_at_epoch_ms, after["a"].queue_name) == (None, None, "cpu")
+    assert (after["a"].created_at, after["a"].recovery_attempts) == (before["a"].created_at, 1), "its place, its count"
+    assert (after["c"], after["d"]) == (before["c"], before["d"])
+    assert {*engine_jobs(engine).c.keys()} <= {*table.c.keys()}

@@ -1,20 +1,51 @@
-"""Lists what applications add to a job's result."""
+"""Writes what applications add to a job's result: ``head-NAME.glb`` and ``head-NAME-shapes.npz``, the template's mesh
+without expression, with shapes; and ``posed.glb``, the same of the model's own mesh, with its texture.
 
+Head frame; the GLBs in metres, the archive in mm. Vertices keep their order; in a GLB, eyeballs are parts of
+their own (``extras.rows`` of a node says which vertices it has). Eyeballs, teeth and a tongue that the mesh lacks are
+added, and have none. With the formats OBJ and USDZ, ``head-NAME-parts.obj`` and ``head-NAME-parts.usdz`` are the same
+without shapes: parts by name.
+"""
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int, UInt8
 
+from pipeline.applications.templates.animated import AnimatedMesh, animated_head, animated_mesh
+from pipeline.applications.templates.eye_picture import PhotographedEyes, darkest_direction, eyeball_uv, paint_eyeball
+from pipeline.applications.templates.eyeballs import AHEAD, turn_to
 from pipeline.applications.templates.flame_fit import FlameFit, fit_flame
+from pipeline.applications.templates.inner_mouth import TONGUE_OUT, WITH_JAW
 from pipeline.applications.templates.template_file import Template, load_template
-from pipeline.applications.templates.write.mesh import write_template, write_template_hair
-from pipeline.applications.templates.write.shapes import write_posed, write_template_shapes
+from pipeline.applications.templates.write.mesh import template_colours, write_template, write_template_hair
+from pipeline.evidence.expression import BlendshapeRig
+from pipeline.faces.irises import Iris, UnseenEye
 from pipeline.head_model.model import HeadModel
-from pipeline.results.reconstruction import Reconstruction
+from pipeline.head_model.subdivision import opened_faces
+from pipeline.head_model.visemes import VISEMES
+from pipeline.results.head_files import encoded, head_from_world, head_mesh, head_skin
+from pipeline.results.reconstruction import Reconstruction, asset_extras
 from pipeline.results.report_types import AddedReport, TemplateReport
 from pipeline.results.write import ResultWriter
 from rig.atomic_write import write_atomically
-from rig.formats.meshes.flame_param import FILE, encoded, flame_param
+from rig.formats.meshes.flame_param import FILE, encode_flame_param, flame_param
+from rig.formats.meshes.glb import scene_glb_bytes
+from rig.formats.meshes.obj import scene_obj_bytes
+from rig.formats.meshes.scene import NECK, Part, Scene, Skin
+from rig.formats.meshes.usdz import scene_usdz_bytes
+from rig.geometry import RigidTransform
+from rig.mesh import Mesh
+
+FORMAT = "eigenhead-shapes/1"
+JAW = "jaw"
+LID_MM = 30.0  # from an eyeball's middle: no other opening is so near
 
 
 def load_template_writers(name: str | None, model: HeadModel) -> tuple[ResultWriter, ...]:
@@ -57,7 +88,7 @@ def write_flame(folder: Path, result: Reconstruction, template: Template) -> Add
     fit = fit_flame(template.flame, template.surface_binding.on(head.vertices, head.faces) / 1000.0, weights)
     of = fit.parameters
     file = flame_param(of.shape, of.expression, of.pose, of.translation, fit.offsets)
-    write_atomically(folder / FILE, encoded(file))
+    write_atomically(folder / FILE, encode_flame_param(file))
     report["flame"] = _flame_figures(fit, skin)
     return {"template": report}
 
@@ -72,3 +103,197 @@ def _flame_figures(fit: FlameFit, skin: np.ndarray) -> dict[str, float]:
         "shape_sigmas": float(np.sqrt((fit.parameters.shape**2).mean())),
         "expression_sigmas": float(np.sqrt((fit.parameters.expression**2).mean())),
     }
+
+
+def write_template_shapes(folder: Path, result: Reconstruction, template: Template) -> None:
+    """Writes the template's mesh with morph targets and pivots, and the same as arrays, if the settings ask for morphs
+    and the model has shapes. Raises OSError."""
+    blendshape_rig = result.evidence.blendshape_rig
+    if blendshape_rig is None or not result.settings.outputs.morphs:
+        return
+    from_world = head_from_world(result)
+    triangles, colours = template.mesh.triangles(), template_colours(result, template)
+    animated = animated_mesh(
+        template.surface_binding,
+        triangles,
+        from_world.apply(blendshape_rig.neutral_world.vertices),
+        blendshape_rig.neutral_world.faces,
+        blendshape_rig.morphs,
+        result.head.model.landmarks,
+        gazes=_gazes(result.faces.eyes, from_world),
+    )
+    name = f"head-{template.name}"
+    extras = asset_extras(result) | {"template": template.name, "template_sha256": template.source_sha256}
+    extras |= {"inner_mouth": animated.inner.absence or "added"}
+    scene = animated_scene(animated, triangles, colours, blendshape_rig.weights)
+    write_atomically(folder / f"{name}.glb", scene_glb_bytes(scene, extras))
+    write_atomically(folder / f"{name}-shapes.npz", _archive(animated, template, blendshape_rig))
+    for suffix, encode in (("obj", scene_obj_bytes), ("usdz", scene_usdz_bytes)):
+        if suffix in result.settings.outputs.formats:
+            write_atomically(folder / f"{name}-parts.{suffix}", encode(scene))
+
+
+def write_posed(folder: Path, result: Reconstruction) -> None:
+    """Writes posed.glb if the settings ask for morphs and the model has shapes: the head without expression, with its
+    texture, shapes, pivots, eyeballs, teeth and tongue, at the weights of the photographed head. Raises OSError."""
+    blendshape_rig = result.evidence.blendshape_rig
+    if blendshape_rig is None or not result.settings.outputs.morphs:
+        return
+    model, from_world, head = result.head.model, head_from_world(result), head_mesh(result)
+    opened = opened_faces({name: model.levels[name].faces for name in ("cage", "full")})
+    neutral, eyes = from_world.apply(blendshape_rig.neutral_world.vertices), result.faces.eyes
+    shapes = blendshape_rig.moving
+    animated = AnimatedMesh(neutral, shapes, {}, {})
+    if len(opened) < len(head.faces):
+        animated = animated_head(neutral, opened, shapes, model.landmarks, gazes=_gazes(eyes, from_world))
+    photographed = PhotographedEyes(head, np.arange(len(opened), len(head.faces)), result.texturing.atlas)
+    animated = replace(animated, gazes=_towards_irises(animated, eyes, from_world, photographed))
+    skin, colours = head_skin(result, head), result.texturing.vertices.colours
+    shut = {name: ball.centre for name, ball in animated.added.items() if _is_bridged(name, result)}
+    middle = head.vertices[head.faces].mean(axis=1)
+    kept = np.arange(len(head.faces)) < len(opened)
+    for centre in shut.values():  # the strip between such lids is skin
+        kept |= np.linalg.norm(middle - centre, axis=1) < LID_MM
+    animated = replace(animated, added={name: ball for name, ball in animated.added.items() if name not in shut})
+    if skin is not None and skin.faces is not None:
+        skin = replace(skin, faces=skin.faces[kept])
+    scene = animated_scene(animated, head.faces[kept], colours, blendshape_rig.weights, skin)
+    scene = replace(scene, parts=[_with_picture(part, animated, photographed) for part in scene.parts])
+    write_atomically(folder / "posed.glb", scene_glb_bytes(scene, asset_extras(result)))
+
+
+def _is_bridged(pivot: str, result: Reconstruction) -> bool:
+    """Tells whether an eye is closed without a blink of the model."""
+    side, found = pivot.removeprefix("eye_"), result.evidence.blendshape_rig
+    eye, blink = result.faces.eyes.get(side), f"eyeBlink{side.title()}"
+    return isinstance(eye, UnseenEye) and eye.cause == "closed" and not (found and found.weights.get(blink))
+
+
+def _towards_irises(
+    animated: AnimatedMesh,
+    eyes: Mapping[str, Iris | UnseenEye],
+    from_world: RigidTransform,
+    photographed: PhotographedEyes,
+) -> dict[str, Float[np.ndarray, " 3"]]:
+    """Returns the directions from added eyeballs to the irises, so that these lie where they were photographed although
+    the ball lies where the lids let it. An iris that was not measured is what is dark between open lids."""
+    found = {}
+    for name, ball in animated.added.items():
+        eye = eyes.get(name.removeprefix("eye_"))
+        if isinstance(eye, Iris):
+            towards = from_world.apply(eye.centre[None])[0] - ball.centre
+            found[name] = towards / np.linalg.norm(towards)
+        elif eye is not None and eye.cause != "closed":
+            found[name] = darkest_direction(ball, photographed)
+    return {name: gaze for name, gaze in found.items() if gaze is not None}
+
+
+def _with_picture(part: Part, animated: AnimatedMesh, photographed: PhotographedEyes) -> Part:
+    """Returns an added eyeball whose iris was seen with its image; other parts as they are."""
+    if part.name not in animated.added or part.name not in animated.gazes:
+        return part
+    ball = replace(animated.added[part.name], gaze=animated.gazes[part.name])
+    image = paint_eyeball(ball, photographed)
+    if image is None:
+        return part
+    return replace(part, skin=Skin(eyeball_uv(ball, part.mesh), encoded(image, "jpeg")))
+
+
+def _gazes(eyes: Mapping[str, Iris | UnseenEye], from_world: RigidTransform) -> dict[str, Float[np.ndarray, " 3"]]:
+    """Returns where eyes that are seen look, by pivot (head frame)."""
+    return {f"eye_{side}": from_world.rotation @ eye.gaze for side, eye in eyes.items() if isinstance(eye, Iris)}
+
+
+def animated_scene(
+    animated: AnimatedMesh,
+    triangles: Int[np.ndarray, "g 3"],
+    colours: UInt8[np.ndarray, "t 3"],
+    weights: Mapping[str, float],
+    skin: Skin | None = None,
+) -> Scene:
+    """Returns an animated mesh by named parts: the head with its shapes and ``skin``, eyeballs that turn about their
+    pivots, teeth and tongue."""
+    turning = np.zeros(len(animated.neutral), bool)
+    for rows in animated.eyeballs.values():
+        turning[rows] = True
+    rows = np.flatnonzero(~turning)
+    named = {"head": rows, **animated.eyeballs} if turning.any() else {"head": None}
+    morphs = {name: shape[rows] for name, shape in animated.shapes.items()}
+    parts = []
+    for name, of_mesh in named.items():
+        mesh = _part(animated, triangles, colours, rows if of_mesh is None else of_mesh)
+        listed = None if of_mesh is None else of_mesh.tolist()
+        if name == "head":
+            parts.append(Part(name, mesh, skin=skin, morphs=morphs, weights=weights, rows=listed))
+        else:
+            parts.append(Part(name, mesh, pivot=name, rows=listed))
+    for name, eyeball in animated.added.items():
+        parts.append(Part(name, replace(eyeball, gaze=AHEAD).mesh(), pivot=name))
+    for name, mesh in animated.inner.parts.items():
+        moves, pivot = animated.inner.moves[name], JAW if name in WITH_JAW else NECK
+        wanted = {shape: move for shape, move in moves.items() if shape in animated.shapes or shape == TONGUE_OUT}
+        parts.append(Part(name, mesh, morphs=wanted, weights=weights, pivot=pivot))
+    return Scene(parts, animated.pivots, {name: turn_to(gaze) for name, gaze in animated.gazes.items()})
+
+
+def _part(
+    animated: AnimatedMesh,
+    triangles: Int[np.ndarray, "g 3"],
+    colours: UInt8[np.ndarray, "t 3"],
+    rows: Int[np.ndarray, " r"],
+) -> Mesh:
+    number = np.full(len(animated.neutral), -1)
+    number[rows] = np.arange(len(rows))
+    inside = triangles[(number[triangles] >= 0).all(axis=1)]
+    return Mesh(animated.neutral[rows], number[inside].astype(np.int32), colours[rows])
+
+
+def _inner_arrays(animated: AnimatedMesh) -> dict[str, Any]:
+    """Returns teeth and tongue as one mesh; ``inner_parts`` says of each vertex which part it belongs to."""
+    inner, vertices, faces, numbers, moves = animated.inner, [], [], [], []
+    for number, (name, part) in enumerate(inner.parts.items()):
+        faces.append(part.faces + sum(len(each) for each in vertices))
+        vertices.append(part.vertices)
+        numbers.append(np.full(len(part.vertices), number, np.uint8))
+        still = np.zeros_like(part.vertices)
+        moves.append(np.stack([inner.moves[name].get(shape, still) for shape in animated.shapes]))
+    if not vertices:
+        return {}
+    return {
+        "inner_vertices": np.concatenate(vertices).astype(np.float32),
+        "inner_triangles": np.concatenate(faces).astype(np.int32),
+        "inner_parts": np.concatenate(numbers),
+        "inner_displacements": np.concatenate(moves, axis=1).astype(np.float32),
+    }
+
+
+def _archive(animated: AnimatedMesh, template: Template, blendshape_rig: BlendshapeRig) -> bytes:
+    moved = {name for moves in animated.inner.moves.values() for name in moves}
+    meta = {
+        "format": FORMAT,
+        "template": template.name,
+        "template_sha256": template.source_sha256,
+        "frame": "head",
+        "unit": "mm",
+        "names": list(animated.shapes),
+        "weights": dict(blendshape_rig.weights),
+        "without_counterpart": [name for name in blendshape_rig.missing if name not in moved],
+        "visemes": {name: dict(mixture) for name, mixture in VISEMES.items()},
+        "pivots": {name: pivot.tolist() for name, pivot in animated.pivots.items()},
+        "eyeballs": {
+            name: {"radius_mm": eyeball.radius_mm, "gaze": eyeball.gaze.tolist()}
+            for name, eyeball in animated.added.items()
+        },
+        "gazes": {name: gaze.tolist() for name, gaze in animated.gazes.items()},
+        "inner_mouth": {"parts": list(animated.inner.parts), "absence": animated.inner.absence},
+    }
+    packed = io.BytesIO()
+    np.savez_compressed(
+        packed,
+        meta=np.frombuffer(json.dumps(meta, sort_keys=True).encode(), np.uint8),
+        neutral=animated.neutral.astype(np.float32),
+        displacements=np.stack(list(animated.shapes.values())).astype(np.float32),
+        triangles=template.mesh.triangles().astype(np.int32),
+        **_inner_arrays(animated),
+    )
+    return packed.getvalue()

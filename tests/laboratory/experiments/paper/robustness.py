@@ -26,7 +26,7 @@ import numpy as np
 
 from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
-from pipeline.segmentation import view_consistency as agreement
+from pipeline.segmentation import segment as agreement
 from pipeline.segmentation.segment import segment
 from pipeline.settings import FittingSettings, Settings
 from pipeline.view_checks import camera_drift as drift

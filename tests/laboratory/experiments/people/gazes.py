@@ -15,7 +15,6 @@ from jaxtyping import Float
 from pipeline.evidence.gaze import pupil_distance
 from pipeline.faces import irises as finding
 from pipeline.faces import limbus as edges
-from pipeline.faces import limbus_fit as fits
 from pipeline.faces.irises import Iris, find_irises
 from pipeline.faces.networks import load_networks
 from pipeline.faces.subject import find_subject
@@ -36,7 +35,7 @@ HEADS = 6  # of each model
 GAZE_DEG = (12.0, 6.0)  # deviations of azimuth and elevation
 FACEKIT_VERTICES = 11248  # of ICT-FaceKit's face and head
 AIMS = {"iris_mm": 0.5, "gaze_deg": 3.0, "pupils_mm": 0.5}
-CODE: tuple[ModuleType, ...] = (finding, edges, fits, studio_eyes)
+CODE: tuple[ModuleType, ...] = (finding, edges, studio_eyes)
 
 
 def gazes(models: Mapping[str, HeadModel], *, renderer: Renderer, bench: Bench, subjects: int = HEADS) -> Outcome:

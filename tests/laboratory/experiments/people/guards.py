@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.scene.rig_scale import times
+from calibration.scene.scale import times
 from pipeline.faces.networks import load_networks
 from pipeline.faces.subject import find_subject
 from pipeline.head_model.model import HeadModel

@@ -10,19 +10,10 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.applications.templates import (
-    animated,
-    carrying,
-    contact,
-    likeness,
-    placement,
-    registration,
-    shape_carrying,
-)
-from pipeline.applications.templates.animated import parted_shapes
+from pipeline.applications.templates import animated, carrying, contact, likeness, placement, registration
+from pipeline.applications.templates.animated import Neutral, carried_shapes, parted_shapes
 from pipeline.applications.templates.contact import WEIGHTS, RestSurface, crossings, rest_surface
 from pipeline.applications.templates.registration import register
-from pipeline.applications.templates.shape_carrying import Neutral, carried_shapes
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.head_model.model import HeadModel
 from pipeline.results.clay import clay
@@ -49,7 +40,7 @@ Moves = Mapping[str, Float[np.ndarray, "t 3"]]
 def shapes(model: HeadModel, facekit: HeadModel, *, bench: Bench) -> Outcome:
     """Returns ``<mesh>_carried_worst`` (error of the worst shape as carried), ``<mesh>_parted_worst`` (once lips and
     lids are kept apart), ``<mesh>_crossings`` and so on."""
-    modules = (animated, carrying, contact, likeness, placement, registration, shape_carrying)
+    modules = (animated, carrying, contact, likeness, placement, registration)
     records = bench.records("shapes", key_of(model.sha256, facekit.sha256, *modules))
     cases = _cases(model, facekit)
     rows: list[Row] = []

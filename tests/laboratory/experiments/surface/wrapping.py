@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.applications.templates import likeness, registration
 from pipeline.applications.templates.registration import register
 from pipeline.applications.templates.template_file import Template
-from pipeline.applications.wrapping import fitting, scan, sighting
+from pipeline.applications.wrapping import scan
 from pipeline.applications.wrapping import wrap as steps
 from pipeline.applications.wrapping.scan import read_raw_scan
 from pipeline.applications.wrapping.wrap import wrap
@@ -29,7 +29,7 @@ from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 def wrapping(facekit: HeadModel, truths: Mapping[str, Path], *, bench: Bench) -> Outcome:
     """Runs this module's experiment. Returns ``<scan>_median_mm``, ``<scan>_landmarks_mm`` and so on."""
-    modules = (fitting, steps, scan, sighting, likeness, registration)
+    modules = (steps, scan, likeness, registration)
     records = bench.records("wrap", key_of(facekit.sha256, *modules))
     pictures: dict[str, np.ndarray] = {}
     rows: list[Row] = []

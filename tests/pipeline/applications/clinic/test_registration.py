@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.applications.clinic.anatomical_frame import frankfurt_axes
 from pipeline.applications.clinic.patient_files import write_registration
-from pipeline.applications.clinic.registration import read_surface_landmarks, register
-from pipeline.applications.clinic.surface import PatientSurface, read_surface
+from pipeline.applications.clinic.registration import PatientSurface, read_surface, read_surface_landmarks, register
 from pipeline.applications.verification.reference import Reference
 from rig.errors import InputError
 from rig.formats.meshes.markups import Axes, MarkupPoint, markups_document

@@ -9,7 +9,7 @@ from trimesh.util import wrap_as_stream
 
 from pipeline.applications.templates.animated import AnimatedMesh
 from pipeline.applications.templates.eyeballs import Eyeball, lifted, placed_eyeballs, turn_to
-from pipeline.applications.templates.write.shapes import animated_scene
+from pipeline.applications.templates.write.writers import animated_scene
 from pipeline.fusion.crossings import crossing_faces
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.obj import scene_obj_bytes

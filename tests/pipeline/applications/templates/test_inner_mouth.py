@@ -12,7 +12,7 @@ from pipeline.applications.templates.inner_mouth import (
     placed_inner_mouth,
 )
 from pipeline.applications.templates.pivots import hinge, jaw_motions
-from pipeline.applications.templates.write.shapes import animated_scene
+from pipeline.applications.templates.write.writers import animated_scene
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.head_model.model import HeadModel
 from rig.formats.meshes.glb import scene_glb_bytes

@@ -20,10 +20,7 @@ from rig.errors import InputError
 from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.geometry import rotation_from_vector
 from rig.mesh import vertex_normals
-
-
-def quiet(stage: str, fraction: float) -> None:
-    """Says nothing."""
+from rig.progress import discard_progress
 
 
 def surface(*meshes: trimesh.Trimesh) -> Surface:
@@ -116,7 +113,7 @@ def test_a_mesh_in_another_order_unit_and_frame_lies_on_the_model_again() -> Non
     order = rng.permutation(level.count)
     shape = model.vertices(np.zeros(0), "p95")[order][:, [2, 0, 1]] / 10.0 + 7.0
     mesh = polygons(shape, np.argsort(order)[level.faces])
-    found = register(mesh, model, name="level.obj", report=quiet)
+    found = register(mesh, model, name="level.obj", report=discard_progress)
     head = model.vertices(rng.standard_normal(len(model.modes)))
     off = np.linalg.norm(found.surface_binding.on(head, model.levels["full"].faces) - head[level.rows[order]], axis=1)
     # chords of 9 mm sag by 0.1 mm on a head, and the model is made like the chords
@@ -125,4 +122,4 @@ def test_a_mesh_in_another_order_unit_and_frame_lies_on_the_model_again() -> Non
     ball = trimesh.creation.icosphere(subdivisions=4, radius=100.0)
     round_one = polygons(np.array(ball.vertices), np.array(ball.faces))
     with pytest.raises(NotRegistered, match="which no head is"):
-        register(round_one, model, name="ball.obj", report=quiet)
+        register(round_one, model, name="ball.obj", report=discard_progress)

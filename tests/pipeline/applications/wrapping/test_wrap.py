@@ -1,22 +1,36 @@
-"""A scan wrapped from its file to the files of the result."""
+"""A scan wrapped from its file to the files of the result; a template drawn onto it, what lies deeper following."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from pipeline.applications.wrapping.scan import read_raw_scan
-from pipeline.applications.wrapping.wrap import residual_colours, wrap
+from pipeline.applications.templates.likeness import SurfaceMarks
+from pipeline.applications.templates.template_file import Template
+from pipeline.applications.wrapping.scan import raw_scan, read_raw_scan
+from pipeline.applications.wrapping.wrap import (
+    PlacedScan,
+    drawn_onto,
+    nearest_axis,
+    place_scan,
+    residual_colours,
+    surface_of,
+    unit_of,
+    wrap,
+)
 from pipeline.applications.wrapping.write import write_wrapped
 from pipeline.geometry.surface_index import SurfaceIndex
-from pipeline.head_model.model import load_model
-from rig.formats.meshes.mesh_file import read_mesh
+from pipeline.head_model.model import HeadModel, load_model
+from rig.errors import InputError
+from rig.formats.meshes.mesh_file import TexturedMesh, read_mesh
 from rig.formats.meshes.polygon_obj import read_polygons
 from rig.geometry import rotation_from_vector
+from rig.mesh import Mesh
 from rig.progress import discard_progress
-from tests.support.ready_templates import ready_template
+from tests.support.ready_templates import EYE_CENTRE, ready_template
 from tests.support.shared_data import shared
 
 
@@ -59,3 +73,79 @@ def test_a_scan_in_metres_lying_askew_is_wrapped(tmp_path: Path) -> None:
     for name in ("cheilion_right", "cheilion_left", "gnathion"):  # the models' other landmarks are other places
         expected = np.array(known[name]) / 1000.0 @ turn.T + (2.0, -1.0, 0.5)
         assert np.linalg.norm(fitted[model.landmarks[name]] - expected) * 1000.0 < 4.0
+
+
+@pytest.fixture(scope="module")
+def template(model: HeadModel) -> Template:
+    return ready_template(model)
+
+
+def test_a_template_lies_on_the_scan_it_was_drawn_to(model: HeadModel, template: Template) -> None:
+    """The scan is the model's mean with a bump of 3 mm, 20 mm broad, on the crown and on a cheek."""
+    mean, faces = model.vertices(np.zeros(0)), model.levels["full"].faces
+    scan = surface_of(mean, faces)
+    crown, cheek = mean[mean[:, 1].argmax()], mean[np.linalg.norm(mean - (45.0, -20.0, 60.0), axis=1).argmin()]
+    squares = [((mean - at) ** 2).sum(axis=1) for at in (crown, cheek)]
+    bump = np.exp(-0.5 * np.array(squares) / 20.0**2).sum(axis=0)
+    scan = surface_of(mean + 3.0 * bump[:, None] * scan.normals, faces)
+    carried = template.surface_binding.on(mean, faces)
+    drawn, met = drawn_onto(carried, template, model, scan)
+    index, skin = SurfaceIndex(scan.vertices, scan.faces), template.surface_binding.skin
+    before, after = (index.closest(points[skin]).distances for points in (carried, drawn))
+    assert before.max() > 2.5
+    assert np.median(after) < 0.02
+    assert np.percentile(after, 75) < 0.1
+    assert met[skin].mean() > 0.9
+    ball = drawn[template.surface_binding.wholes == 0]
+    assert np.ptp(np.linalg.norm(ball - ball.mean(axis=0), axis=1)) < 0.5  # still round
+    assert np.linalg.norm(ball.mean(axis=0) - EYE_CENTRE) < 3.0
+
+
+def marked_scan(model: HeadModel, factor: float) -> tuple[PlacedScan, np.ndarray]:
+    """The mean head in another unit, askew, off the origin, its triangles turned over; placed by its landmarks."""
+    turn = rotation_from_vector(np.array([1.2, -0.4, 0.7]))
+    mean, faces = model.vertices(np.zeros(0), "p95"), model.levels["p95"].faces
+    moved = mean @ turn.T * factor + 3.0
+    where = {name: model.vertices(np.zeros(0))[row] @ turn.T * factor + 3.0 for name, row in model.landmarks.items()}
+    scan = raw_scan(TexturedMesh(Mesh(moved, np.ascontiguousarray(faces[:, ::-1]))), "scan")
+    return place_scan(scan, model, where), turn
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1.0, "mm"), (0.1, "cm"), (0.001, "m"), (0.0043, None)])
+def test_landmarks_place_a_scan_in_any_unit(model: HeadModel, factor: float, unit: str | None) -> None:
+    placed, turn = marked_scan(model, factor)
+    assert placed.unit == unit
+    assert placed.mm_per_unit == pytest.approx(1.0 / factor, rel=1e-6)
+    assert placed.turned_over
+    assert placed.up == nearest_axis(turn[:, 1])
+    assert placed.front == nearest_axis(turn[:, 2])
+    surface, level = placed.surface(), model.levels["p95"]
+    np.testing.assert_allclose(
+        surface.vertices[surface.faces], model.vertices(np.zeros(0), "p95")[level.faces], atol=1e-6
+    )
+    np.testing.assert_allclose(placed.marks.on(model.vertices(np.zeros(0))), placed.marks.points, atol=1e-6)
+
+
+def test_landmarks_that_are_too_few_are_refused(model: HeadModel) -> None:
+    mesh = Mesh(model.vertices(np.zeros(0), "p95"), model.levels["p95"].faces)
+    with pytest.raises(InputError, match="landmarks"):
+        place_scan(raw_scan(TexturedMesh(mesh), "scan"), model, {"pronasale": np.zeros(3)})
+
+
+@pytest.mark.parametrize(
+    ("scale", "expected"), [(1.1, ("mm", 1.0)), (0.09, ("cm", 10.0)), (0.04, ("in", 25.4)), (0.001, ("m", 1000.0))]
+)
+def test_a_faces_size_tells_the_unit(scale: float, expected: tuple[str, float]) -> None:
+    assert unit_of(scale) == expected
+
+
+def test_a_size_of_no_unit_becomes_a_mean_adults() -> None:
+    assert unit_of(0.5) == (None, 2.0)
+
+
+def test_marks_lie_where_landmarks_do(model: HeadModel) -> None:
+    mean = model.vertices(np.zeros(0))
+    named: Mapping[str, np.ndarray] = {name: mean[row] for name, row in model.landmarks.items()}
+    marks = SurfaceMarks.of_landmarks(model, {**named, "nobody": np.zeros(3)})
+    np.testing.assert_allclose(marks.on(mean), marks.points, atol=1e-9)
+    assert len(marks.points) == len(model.landmarks)

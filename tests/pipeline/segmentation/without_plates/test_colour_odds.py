@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.segmentation.without_plates.colour_odds import Samples, colour_odds, histogram
+from pipeline.segmentation.without_plates.mask_search import Samples, colour_odds, histogram
 
 NOISE = np.full(3, 3.0)
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.segmentation.without_plates.local_cut import BANDS, cut_along
+from pipeline.segmentation.without_plates.decide import BANDS, cut_along
 
 
 def scene() -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rig.errors import InputError
-from rig.formats.captures.capture_folder import read_capture, write_capture
+from rig.formats.captures.capture_folder import full_size_reader, read_capture, write_capture
 from rig.formats.captures.features_json import features_from_bytes
 from rig.formats.pictures.images import read_image, write_image
 from rig.messages.message import Message, texts_of
@@ -234,3 +234,14 @@ def test_what_may_not_be_read_is_neither_damaged_nor_wrong(
     monkeypatch.setattr(Path, "read_bytes", refused)
     with pytest.raises(InputError, match=r"cannot be read \(Permission denied\)"):
         read_capture(folder)
+
+
+def test_a_reduced_picture_is_read_at_full_size(tmp_path: Path) -> None:
+    write_capture(tmp_path, whole := small_capture(), small_rig())
+    reduced, _ = read_capture(tmp_path, pixels_most=800)
+    assert reduced.images["b"].shape == (24, 32, 3)
+    read = full_size_reader(tmp_path, small_rig())
+    np.testing.assert_array_equal(read("b"), whole.images["b"])
+    (tmp_path / "images" / "b.png").unlink()
+    with pytest.raises(InputError):
+        read("b")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from pipeline.applications.model_building.correspondence import prior
+from pipeline.applications.model_building.correspondence import correspondence as prior
 from pipeline.applications.model_building.correspondence.correspondence import (
     Correspondence,
     Matching,

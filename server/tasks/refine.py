@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.silhouette_refinement.refine import TooFewCaptures, refine
+from calibration.silhouette_refinement.refine import Heads, TooFewCaptures, refine
 from calibration.silhouette_refinement.report import RefinementRun
-from calibration.silhouette_refinement.rims import Heads
 from pipeline.head_model.model import load_model, with_modes
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.segmentation.segment import segment
