@@ -67,6 +67,9 @@ def simulate(
     gaze: Gaze = None,
     fault: Faults = None,
     board: BoardShots = False,
+    sequence: Annotated[
+        int | None, typer.Option(help="So many frames of a subject that moves and speaks, 25 a second.", min=2)
+    ] = None,
     serve: Served = False,
     port: Annotated[int, typer.Option(help="--serve: of the cameras; 0 takes a free one.", min=0, max=65535)] = 0,
     fps: Annotated[float, number("--serve: of the live views.", min=0.5, max=30)] = 4.0,
@@ -96,6 +99,10 @@ def simulate(
         return
     _check_planted(fault or [], expression or [])
     _make_way(out, overwrite)
+    if sequence is not None:
+        from server.cli.moments import film_sequence
+
+        return film_sequence(out, sequence, seed, preset, json_out)
     from rig.render.renderer import Renderer
     from server.tasks.subjects import simulate_folder
 

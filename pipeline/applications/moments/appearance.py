@@ -27,8 +27,9 @@ from rig.mesh import vertex_normals
 from rig.rig import Rig
 
 SAMPLE_MM = 2.5  # distance of samples
-FINE_PX, COARSE_PX = 1.0, 2.5  # blurs of the pictures
-SHADING = 5.0  # the local mean's window, in blurs
+REDUCED = (2, 1)  # of the pictures, from coarse to fine
+BLUR_PX = 1.0  # of a reduced picture
+SHADING_PX, SHADING_SIZE = 5.0, 4  # the local mean's window, and by how much smaller its picture is
 DARK = 12.0  # grey levels added before the logarithm: noise of dark pixels is not amplified
 LID_MM = 1.5  # what a blink moves by more is a lid
 MIN_COSINE = 0.3  # of a sample's normal to the camera
@@ -63,41 +64,54 @@ def spread(person: SequencePerson) -> Samples:
 
 def lid_motion_mm(person: SequencePerson) -> Float[np.ndarray, " v"]:
     """Returns how far a blink moves each vertex."""
-    blinks = [k for k, name in enumerate(person.model.expressions.names) if plain_name(name) in BLINKS]
+    blinks = [k for k, name in enumerate(person.names) if plain_name(name) in BLINKS]
     return np.linalg.norm(person.shapes[blinks], axis=2).max(axis=0, initial=0.0)
 
 
-def texture_of(grey: Float32[np.ndarray, "h w"], blur_px: float) -> Float32[np.ndarray, "h w 3"]:
-    """Returns the fine texture of a grey picture, and its slopes along x and y by the pixel."""
-    levels = np.log(cv2.GaussianBlur(grey, (0, 0), blur_px) + DARK)
-    fine = levels - cv2.GaussianBlur(levels, (0, 0), SHADING * blur_px)
-    kernel = np.array([[-0.5, 0.0, 0.5]], np.float32)
-    return np.stack([fine, cv2.filter2D(fine, -1, kernel), cv2.filter2D(fine, -1, kernel.T)], axis=2)
+@dataclass(frozen=True, slots=True, eq=False)
+class Texture:
+    """Holds the fine texture of a picture, and its slopes along x and y by the pixel, at a ``reduced`` size."""
+
+    image: Float32[np.ndarray, "h w 3"]
+    reduced: int
+
+    def read(self, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+        """Returns texture and slopes at pixels of the whole picture, and which of them lie inside it."""
+        height, width = self.image.shape[:2]
+        scaled = (pixels + 0.5) / self.reduced - 0.5
+        inside = ((scaled >= 0.0) & (scaled < (width - 1.001, height - 1.001))).all(axis=1)  # False for NaN
+        at = np.where(inside[:, None], scaled, 0.0)
+        first = np.floor(at)
+        column, row = first.astype(np.int64).T
+        x, y = (at - first).astype(np.float32).T[:, :, None]
+        flat, start = self.image.reshape(-1, 3), row * width + column
+        top = flat[start] * (1.0 - x) + flat[start + 1] * x
+        bottom = flat[start + width] * (1.0 - x) + flat[start + width + 1] * x
+        return top * (1.0 - y) + bottom * y, inside
 
 
-def textures(pictures: Pictures, rig: Rig, blur_px: float) -> list[Float32[np.ndarray, "_ _ 3"] | None]:
+def texture_of(grey: Float32[np.ndarray, "h w"], reduced: int) -> Texture:
+    """Returns the fine texture of a grey picture that is reduced by a whole factor."""
+    height, width = grey.shape
+    if reduced > 1:
+        grey = cv2.resize(grey, (width // reduced, height // reduced), interpolation=cv2.INTER_AREA)
+    levels = np.log(cv2.GaussianBlur(grey, (0, 0), BLUR_PX) + DARK)
+    size = levels.shape[1] // SHADING_SIZE, levels.shape[0] // SHADING_SIZE
+    small = cv2.GaussianBlur(cv2.resize(levels, size, interpolation=cv2.INTER_AREA), (0, 0), SHADING_PX / SHADING_SIZE)
+    fine = levels - cv2.resize(small, levels.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    kernel = np.array([[-0.5, 0.0, 0.5]], np.float32) / np.float32(reduced)
+    slopes = cv2.filter2D(fine, -1, kernel), cv2.filter2D(fine, -1, kernel.T)
+    return Texture(cv2.merge([fine, *slopes]), reduced)
+
+
+def textures(pictures: Pictures, rig: Rig, reduced: int) -> list[Texture | None]:
     """Returns the textures of a frame in the order of the cameras; None where one has no picture."""
 
-    def one(k: int) -> Float32[np.ndarray, "h w 3"] | None:
+    def one(k: int) -> Texture | None:
         image = pictures.get(rig.names[k])
-        return None if image is None else texture_of(image.astype(np.float32) @ LUMINANCE, blur_px)
+        return None if image is None else texture_of(cv2.transform(image, LUMINANCE[None]).astype(np.float32), reduced)
 
     return map_in_threads(one, len(rig))
-
-
-def read_at(
-    image: Float32[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2"]
-) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Returns the values between the pixels, and which lie inside the picture."""
-    height, width = image.shape[:2]
-    inside = ((pixels >= 0.0) & (pixels < (width - 1.001, height - 1.001))).all(axis=1)  # False for NaN
-    at = np.where(inside[:, None], pixels, 0.0)
-    column, row = np.floor(at).astype(np.int64).T
-    x, y = (at - np.floor(at)).astype(np.float32).T[:, :, None]
-    flat, first = image.reshape(-1, 3), row * width + column
-    top = flat[first] * (1.0 - x) + flat[first + 1] * x
-    bottom = flat[first + width] * (1.0 - x) + flat[first + width + 1] * x
-    return top * (1.0 - y) + bottom * y, inside
 
 
 def visible(person: SequencePerson, samples: Samples, motion: Motion) -> list[Int[np.ndarray, " n"]]:
@@ -145,17 +159,17 @@ class Appearance:
 
 
 def observe(
-    person: SequencePerson, samples: Samples, shown: Iterable[tuple[Pictures, Motion]], blur_px: float
+    person: SequencePerson, samples: Samples, shown: Iterable[tuple[Pictures, Motion]], reduced: int
 ) -> Appearance:
     """Returns the appearance of a person in some frames, whose motions are known."""
     shape = (len(person.rig), len(samples.neutral))
     total, count, squares = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for pictures, motion in shown:
         points, seen = motion.world_from_head.apply(samples.points(motion.weights)), visible(person, samples, motion)
-        for k, image in enumerate(textures(pictures, person.rig, blur_px)):
+        for k, image in enumerate(textures(pictures, person.rig, reduced)):
             if image is None:
                 continue
-            values, inside = read_at(image, project_points(person.rig.cameras[k], points[seen[k]]))
+            values, inside = image.read(project_points(person.rig.cameras[k], points[seen[k]]))
             rows = seen[k][inside]
             total[k, rows] += values[inside, 0]
             squares[k, rows] += values[inside, 0] ** 2
@@ -169,4 +183,4 @@ def observe(
     return Appearance(np.where(count > 0.0, mean, pooled[None]).astype(np.float32), max(deviation, 1e-3))
 
 
-Levels = Mapping[float, Appearance]  # by blur
+Levels = Mapping[int, Appearance]  # by how much the pictures are reduced

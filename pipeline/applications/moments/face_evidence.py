@@ -130,7 +130,7 @@ def closing_of(person: SequencePerson) -> dict[str, Float[np.ndarray, " e"]]:
     out."""
     places, right = landmark_map(person.model), np.array(RIGHT_EYE_OUTLINE)
     outline = {"right": right, "left": point_table().mirror_images[right]}
-    names, found = [plain_name(name) for name in person.model.expressions.names], {}
+    names, found = [plain_name(name) for name in person.names], {}
     for side, rows in outline.items():
         corners, blend = places.rows[rows], places.weights[rows]
         moved = np.einsum("nk,enkc->enc", blend, person.shapes[:, corners], optimize=True)

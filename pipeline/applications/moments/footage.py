@@ -1,4 +1,4 @@
-"""Reads a sequence: a folder with cameras.json and either ``images/<camera>/<frame>.<ext>`` or ``videos/<camera>.<ext>``.
+"""Reads a sequence: cameras.json, and either ``images/<camera>/<frame>.<ext>`` or ``videos/<camera>.<ext>``.
 
 Beside them may lie clean plates (``background/``, as in a capture), masks (``masks/<camera>/<frame>.<ext>``), and
 ``times.csv`` with the columns frame and time_s. Frames are read small, one after another, for tracking; single ones
@@ -8,7 +8,7 @@ also as a capture, at the size of a single job.
 import csv
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -48,12 +48,14 @@ class Footage:
     files: Mapping[str, Mapping[str, Path]]
     videos: Mapping[str, Path]
 
-    def read(self, first: int = 0) -> Iterator[Pictures]:
-        """Yields the small pictures of every frame from ``first`` on. A picture that is missing or damaged is left
-        out."""
+    def read(self, first: int = 0, cameras: Sequence[str] = ()) -> Iterator[Pictures]:
+        """Yields the small pictures of every frame from ``first`` on, of all ``cameras`` if none is named. A picture
+        that is missing or damaged is left out."""
+        names = cameras or self.rig.names
         with ExitStack() as stack:
             pool = stack.enter_context(ThreadPoolExecutor(thread_count()))
-            films = {name: stack.enter_context(_opened(path)) for name, path in self.videos.items()}
+            of_names = {name: path for name, path in self.videos.items() if name in names}
+            films = {name: stack.enter_context(_opened(path)) for name, path in of_names.items()}
             for reel in films.values():
                 for _ in range(first):  # exact, unlike a seek
                     reel.grab()
@@ -65,7 +67,7 @@ class Footage:
                     path = self.files[name].get(frame)
                     return None if path is None else self._of_file(name, path)
 
-                found = dict(zip(self.rig.names, pool.map(one, self.rig.names), strict=True))
+                found = dict(zip(names, pool.map(one, names), strict=True))
                 yield {name: image for name, image in found.items() if image is not None}
 
     @contextmanager

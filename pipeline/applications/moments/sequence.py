@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.applications.moments.appearance import COARSE_PX, FINE_PX, Levels, Samples, observe, spread
+from pipeline.applications.moments.appearance import REDUCED, Levels, Samples, observe, spread
 from pipeline.applications.moments.face_evidence import FaceReference, landmarks_of, refer, sight, terms_of
 from pipeline.applications.moments.footage import Footage, Pictures
 from pipeline.applications.moments.sequence_person import Motion, SequencePerson, find_person
@@ -37,6 +37,8 @@ from rig.render.renderer import Renderer
 CHUNK = 25  # frames that are kept together
 MIN_VIEWS = 2
 MIN_ALIKE = 0.5  # correlation of a frame's texture with the reference: .8 to .97 on drawn heads, .1 where it is lost
+ROUNDS = 1  # of fits of the first frames
+KEPT = 0.5  # with all of it, an error along what pictures tell least grew from frame to frame
 SHARE = 0.1  # of the work, that finds the person
 
 
@@ -74,15 +76,17 @@ class Tracker:
         """Fits one frame. Returns None where the head is not found."""
         if len(pictures) < MIN_VIEWS:
             return None
-        found = self._fit(pictures, start)
+        found = self.fit(pictures, start)
         if found.alike >= MIN_ALIKE:
             return found
         again = self._searched(pictures, start)
-        found = None if again is None else self._fit(pictures, again)
+        found = None if again is None else self.fit(pictures, again)
         return found if found is not None and found.alike >= MIN_ALIKE else None
 
-    def _fit(self, pictures: Pictures, start: Motion) -> Tracked:
-        terms = terms_of(self.reference, self.person.rig, sight(self.person, self.networks, pictures, start))
+    def fit(self, pictures: Pictures, start: Motion) -> Tracked:
+        """Fits one frame from a motion that is near."""
+        found = sight(self.person, self.networks, pictures, start)
+        terms = terms_of(self.reference, self.person.rig, found)
         return fit_frame(self.person, self.samples, self.levels, pictures, start, terms)
 
     def _searched(self, pictures: Pictures, start: Motion) -> Motion | None:
@@ -97,15 +101,24 @@ def make_tracker(footage: Footage, person: SequencePerson) -> Tracker:
     """Learns what the person looks like in the frames by which it was found."""
     networks, samples = load_networks(), spread(person)
     shown = [(next(footage.read(key)), motion) for key, motion in zip(person.keys, person.motions, strict=True)]
-    reference = refer(person, networks, shown)
-    levels = {blur: observe(person, samples, shown, blur) for blur in (FINE_PX, COARSE_PX)}
-    return Tracker(person, samples, levels, reference, networks)
+    tracker = _learn(person, samples, networks, shown)
+    for _ in range(ROUNDS):  # the frames agree on the skin once each is fitted to all of them
+        shown = [(pictures, tracker.fit(pictures, motion).motion) for pictures, motion in shown]
+        tracker = _learn(person, samples, networks, shown)
+    return tracker
+
+
+def _learn(
+    person: SequencePerson, samples: Samples, networks: FaceNetworks, shown: list[tuple[Pictures, Motion]]
+) -> Tracker:
+    levels = {reduced: observe(person, samples, shown, reduced) for reduced in REDUCED}
+    return Tracker(person, samples, levels, refer(person, networks, shown), networks)
 
 
 def track_sequence(
     footage: Footage, model: HeadModel, settings: Settings, kept: Path, *, renderer: Renderer, report: Progress
 ) -> tuple[SequencePerson, Course]:
-    """Tracks a head through all frames. ``kept`` is the folder of what an earlier run has found. Returns the person, and
+    """Tracks a head through all frames. ``kept`` is the folder of what an earlier run has found. Returns the person and
     the courses as measured. Raises what ``find_person`` raises."""
     said = inputs_of(footage, model, settings)
     if not (kept / "inputs.json").is_file() or json.loads((kept / "inputs.json").read_text()) != said:
@@ -154,12 +167,13 @@ def _track_chunk(tracker: Tracker, footage: Footage, frames: range, before: Cour
 
 
 def moved_on(last: list[Motion]) -> Motion:
-    """Returns the motion after the last two, if the head keeps its speed."""
+    """Returns the motion after the last two, if the head keeps a ``KEPT`` share of its speed."""
     if len(last) < 2:
         return last[-1]
     before, now = (each.world_from_head for each in last)
-    turned = now.rotation @ before.rotation.T @ now.rotation
-    return replace(last[-1], world_from_head=RigidTransform(turned, 2.0 * now.translation - before.translation))
+    turn = rotation_from_vector(KEPT * vector_from_rotation(now.rotation @ before.rotation.T))
+    shift = now.translation + KEPT * (now.translation - before.translation)
+    return replace(last[-1], world_from_head=RigidTransform(turn @ now.rotation, shift))
 
 
 def smoothed(course: Course) -> Course:
@@ -208,6 +222,7 @@ def _keep_person(path: Path, person: SequencePerson) -> None:
     poses = [each.world_from_head for each in person.motions]
     write_arrays(
         path,
+        names=np.array(person.names),
         neutral=person.neutral,
         shapes=person.shapes,
         keys=np.array(person.keys),
@@ -231,7 +246,9 @@ def _kept_person(path: Path, footage: Footage, model: HeadModel) -> SequencePers
         for rotation, shift, weights in zip(a["rotations"], a["translations"], a["weights"], strict=True)
     ]
     rig = replace(footage.work, cameras=tuple(cameras))
-    return SequencePerson(model, a["neutral"], a["shapes"], rig, tuple(map(int, a["keys"])), tuple(motions))
+    return SequencePerson(
+        model, tuple(map(str, a["names"])), a["neutral"], a["shapes"], rig, tuple(map(int, a["keys"])), tuple(motions)
+    )
 
 
 def write_arrays(path: Path, **arrays: Any) -> None:

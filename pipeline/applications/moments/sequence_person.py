@@ -14,6 +14,8 @@ from pipeline.applications.moments.footage import Footage
 from pipeline.applications.moments.joint_fit import fit_jointly
 from pipeline.applications.moments.take import named, solution_of
 from pipeline.contour_fit.contour import ContourSolution
+from pipeline.estimation.bounded import least_within
+from pipeline.head_model.expressions import arkit_parts
 from pipeline.head_model.model import HeadModel
 from pipeline.reconstruct import start_reconstruction
 from pipeline.settings import Settings
@@ -22,6 +24,7 @@ from rig.geometry import RigidTransform, rotation_from_vector
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
+RIDGE = 1e-3  # of the mean diagonal: shapes that are alike share
 FIRST_S, KEYS = 1.0, 5  # the identity's frames: the sharpest of each fifth of the first second
 
 
@@ -40,6 +43,7 @@ class SequencePerson:
     cameras of the small pictures, corrected."""
 
     model: HeadModel
+    names: tuple[str, ...]  # of the expressions that are tracked: the model's for Apple's names
     neutral: Float[np.ndarray, "v 3"]
     shapes: Float32[np.ndarray, "e v 3"]  # mm at weight 1
     rig: Rig
@@ -87,15 +91,36 @@ def person_of(
     fitted, scale = longest.problem.model, longest.state.world_from_head.scale
     coefficients = longest.state.coefficients.copy()
     coefficients[np.asarray(fitted.posed, int)] = 0.0
-    operator = model.levels["full"].operator
+    operator, names = model.levels["full"].operator, tracked_names(model)
+    rows = [model.expressions.names.index(name) for name in names]
     shapes = np.stack([scale * (operator @ shape) for shape in model.expressions.shapes]).astype(np.float32)
     motions = []
     for each in joint:
         pose, posed = each.state.world_from_head, each.problem.model.posed
-        weights = each.state.coefficients[posed.start : posed.stop]
-        motions.append(Motion(RigidTransform(pose.rotation, pose.translation), np.clip(weights, 0.0, 1.0)))
+        weights = np.clip(each.state.coefficients[posed.start : posed.stop], 0.0, 1.0)
+        weights = weights_alone(shapes[:, model.levels["full"].face_region], weights, rows)
+        motions.append(Motion(RigidTransform(pose.rotation, pose.translation), weights))
     rig = _corrected(footage.work, joint)
-    return SequencePerson(model, scale * fitted.vertices(coefficients), shapes, rig, keys, tuple(motions))
+    return SequencePerson(model, names, scale * fitted.vertices(coefficients), shapes[rows], rig, keys, tuple(motions))
+
+
+def tracked_names(model: HeadModel) -> tuple[str, ...]:
+    """Returns the model's expressions that belong to Apple's 52 names: its other ones say much the same once more, and
+    together they can imitate a shift of the whole head."""
+    parts = arkit_parts(model.expressions.names)
+    return tuple(model.expressions.names[row] for row in sorted({row for of in parts.values() for row in of}))
+
+
+def weights_alone(
+    shapes: Float32[np.ndarray, "n v 3"], weights: Float[np.ndarray, " n"], rows: list[int]
+) -> Float[np.ndarray, " e"]:
+    """Returns the weights of the shapes ``rows`` alone that move the head most nearly as ``weights`` of all do."""
+    flat = shapes.reshape(len(shapes), -1)
+    alone = flat[rows]
+    matrix = (alone @ alone.T).astype(float)
+    matrix += RIDGE * np.trace(matrix) / len(rows) * np.eye(len(rows))
+    slope = -(alone @ (weights.astype(np.float32) @ flat)).astype(float)
+    return least_within(matrix, slope, np.zeros(len(rows)), np.ones(len(rows)))
 
 
 def _corrected(rig: Rig, joint: tuple[ContourSolution, ...]) -> Rig:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from pipeline.applications.moments.appearance import Appearance, Levels, Samples, read_at, textures, visible
+from pipeline.applications.moments.appearance import REDUCED, Appearance, Levels, Samples, Texture, textures, visible
 from pipeline.applications.moments.footage import Pictures
 from pipeline.applications.moments.sequence_person import Motion, SequencePerson
 from pipeline.contour_fit.prior_term import weight_slope
@@ -27,10 +27,9 @@ from rig.geometry import RigidTransform, rotation_from_vector
 from rig.rig import Rig
 
 POSE = 6  # rotation (rad), translation (mm)
-COARSE_SCALE, FINE_SCALE = 8.0, 5.0  # Geman-McClure, in deviations
-ALIKE = 9.0  # samples that err alike: neighbours share pixels, and the head's own error
-COARSE_STEPS, FINE_STEPS, TOLERANCE = 3, 4, 0.05
-THINNED = 3  # of the samples, one of so many speaks in the coarse step
+SCALES = {2: 6.0, 1: 3.0}  # Geman-McClure, in deviations, by how much pictures are reduced
+ALIKE = 25.0  # samples that err alike: neighbours share pixels, and the head's own error
+STEPS, TOLERANCE = {2: 3, 1: 4}, 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +38,7 @@ class TextureTerm:
 
     samples: Samples
     rig: Rig
-    images: Sequence[Float32[np.ndarray, "_ _ 3"] | None]
+    images: Sequence[Texture | None]
     seen: Sequence[Int[np.ndarray, " n"]]
     appearance: Appearance
     scale: float
@@ -53,7 +52,7 @@ class TextureTerm:
             if image is None:
                 continue
             which = self.seen[k]
-            values, inside = read_at(image, project_points(self.rig.cameras[k], world[which]))
+            values, inside = image.read(project_points(self.rig.cameras[k], world[which]))
             off = (values[:, 0] - self.appearance.reference[k, which]) / sigma
             good = inside & np.isfinite(off)
             parts.append(off[good])
@@ -70,7 +69,7 @@ class TextureTerm:
         world, pairs = motion.world_from_head.apply(self.samples.points(motion.weights)), []
         for k, image in enumerate(self.images):
             if image is not None:
-                values, inside = read_at(image, project_points(self.rig.cameras[k], world[self.seen[k]]))
+                values, inside = image.read(project_points(self.rig.cameras[k], world[self.seen[k]]))
                 pairs.append(np.stack([values[:, 0], self.appearance.reference[k, self.seen[k]]])[:, inside])
         both = np.concatenate(pairs, axis=1) if pairs else np.zeros((2, 0))
         both = both[:, np.isfinite(both).all(axis=0)]
@@ -132,7 +131,8 @@ def after(motion: Motion, step: Float[np.ndarray, " p"]) -> Motion:
     """Returns a motion after a step of its unknowns."""
     pose = motion.world_from_head
     turned = rotation_from_vector(step[:3]) @ pose.rotation
-    return Motion(RigidTransform(turned, pose.translation + step[3:POSE]), np.clip(motion.weights + step[POSE:], 0, 1))
+    weights = np.clip(motion.weights + step[POSE:], 0.0, 1.0)
+    return Motion(RigidTransform(turned, pose.translation + step[3:POSE]), weights)
 
 
 def room(motion: Motion) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
@@ -157,21 +157,15 @@ def fit_frame(
     levels: Levels,
     pictures: Pictures,
     start: Motion,
-    others: Sequence[Term[Motion]] = (),
+    terms: Sequence[Term[Motion]] = (),
 ) -> Tracked:
     """Fits a frame to its texture, from coarse to fine, and to other evidence."""
-    seen, motion = visible(person, samples, start), start
-    unknowns, (fine, coarse) = POSE + len(start.weights), sorted(levels)
-
-    def problem_at(blur: float, scale: float, thinned: int) -> Problem[Motion]:
-        images = textures(pictures, person.rig, blur)
-        term = TextureTerm(samples, person.rig, images, [rows[::thinned] for rows in seen], levels[blur], scale)
-        return Problem((term, *others, WeightPrior()), unknowns, after, room=room)
-
-    motion = minimise(problem_at(coarse, COARSE_SCALE, THINNED), motion, Limits(COARSE_STEPS, TOLERANCE)).value
-    problem = problem_at(fine, FINE_SCALE, 1)
-    found = minimise(problem, motion, Limits(FINE_STEPS, TOLERANCE))
+    seen, motion, weights = visible(person, samples, start), start, len(start.weights)
+    for reduced in REDUCED:
+        some, images = [rows[::reduced] for rows in seen], textures(pictures, person.rig, reduced)
+        texture = TextureTerm(samples, person.rig, images, some, levels[reduced], SCALES[reduced])
+        problem = Problem((texture, *terms, WeightPrior()), POSE + weights, after, room=room)
+        found = minimise(problem, motion, Limits(STEPS[reduced], TOLERANCE))
+        motion = found.value
     deviation = np.sqrt(inverse_diagonal(problem.equations(found.at).matrix))
-    texture = problem.terms[0]
-    assert isinstance(texture, TextureTerm)
-    return Tracked(found.value, deviation, texture.correlation(found.value))
+    return Tracked(motion, deviation, texture.correlation(motion))

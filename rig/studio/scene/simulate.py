@@ -301,6 +301,7 @@ def _settled(fault: Fault, rig: Rig, rng: np.random.Generator) -> Fault:
 
 
 def worn_look(look: Look, preset: Preset, faults: Sequence[Fault]) -> Look:
+    """Returns a look with what the preset and the faults change of it."""
     look = replace(restyled(look, preset.hairstyle), pores=preset.pores, oil=preset.oil)
     look = replace(look, scattering_mm=preset.scattering_mm)
     if not preset.hair:
@@ -343,6 +344,7 @@ def view_cameras(
     faults: Sequence[Fault],
     rng: np.random.Generator,
 ) -> dict[str, View]:
+    """Draws the backdrops and sensors of all cameras, around the subject's ``light``."""
     colour = CAMOUFLAGE if any(fault.kind == "camouflage" for fault in faults) else None
 
     def one(camera: Camera, camera_rng: np.random.Generator) -> View:
