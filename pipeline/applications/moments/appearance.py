@@ -79,7 +79,7 @@ class Texture:
         """Returns texture and slopes at pixels of the whole picture, and which of them lie inside it."""
         height, width = self.image.shape[:2]
         scaled = (pixels + 0.5) / self.reduced - 0.5
-        inside = ((scaled >= 0.0) & (scaled < (width - 1.001, height - 1.001))).all(axis=1)  # False for NaN
+        inside = np.all((scaled >= 0.0) & (scaled < (width - 1.001, height - 1.001)), axis=1)  # False for NaN
         at = np.where(inside[:, None], scaled, 0.0)
         first = np.floor(at)
         column, row = first.astype(np.int64).T

@@ -70,9 +70,10 @@ class TextureTerm:
         for k, image in enumerate(self.images):
             if image is not None:
                 values, inside = image.read(project_points(self.rig.cameras[k], world[self.seen[k]]))
-                pairs.append(np.stack([values[:, 0], self.appearance.reference[k, self.seen[k]]])[:, inside])
+                both = np.stack([values[:, 0], self.appearance.reference[k, self.seen[k]]])
+                pairs.append(both[:, inside])
         both = np.concatenate(pairs, axis=1) if pairs else np.zeros((2, 0))
-        both = both[:, np.isfinite(both).all(axis=0)]
+        both = both[:, np.all(np.isfinite(both), axis=0)]
         return float(np.corrcoef(both)[0, 1]) if both.shape[1] > 1 else 0.0
 
     def _jacobian(
@@ -161,11 +162,15 @@ def fit_frame(
 ) -> Tracked:
     """Fits a frame to its texture, from coarse to fine, and to other evidence."""
     seen, motion, weights = visible(person, samples, start), start, len(start.weights)
-    for reduced in REDUCED:
+
+    def problem_at(reduced: int) -> tuple[Problem[Motion], TextureTerm]:
         some, images = [rows[::reduced] for rows in seen], textures(pictures, person.rig, reduced)
         texture = TextureTerm(samples, person.rig, images, some, levels[reduced], SCALES[reduced])
-        problem = Problem((texture, *terms, WeightPrior()), POSE + weights, after, room=room)
-        found = minimise(problem, motion, Limits(STEPS[reduced], TOLERANCE))
-        motion = found.value
+        return Problem((texture, *terms, WeightPrior()), POSE + weights, after, room=room), texture
+
+    for reduced in REDUCED[:-1]:
+        motion = minimise(problem_at(reduced)[0], motion, Limits(STEPS[reduced], TOLERANCE)).value
+    problem, texture = problem_at(REDUCED[-1])
+    found = minimise(problem, motion, Limits(STEPS[REDUCED[-1]], TOLERANCE))
     deviation = np.sqrt(inverse_diagonal(problem.equations(found.at).matrix))
-    return Tracked(motion, deviation, texture.correlation(motion))
+    return Tracked(found.value, deviation, texture.correlation(found.value))
