@@ -70,11 +70,10 @@ class TextureTerm:
         for k, image in enumerate(self.images):
             if image is not None:
                 values, inside = image.read(project_points(self.rig.cameras[k], world[self.seen[k]]))
-                both = np.stack([values[:, 0], self.appearance.reference[k, self.seen[k]]])
-                pairs.append(both[:, inside])
-        both = np.concatenate(pairs, axis=1) if pairs else np.zeros((2, 0))
-        both = both[:, np.all(np.isfinite(both), axis=0)]
-        return float(np.corrcoef(both)[0, 1]) if both.shape[1] > 1 else 0.0
+                pairs.append(np.stack([values[:, 0], self.appearance.reference[k, self.seen[k]]], axis=1)[inside])
+        both = np.concatenate([np.zeros((0, 2)), *pairs])
+        known = both[np.isfinite(both).all(axis=1)]
+        return float(np.corrcoef(known.T)[0, 1]) if len(known) > 1 else 0.0
 
     def _jacobian(
         self, world: Float[np.ndarray, "s 3"], pose: RigidTransform, rows: list

@@ -4,9 +4,9 @@ cameras of 640 x 480 pixels, and one that sits still.
 ``error`` is the mean distance (mm) of the face's vertices from the true ones, aligned to nothing, over all frames;
 ``single_error`` that of single jobs at level photo of every tenth frame, ``same_error`` that of tracking in the same
 frames. ``jitter`` is the RMS over still frames of a vertex's distance from its own mean, ``raw_jitter`` that before
-smoothing. A blink is kept if the lids are shut by ``SHUT`` or more, and most within a frame of the truth. CPU seconds are
-of this process, decoding included. The command is killed ``KILLS`` times while it tracks; its files must be the bytes of
-a run that nobody killed.
+smoothing. A blink is kept if the lids are shut by ``SHUT`` or more, and most within a frame of the truth. CPU seconds
+are of this process, decoding included. The command is killed ``KILLS`` times while it tracks; its files must be the
+bytes of a run that nobody killed.
 """
 
 import os
@@ -37,7 +37,7 @@ from rig.studio.sensor.preset import PRESET
 from server.processes import python_command, python_environment
 from tests.laboratory.experiments.records import Bench, Outcome
 
-SEED, STILL_FRAMES, EACH, KILLS = 54, 40, 10, 5
+SEED, STILL_FRAMES, EACH, KILLS = 3, 40, 10, 5
 SHUT, NEAR = 0.4, 1  # weight; frames
 PAGE = os.sysconf("SC_PAGE_SIZE")
 SETTINGS = replace(Settings(), detail="photo", outputs=OutputSettings(surface="head"))
@@ -197,8 +197,8 @@ def killed_figures(folder: Path, bench: Bench) -> dict[str, float]:
 
 
 def run(folder: Path, out: Path, kept: Path, after_s: float | None) -> bool:
-    """Runs the command, and kills it after some seconds. Returns whether it was killed. It begins with the identity that
-    is ``kept``."""
+    """Runs the command, and kills it after some seconds. Returns whether it was killed. It begins with the identity
+    that is ``kept``."""
     for name in ("person.npz", "inputs.json"):
         if not (out / CHUNKS / name).is_file():
             shutil.copyfile(kept / name, out / CHUNKS / name)
