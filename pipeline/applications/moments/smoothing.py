@@ -52,7 +52,8 @@ def smooth(
     near = failed[:-2] | failed[1:-1] | failed[2:]
     held = np.where(near[:, None], np.minimum(held, 1.0 / (least + usual)), held)
     variance = _inverse_diagonal(_factor(information, held))
-    return found, np.sqrt(np.maximum(spread**2 - noise**2, 0.0) + variance)
+    lasting = np.where(failed[:, None], spread**2, np.maximum(spread**2 - noise**2, 0.0))  # what no smoothing removes
+    return found, np.sqrt(lasting + variance)
 
 
 def _together(squares: Courses, groups: Sequence[Int[np.ndarray, " g"]]) -> Courses:

@@ -66,12 +66,13 @@ class TextureTerm:
 
     def correlation(self, motion: Motion) -> float:
         """Returns the correlation of all samples with their reference; 0 without any."""
-        world, pairs = motion.world_from_head.apply(self.samples.points(motion.weights)), []
+        world = motion.world_from_head.apply(self.samples.points(motion.weights))
+        pairs = [np.zeros((0, 2))]
         for k, image in enumerate(self.images):
             if image is not None:
                 values, inside = image.read(project_points(self.rig.cameras[k], world[self.seen[k]]))
                 pairs.append(np.stack([values[:, 0], self.appearance.reference[k, self.seen[k]]], axis=1)[inside])
-        both = np.concatenate([np.zeros((0, 2)), *pairs])
+        both: np.ndarray = np.concatenate(pairs)
         known = both[np.isfinite(both).all(axis=1)]
         return float(np.corrcoef(known.T)[0, 1]) if len(known) > 1 else 0.0
 
