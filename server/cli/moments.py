@@ -1,6 +1,5 @@
 """Implements the commands for one person and many moments: take, sequence."""
 
-import shutil
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,6 @@ from server.cli.answers import (
     Json,
     Overwrite,
     answer,
-    number,
     prepare_folder,
     progress_bar,
     terminated_like_interrupted,
@@ -86,38 +84,26 @@ def sequence(
             help="cameras.json, and images/CAMERA/FRAME.png or videos/CAMERA.mp4.", file_okay=False, exists=True
         ),
     ],
-    out: Annotated[
-        Path, typer.Option(help="The folder of the result; a run that was cut short goes on there.", file_okay=False)
-    ],
+    out: Annotated[Path, typer.Option(help="The result folder; a killed run goes on there.", file_okay=False)],
     *,
     model: Model = None,
-    fps: Annotated[
-        float | None, number("Frames a second, without times.csv; a video's own, or 25.", min=0.1, max=1000)
-    ] = None,
-    settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     data: Data = None,
-    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Track one head through a sequence of pictures or videos.
-
-    Writes pose and expression of every frame, an animated head and a preview."""
-    from pipeline.applications.moments.sequence_files import CHUNKS, FILES, make_sequence
+    """Track one head through pictures or videos."""
+    from pipeline.applications.moments.sequence_files import FILES, make_sequence
     from pipeline.settings import settings_from_document
     from server.cli.heads import head_alone
     from server.cli.reconstruct_local import check_apart
     from server.tasks.prepare import prepare_kernels
     from server.tasks.settings_file import settings_document
 
-    chosen = settings_from_document(head_alone(settings_document(settings, detail="photo")))
+    chosen = settings_from_document(head_alone(settings_document(None, detail="photo")))
     check_apart(out, folder)
-    warn_of_replacement(out / "report.json", overwrite)
     prepare_folder(out)
-    if overwrite:
-        shutil.rmtree(out / CHUNKS, ignore_errors=True)
     with progress_bar() as report, terminated_like_interrupted():
         prepare_kernels(report, chosen)
-        document = make_sequence(folder, out, model=model or "default", settings=chosen, fps=fps, report=report)
+        document = make_sequence(folder, out, model=model or "default", settings=chosen, report=report)
     for warning in document["warnings"]:
         warn(f"{warning['code']}: {warning['message']}")
     answer(document, json_out, [str(out / name) for name in FILES])

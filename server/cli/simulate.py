@@ -67,9 +67,7 @@ def simulate(
     gaze: Gaze = None,
     fault: Faults = None,
     board: BoardShots = False,
-    sequence: Annotated[
-        int | None, typer.Option(help="So many frames of a subject that moves and speaks, 25 a second.", min=2)
-    ] = None,
+    sequence: Annotated[int | None, typer.Option(help="Frames of a subject that moves and speaks.", min=2)] = None,
     serve: Served = False,
     port: Annotated[int, typer.Option(help="--serve: of the cameras; 0 takes a free one.", min=0, max=65535)] = 0,
     fps: Annotated[float, number("--serve: of the live views.", min=0.5, max=30)] = 4.0,

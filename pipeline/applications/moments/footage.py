@@ -111,9 +111,8 @@ class Footage:
         return rgb if camera.recorded is None else camera.recorded.undistort(rgb, k.matrix())
 
 
-def open_footage(folder: Path, fps: float | None = None) -> Footage:
-    """Finds the pictures of a sequence. ``fps``: frames a second where times.csv says nothing. Raises InputError that
-    names every fault."""
+def open_footage(folder: Path) -> Footage:
+    """Finds the pictures of a sequence. Raises InputError that names every fault."""
     folder = capture_root(folder)
     rig_file = find_rig_file(folder)
     if rig_file is None:
@@ -141,7 +140,7 @@ def open_footage(folder: Path, fps: float | None = None) -> Footage:
         faults.append(compose("sequence-too-short", count=len(frames)))
     if faults:
         raise InputError("sequence", faults)
-    rate = fps or next((each for each in rates if each > 0.0), FPS)
+    rate = next((each for each in rates if each > 0.0), FPS)
     times = _times(folder / TIMES, frames, rate)
     return Footage(folder, rig, work_rig(rig, TRACKED_PIXELS), frames, times, files, videos)
 

@@ -48,12 +48,10 @@ USED = 0.02  # largest weight of an expression that is left out of sequence.glb
 CLAY, LIGHT = np.array([198.0, 176.0, 158.0]), np.array([-0.35, 0.45, 0.82])  # colour; direction to it, camera's axes
 
 
-def make_sequence(
-    folder: Path, out: Path, *, model: str, settings: Settings, fps: float | None, report: Progress
-) -> dict[str, Any]:
+def make_sequence(folder: Path, out: Path, *, model: str, settings: Settings, report: Progress) -> dict[str, Any]:
     """Tracks the head of a sequence and writes the ``FILES`` into ``out``. Returns the content of report.json. Raises
     InputError for a wrong folder, what the identity's single jobs raise, UnknownModel or BadModel, and OSError."""
-    footage, head_model = open_footage(folder, fps), load_model(model)
+    footage, head_model = open_footage(folder), load_model(model)
     with Renderer.create() as renderer:
         person, course = track_sequence(footage, head_model, settings, out / CHUNKS, renderer=renderer, report=report)
     if course.failed.all():

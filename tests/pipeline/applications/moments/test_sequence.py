@@ -18,6 +18,7 @@ from pipeline.applications.moments.moving_subject import FPS, Person, simulate_s
 from pipeline.applications.moments.sequence_files import CHUNKS, FILES
 from pipeline.head_model.model import HeadModel
 from rig.errors import InputError
+from rig.formats.pictures.images import read_image
 from rig.formats.pictures.work_size import work_rig
 from rig.geometry import vector_from_rotation
 from rig.render.renderer import Renderer
@@ -33,7 +34,7 @@ CAMERAS = ["cam00", "cam01", "cam03", "cam04", "cam07"]
 def film(model: HeadModel, renderer: Renderer, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The film; its frame ``LOST`` has no pictures but one."""
     folder = tmp_path_factory.mktemp("film") / "anna"
-    person = Person(model, 0.8 * np.random.default_rng(4).standard_normal(len(model.modes)), 4)
+    person = Person(model, 0.8 * np.random.default_rng(4).standard_normal(len(model.modes)), 3)
     rig, preset = work_rig(default_layout().subset(CAMERAS), PIXELS), replace(CLEAN, noise=0.005, plates=2)
     simulate_sequence(folder, person, rig, preset, FRAMES, renderer=renderer, report=lambda stage, share: None)
     for name in CAMERAS[1:]:
@@ -121,7 +122,7 @@ def test_videos_are_read_from_any_frame(film: Path, tmp_path: Path) -> None:
             str(tmp_path / "videos" / f"{name}.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (320, 240)
         )
         for k in range(LOST):
-            film_of.write(cv2.imread(str(film / "images" / name / f"{k:05}.png")))
+            film_of.write(np.ascontiguousarray(read_image(film / "images" / name / f"{k:05}.png")[:, :, ::-1]))
         film_of.release()
     footage = open_footage(tmp_path)
     np.testing.assert_allclose(footage.times_s, np.arange(LOST) / 30.0)
