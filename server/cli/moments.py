@@ -114,11 +114,11 @@ def film_sequence(out: Path, frames: int, seed: int, preset: "Preset", json_out:
     import numpy as np
 
     from pipeline.applications.moments.footage import TRACKED_PIXELS
-    from pipeline.applications.moments.moving_subject import Person, simulate_sequence
     from pipeline.head_model.model import load_model
     from rig.formats.pictures.work_size import work_rig
     from rig.render.renderer import Renderer
     from rig.studio.scene.layout import default_layout
+    from server.tasks.moving_subject import Person, simulate_sequence
 
     model, studio = load_model(), work_rig(default_layout(), TRACKED_PIXELS)
     person = Person(model, np.random.default_rng((seed, 0)).standard_normal(len(model.modes)), seed)

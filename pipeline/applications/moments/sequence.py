@@ -198,8 +198,8 @@ def inputs_of(footage: Footage, model: HeadModel, settings: Settings) -> dict[st
     """Returns what a sequence's result follows from: its files by name, size and time, the model, and the settings."""
     digest, paths = hashlib.sha256(), sorted(path for path in footage.folder.rglob("*") if path.is_file())
     for path in paths:
-        told = path.stat()
-        digest.update(f"{path.relative_to(footage.folder).as_posix()} {told.st_size} {told.st_mtime_ns}\n".encode())
+        status = path.stat()
+        digest.update(f"{path.relative_to(footage.folder).as_posix()} {status.st_size} {status.st_mtime_ns}\n".encode())
     return {
         "files_sha256": digest.hexdigest(),
         "times_s": footage.times_s.tolist(),

@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.applications.moments.footage import TRACKED_PIXELS, Footage, open_footage
-from pipeline.applications.moments.moving_subject import Person, simulate_sequence
 from pipeline.applications.moments.sequence import Course, smoothed, track_sequence
 from pipeline.applications.moments.sequence_files import CHUNKS, FILES
 from pipeline.applications.moments.sequence_person import SequencePerson
@@ -35,6 +34,7 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.sensor.preset import PRESET
 from server.cli.verify import head_alone
 from server.processes import python_command, python_environment
+from server.tasks.moving_subject import Person, simulate_sequence
 from server.tasks.settings_file import settings_document
 from tests.laboratory.experiments.records import Bench, Outcome
 

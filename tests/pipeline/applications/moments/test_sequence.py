@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 from pipeline.applications.moments import sequence, sequence_person
 from pipeline.applications.moments.footage import open_footage
-from pipeline.applications.moments.moving_subject import FPS, Person, simulate_sequence
 from pipeline.applications.moments.sequence_files import CHUNKS, FILES
 from pipeline.head_model.model import HeadModel
 from rig.errors import InputError
@@ -25,6 +24,7 @@ from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.sensor.preset import CLEAN
 from server.cli.main import app
+from server.tasks.moving_subject import FPS, Person, simulate_sequence
 
 FRAMES, LOST, PIXELS = 7, 4, 320 * 240
 CAMERAS = ["cam00", "cam01", "cam03", "cam04", "cam07"]
