@@ -147,3 +147,19 @@ def test_what_is_wrong_with_a_folder_is_said(film: Path, tmp_path: Path) -> None
     (tmp_path / "times.csv").write_text("frame,time_s\n00000,0.0\n")
     with pytest.raises(InputError, match=r"times\.csv"):
         open_footage(tmp_path)
+
+
+def test_the_studio_films_a_subject(tmp_path: Path, model: HeadModel) -> None:
+    out = tmp_path / "film"
+    result = CliRunner().invoke(app, ["simulate", str(out), "--sequence", "2", "--seed", "3", "--json"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout) == {"sequence": str(out), "truth": str(tmp_path / "film.truth")}
+    footage = open_footage(out)
+    assert footage.frames == ("00000", "00001")
+    assert len(footage.rig) == len(list((out / "background").iterdir())) == 11
+    assert {image.shape for image in next(footage.read()).values()} == {(480, 640, 3)}
+    with np.load(tmp_path / "film.truth" / "truth.npz") as truth:
+        moved = np.linalg.norm(truth["vertices"][1] - truth["vertices"][0], axis=1)
+        face = truth["face"]
+    assert face.shape == moved.shape == (model.levels["full"].count,)
+    assert 0.1 < moved[face].mean() < 5.0  # talk, at 25 frames a second
