@@ -34,6 +34,7 @@ from rig.geometry import RigidTransform, rigid_fit, rotation_from_vector, vector
 from rig.progress import Progress
 from rig.render.renderer import Renderer
 
+INPUTS = "inputs.json"
 CHUNK = 25  # frames that are kept together
 MIN_VIEWS = 2
 MIN_ALIKE = 0.5  # correlation of a frame's texture with the reference: .8 to .97 on drawn heads, .1 where it is lost
@@ -120,11 +121,11 @@ def track_sequence(
 ) -> tuple[SequencePerson, Course]:
     """Tracks a head through all frames. ``kept`` is the folder of what an earlier run has found. Returns the person and
     the courses as measured. Raises what ``find_person`` raises."""
-    said = inputs_of(footage, model, settings)
-    if not (kept / "inputs.json").is_file() or json.loads((kept / "inputs.json").read_text()) != said:
+    inputs = json.dumps(inputs_of(footage, model, settings)).encode()
+    if not (kept / INPUTS).is_file() or (kept / INPUTS).read_bytes() != inputs:
         for path in kept.glob("*.npz"):
             path.unlink()
-        write_atomically(kept / "inputs.json", json.dumps(said).encode())
+        write_atomically(kept / INPUTS, inputs)
     person = _kept_person(kept / "person.npz", footage, model)
     if person is None:
         person = find_person(footage, model, settings, renderer, lambda done: report("identity", SHARE * done))
@@ -149,8 +150,7 @@ def _track_chunk(tracker: Tracker, footage: Footage, frames: range, before: Cour
     found, pictures = list[Tracked | None](), footage.read(frames.start)
     for number in frames:
         report(f"frame {number + 1} of {count}", SHARE + (1.0 - SHARE) * number / count)
-        steady = not found or found[-1] is None
-        tracked = tracker.track(next(pictures), last[-1] if steady and before is None else moved_on(last))
+        tracked = tracker.track(next(pictures), moved_on(last))
         found.append(tracked)
         if tracked is not None:
             last = [*last[-1:], tracked.motion]

@@ -109,7 +109,10 @@ def test_a_run_that_was_cut_short_goes_on_to_the_same_bytes(
     for path in sorted((out / CHUNKS).glob("0*.npz"))[1:]:
         path.unlink()
     (out / CHUNKS / ".0000003.npz.x.part").write_bytes(b"half of it")
+    kept = {path.name: path.stat().st_mtime_ns for path in (out / CHUNKS).glob("*.npz")}
+    assert len(kept) == 2
     run(film, out)
+    assert {name: (out / CHUNKS / name).stat().st_mtime_ns for name in kept} == kept  # they were not made anew
     for name in FILES:
         assert (out / name).read_bytes() == (done[0] / name).read_bytes(), name
 
