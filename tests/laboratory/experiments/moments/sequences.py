@@ -182,7 +182,7 @@ def killed_figures(folder: Path, bench: Bench) -> dict[str, float]:
     whole_s, kills = time.monotonic() - begun, 0
     while kills < KILLS and not (outs[1] / "report.json").is_file():
         bench.report("kills", kills / KILLS)
-        kills += run(folder, outs[1], outs[0] / CHUNKS, drawn.uniform(0.1, 0.3) * whole_s)
+        kills += run(folder, outs[1], outs[0] / CHUNKS, drawn.uniform(0.08, 0.2) * whole_s)
     run(folder, outs[1], outs[0] / CHUNKS, None)
     equal = [(outs[0] / name).read_bytes() == (outs[1] / name).read_bytes() for name in FILES]
     with np.load(outs[1] / "sequence.npz") as arrays:
