@@ -32,7 +32,7 @@ from rig.formats.pictures.work_size import work_rig
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.sensor.preset import PRESET
-from server.cli.verify import head_alone
+from server.cli.heads import head_alone
 from server.processes import python_command, python_environment
 from server.tasks.moving_subject import Person, simulate_sequence
 from server.tasks.settings_file import settings_document
