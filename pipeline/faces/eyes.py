@@ -48,7 +48,7 @@ def eye_openings(face: MatchedFaces, rig: Rig) -> dict[str, float]:
     openings: dict[str, float] = {}
     for side, rows in LIDS.items():
         views = [
-            _opening(lids[rows], facing[name])
+            opening_of(lids[rows], facing[name])
             for name in frontal
             if (lids := face.detections[name].lids_px) is not None
         ]
@@ -70,7 +70,7 @@ def eye_warnings(closed: Collection[str]) -> list[Message]:
     return [compose("eyes-closed", eyes=compose("both-eyes-are") if both else compose("one-eye-is", side=min(closed)))]
 
 
-def _opening(lids_px: Float[np.ndarray, "16 2"], direction: Float[np.ndarray, " 3"]) -> float:
+def opening_of(lids_px: Float[np.ndarray, "16 2"], direction: Float[np.ndarray, " 3"]) -> float:
     """Returns the gap's height over the length between the eye's corners, as if seen from the front."""
     across = lids_px[INNER] - lids_px[0]
     length = float(np.linalg.norm(across))

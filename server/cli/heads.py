@@ -1,10 +1,8 @@
-"""Implements the commands that make and judge heads: reconstruct, take, check, verify, demo."""
+"""Implements the commands that make and judge heads: reconstruct, check, verify, demo."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from datetime import date
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -24,12 +22,10 @@ from server.cli.answers import (
     model_names,
     number,
     prepare_file,
-    prepare_folder,
     progress_bar,
     switch,
     warn,
     warn_of_replacement,
-    wrong_usage,
 )
 
 if TYPE_CHECKING:
@@ -179,54 +175,6 @@ def reconstruct(
     names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # in the order of looking at them
     files = [out / name for name in names if (out / name).is_file()]
     answer(written, json_out, [*(str(path) for path in files), *flame_lines(written, out)])
-
-
-@app.command(epilog="Example: eigenhead take shots/anna-calm shots/anna-smile shots/anna-open --out takes/anna")
-def take(
-    captures: Annotated[
-        list[Path], typer.Argument(help="Two or more captures of one person, in different expressions.", exists=True)
-    ],
-    out: Annotated[Path, typer.Option(help="The folder of the take.", file_okay=False)],
-    *,
-    model: Model = None,
-    detail: Detail = None,
-    settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
-    data: Data = None,
-    overwrite: Overwrite = False,
-    json_out: Json = False,
-) -> None:
-    """Solve several captures of one person as one.
-
-    Writes the neutral head with the person's own shapes, and the head of each capture."""
-    from pipeline.applications.moments.take import check_count, named
-    from pipeline.applications.moments.take_files import Shot, make_take, warning_lines
-    from pipeline.settings import settings_from_document
-    from server.cli.reconstruct_local import check_apart
-    from server.tasks.photographs import keep_masks, read_or_calibrate
-    from server.tasks.prepare import prepare_kernels
-    from server.tasks.reconstruct_folder import folder_of
-    from server.tasks.settings_file import settings_document
-
-    with wrong_usage("CAPTURES"):
-        names = capture_names(captures)
-        check_count(len(names))
-    chosen = settings_from_document(head_alone(settings_document(settings, detail=detail)))
-    for capture in captures:
-        check_apart(out, capture)
-    warn_of_replacement(out / "report.json", overwrite)
-    prepare_folder(out)
-    with progress_bar() as report, ExitStack() as stack:
-        prepare_kernels(report, chosen)
-        shots = {}
-        for name, capture in zip(names, captures, strict=True):
-            with named(name):
-                kept, folder = out / "moments" / name, stack.enter_context(folder_of(capture))
-                found = read_or_calibrate(folder, kept, front=chosen.front, report=report)
-            shots[name] = Shot(found.capture, found.rig, partial(keep_masks, kept))
-        document = make_take(out, shots, model=model or "default", settings=chosen, report=report)
-    for line in warning_lines(document):
-        warn(line)
-    answer(document, json_out, [str(out / name) for name in ("neutral.ply", "neutral.glb", "moments")])
 
 
 @app.command(epilog="Example: eigenhead check shots/anna.tar.gz --json")

@@ -10,11 +10,11 @@ import typer
 from typer.core import TyperGroup, TyperOption
 
 from rig.errors import EigenheadError
-from server.cli import batch, cameras, clinic, export, heads, models, rig, service, simulate, templates
+from server.cli import batch, cameras, clinic, export, heads, models, moments, rig, service, simulate, templates
 from server.cli.answers import QUIET, fail, use_threads
 
 ROOMS = {  # page below docs/commands: its title, and its commands in the order of a day's work
-    "heads": ("Heads", ("reconstruct", "take", "batch", "check", "export")),
+    "heads": ("Heads", ("reconstruct", "take", "sequence", "batch", "check", "export")),
     "clinic": ("Clinic", ("compare", "register", "measure")),
     "trials": ("Trials", ("simulate", "demo", "verify")),
     "cameras": ("Cameras", ("board", "calibrate", "refine", "convert")),
@@ -65,7 +65,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # importing rich's markdown alone takes half a second
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for room in (service, heads, simulate, batch, export, clinic, templates, cameras):
+for room in (service, heads, moments, simulate, batch, export, clinic, templates, cameras):
     app.add_typer(room.app)
 groups = {"keys": service.keys_app, "rig": rig.rig_app, "model": models.model_app, "template": templates.template_app}
 for name, group in groups.items():

@@ -9,6 +9,7 @@ import typer
 
 from rig.studio.sensor.faults import KINDS
 from server.cli.answers import Json, Overwrite, Overwrites, answer, number, prepare_file, progress_bar, wrong_usage
+from server.cli.moments import film_sequence
 
 if TYPE_CHECKING:
     from rig.studio.sensor.preset import Preset
@@ -35,6 +36,11 @@ Faults = Annotated[
     list[str] | None, typer.Option(help=f"KIND[:CAMERA][=AMOUNT]; may be repeated. Kinds: {', '.join(KINDS)}.")
 ]
 BoardShots = Annotated[bool, typer.Option("--board", help="OUT/CAMERA/SHOT.png of the default board, and board.toml.")]
+Realism = Annotated[
+    str | None,
+    typer.Option(help="NAME[,NAME] of what real photographs have: smooth, oily, scattering, mosaic, jpeg; or all."),
+]
+Frames = Annotated[int | None, typer.Option(help="Frames of a subject that moves and speaks.", min=2)]
 Served = Annotated[
     bool, typer.Option("--serve", help="Keep the studio running as cameras and a trigger box, until Ctrl-C.")
 ]
@@ -57,16 +63,14 @@ def simulate(
     defocus: Annotated[float | None, number("Blur, pixels.", min=0)] = None,
     rolling_ms: Annotated[float | None, number("Readout of a rolling shutter.", min=0, max=200)] = None,
     hair: HairNames = None,
-    realism: Annotated[
-        str | None,
-        typer.Option(help="NAME[,NAME] of what real photographs have: smooth, oily, scattering, mosaic, jpeg; or all."),
-    ] = None,
+    realism: Realism = None,
     no_hair: Annotated[bool, typer.Option("--no-hair", help="Neither hair nor beard.")] = False,
     polarised: Annotated[bool, typer.Option("--polarised", help="Also the texture sets cross and parallel.")] = False,
     expression: Expressions = None,
     gaze: Gaze = None,
     fault: Faults = None,
     board: BoardShots = False,
+    sequence: Frames = None,
     serve: Served = False,
     port: Annotated[int, typer.Option(help="--serve: of the cameras; 0 takes a free one.", min=0, max=65535)] = 0,
     fps: Annotated[float, number("--serve: of the live views.", min=0.5, max=30)] = 4.0,
@@ -96,6 +100,8 @@ def simulate(
         return
     _check_planted(fault or [], expression or [])
     _make_way(out, overwrite)
+    if sequence:
+        return film_sequence(out, sequence, seed, preset, json_out)
     from rig.render.renderer import Renderer
     from server.tasks.subjects import simulate_folder
 

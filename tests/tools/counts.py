@@ -22,8 +22,8 @@ SOLVERS = ("solve", "lstsq", "lsq_linear", "cho_solve", "solveh_banded", "spsolv
 DEFINITION = re.compile(r"^ *(?:async )?def ", re.MULTILINE)
 SOLVER_ROOMS = ("pipeline.estimation.", "pipeline.geometry.registration")
 MOMENTS = (
-    *("pipeline.applications.moments", "server.services.live", "tests.laboratory.experiments.moments"),
-    *("tests.pipeline.applications.moments", "tests.server.services.live"),
+    *("pipeline.applications.moments", "server.cli.moments", "server.services.live", "server.tasks.moving_subject"),
+    *("tests.laboratory.experiments.moments", "tests.pipeline.applications.moments", "tests.server.services.live"),
 )  # new ground, counted apart: what the ceilings hold has none of it
 PARTS = ("product", "tests", "tests.laboratory")
 

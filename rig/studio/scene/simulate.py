@@ -191,7 +191,7 @@ def build_scene(
     """Dresses, lights and renders the subject, and draws the backdrops. The same state of ``rng`` gives the same skin,
     hair and backdrops also for another pose or other ``lamps``."""
     look_rng, pose_rng, dress_rng, set_rng = rng.spawn(4)
-    look = _worn(look or random_look(look_rng), preset, faults)
+    look = worn_look(look or random_look(look_rng), preset, faults)
     pose = world_from_head or random_pose(rig.centre_world(), preset.pose_spread_deg, preset.pose_spread_mm, pose_rng)
     dressed = dress(renderer, subject, look, pose, clothes=preset.clothes, rng=dress_rng, lamps=lamps)
     true_rig = Rig(tuple(_knocked(camera, faults, set_rng) for camera in rig))
@@ -208,7 +208,7 @@ def build_scene(
     coarse = true_rig.scaled(0.5)  # enough to tell what hides what
     depth = renderer.depth(coarse, *dressed.solid)
     marks = {name: pose.apply(point[None])[0] for name, point in subject.landmarks.items()}
-    views = _views(true_rig, light, preset, faults, set_rng)
+    views = view_cameras(true_rig, light, preset, faults, set_rng)
     views = {name: replace(view, matt=matt.get(name)) for name, view in views.items()}
     masks = {name: view.mask for name, view in views.items()}
     return Scene(
@@ -300,7 +300,8 @@ def _settled(fault: Fault, rig: Rig, rng: np.random.Generator) -> Fault:
     return replace(fault, camera=drawn) if alone and fault.camera is None else fault
 
 
-def _worn(look: Look, preset: Preset, faults: Sequence[Fault]) -> Look:
+def worn_look(look: Look, preset: Preset, faults: Sequence[Fault]) -> Look:
+    """Returns a look with what the preset and the faults change of it."""
     look = replace(restyled(look, preset.hairstyle), pores=preset.pores, oil=preset.oil)
     look = replace(look, scattering_mm=preset.scattering_mm)
     if not preset.hair:
@@ -336,13 +337,14 @@ def _rolling(
     return {name: rolled(light[name], shifts[name]) for name in light}
 
 
-def _views(
+def view_cameras(
     rig: Rig,
     light: Mapping[str, Float[np.ndarray, "h w 4"]],
     preset: Preset,
     faults: Sequence[Fault],
     rng: np.random.Generator,
 ) -> dict[str, View]:
+    """Draws the backdrops and sensors of all cameras, around the subject's ``light``."""
     colour = CAMOUFLAGE if any(fault.kind == "camouflage" for fault in faults) else None
 
     def one(camera: Camera, camera_rng: np.random.Generator) -> View:

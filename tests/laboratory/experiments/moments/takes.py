@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -35,6 +36,7 @@ from rig.studio.scene.simulate import simulate
 from rig.studio.scene.subject import Subject, random_look
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
+from tests.laboratory.experiments.moments.sequences import sequences
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.drawn_expressions import drawn_weights
 
@@ -53,12 +55,18 @@ def moments(
     subjects: int = SUBJECTS,
     moments: int = MOMENTS,
     cameras: Sequence[int] = (3, 11),
+    sequence: int = 0,
+    folder: Path | None,
+    scratch: Path,
 ) -> Outcome:
     """Runs this module's experiment. Returns figures named ``<cameras>_<who>_<quantity>``, ``<cameras>_gain`` (1 minus
     the joint error by the single one) and ``<cameras>_weights_...``, over all subjects of both models.
 
-    ``subjects``: of each model. ``moments``: of each subject. ``cameras``: how many there are.
+    ``subjects``: of each model. ``moments``: of each subject. ``cameras``: how many there are. ``sequence``: frames of
+    a film, which is measured instead (``sequences``); films are kept in the folder of ``--out``.
     """
+    if sequence:
+        return sequences(models["default"], renderer, bench, folder or scratch, sequence)
     settings = replace(Settings(), detail="photo", outputs=OutputSettings(surface="head"))
     code = (*CONTOUR, arrow, joint_fit, refine, depth_search)
     rows: list[Row] = []

@@ -1,0 +1,258 @@
+"""Tracks a head through a sequence: one identity, and the pose and expression of every frame.
+
+The identity follows from the sharpest frames of the first second (``sequence_person``). Then each frame is fitted from
+the last one's state, moved on as the head moved before (``track_frame``). A head that is lost is searched anew; where
+that fails, too, the frame has failed and is interpolated. At last all courses are smoothed (``smoothing``).
+
+What is found is kept in chunks, each written under a temporary name first. A run that was killed goes on after the last
+whole chunk, from its very numbers, and so finds the same.
+"""
+
+import hashlib
+import io
+import json
+from dataclasses import dataclass, fields, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.applications.moments.appearance import REDUCED, Levels, Samples, observe, spread
+from pipeline.applications.moments.face_evidence import FaceReference, landmarks_of, refer, sight, terms_of
+from pipeline.applications.moments.footage import Footage, Pictures
+from pipeline.applications.moments.sequence_person import Motion, SequencePerson, find_person
+from pipeline.applications.moments.smoothing import smooth
+from pipeline.applications.moments.track_frame import POSE, Tracked, fit_frame
+from pipeline.faces.networks import FaceNetworks, load_networks
+from pipeline.faces.subject import find_subject
+from pipeline.head_model.model import HeadModel
+from pipeline.settings import Settings, document_from_settings
+from rig.atomic_write import write_atomically
+from rig.geometry import RigidTransform, rigid_fit, rotation_from_vector, vector_from_rotation
+from rig.progress import Progress
+from rig.render.renderer import Renderer
+
+INPUTS = "inputs.json"
+CHUNK = 25  # frames that are kept together
+MIN_VIEWS = 2
+MIN_ALIKE = 0.5  # correlation of a frame's texture with the reference: .8 to .97 on drawn heads, .1 where it is lost
+ROUNDS = 1  # of fits of the first frames
+KEPT = 0.5  # with all of it, an error along what pictures tell least grew from frame to frame
+SHARE = 0.1  # of the work, that finds the person
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Course:
+    """Holds what was found frame by frame: weights of the model's expressions, pose (world_from_head), deviations of
+    rotation (rad), translation (mm) and weights, the correlation of the texture, and which frames have failed."""
+
+    weights: Float[np.ndarray, "t e"]
+    rotations: Float[np.ndarray, "t 3 3"]
+    translations: Float[np.ndarray, "t 3"]
+    deviations: Float[np.ndarray, "t p"]
+    alike: Float[np.ndarray, " t"]
+    failed: Bool[np.ndarray, " t"]
+
+    def __len__(self) -> int:
+        return len(self.failed)
+
+    def motion(self, frame: int) -> Motion:
+        """Returns what the head does at a frame."""
+        return Motion(RigidTransform(self.rotations[frame], self.translations[frame]), self.weights[frame])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracker:
+    """Holds everything that stays the same from frame to frame."""
+
+    person: SequencePerson
+    samples: Samples
+    levels: Levels
+    reference: FaceReference
+    networks: FaceNetworks
+
+    def track(self, pictures: Pictures, start: Motion) -> Tracked | None:
+        """Fits one frame. Returns None where the head is not found."""
+        if len(pictures) < MIN_VIEWS:
+            return None
+        found = self.fit(pictures, start)
+        if found.alike >= MIN_ALIKE:
+            return found
+        again = self._searched(pictures, start)
+        found = None if again is None else self.fit(pictures, again)
+        return found if found is not None and found.alike >= MIN_ALIKE else None
+
+    def fit(self, pictures: Pictures, start: Motion) -> Tracked:
+        """Fits one frame from a motion that is near."""
+        found = sight(self.person, self.networks, pictures, start)
+        terms = terms_of(self.reference, self.person.rig, found)
+        return fit_frame(self.person, self.samples, self.levels, pictures, start, terms)
+
+    def _searched(self, pictures: Pictures, start: Motion) -> Motion | None:
+        matched = find_subject(pictures, self.person.rig, self.networks).matched
+        if matched is None:
+            return None
+        head = landmarks_of(self.person, start.weights)
+        return replace(start, world_from_head=rigid_fit(head, matched.points_world))
+
+
+def make_tracker(footage: Footage, person: SequencePerson) -> Tracker:
+    """Learns what the person looks like in the frames by which it was found."""
+    networks, samples = load_networks(), spread(person)
+    shown = [(next(footage.read(key)), motion) for key, motion in zip(person.keys, person.motions, strict=True)]
+    tracker = _learn(person, samples, networks, shown)
+    for _ in range(ROUNDS):  # the frames agree on the skin once each is fitted to all of them
+        shown = [(pictures, tracker.fit(pictures, motion).motion) for pictures, motion in shown]
+        tracker = _learn(person, samples, networks, shown)
+    return tracker
+
+
+def _learn(
+    person: SequencePerson, samples: Samples, networks: FaceNetworks, shown: list[tuple[Pictures, Motion]]
+) -> Tracker:
+    levels = {reduced: observe(person, samples, shown, reduced) for reduced in REDUCED}
+    return Tracker(person, samples, levels, refer(person, networks, shown), networks)
+
+
+def track_sequence(
+    footage: Footage, model: HeadModel, settings: Settings, kept: Path, *, renderer: Renderer, report: Progress
+) -> tuple[SequencePerson, Course]:
+    """Tracks a head through all frames. ``kept`` is the folder of what an earlier run has found. Returns the person and
+    the courses as measured. Raises what ``find_person`` raises."""
+    inputs = json.dumps(inputs_of(footage, model, settings)).encode()
+    if not (kept / INPUTS).is_file() or (kept / INPUTS).read_bytes() != inputs:
+        for path in kept.glob("*.npz"):
+            path.unlink()
+        write_atomically(kept / INPUTS, inputs)
+    person = _kept_person(kept / "person.npz", footage, model)
+    if person is None:
+        person = find_person(footage, model, settings, renderer, lambda done: report("identity", SHARE * done))
+        _keep_person(kept / "person.npz", person)
+    count, parts, tracker = len(footage.frames), list[Course](), None
+    for first in range(0, count, CHUNK):
+        path = kept / f"{first:07}.npz"
+        if not path.is_file():
+            tracker = tracker or make_tracker(footage, person)
+            frames = range(first, min(first + CHUNK, count))
+            _keep(path, _track_chunk(tracker, footage, frames, parts[-1] if parts else None, report))
+        parts.append(_read_kept(path))
+    joined = Course(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Course)))
+    return person, joined
+
+
+def _track_chunk(tracker: Tracker, footage: Footage, frames: range, before: Course | None, report: Progress) -> Course:
+    """Tracks the frames of a chunk, from the last two motions of the one before."""
+    person, count = tracker.person, len(footage.frames)
+    last = [before.motion(k) for k in np.flatnonzero(~before.failed)[-2:]] if before is not None else []
+    last = last or [person.motions[0]]
+    found, pictures = list[Tracked | None](), footage.read(frames.start)
+    for number in frames:
+        report(f"frame {number + 1} of {count}", SHARE + (1.0 - SHARE) * number / count)
+        tracked = tracker.track(next(pictures), moved_on(last))
+        found.append(tracked)
+        if tracked is not None:
+            last = [*last[-1:], tracked.motion]
+    lost = Tracked(last[0], np.full(POSE + len(last[0].weights), np.inf), 0.0)
+    whole = [lost if each is None else each for each in found]
+    return Course(
+        np.stack([each.motion.weights for each in whole]),
+        np.stack([each.motion.world_from_head.rotation for each in whole]),
+        np.stack([each.motion.world_from_head.translation for each in whole]),
+        np.stack([each.deviation for each in whole]),
+        np.array([each.alike for each in whole]),
+        np.array([each is None for each in found]),
+    )
+
+
+def moved_on(last: list[Motion]) -> Motion:
+    """Returns the motion after the last two, if the head keeps a ``KEPT`` share of its speed."""
+    if len(last) < 2:
+        return last[-1]
+    before, now = (each.world_from_head for each in last)
+    turn = rotation_from_vector(KEPT * vector_from_rotation(now.rotation @ before.rotation.T))
+    shift = now.translation + KEPT * (now.translation - before.translation)
+    return replace(last[-1], world_from_head=RigidTransform(turn @ now.rotation, shift))
+
+
+def smoothed(course: Course) -> Course:
+    """Returns the courses smoothed, with a pose and deviations for failed frames, too."""
+    if course.failed.all():
+        return course
+    middle = course.rotations[np.flatnonzero(~course.failed)[0]]
+    turns = np.stack([vector_from_rotation(each @ middle.T) for each in course.rotations])
+    measured = np.concatenate([turns, course.translations, course.weights], axis=1)
+    alone = [np.array([row]) for row in range(POSE, measured.shape[1])]
+    found, spread_of = smooth(measured, course.deviations, course.failed, [np.arange(3), np.arange(3, POSE), *alone])
+    return replace(
+        course,
+        weights=np.clip(found[:, POSE:], 0.0, 1.0),
+        rotations=rotation_from_vector(found[:, :3]) @ middle,
+        translations=found[:, 3:POSE],
+        deviations=spread_of,
+    )
+
+
+def inputs_of(footage: Footage, model: HeadModel, settings: Settings) -> dict[str, Any]:
+    """Returns what a sequence's result follows from: its files by name, size and time, the model, and the settings."""
+    digest, paths = hashlib.sha256(), sorted(path for path in footage.folder.rglob("*") if path.is_file())
+    for path in paths:
+        status = path.stat()
+        digest.update(f"{path.relative_to(footage.folder).as_posix()} {status.st_size} {status.st_mtime_ns}\n".encode())
+    return {
+        "files_sha256": digest.hexdigest(),
+        "times_s": footage.times_s.tolist(),
+        "model_sha256": model.sha256,
+        "settings": document_from_settings(settings),
+        "version": version("eigenhead"),
+    }
+
+
+def _keep(path: Path, course: Course) -> None:
+    write_arrays(path, **{each.name: getattr(course, each.name) for each in fields(Course)})
+
+
+def _read_kept(path: Path) -> Course:
+    with np.load(path, allow_pickle=False) as arrays:
+        return Course(*(arrays[each.name] for each in fields(Course)))
+
+
+def _keep_person(path: Path, person: SequencePerson) -> None:
+    poses = [each.world_from_head for each in person.motions]
+    write_arrays(
+        path,
+        names=np.array(person.names),
+        neutral=person.neutral,
+        shapes=person.shapes,
+        keys=np.array(person.keys),
+        weights=np.stack([each.weights for each in person.motions]),
+        rotations=np.stack([each.rotation for each in poses]),
+        translations=np.stack([each.translation for each in poses]),
+        camera_rotations=np.stack([each.camera_from_world.rotation for each in person.rig]),
+        camera_translations=np.stack([each.camera_from_world.translation for each in person.rig]),
+    )
+
+
+def _kept_person(path: Path, footage: Footage, model: HeadModel) -> SequencePerson | None:
+    if not path.is_file():
+        return None
+    with np.load(path, allow_pickle=False) as arrays:
+        a = dict(arrays)
+    placed = [RigidTransform(*pose) for pose in zip(a["camera_rotations"], a["camera_translations"], strict=True)]
+    cameras = [replace(camera, camera_from_world=pose) for camera, pose in zip(footage.work, placed, strict=True)]
+    motions = [
+        Motion(RigidTransform(rotation, shift), weights)
+        for rotation, shift, weights in zip(a["rotations"], a["translations"], a["weights"], strict=True)
+    ]
+    rig = replace(footage.work, cameras=tuple(cameras))
+    return SequencePerson(
+        model, tuple(map(str, a["names"])), a["neutral"], a["shapes"], rig, tuple(map(int, a["keys"])), tuple(motions)
+    )
+
+
+def write_arrays(path: Path, **arrays: Any) -> None:
+    """Writes arrays as .npz, under a temporary name first. Equal arrays give equal bytes."""
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    write_atomically(path, buffer.getvalue())

@@ -1,0 +1,144 @@
+"""Makes a sequence from its folder, and writes it.
+
+sequence.npz    frames (t), times_s, expressions (e), weights and weight_deviations (t e), rotations (t 3 3),
+                translations (t 3, mm; world_from_head), pose_deviations (t 6: rad, mm), alike (t: correlation of the
+                skin's texture), failed (t); all smoothed
+person.npz      names (e), neutral (v 3, head frame, mm), shapes (e v 3, mm at weight 1), the corrected cameras; the
+                head of a frame is rotation (neutral + sum of weights times shapes) + translation
+sequence.glb    the head, animated: its expressions as morph targets, its pose relative to the first frame
+preview.mp4     the front camera's pictures beside the head in clay
+report.json     what was found, written last
+.chunks/        what a run that was killed goes on from
+"""
+
+import json
+import shutil
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.applications.moments.animated_glb import animated
+from pipeline.applications.moments.footage import Footage, open_footage
+from pipeline.applications.moments.sequence import Course, smoothed, track_sequence, write_arrays
+from pipeline.applications.moments.sequence_person import Motion, SequencePerson
+from pipeline.applications.moments.track_frame import POSE
+from pipeline.geometry.raster import picture
+from pipeline.head_model.expressions import plain_name
+from pipeline.head_model.model import load_model
+from pipeline.settings import Settings
+from rig.atomic_write import write_atomically
+from rig.camera import Camera
+from rig.errors import EigenheadError
+from rig.formats.meshes.glb import scene_glb_bytes
+from rig.formats.meshes.scene import Part, Scene
+from rig.geometry import RigidTransform
+from rig.mesh import Mesh, vertex_normals
+from rig.messages.message import Message, compose, documents_of
+from rig.progress import Progress
+from rig.render.renderer import Renderer
+
+FORMAT = "eigenhead-sequence/1"
+FILES = ("sequence.npz", "person.npz", "sequence.glb", "preview.mp4", "report.json")
+CHUNKS = ".chunks"
+USED = 0.02  # largest weight of an expression that is left out of sequence.glb
+CLAY, LIGHT = np.array([198.0, 176.0, 158.0]), np.array([-0.35, 0.45, 0.82])  # colour; direction to it, camera's axes
+
+
+def make_sequence(folder: Path, out: Path, *, model: str, settings: Settings, report: Progress) -> dict[str, Any]:
+    """Tracks the head of a sequence and writes the ``FILES`` into ``out``. Returns the content of report.json. Raises
+    InputError for a wrong folder, what the identity's single jobs raise, UnknownModel or BadModel, and OSError."""
+    footage, head_model = open_footage(folder), load_model(model)
+    with Renderer.create() as renderer:
+        person, course = track_sequence(footage, head_model, settings, out / CHUNKS, renderer=renderer, report=report)
+    if course.failed.all():
+        raise EigenheadError(compose("sequence-without-face"))
+    found = smoothed(course)
+    write_arrays(
+        out / "sequence.npz",
+        frames=np.array(footage.frames),
+        times_s=footage.times_s,
+        expressions=np.array([plain_name(name) for name in person.names]),
+        weights=found.weights,
+        weight_deviations=found.deviations[:, POSE:],
+        rotations=found.rotations,
+        translations=found.translations,
+        pose_deviations=found.deviations[:, :POSE],
+        alike=found.alike,
+        failed=found.failed,
+    )
+    shutil.copyfile(out / CHUNKS / "person.npz", out / "person.npz")
+    write_atomically(out / "sequence.glb", animation_of(person, footage, found))
+    write_preview(out / "preview.mp4", person, footage, found, report)
+    document = document_of(person, footage, found)
+    write_atomically(out / "report.json", json.dumps(document, indent=1, allow_nan=False).encode())
+    return document
+
+
+def document_of(person: SequencePerson, footage: Footage, course: Course) -> dict[str, Any]:
+    """Returns the content of a sequence's report.json."""
+    failed = [frame for frame, lost in zip(footage.frames, course.failed, strict=True) if lost]
+    warnings = list[Message]()
+    if failed:
+        warnings.append(compose("sequence-frames-failed", count=len(failed), all=len(course), frames=failed[:10]))
+    turn, shift = (np.median(course.deviations[:, rows], axis=0) for rows in (slice(3), slice(3, POSE)))
+    return {
+        "format": FORMAT,
+        "version": version("eigenhead"),
+        "model": {"name": person.model.name, "sha256": person.model.sha256},
+        "frames": len(course),
+        "duration_s": float(footage.times_s[-1] - footage.times_s[0]),
+        "cameras": list(footage.rig.names),
+        "identity_frames": [footage.frames[key] for key in person.keys],
+        "failed": failed,
+        "deviation": {"rotation_deg": np.degrees(turn).tolist(), "translation_mm": shift.tolist()},
+        "alike": {"median": float(np.median(course.alike)), "least": float(course.alike[~course.failed].min())},
+        "warnings": documents_of(warnings),
+    }
+
+
+def animation_of(person: SequencePerson, footage: Footage, course: Course) -> bytes:
+    """Returns sequence.glb."""
+    used = np.flatnonzero(course.weights.max(axis=0) > USED)
+    faces = person.model.levels["full"].faces
+    shapes = {plain_name(person.names[row]): person.shapes[row].astype(float) for row in used}
+    extras = {"unit": "m", "frame": "head", "model": {"name": person.model.name, "sha256": person.model.sha256}}
+    still = scene_glb_bytes(Scene([Part("head", Mesh(person.neutral, faces), None, None, shapes)]), extras)
+    first = RigidTransform(course.rotations[0], course.translations[0]).inverse()
+    poses = [first @ RigidTransform(*pose) for pose in zip(course.rotations, course.translations, strict=True)]
+    return animated(still, footage.times_s - footage.times_s[0], course.weights[:, used], poses)
+
+
+def write_preview(path: Path, person: SequencePerson, footage: Footage, course: Course, report: Progress) -> None:
+    """Writes preview.mp4, under a temporary name first."""
+    name, scratch = person.rig.front_camera(), path.with_name(f".{path.name}.part.mp4")
+    camera, count = person.rig[name], len(course)
+    size = 2 * camera.intrinsics.width, camera.intrinsics.height
+    rate = (count - 1) / max(float(footage.times_s[-1] - footage.times_s[0]), 1e-6)
+    film = cv2.VideoWriter(str(scratch), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+    try:
+        for number, pictures in enumerate(footage.read(cameras=(name,))):
+            report("preview", number / count)
+            clay = draw_clay(person, camera, course.motion(number))
+            photo = pictures.get(name, np.zeros_like(clay))
+            film.write(np.ascontiguousarray(np.concatenate([photo, clay], axis=1)[:, :, ::-1]))
+    finally:
+        film.release()
+    scratch.replace(path)
+
+
+def draw_clay(person: SequencePerson, camera: Camera, motion: Motion) -> UInt8[np.ndarray, "h w 3"]:
+    """Draws the head of a frame in clay, as a camera sees it."""
+    faces = person.model.levels["full"].faces
+    head = motion.world_from_head.apply(person.head(motion.weights))
+    return picture(camera, head, faces, clay_colours(vertex_normals(head, faces), camera), (255, 255, 255))
+
+
+def clay_colours(normals: Float[np.ndarray, "v 3"], camera: Camera) -> UInt8[np.ndarray, "v 3"]:
+    """Returns the colours of clay under a lamp beside the camera, by unit normals in the world frame."""
+    towards = camera.camera_from_world.rotation.T @ (LIGHT * (1.0, -1.0, -1.0))
+    shade = 0.25 + 0.75 * np.clip(normals @ towards / np.linalg.norm(LIGHT), 0.0, 1.0)
+    return np.clip(CLAY * shade[:, None] * 1.2, 0, 255).astype(np.uint8)

@@ -1,0 +1,137 @@
+"""Finds the person of a sequence: the one head of its first second, solved as a take.
+
+Enters: the footage. Leaves: the neutral head with the model's expressions at its vertices, the cameras with the
+corrections that all of these frames agree on, and the pose and weights of each of them.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from pipeline.applications.moments.footage import Footage
+from pipeline.applications.moments.joint_fit import fit_jointly
+from pipeline.applications.moments.take import named, solution_of
+from pipeline.contour_fit.contour import ContourSolution
+from pipeline.estimation.bounded import least_within
+from pipeline.head_model.expressions import arkit_parts
+from pipeline.head_model.model import HeadModel
+from pipeline.reconstruct import start_reconstruction
+from pipeline.settings import Settings
+from pipeline.stages.context import ReconstructionContext
+from rig.geometry import RigidTransform, rotation_from_vector
+from rig.render.renderer import Renderer
+from rig.rig import Rig
+
+RIDGE = 1e-3  # of the mean diagonal: shapes that are alike share
+FIRST_S, KEYS = 1.0, 5  # the identity's frames: the sharpest of each fifth of the first second
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Holds what changes from frame to frame: the pose of the head (its scale is in its vertices), and the weights of
+    the model's expressions."""
+
+    world_from_head: RigidTransform
+    weights: Float[np.ndarray, " e"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SequencePerson:
+    """Holds the head of a sequence. Vertices and shapes are those of the full level, head frame, mm; ``rig`` are the
+    cameras of the small pictures, corrected."""
+
+    model: HeadModel
+    names: tuple[str, ...]  # of the expressions that are tracked: the model's for Apple's names
+    neutral: Float[np.ndarray, "v 3"]
+    shapes: Float32[np.ndarray, "e v 3"]  # mm at weight 1
+    rig: Rig
+    keys: tuple[int, ...]  # frames by which the identity was found ...
+    motions: tuple[Motion, ...]  # ... and what the head does there
+
+    def head(self, weights: Float[np.ndarray, " e"]) -> Float[np.ndarray, "v 3"]:
+        """Returns the head with an expression."""
+        return self.neutral + np.tensordot(weights.astype(np.float32), self.shapes, axes=1)
+
+
+def find_person(
+    footage: Footage, model: HeadModel, settings: Settings, renderer: Renderer, report: Callable[[float], None]
+) -> SequencePerson:
+    """Solves the best frames of the first second as a take. Raises what ``reconstruct`` raises, with the frame's name,
+    and InputError for the method simplex."""
+    keys, solved = best_frames(footage), list[ContourSolution]()
+    for done, key in enumerate(keys):
+        report(done / (len(keys) + 1))
+        with named(footage.frames[key]), footage.capture(key) as (capture, rig):
+            steps = start_reconstruction(ReconstructionContext(capture, rig, model, settings, renderer))
+            solved.append(solution_of(next(steps)))
+            steps.close()
+    report(len(keys) / (len(keys) + 1))
+    joint = fit_jointly(solved, min(settings.fitting.modes, len(model.modes))) if len(solved) > 1 else tuple(solved)
+    return person_of(footage, model, keys, joint)
+
+
+def best_frames(footage: Footage) -> tuple[int, ...]:
+    """Returns the sharpest frame of each part of the first second."""
+    count = int(np.searchsorted(footage.times_s, footage.times_s[0] + FIRST_S, side="right"))
+    sharpness = []
+    for number, pictures in zip(range(count), footage.read(), strict=False):
+        edges = [float(np.abs(np.diff(image[::4].astype(np.int16), axis=1)).mean()) for image in pictures.values()]
+        sharpness.append(np.mean(edges) if len(pictures) == len(footage.rig) else -float(number))
+    parts = np.array_split(np.arange(len(sharpness)), min(KEYS, len(sharpness)))
+    return tuple(int(part[np.argmax(np.array(sharpness)[part])]) for part in parts)
+
+
+def person_of(
+    footage: Footage, model: HeadModel, keys: tuple[int, ...], joint: tuple[ContourSolution, ...]
+) -> SequencePerson:
+    """Returns the head that the solutions of the frames ``keys`` share."""
+    longest = max(joint, key=lambda each: len(each.state.coefficients))
+    fitted, scale = longest.problem.model, longest.state.world_from_head.scale
+    coefficients = longest.state.coefficients.copy()
+    coefficients[np.asarray(fitted.posed, int)] = 0.0
+    operator, names = model.levels["full"].operator, tracked_names(model)
+    rows = [model.expressions.names.index(name) for name in names]
+    shapes = np.stack([scale * (operator @ shape) for shape in model.expressions.shapes]).astype(np.float32)
+    motions = []
+    for each in joint:
+        pose, posed = each.state.world_from_head, each.problem.model.posed
+        weights = np.clip(each.state.coefficients[posed.start : posed.stop], 0.0, 1.0)
+        weights = weights_alone(shapes[:, model.levels["full"].face_region], weights, rows)
+        motions.append(Motion(RigidTransform(pose.rotation, pose.translation), weights))
+    rig = _corrected(footage.work, joint)
+    return SequencePerson(model, names, scale * fitted.vertices(coefficients), shapes[rows], rig, keys, tuple(motions))
+
+
+def tracked_names(model: HeadModel) -> tuple[str, ...]:
+    """Returns the model's expressions that belong to Apple's 52 names: its other ones say much the same once more, and
+    together they can imitate a shift of the whole head."""
+    parts = arkit_parts(model.expressions.names)
+    return tuple(model.expressions.names[row] for row in sorted({row for of in parts.values() for row in of}))
+
+
+def weights_alone(
+    shapes: Float32[np.ndarray, "n v 3"], weights: Float[np.ndarray, " n"], rows: list[int]
+) -> Float[np.ndarray, " e"]:
+    """Returns the weights of the shapes ``rows`` alone that move the head most nearly as ``weights`` of all do."""
+    flat = shapes.reshape(len(shapes), -1)
+    alone = flat[rows]
+    matrix = (alone @ alone.T).astype(float)
+    matrix += RIDGE * np.trace(matrix) / len(rows) * np.eye(len(rows))
+    slope = -(alone @ (weights.astype(np.float32) @ flat)).astype(float)
+    return least_within(matrix, slope, np.zeros(len(rows)), np.ones(len(rows)))
+
+
+def _corrected(rig: Rig, joint: tuple[ContourSolution, ...]) -> Rig:
+    """Returns the cameras with the mean of the frames' corrections: they stand still."""
+    shifts: dict[str, list[np.ndarray]] = {name: [] for name in rig.names}
+    for each in joint:
+        for name, shift in zip(each.problem.views.names, each.state.camera_shift, strict=True):
+            shifts[name].append(shift)
+    cameras = []
+    for camera in rig:
+        mean = np.mean(shifts[camera.name] or [np.zeros(6)], axis=0)
+        moved = RigidTransform(rotation_from_vector(mean[:3]), mean[3:])
+        cameras.append(replace(camera, camera_from_world=moved @ camera.camera_from_world))
+    return replace(rig, cameras=tuple(cameras))

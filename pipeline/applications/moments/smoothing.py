@@ -1,0 +1,116 @@
+"""Smooths the course of a sequence's unknowns forward and backward, as strongly as their noise asks for.
+
+Of every unknown x, measured as y with deviation s at each of T frames, the smooth course minimises
+
+    sum_t (x_t - y_t)^2 / s_t^2 + sum_t log(q^2 + a_t^2) ,    a_t = x_t+1 - 2 x_t + x_t-1
+
+where q is a share of its noise. The logarithm holds back accelerations that noise explains, and lets larger ones be: a
+blink stays as it is. Unknowns of one group (a rotation's three) accelerate together. It is solved by repeated weighted
+least squares, a Cholesky factor of five diagonals for all unknowns at once; the same factor gives the deviations. A
+frame without a measurement follows from its neighbours, as far as accelerations of the whole sequence allow.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+STIFFNESS = 0.1  # q by the noise
+ROUNDS = 12
+QUIET = 0.25  # quantile of accelerations that are noise: people rest between movements
+QUIET_NORMAL = 0.3186 * 6.0**0.5  # the same quantile for unit noise
+TINY = 1e-9
+Courses = Float[np.ndarray, "t p"]
+
+
+def smooth(
+    measured: Courses, deviation: Courses, failed: Bool[np.ndarray, " t"], groups: Sequence[Int[np.ndarray, " g"]]
+) -> tuple[Courses, Courses]:
+    """Returns the smooth courses and their deviations.
+
+    Args:
+        measured: the courses; what stands at failed frames does not matter.
+        deviation: of each measurement, by all that is unknown of it.
+        failed: frames without a measurement.
+        groups: unknowns that accelerate together; all must be in one.
+    """
+    known = np.flatnonzero(~failed)
+    if len(measured) < 3 or len(known) < 2:
+        return measured, deviation
+    course = np.stack([np.interp(np.arange(len(measured)), known, column[known]) for column in measured.T], axis=1)
+    spread = np.stack([np.interp(np.arange(len(measured)), known, column[known]) for column in deviation.T], axis=1)
+    jerks = np.abs(np.diff(course, 2, axis=0))[~(failed[:-2] | failed[1:-1] | failed[2:])]
+    level = np.quantile(jerks, QUIET, axis=0) / QUIET_NORMAL if len(jerks) else np.median(spread, axis=0)
+    noise = spread * np.minimum(level / np.maximum(np.median(spread, axis=0), TINY), 1.0) + TINY
+    information = np.where(failed[:, None], 0.0, noise**-2)
+    least = (STIFFNESS * np.median(noise, axis=0)) ** 2
+    held, found = np.ones((len(course) - 2, course.shape[1])), course
+    for _ in range(ROUNDS):
+        held = 1.0 / _together(least + np.diff(found, 2, axis=0) ** 2, groups)
+        found = _solve(_factor(information, held), information * course)
+    usual = (np.diff(found, 2, axis=0) ** 2).mean(axis=0)
+    near = failed[:-2] | failed[1:-1] | failed[2:]
+    held = np.where(near[:, None], np.minimum(held, 1.0 / (least + usual)), held)
+    variance = _inverse_diagonal(_factor(information, held))
+    lasting = np.where(failed[:, None], spread**2, np.maximum(spread**2 - noise**2, 0.0))  # what no smoothing removes
+    return found, np.sqrt(lasting + variance)
+
+
+def _together(squares: Courses, groups: Sequence[Int[np.ndarray, " g"]]) -> Courses:
+    out = np.empty_like(squares)
+    for rows in groups:
+        out[:, rows] = squares[:, rows].mean(axis=1, keepdims=True)
+    return out
+
+
+def _factor(information: Courses, held: Courses) -> tuple[Courses, Courses, Courses]:
+    """Returns the factor L D L^T of the five-diagonal matrices: D, and the two diagonals of L below its unit one."""
+    count = len(information)
+    main, first, second = information.copy(), np.zeros_like(information), np.zeros_like(information)
+    main[:-2] += held
+    main[1:-1] += 4.0 * held
+    main[2:] += held
+    first[1:-1] -= 2.0 * held  # row t, column t - 1
+    first[2:] -= 2.0 * held
+    second[2:] += held
+    for t in range(count):
+        if t > 1:
+            second[t] /= main[t - 2]
+            first[t] -= second[t] * main[t - 2] * first[t - 1]
+            main[t] -= second[t] ** 2 * main[t - 2]
+        if t > 0:
+            first[t] /= main[t - 1]
+            main[t] -= first[t] ** 2 * main[t - 1]
+    return main, first, second
+
+
+def _solve(factor: tuple[Courses, Courses, Courses], right: Courses) -> Courses:
+    (main, first, second), found = factor, right.copy()
+    count = len(found)
+    for t in range(1, count):
+        found[t] -= first[t] * found[t - 1]
+        if t > 1:
+            found[t] -= second[t] * found[t - 2]
+    found /= main
+    for t in range(count - 2, -1, -1):
+        found[t] -= first[t + 1] * found[t + 1]
+        if t < count - 2:
+            found[t] -= second[t + 2] * found[t + 2]
+    return found
+
+
+def _inverse_diagonal(factor: tuple[Courses, Courses, Courses]) -> Courses:
+    """Returns the diagonal of the inverse: of the inverse Z = L^-T D^-1 + (1 - L^T) Z only the five diagonals are
+    needed (Takahashi, Fagan and Chen 1973)."""
+    main, first, second = factor
+    count = len(main)
+    same, beside, beyond = 1.0 / main, np.zeros_like(main), np.zeros_like(main)  # Z at (t, t), (t, t+1), (t, t+2)
+    for t in range(count - 2, -1, -1):
+        one = first[t + 1]
+        two = second[t + 2] if t < count - 2 else np.zeros_like(one)
+        after = beside[t + 1] if t < count - 2 else np.zeros_like(one)
+        last = same[t + 2] if t < count - 2 else np.zeros_like(one)
+        beside[t] = -one * same[t + 1] - two * after
+        beyond[t] = -one * after - two * last
+        same[t] = 1.0 / main[t] - one * beside[t] - two * beyond[t]
+    return same

@@ -1,0 +1,127 @@
+"""Implements the commands for one person and many moments: take, sequence."""
+
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from server.cli.answers import (
+    Data,
+    Json,
+    Overwrite,
+    answer,
+    prepare_folder,
+    progress_bar,
+    terminated_like_interrupted,
+    warn,
+    warn_of_replacement,
+    wrong_usage,
+)
+from server.cli.heads import Detail, Model
+
+if TYPE_CHECKING:
+    from rig.studio.sensor.preset import Preset
+
+app = typer.Typer(rich_markup_mode=None)
+
+
+@app.command(epilog="Example: eigenhead take shots/anna-calm shots/anna-smile shots/anna-open --out takes/anna")
+def take(
+    captures: Annotated[
+        list[Path], typer.Argument(help="Two or more captures of one person, in different expressions.", exists=True)
+    ],
+    out: Annotated[Path, typer.Option(help="The folder of the take.", file_okay=False)],
+    *,
+    model: Model = None,
+    detail: Detail = None,
+    settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
+    data: Data = None,
+    overwrite: Overwrite = False,
+    json_out: Json = False,
+) -> None:
+    """Solve several captures of one person as one.
+
+    Writes the neutral head with the person's own shapes, and the head of each capture."""
+    from pipeline.applications.moments.take import check_count, named
+    from pipeline.applications.moments.take_files import Shot, make_take, warning_lines
+    from pipeline.settings import settings_from_document
+    from server.cli.heads import capture_names, head_alone
+    from server.cli.reconstruct_local import check_apart
+    from server.tasks.photographs import keep_masks, read_or_calibrate
+    from server.tasks.prepare import prepare_kernels
+    from server.tasks.reconstruct_folder import folder_of
+    from server.tasks.settings_file import settings_document
+
+    with wrong_usage("CAPTURES"):
+        names = capture_names(captures)
+        check_count(len(names))
+    chosen = settings_from_document(head_alone(settings_document(settings, detail=detail)))
+    for capture in captures:
+        check_apart(out, capture)
+    warn_of_replacement(out / "report.json", overwrite)
+    prepare_folder(out)
+    with progress_bar() as report, ExitStack() as stack:
+        prepare_kernels(report, chosen)
+        shots = {}
+        for name, capture in zip(names, captures, strict=True):
+            with named(name):
+                kept, folder = out / "moments" / name, stack.enter_context(folder_of(capture))
+                found = read_or_calibrate(folder, kept, front=chosen.front, report=report)
+            shots[name] = Shot(found.capture, found.rig, partial(keep_masks, kept))
+        document = make_take(out, shots, model=model or "default", settings=chosen, report=report)
+    for line in warning_lines(document):
+        warn(line)
+    answer(document, json_out, [str(out / name) for name in ("neutral.ply", "neutral.glb", "moments")])
+
+
+@app.command(epilog="Example: eigenhead sequence films/anna --out tracks/anna")
+def sequence(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="cameras.json, and images/CAMERA/FRAME.png or videos/CAMERA.mp4.", file_okay=False, exists=True
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="The result folder; a killed run goes on there.", file_okay=False)],
+    *,
+    model: Model = None,
+    data: Data = None,
+    json_out: Json = False,
+) -> None:
+    """Track one head through pictures or videos."""
+    from pipeline.applications.moments.sequence_files import FILES, make_sequence
+    from pipeline.settings import settings_from_document
+    from server.cli.heads import head_alone
+    from server.cli.reconstruct_local import check_apart
+    from server.tasks.prepare import prepare_kernels
+    from server.tasks.settings_file import settings_document
+
+    chosen = settings_from_document(head_alone(settings_document(None, detail="photo")))
+    check_apart(out, folder)
+    prepare_folder(out)
+    with progress_bar() as report, terminated_like_interrupted():
+        prepare_kernels(report, chosen)
+        document = make_sequence(folder, out, model=model or "default", settings=chosen, report=report)
+    for warning in document["warnings"]:
+        warn(f"{warning['code']}: {warning['message']}")
+    answer(document, json_out, [str(out / name) for name in FILES])
+
+
+def film_sequence(out: Path, frames: int, seed: int, preset: "Preset", json_out: bool) -> None:
+    """Films a moving subject of the simulated studio before its cameras, pictures of 640 x 480, into ``out``."""
+    import numpy as np
+
+    from pipeline.applications.moments.footage import TRACKED_PIXELS
+    from pipeline.head_model.model import load_model
+    from rig.formats.pictures.work_size import work_rig
+    from rig.render.renderer import Renderer
+    from rig.studio.scene.layout import default_layout
+    from server.tasks.moving_subject import Person, simulate_sequence
+
+    model, studio = load_model(), work_rig(default_layout(), TRACKED_PIXELS)
+    person = Person(model, np.random.default_rng((seed, 0)).standard_normal(len(model.modes)), seed)
+    with progress_bar() as report, Renderer.create() as renderer:
+        truth = simulate_sequence(out, person, studio, preset, frames, renderer=renderer, report=report)
+    answer({"sequence": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
