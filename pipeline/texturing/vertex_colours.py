@@ -121,7 +121,7 @@ class Shown:
 
     Attributes:
         likely: the part (a code of ``Part``) of each vertex if nobody sees it; ``HAIR`` is the scalp, bald or not.
-        shares: gives for a camera the probabilities (0 to 1) of skin, hair and clothes at each vertex.
+        shares: gives for a camera the probabilities (0 to 1) of skin, hair and clothes at the chosen vertices.
         hairless: where hair hides the surface, which is a bare head's; None: hair belongs to the surface.
         face: where what is of no part is a mouth or a nostril, and not a backdrop.
         measured: where depth agrees with the surface; None: everywhere.
@@ -129,7 +129,7 @@ class Shown:
     """
 
     likely: UInt8[np.ndarray, " v"]
-    shares: Callable[[Camera], Points]
+    shares: Callable[[Camera, Bool[np.ndarray, " v"]], Points]
     hairless: Bool[np.ndarray, " v"] | None = None
     face: Bool[np.ndarray, " v"] | None = None
     measured: Bool[np.ndarray, " v"] | None = None
@@ -138,7 +138,9 @@ class Shown:
     def weigh(self, weights: Weights, views: Rig) -> tuple[Weights, UInt8[np.ndarray, " v"]]:
         """Returns the views' weights, 0 where one of them, or the mean of all, hardly shows the surface; and the parts
         from which unseen vertices are filled: hair from the hair of the scalp, where most of the scalp has hair."""
-        shares = np.stack([self.shares(camera) for camera in views]).astype(np.float32)
+        shares = np.zeros((*weights.shape, 3), np.float32)  # read where a view may colour
+        for of_view, seen, camera in zip(shares, weights > 0, views, strict=True):
+            of_view[seen] = self.shares(camera, seen)
         total = np.maximum(weights.sum(axis=0), 1e-9)
         scalp = self.likely == Part.HAIR
         hair = (weights * shares[..., Part.HAIR.channel]).sum(axis=0) / total
