@@ -34,7 +34,7 @@ from numba.core import config, serialize
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
-from numba.core.runtime import rtsys
+from numba.core.runtime.nrt import rtsys
 
 from rig.atomic_write import write_atomically
 from rig.cache_folder import cache_folder

@@ -139,8 +139,8 @@ class Shown:
         """Returns the views' weights, 0 where one of them, or the mean of all, hardly shows the surface; and the parts
         from which unseen vertices are filled: hair from the hair of the scalp, where most of the scalp has hair."""
         shares = np.zeros((*weights.shape, 3), np.float32)  # read where a view may colour
-        for of_view, seen, camera in zip(shares, weights > 0, views, strict=True):
-            of_view[seen] = self.shares(camera, seen)
+        for k, camera in enumerate(views):
+            shares[k, weights[k] > 0] = self.shares(camera, weights[k] > 0)
         total = np.maximum(weights.sum(axis=0), 1e-9)
         scalp = self.likely == Part.HAIR
         hair = (weights * shares[..., Part.HAIR.channel]).sum(axis=0) / total
