@@ -135,11 +135,8 @@ def colour_bust(
         return Staged(None)
     settings, rig, mesh = context.settings, context.rig, shaped.surface.mesh_world
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
-    shown = Shown(
-        shaped.likely_part,
-        lambda camera, chosen: labels.shares(camera, mesh.vertices[chosen]),
-        measured=shaped.surface.seen,
-    )
+    likely, seen = shaped.likely_part, shaped.surface.seen
+    shown = Shown(likely, lambda camera, rows: labels.shares(camera, mesh.vertices[rows]), measured=seen)
     colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture, shown=shown)
     return Staged(Bust(shaped, normals, colours.colours, colours.views, settings.bust.spacing_mm))
 

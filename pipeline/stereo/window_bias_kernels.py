@@ -7,17 +7,7 @@ from rig.jit import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def windowed_heights(
-    surface: np.ndarray,
-    wanted: np.ndarray,
-    keys: np.ndarray,
-    spans: np.ndarray,
-    window_mm: float,
-    reach_mm: float,
-    height_mm: np.ndarray,
-    first: int,
-    last: int,
-) -> None:
+def windowed_heights(surface, wanted, keys, spans, window_mm, reach_mm, height_mm, first, last):
     """Fills ``height_mm`` (v) of the ``wanted`` vertices: how far the mean of the vertices around each lies above it,
     along its normal.
 

@@ -78,8 +78,6 @@ DOUBTFUL_MM2 = 1000.0  # of connected surface that no view shows surely; a nostr
 GUESS_SHARE = 0.35  # of the median weight: curls before a white wall made a guessed back of hair grey below it
 GREY = 0.22  # linear: what a head gets that no camera saw
 STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
-
-
 MIN_FACING = 0.2  # cosine to where the face looks: hair hangs before it otherwise, seen from behind the cheek
 MIN_SKIN, MIN_MEAN_SKIN = 0.5, 0.7  # of a view, and of all: at a collar's soft edge single views are sure of skin
 GAIN_HALVED = 1.0  # of the light, in powers of two: a camera that differs so much counts half

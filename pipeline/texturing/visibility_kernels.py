@@ -82,8 +82,7 @@ def sample_colours(
     ``table`` is the linear light of each code, ``sigma`` the window's width in px.
     """
     height, width = image.shape[:2]
-    out = np.zeros((len(weights), 3), np.float32)
-    across, down = np.empty(4), np.empty(4)
+    out, across, down = np.zeros((len(weights), 3), np.float32), np.empty(4), np.empty(4)
     scale = -0.5 / (sigma * sigma)
     for v in range(len(weights)):
         if weights[v] <= 0:
