@@ -36,8 +36,7 @@ OPEN_DIFFERENCE = 0.78  # of the larger opening, between views of one open mouth
 OPENING_NOISE = 0.15  # of the opening that the other views see, by which lips seen from above or below differ
 MIN_FACING = 0.5  # cosine, of a view whose lips are judged: from the side all mouths look shut
 MIN_OFFSET_MM = 5.0, 30.0  # of a head from the front and aside: clean ones are up to 5.2 mm (3.3 deviations) and 20 off
-# Of so many views or more, one that errs by less than a third of the limits in the face that all see is not compared
-# with the others alone, where it errs up to 1.6 times as much.
+# With so many, one that errs by a third of the limits in the face of all passes: in that of the others it is 1.6 times
 MIN_JOINT, CAUTION = 6, 3.0
 UPPER_LIP, LOWER_LIP = [0, 37, 267, 13, 82, 312, 81, 311], [17, 84, 314, 14, 87, 317, 178, 402]  # of the 468 points
 
