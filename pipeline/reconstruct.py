@@ -67,8 +67,7 @@ def start_reconstruction(context: ReconstructionContext) -> Generator[Any, HeadF
         run.stage("fine") as stage,
     ):
         refined = stage.keep(refine_head(stage.context, views, faces, head, labels, depth))
-    votes = depth.votes
-    del depth
+    votes, depth = depth.votes, None
     with run.beside("bust", lambda quiet: shape_bust(quiet, views, votes, refined, fused.product)) as surface:
         with run.stage("texture") as stage:
             texturing = stage.keep(texture_head(stage.context, views, head, refined, labels))
