@@ -35,7 +35,7 @@ def windowed_height(
     the window that face another way do not count. If ``wanted`` is not None, vertices outside it get 0."""
     order, keys, spans = sorted_into_cells(vertices, REACH_MM)
     chosen = np.ones(len(vertices), bool) if wanted is None else wanted[order]
-    surface = np.concatenate([(vertices - vertices.min(axis=0)).T, normals.T])[:, order].astype(np.float32)
+    surface = np.concatenate([(vertices - vertices.min(axis=0)).T, normals.T])[:, order].astype(np.float32, order="C")
     sorted_mm, height_mm = np.zeros(len(vertices), np.float32), np.empty(len(vertices))
 
     def fill(first: int, last: int) -> None:
