@@ -229,12 +229,9 @@ def texture(
         decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, hidden)
     whole = fill_unknown(agreed, seen > 0, mesh_world.faces, parts)
     codes, by_camera = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8), _by_name(views, gains)
-    filled = int(np.count_nonzero(seen == 0))
     dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
-    warnings = (
-        *_gain_warnings(by_camera),
-        *(compose("view-unlike", camera=name, likeness=likeness) for name, likeness in unlike.items()),
-    )
+    warnings = [compose("view-unlike", camera=name, likeness=likeness) for name, likeness in unlike.items()]
+    warnings, filled = (*_gain_warnings(by_camera), *warnings), int(np.count_nonzero(seen == 0))
     return Texture(codes, seen, by_camera, _by_name(views, offsets), filled, decision, dim, warnings)
 
 
