@@ -114,7 +114,8 @@ fi
 say "compiling what a start loads, once for this machine"
 env -u PYTHONDONTWRITEBYTECODE .venv/bin/python -m compileall -q rig pipeline calibration server || true
 env -u PYTHONDONTWRITEBYTECODE .venv/bin/python -c 'from server.cli import demo, reconstruct_local; from server.http import serve; from server.worker import worker
-from scipy import linalg, ndimage, optimize, signal, sparse, spatial, special; import scipy.sparse.linalg, scipy.sparse.csgraph' ||
+from scipy import linalg, ndimage, optimize, signal, sparse, spatial, special; import scipy.sparse.linalg, scipy.sparse.csgraph, moderngl
+from numba.core.registry import cpu_target; from PIL import Image; cpu_target.target_context.refresh(); Image.init()' ||
   say "the service's modules cannot be imported; \`eigenhead doctor\` may say why"
 if [ -n "$quick" ]; then
   echo "$wanted" >.venv/.ready-quick

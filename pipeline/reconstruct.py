@@ -61,12 +61,14 @@ def start_reconstruction(context: ReconstructionContext) -> Generator[Any, HeadF
     head = yield head
     with run.stage("depth") as stage:
         depth = stage.keep(measure_depth(stage.context, views, head, labels))
+    handed_over, depth = [depth], replace(depth, maps=())  # the maps are large, and only fused
     with (
-        run.beside("bust", lambda quiet: fuse_depth(quiet, views, head.mesh_world, labels, depth)) as fused,
+        run.beside("bust", lambda quiet: fuse_depth(quiet, views, head.mesh_world, labels, handed_over.pop())) as fused,
         run.stage("fine") as stage,
     ):
         refined = stage.keep(refine_head(stage.context, views, faces, head, labels, depth))
-    with run.beside("bust", lambda quiet: shape_bust(quiet, views, depth, refined, fused.product)) as surface:
+    votes, depth = depth.votes, None
+    with run.beside("bust", lambda quiet: shape_bust(quiet, views, votes, refined, fused.product)) as surface:
         with run.stage("texture") as stage:
             texturing = stage.keep(texture_head(stage.context, views, head, refined, labels))
         with run.stage("evidence") as stage:

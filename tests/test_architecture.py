@@ -121,7 +121,6 @@ MANY_FOR_A_REASON = {
     "server.cli.cameras.calibrate": "each is an option of a command",
     "server.http.routes.jobs.list_jobs": "each is a parameter of the query",
     "server.cli.simulate.simulate": "each is an option of a command",
-    "pipeline.stereo.window_bias_kernels.windowed_heights": "a compiled loop over a thread's share of plain arrays",
 }
 
 

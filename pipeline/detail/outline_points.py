@@ -6,14 +6,14 @@ surface's normal lies in the image, so that the signed distance to the silhouett
 the face's rim counts, and less where pixels show hair, whose outline is not the skin's.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from pipeline.contour_fit.fit import Fit
-from pipeline.contour_fit.rim import Rim, Topology, Views, find_rim, make_topology, pack_views
+from pipeline.contour_fit.rim import Rim, Topology, Views, find_rim, make_topology
 from pipeline.contour_fit.rim_term import OUTSIDE_SCALE
 from pipeline.detail.solve import Observed
 from pipeline.geometry.nearest import PointTree, nearest
@@ -21,7 +21,6 @@ from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit.hair_mask import HairProbability
 from rig.camera import Camera
 from rig.geometry import RigidTransform, rotation_from_vector
-from rig.rig import Rig
 
 # Variance of an outline's mean over a pixel of its length: 1 px, alike over 8 px. With 2 and 32 the median and the 95th
 # percentile of scan-a are 0.001 and 0.014 mm worse, with 0.5 and 2 the median of scan-a-skin 0.007.
@@ -81,18 +80,19 @@ class OutlineSearch:
         return share
 
 
-def outline_search(
-    model: HeadModel, fit: Fit, distances: Mapping[str, Float32[np.ndarray, "h w"]], hair: HairProbability, rig: Rig
-) -> OutlineSearch:
+def outline_search(model: HeadModel, views: Views, cameras: Sequence[Camera], hair: HairProbability) -> OutlineSearch:
     """Prepares the search.
 
-    ``model``: whose full level is deformed. ``fit``: has the cameras' corrections. ``distances``: signed distances to
-    the silhouettes (px), by camera. ``hair``: for each camera, the probability that a pixel shows hair. ``rig``: the
-    cameras as calibrated.
+    ``model``: whose full level is deformed. ``views``: the silhouettes. ``cameras``: of the views, with the fit's
+    corrections. ``hair``: for each camera, the probability that a pixel shows hair.
     """
-    level = model.levels["full"]
-    moved = Rig(tuple(corrected(camera, fit) for camera in rig))
-    return OutlineSearch(make_topology(level.faces, level.face_region), pack_views(moved, dict(distances)), hair)
+    level, poses = model.levels["full"], [camera.camera_from_world for camera in cameras]
+    moved = replace(
+        views,
+        rotation=np.stack([pose.rotation for pose in poses]),
+        translation=np.stack([pose.translation for pose in poses]),
+    )
+    return OutlineSearch(make_topology(level.faces, level.face_region), moved, hair)
 
 
 def corrected(camera: Camera, fit: Fit) -> Camera:

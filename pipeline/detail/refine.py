@@ -188,8 +188,8 @@ def deform_to_points(
         The same vertices displaced; far from all points they are unchanged.
     """
     amplitude = np.maximum(deviation_mm, MIN_AMPLITUDE_MM)
-    informative = surface.chosen((surface.part != Part.UNSEEN) & np.isfinite(surface.deviation_mm))
-    fine_points = thinned(informative, CELL_MM)
+    informative = (surface.part != Part.UNSEEN) & np.isfinite(surface.deviation_mm)
+    fine_points = thinned(surface.chosen(informative), CELL_MM)
     coarse_points = thinned(fine_points, COARSE_CELL_MM)
     current = _coarsely_deformed(
         vertices, amplitude, faces, nodes.coarse, coarse_points, loose=loose, outlines=outlines, report=report

@@ -16,10 +16,11 @@ a thickness above it, says nothing of hair that hangs free.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
@@ -248,7 +249,7 @@ def parts_over_head(votes: PartVotes, head_world: Mesh, stubble: bool = True) ->
     both, out = votes.probability[:, skin] + votes.probability[:, hair], votes.probability.copy()
     far, near = nearest(PointTree.of(head_world.vertices), votes.places)
     height = ((votes.places - head_world.vertices[near]) * head_world.normals()[near]).sum(axis=1)
-    alike = nearest(PointTree.of(votes.places), votes.places, count=min(CELLS, len(height)))[1]
+    alike = _cells_about(votes)
     weight = out[alike, hair] + 1e-9
     mean_mm = (weight * height[alike]).sum(axis=1) / weight.sum(axis=1)
     over = np.interp(mean_mm, STUBBLE_MM, (0.0, 1.0)) if stubble else 1.0
@@ -256,6 +257,12 @@ def parts_over_head(votes: PartVotes, head_world: Mesh, stubble: bool = True) ->
     out[:, hair] = np.where(off, both, over * out[:, hair])
     out[:, skin] = both - out[:, hair]
     return replace(votes, probability=out)
+
+
+@lru_cache(maxsize=1)  # a surface asks twice, before and after the head is refined
+def _cells_about(votes: PartVotes) -> Int[np.ndarray, "g c"]:
+    """Returns the rows of the cells nearest to each, itself among them."""
+    return nearest(PointTree.of(votes.places), votes.places, count=min(CELLS, len(votes.places)))[1].astype(np.int32)
 
 
 @traced

@@ -172,7 +172,7 @@ def _seen(
     column, row = np.rint(pixels[rows]).astype(int).T
     clear = depths[rows] < nearest[row, column] + HIDDEN_MM + 3.0 * pixel_mm / cosine[rows]
     clear &= silhouette.distance[box][row, column] * pixel_mm < -OUTLINE_MM
-    linear = np.power(np.arange(256, dtype=np.float32) / 255.0, GAMMA)[image[box]]
+    linear = cv2.LUT(image[box], np.power(np.arange(256, dtype=np.float32) / 255.0, GAMMA))
     smooth = cv2.GaussianBlur(linear, (0, 0), max(BLUR_MM / pixel_mm, 0.5))
     colours = np.full((len(vertices), 3), np.nan, np.float32)
     colours[rows[clear]] = smooth[row[clear], column[clear]]

@@ -124,9 +124,7 @@ def _matches(one: Camera, first: Keypoints, two: Camera, second: Keypoints) -> I
     if min(len(first[0]), len(second[0])) < 2:
         return np.zeros((0, 2), int)
     every = first[1] @ second[1].T
-    rows, columns = np.nonzero(every > MIN_LIKENESS)
-    near = _beside_lines(one, first[0], rows, two, second[0], columns) < BAND
-    rows, columns = rows[near], columns[near]
+    rows, columns = np.nonzero((every > MIN_LIKENESS) & _near_lines(one, first[0], two, second[0]))
     likeness = every[rows, columns]
     order = np.lexsort((-likeness, rows))
     rows, columns, likeness = rows[order], columns[order], likeness[order]
@@ -140,24 +138,19 @@ def _matches(one: Camera, first: Keypoints, two: Camera, second: Keypoints) -> I
     return np.stack([rows[best][good], columns[best][good]], axis=1)
 
 
-def _beside_lines(
-    one: Camera,
-    first: Float[np.ndarray, "n 2"],
-    rows: Int[np.ndarray, " p"],
-    two: Camera,
-    second: Float[np.ndarray, "m 2"],
-    columns: Int[np.ndarray, " p"],
-) -> Float[np.ndarray, " p"]:
-    """Returns how far the pixels of each pair of rows are from each other's epipolar lines, in shares of the first
-    picture's width."""
+def _near_lines(
+    one: Camera, first: Float[np.ndarray, "n 2"], two: Camera, second: Float[np.ndarray, "m 2"]
+) -> Bool[np.ndarray, "n m"]:
+    """Tells which pixels of two views are within ``BAND`` of each other's epipolar lines."""
     relative = two.camera_from_world @ one.camera_from_world.inverse()
-    x, y, z = relative.translation
+    x, y, z = relative.translation / np.linalg.norm(relative.translation)
     essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ relative.rotation
     straight, other = (np.insert(c.undistort(p), 2, 1.0, axis=1) for c, p in ((one, first), (two, second)))
     line, other_line = straight @ essential.T, other @ essential
-    slopes = (line[:, :2] ** 2).sum(axis=1)[rows] + (other_line[:, :2] ** 2).sum(axis=1)[columns]
-    missed = np.abs(np.einsum("pk,pk->p", line[rows], other[columns])) / np.sqrt(np.maximum(slopes, 1e-12))
-    return missed * (one.intrinsics.fx / one.intrinsics.width)
+    band = BAND * one.intrinsics.width / one.intrinsics.fx
+    slopes, other_slopes = (band**2 * (of[:, :2] ** 2).sum(axis=1).astype(np.float32) for of in (line, other_line))
+    missed = line.astype(np.float32) @ other.T.astype(np.float32)
+    return np.square(missed, out=missed) < slopes[:, None] + other_slopes
 
 
 def _joined(

@@ -54,8 +54,6 @@ ANY_LEVELS = 64  # a channel: the spread of any colour at all, as in ANY_COLOUR_
 REACH = 24  # coarse pixels from the mask in which a doubtful pixel may still be the subject
 MAX_PLATE_CHI2 = 3.0  # chi-squared by its median over the background, up to which a pixel is the plate: 93 % of it are
 HAIR_DEPTH = 6  # coarse pixels (24 px)
-
-
 NOISE_HOLE_COARSE_PX = 3  # coarse pixels: a hole of this size is noise wherever it is
 MIXED = 0.1  # of the difference to the plate: standard deviation within a coarse pixel from which it is a mixture
 MIXED_SINGLE = 0.2  # the same where a quarter of the coarse pixel is one pixel, whose noise nothing averages

@@ -31,8 +31,6 @@ ALPHA_BLUR_PX = 0.7  # blur that optics and pixel give an edge anyway; it halves
 WEAK_CONTRAST = 4.0  # standard deviations between subject and background below which a contour piece is weak
 FULL_REDUCTION = 3  # pixels to a coarse one, for which the distances in pixels below were chosen
 INSIDE_PX = 3  # the subject's colour is taken this far inside the first contour: beyond the blur of an edge (3 sigma)
-
-
 SOLID = 0.85  # alpha above which a pixel shows the subject's own colour, and not hair before the background
 WINDOW_PX = 3.0  # sigma of the window it is averaged in
 DEPTH = 6  # bands inside the outline up to which a gap before the plate is looked for: 48 px

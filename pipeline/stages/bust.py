@@ -16,6 +16,7 @@ from pipeline.geometry.raster import depth_maps
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import scalp
 from pipeline.part_labels.codes import Part
+from pipeline.part_labels.votes import PartVotes
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
 from pipeline.stages.part_labels import PartLabels
@@ -103,14 +104,18 @@ def fuse_depth(
 
 
 def shape_bust(
-    context: ReconstructionContext, views: Views, depth: Depth, refined: RefinedHead, fused: DepthSurface | None
+    context: ReconstructionContext,
+    views: Views,
+    votes: PartVotes | None,
+    refined: RefinedHead,
+    fused: DepthSurface | None,
 ) -> Staged[ShapedBust | None]:
     """Combines the fused surface with the delivered head, extends hair to its outlines, and mends the triangles.
     Returns None for None. Warns ``bust-guessed`` if neither depth nor the head measured much of the face."""
     if fused is None:
         return Staged(None)
     head = HeadSkin(refined.mesh_world, refined.deviation_mm)
-    surface = finished(fused, depth.votes, head, views.silhouettes, context.rig)
+    surface = finished(fused, votes, head, views.silhouettes, context.rig)
     mesh, face = surface.mesh_world, context.model.levels["full"].face_region
     far, near = nearest(PointTree.of(head.mesh_world.vertices), mesh.vertices)
     on_face = (far < FACE_REACH_MM) & face[near]
@@ -135,7 +140,8 @@ def colour_bust(
         return Staged(None)
     settings, rig, mesh = context.settings, context.rig, shaped.surface.mesh_world
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
-    shown = Shown(shaped.likely_part, lambda camera: labels.shares(camera, mesh.vertices), measured=shaped.surface.seen)
+    likely, seen = shaped.likely_part, shaped.surface.seen
+    shown = Shown(likely, lambda camera, rows: labels.shares(camera, mesh.vertices[rows]), measured=seen)
     colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture, shown=shown)
     return Staged(Bust(shaped, normals, colours.colours, colours.views, settings.bust.spacing_mm))
 

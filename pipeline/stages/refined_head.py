@@ -54,6 +54,7 @@ def refine_head(
     cameras, face = [context.rig[name] for name in distances], np.flatnonzero(model.levels["full"].face_region)
     factor = head_depth_factor(mesh, face, cameras)
     hair = labels.hiding_probability()
+    patches = patch_search(model, fit, depth.images, distances, hair, context.rig)
     displaced = refine_to_surface(
         fit,
         model,
@@ -61,8 +62,8 @@ def refine_head(
         eigenheads=min(settings.fitting.modes, len(fit.coefficients)),
         deviation_mm=deviation_mm,
         eyes=measure_eye_appearance(model, mesh.vertices, views.capture.images, context.rig, faces.eye_openings),
-        patches=patch_search(model, fit, depth.images, distances, hair, context.rig),
-        outlines=outline_search(model, fit, distances, hair, context.rig),
+        patches=patches,
+        outlines=outline_search(model, patches.views, patches.cameras, hair),
         report=context.progress,
     )
     share, needed = float(displaced.observed[model.levels["full"].face_region].mean()), MIN_OBSERVED_SHARE

@@ -67,7 +67,7 @@ def texture_head(
         dim_share=DIM_SHARE if settings.outputs.albedo != "none" else None,
         shown=Shown(
             np.where(scalp(model), Part.HAIR, Part.SKIN).astype(np.uint8),
-            lambda camera: labels.shares(camera, mesh.vertices),
+            lambda camera, chosen: labels.shares(camera, mesh.vertices[chosen]),
             hairless=pinnae(model),
             face=face,
             compared=halves_of_face(model),

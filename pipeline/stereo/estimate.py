@@ -41,13 +41,9 @@ MAX_DEVIATION_MM = 2.0  # a depth with a larger standard deviation is discarded
 OUTLINE_PX = 1.0  # no depth nearer to the background: the edge is blurred over it
 AGREE_MM = 1.5  # two views agree where their surfaces are nearer than that ...
 AGREE_DEVIATIONS = 3.0  # ... and than this many of their joint standard deviation
-
-
 # Views that see past a place, for each that has it too: they may err as well. At 1 a tenth of the hair is lost, without
 # a bound a percent of what is told lies more than 2 mm off.
 MAX_CONTRADICTING_VIEWS = 2
-
-
 # Variance along the ray of what the views agree on, by features that say it on two captures rendered by another program
 # (330,000 pixels; Student's t with 3 degrees of freedom by most likelihood, then scaled until 68 % lie within one
 # standard deviation). Given these a match's own information says nothing more.

@@ -20,8 +20,6 @@ from pipeline.stereo.sweep_kernels import aggregate
 from rig.camera import Camera
 
 LABELS = 21  # depths along a ray in each of two sweeps: 4.5 mm apart at the deepest; 41 are no better
-
-
 # On the subject, of images that are searched: windows of 5 pixels then span 10 mm. At 512 x 384 a quarter of the size,
 # 4.2 mm a pixel, left 21 % of the face 2 mm off, half of it leaves 14 % (an oily head, noise of 6 levels).
 SEARCH_PIXEL_MM = 2.1

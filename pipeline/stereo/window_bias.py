@@ -33,17 +33,16 @@ def windowed_height(
 ) -> Float[np.ndarray, " v"]:
     """Computes how far (mm, along the normal) the mean of the surface over a window lies above each vertex. Parts of
     the window that face another way do not count. If ``wanted`` is not None, vertices outside it get 0."""
-    height_mm, cells = np.zeros(len(vertices)), sorted_into_cells(vertices, REACH_MM)
-    chosen = (
-        np.ones(len(vertices), bool) if wanted is None else wanted.copy()
-    )  # a model's own is read-only: another type
-    points, facing = np.ascontiguousarray(vertices), np.ascontiguousarray(normals)
-    order, keys, spans = cells
+    order, keys, spans = sorted_into_cells(vertices, REACH_MM)
+    chosen = np.ones(len(vertices), bool) if wanted is None else wanted[order]
+    surface = np.concatenate([(vertices - vertices.min(axis=0)).T, normals.T])[:, order].astype(np.float32, order="C")
+    sorted_mm, height_mm = np.zeros(len(vertices), np.float32), np.empty(len(vertices))
 
     def fill(first: int, last: int) -> None:
-        windowed_heights(points, facing, chosen, order, keys, spans, WINDOW_MM, REACH_MM, height_mm, first, last)
+        windowed_heights(surface, chosen, keys, spans, WINDOW_MM, REACH_MM, sorted_mm, first, last)
 
     in_threads(len(vertices), fill)
+    height_mm[order] = sorted_mm
     return height_mm
 
 

@@ -78,8 +78,6 @@ DOUBTFUL_MM2 = 1000.0  # of connected surface that no view shows surely; a nostr
 GUESS_SHARE = 0.35  # of the median weight: curls before a white wall made a guessed back of hair grey below it
 GREY = 0.22  # linear: what a head gets that no camera saw
 STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
-
-
 MIN_FACING = 0.2  # cosine to where the face looks: hair hangs before it otherwise, seen from behind the cheek
 MIN_SKIN, MIN_MEAN_SKIN = 0.5, 0.7  # of a view, and of all: at a collar's soft edge single views are sure of skin
 GAIN_HALVED = 1.0  # of the light, in powers of two: a camera that differs so much counts half
@@ -121,7 +119,7 @@ class Shown:
 
     Attributes:
         likely: the part (a code of ``Part``) of each vertex if nobody sees it; ``HAIR`` is the scalp, bald or not.
-        shares: gives for a camera the probabilities (0 to 1) of skin, hair and clothes at each vertex.
+        shares: gives for a camera the probabilities (0 to 1) of skin, hair and clothes at the chosen vertices.
         hairless: where hair hides the surface, which is a bare head's; None: hair belongs to the surface.
         face: where what is of no part is a mouth or a nostril, and not a backdrop.
         measured: where depth agrees with the surface; None: everywhere.
@@ -129,7 +127,7 @@ class Shown:
     """
 
     likely: UInt8[np.ndarray, " v"]
-    shares: Callable[[Camera], Points]
+    shares: Callable[[Camera, Bool[np.ndarray, " v"]], Points]
     hairless: Bool[np.ndarray, " v"] | None = None
     face: Bool[np.ndarray, " v"] | None = None
     measured: Bool[np.ndarray, " v"] | None = None
@@ -138,7 +136,9 @@ class Shown:
     def weigh(self, weights: Weights, views: Rig) -> tuple[Weights, UInt8[np.ndarray, " v"]]:
         """Returns the views' weights, 0 where one of them, or the mean of all, hardly shows the surface; and the parts
         from which unseen vertices are filled: hair from the hair of the scalp, where most of the scalp has hair."""
-        shares = np.stack([self.shares(camera) for camera in views]).astype(np.float32)
+        shares = np.zeros((*weights.shape, 3), np.float32)  # read where a view may colour
+        for k, camera in enumerate(views):
+            shares[k, weights[k] > 0] = self.shares(camera, weights[k] > 0)
         total = np.maximum(weights.sum(axis=0), 1e-9)
         scalp = self.likely == Part.HAIR
         hair = (weights * shares[..., Part.HAIR.channel]).sum(axis=0) / total
@@ -205,8 +205,9 @@ def texture(
         image = sharpened(capture.images[camera.name], silhouette.mask, settings.sharpening)
         return see_points(camera, image, silhouette, depths[camera.name], mesh_world.vertices, normals), image
 
-    found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
-    weights, colours = (np.stack([getattr(sight, name) for sight, _ in found]) for name in ("weights", "colours"))
+    sights, images = zip(*map_in_threads(lambda k: read_view(views.cameras[k]), len(views)), strict=True)
+    weights, colours = (np.stack([getattr(sight, name) for sight in sights]) for name in ("weights", "colours"))
+    del sights  # of a bust 36 MB
     hidden = np.asarray((weights > 0).any(axis=0))
     weights, parts = (weights, None) if shown is None else shown.weigh(weights, views)
     hidden &= ~(weights > 0).any(axis=0)
@@ -223,17 +224,14 @@ def texture(
     decision = None
     if around is not None:
         masks = {name: silhouettes[name].mask for name in views.names}
-        pictures = pack_pictures(views, [image for _, image in found], masks, gains, offsets, mesh_world=mesh_world)
+        pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world=mesh_world)
         decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
         decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, hidden)
     whole = fill_unknown(agreed, seen > 0, mesh_world.faces, parts)
     codes, by_camera = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8), _by_name(views, gains)
-    filled = int(np.count_nonzero(seen == 0))
     dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
-    warnings = (
-        *_gain_warnings(by_camera),
-        *(compose("view-unlike", camera=name, likeness=likeness) for name, likeness in unlike.items()),
-    )
+    warnings = [compose("view-unlike", camera=name, likeness=likeness) for name, likeness in unlike.items()]
+    warnings, filled = (*_gain_warnings(by_camera), *warnings), int(np.count_nonzero(seen == 0))
     return Texture(codes, seen, by_camera, _by_name(views, offsets), filled, decision, dim, warnings)
 
 

@@ -82,7 +82,7 @@ def sample_colours(
     ``table`` is the linear light of each code, ``sigma`` the window's width in px.
     """
     height, width = image.shape[:2]
-    out = np.zeros((len(weights), 3), np.float32)
+    out, across, down = np.zeros((len(weights), 3), np.float32), np.empty(4), np.empty(4)
     scale = -0.5 / (sigma * sigma)
     for v in range(len(weights)):
         if weights[v] <= 0:
@@ -90,9 +90,11 @@ def sample_colours(
         x, y = pixels[v, 0], pixels[v, 1]
         left, top = int(np.floor(x)) - 1, int(np.floor(y)) - 1
         total, r, g, b = 0.0, 0.0, 0.0, 0.0
+        for k in range(4):
+            across[k], down[k] = np.exp(scale * (left + k - x) ** 2), np.exp(scale * (top + k - y) ** 2)
         for j in range(max(0, top), min(height, top + 4)):
             for i in range(max(0, left), min(width, left + 4)):
-                share = np.exp(scale * ((i - x) * (i - x) + (j - y) * (j - y)))
+                share = across[i - left] * down[j - top]
                 total += share
                 r += share * image[j, i, 0]
                 g += share * image[j, i, 1]

@@ -42,8 +42,6 @@ PLATE_GAIN = 1.3  # how many times as much of each picture the other plates must
 PLATE_COLUMNS = 64
 PLATE_TOLERANCE = 0.06  # of log level: 2 % of light drift, vignetting, and noise averaged over 16 x 16 pixels
 CLICK_PX, MAX_CLICK_MISFIT = 1.5, 50.0
-
-
 Segmentation = Callable[[Capture], dict[str, Silhouette]]
 
 

@@ -19,7 +19,13 @@ from jaxtyping import Float
 from pipeline.faces.detection import FaceDetection
 from pipeline.faces.points import direction_from_face, point_table
 from pipeline.faces.subject import SubjectFaces
-from pipeline.faces.triangulated_face import shared_modes, triangulate_face, unbiased_px, view_noise_px
+from pipeline.faces.triangulated_face import (
+    TriangulatedFace,
+    shared_modes,
+    triangulate_face,
+    unbiased_px,
+    view_noise_px,
+)
 from pipeline.warnings import ReportWarning
 from rig.messages.message import compose
 from rig.rig import Rig
@@ -30,6 +36,8 @@ OPEN_DIFFERENCE = 0.78  # of the larger opening, between views of one open mouth
 OPENING_NOISE = 0.15  # of the opening that the other views see, by which lips seen from above or below differ
 MIN_FACING = 0.5  # cosine, of a view whose lips are judged: from the side all mouths look shut
 MIN_OFFSET_MM = 5.0, 30.0  # of a head from the front and aside: clean ones are up to 5.2 mm (3.3 deviations) and 20 off
+# With so many, one that errs by a third of the limits in the face of all passes: in that of the others it is 1.6 times
+MIN_JOINT, CAUTION = 6, 3.0
 UPPER_LIP, LOWER_LIP = [0, 37, 267, 13, 82, 312, 81, 311], [17, 84, 314, 14, 87, 317, 178, 402]  # of the 468 points
 
 
@@ -64,17 +72,20 @@ def judge_moments(subject: SubjectFaces | None, rig: Rig) -> list[ReportWarning]
 def _list_differing(shown: Mapping[str, FaceDetection], matched: Container[str], rig: Rig) -> list[_Offset]:
     """Returns the views that differ from the other matched ones, the worst first; from all, if only one is matched."""
     offsets = []
+    every = {name: seen for name, seen in shown.items() if name in matched}
+    joint = triangulate_face(every, rig) if len(every) >= MIN_JOINT else None
     for name, seen in shown.items():
+        if joint is not None and _offset(name, seen, joint, rig, CAUTION).sigmas < MAX_SIGMAS / CAUTION:
+            continue
         others = {other: face for other, face in shown.items() if other != name}
         agreeing = {other: face for other, face in others.items() if other in matched}
-        offsets.append(_offset(name, seen, agreeing if len(agreeing) > 1 else others, rig))
-    return sorted((one for one in offsets if one is not None and one.sigmas > MAX_SIGMAS), reverse=True)
+        face = triangulate_face(agreeing if len(agreeing) > 1 else others, rig)
+        if face is not None:
+            offsets.append(_offset(name, seen, face, rig))
+    return sorted((one for one in offsets if one.sigmas > MAX_SIGMAS), reverse=True)
 
 
-def _offset(name: str, seen: FaceDetection, others: Mapping[str, FaceDetection], rig: Rig) -> _Offset | None:
-    face = triangulate_face(others, rig)
-    if face is None:
-        return None
+def _offset(name: str, seen: FaceDetection, face: TriangulatedFace, rig: Rig, caution: float = 1.0) -> _Offset:
     camera, points = rig[name], face.points.positions_world
     aside = direction_from_face(face.world_from_face, camera)[2] < MIN_FACING
     pixels, slopes = camera.project_with_jacobian(points)
@@ -90,7 +101,7 @@ def _offset(name: str, seen: FaceDetection, others: Mapping[str, FaceDetection],
     seen_px = float(np.linalg.norm(seen_there))
     both_open = min(float(np.linalg.norm(world)), seen_px * mm_per_px) > OPEN_MM
     both_open &= lips_px < OPEN_DIFFERENCE * max(open_px, seen_px)
-    head_px *= head_px * mm_per_px > MIN_OFFSET_MM[int(aside)]
+    head_px *= caution * head_px * mm_per_px > MIN_OFFSET_MM[int(aside)]
     lips_px *= not both_open and not aside
     by_head = _Offset(head_px / float(noise_px), head_px * mm_per_px, name)
     by_lips = _Offset(lips_px / float(np.hypot(noise_px, OPENING_NOISE * open_px)), lips_px * mm_per_px, name)

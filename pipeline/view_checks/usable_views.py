@@ -240,9 +240,11 @@ def turned_against_others(silhouettes: Mapping[str, Silhouette], name: str, rig:
         return own_misfit({**others, name: silhouette_from_mask(mask)}, rig)[name]
 
     mask = silhouettes[name].mask
+    if (present := misfit(mask)) <= FITTING_MISFIT:
+        return None
     misfits = {turn: misfit(turned) for turn, turned in _turns(mask).items()}
     turn, least = min(misfits.items(), key=lambda one: one[1])
-    if not least < FITTING_MISFIT < misfit(mask) or misfit(mask) < MISFIT_GAIN * least:
+    if least >= FITTING_MISFIT or present < MISFIT_GAIN * least:
         return None
     return compose("picture-turned-to-others", turn=turn)
 

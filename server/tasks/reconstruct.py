@@ -120,7 +120,7 @@ def run_job(
             read_original=full_size_pictures(*folders) if chosen.detail == "pores" else None,
         )
     )
-    report("write", 0.0)
+    tidied(report)("write", 0.0)
     done = replace(done, warnings=_with_scale((*prepared.warnings, *done.warnings), done.scale_sigma))
     with span("stage", "write"):
         write_result(out, done, prepared.capture, writers)

@@ -62,7 +62,7 @@ def photographed(renderer: Renderer) -> tuple[Bust, Capture, dict]:
     refined = RefinedHead(head, np.ones(len(head.vertices)), Detail("photo", verbatim("planted")))
     views = Views(capture, made.silhouettes, {})
     fused = fuse_depth(context, views, head, PartLabels({}), depth).product
-    surface = shape_bust(context, views, depth, refined, fused).product
+    surface = shape_bust(context, views, depth.votes, refined, fused).product
     bust = colour_bust(context, views, PartLabels({}), surface, capture).product
     assert bust is not None
     return bust, capture, made.silhouettes
