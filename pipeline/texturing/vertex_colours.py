@@ -160,16 +160,16 @@ class Shown:
 
     def find_unlike(
         self, weights: Weights, balanced: Colours, mesh: Mesh, normals: Points, views: Rig
-    ) -> dict[str, float]:
-        """Returns the cameras before the face that show it otherwise than the others, each with its likeness."""
+    ) -> list[ReportWarning]:
+        """Returns a warning for each camera before the face that shows it otherwise than the others."""
         if not self.compared:
-            return {}
+            return []
         face = np.logical_or.reduce(self.compared)
         ahead, middle = normals[face].mean(axis=0), mesh.vertices[face].mean(axis=0)
         towards = np.stack([camera.centre_world for camera in views]) - middle
         cosines = towards @ ahead / np.linalg.norm(towards, axis=1) / np.linalg.norm(ahead)
         found = find_unlike(weights * (cosines > MIN_FACING)[:, None], balanced, self.compared)
-        return {views.names[k]: likeness for k, likeness in found.items()}
+        return [compose("view-unlike", camera=views.names[k], likeness=likeness) for k, likeness in found.items()]
 
 
 @traced
@@ -215,7 +215,7 @@ def texture(
     gains, offsets = balance(weights, colours) if settings.balance else unit
     weights *= (1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2))[:, None]  # of noise, or in shadow
     balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
-    unlike = {} if shown is None else shown.find_unlike(weights, balanced, mesh_world, normals, views)
+    unlike = [] if shown is None else shown.find_unlike(weights, balanced, mesh_world, normals, views)
     agreed, seen = blend_views(weights, balanced, outlier)
     if not seen.any():
         return _untextured(len(seen))
@@ -230,8 +230,7 @@ def texture(
     whole = fill_unknown(agreed, seen > 0, mesh_world.faces, parts)
     codes, by_camera = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8), _by_name(views, gains)
     dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
-    warnings = [compose("view-unlike", camera=name, likeness=likeness) for name, likeness in unlike.items()]
-    warnings, filled = (*_gain_warnings(by_camera), *warnings), int(np.count_nonzero(seen == 0))
+    filled, warnings = int(np.count_nonzero(seen == 0)), (*_gain_warnings(by_camera), *unlike)
     return Texture(codes, seen, by_camera, _by_name(views, offsets), filled, decision, dim, warnings)
 
 
