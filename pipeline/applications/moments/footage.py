@@ -9,7 +9,6 @@ import csv
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import map_in_threads
 from rig.capture import Capture, ImageRgb
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import find_rig_file
@@ -53,7 +52,6 @@ class Footage:
         that is missing or damaged is left out."""
         names = cameras or self.rig.names
         with ExitStack() as stack:
-            pool = stack.enter_context(ThreadPoolExecutor(thread_count()))
             of_names = {name: path for name, path in self.videos.items() if name in names}
             films = {name: stack.enter_context(_opened(path)) for name, path in of_names.items()}
             for reel in films.values():
@@ -61,13 +59,14 @@ class Footage:
                     reel.grab()
             for frame in self.frames[first:]:
 
-                def one(name: str, frame: str = frame) -> ImageRgb | None:
+                def read_camera(k: int, frame: str = frame) -> ImageRgb | None:
+                    name = names[k]
                     if name in films:
                         return self._of_video(films[name], name)
                     path = self.files[name].get(frame)
                     return None if path is None else self._of_file(name, path)
 
-                found = dict(zip(names, pool.map(one, names), strict=True))
+                found = dict(zip(names, map_in_threads(read_camera, len(names)), strict=True))
                 yield {name: image for name, image in found.items() if image is not None}
 
     @contextmanager

@@ -37,7 +37,7 @@ from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.scene import Part, Scene
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh, vertex_normals
-from rig.messages.message import Message, compose, documents_of
+from rig.messages.message import compose, documents_of
 from rig.progress import Progress
 from rig.render.renderer import Renderer
 
@@ -81,9 +81,7 @@ def make_sequence(folder: Path, out: Path, *, model: str, settings: Settings, re
 def document_of(person: SequencePerson, footage: Footage, course: Course) -> dict[str, Any]:
     """Returns the content of a sequence's report.json."""
     failed = [frame for frame, lost in zip(footage.frames, course.failed, strict=True) if lost]
-    warnings = list[Message]()
-    if failed:
-        warnings.append(compose("sequence-frames-failed", count=len(failed), all=len(course), frames=failed[:10]))
+    lost = compose("sequence-frames-failed", count=len(failed), all=len(course), frames=failed[:10])
     turn, shift = (np.median(course.deviations[:, rows], axis=0) for rows in (slice(3), slice(3, POSE)))
     return {
         "format": FORMAT,
@@ -96,7 +94,7 @@ def document_of(person: SequencePerson, footage: Footage, course: Course) -> dic
         "failed": failed,
         "deviation": {"rotation_deg": np.degrees(turn).tolist(), "translation_mm": shift.tolist()},
         "alike": {"median": float(np.median(course.alike)), "least": float(course.alike[~course.failed].min())},
-        "warnings": documents_of(warnings),
+        "warnings": documents_of([lost] if failed else []),
     }
 
 
