@@ -5,7 +5,7 @@ TEMPLATES = {
     "take-needs-contour": "A take is solved by the method contour: leave the method simplex out of the settings.",
     "take-other-person": "The head of {moment} differs from that of all moments by {sigmas:.1f} standard deviations: if it is another person, leave it out.",
     "sequence-without-cameras": "There are no cameras: put cameras.json into the folder of the sequence.",
-    "sequence-camera-empty": "There are no pictures of {cameras}: expected images/CAMERA/FRAME.png or videos/CAMERA.mp4.",
+    "sequence-camera-empty": "There are no pictures of {cameras}: expected images/CAMERA/FRAME.png or videos/CAMERA.mp4. Take cameras that did not film out of cameras.json.",
     "sequence-too-short": "A sequence needs two frames or more: found {count}.",
     "sequence-times-wrong": "times.csv must give every frame a time_s, each later than the one before: columns frame,time_s.",
     "sequence-video-unread": "{file} cannot be decoded: give single pictures, images/CAMERA/FRAME.png.",

@@ -707,7 +707,7 @@ export default {
   "take-other-person": "Der Kopf von {moment} weicht um {sigmas:.1f} Standardabweichungen von dem aller Aufnahmen ab: ist es eine andere Person, diese Aufnahme weglassen.",
   "view-unlike": "{camera} zeigt das Gesicht anders als die übrigen Kameras (Ähnlichkeit {likeness:.2f} von 1): ein anderer Moment, Ausdruck oder Mensch, oder die Kamera wurde bewegt. Alle Kameras gleichzeitig auslösen, oder das richtige Bild dorthin legen",
   "sequence-without-cameras": "Es gibt keine Kameras: cameras.json in den Ordner der Sequenz legen.",
-  "sequence-camera-empty": "Von {cameras} gibt es keine Bilder: erwartet wird images/KAMERA/BILD.png oder videos/KAMERA.mp4.",
+  "sequence-camera-empty": "Von {cameras} gibt es keine Bilder: erwartet wird images/KAMERA/BILD.png oder videos/KAMERA.mp4. Kameras, die nicht gefilmt haben, aus cameras.json nehmen.",
   "sequence-too-short": "Eine Sequenz braucht zwei Bilder oder mehr: gefunden {count}.",
   "sequence-times-wrong": "times.csv muss jedem Bild eine time_s geben, jede später als die davor: Spalten frame,time_s.",
   "sequence-video-unread": "{file} lässt sich nicht lesen: einzelne Bilder geben, images/KAMERA/BILD.png.",
