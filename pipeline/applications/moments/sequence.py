@@ -145,7 +145,7 @@ def track_sequence(
 def _track_chunk(tracker: Tracker, footage: Footage, frames: range, before: Course | None, report: Progress) -> Course:
     """Tracks the frames of a chunk, from the last two motions of the one before."""
     person, count = tracker.person, len(footage.frames)
-    last = [before.motion(k) for k in np.flatnonzero(~before.failed)[-2:]] if before is not None else []
+    last = [before.motion(k) for k in np.flatnonzero(~before.failed)[-2:].tolist()] if before is not None else []
     last = last or [person.motions[0]]
     found, pictures = list[Tracked | None](), footage.read(frames.start)
     for number in frames:

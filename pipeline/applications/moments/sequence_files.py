@@ -93,7 +93,10 @@ def document_of(person: SequencePerson, footage: Footage, course: Course) -> dic
         "identity_frames": [footage.frames[key] for key in person.keys],
         "failed": failed,
         "deviation": {"rotation_deg": np.degrees(turn).tolist(), "translation_mm": shift.tolist()},
-        "alike": {"median": float(np.median(course.alike)), "least": float(course.alike[~course.failed].min(initial=1.0))},
+        "alike": {
+            "median": float(np.median(course.alike)),
+            "least": float(course.alike[~course.failed].min(initial=1.0)),
+        },
         "warnings": documents_of([lost] if failed else []),
     }
 

@@ -63,7 +63,7 @@ def _together(squares: Courses, groups: Sequence[Int[np.ndarray, " g"]]) -> Cour
     return out
 
 
-def _factor(information: Courses, held: Courses) -> tuple[Courses, Courses, Courses]:
+def _factor(information: Courses, held: Float[np.ndarray, "t-2 p"]) -> tuple[Courses, Courses, Courses]:
     """Returns the factor L D L^T of the five-diagonal matrices: D, and the two diagonals of L below its unit one."""
     count = len(information)
     main, first, second = information.copy(), np.zeros_like(information), np.zeros_like(information)
