@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32, Int
 from pipeline.applications.moments.appearance import REDUCED, Appearance, Levels, Samples, Texture, textures, visible
 from pipeline.applications.moments.footage import Pictures
 from pipeline.applications.moments.sequence_person import Motion, SequencePerson
-from pipeline.contour_fit.prior_term import weight_slope
+from pipeline.contour_fit.prior_term import EXPRESSION_MEDIAN, TAIL, weight_slope
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.positive_definite import inverse_diagonal
 from pipeline.estimation.robust import GemanMcClure
@@ -119,7 +119,7 @@ class LinearisedWeightPrior:
     @property
     def cost(self) -> float:
         """Returns minus twice the logarithm of the density."""
-        return float((self.weights**2).sum() + 4.0 * np.log1p(self.weights / 0.1).sum())
+        return float((self.weights**2).sum() + 2.0 * TAIL * np.log1p(self.weights / EXPRESSION_MEDIAN).sum())
 
     def add_to(self, equations: NormalEquations) -> None:
         """Adds the prior's part in place."""
