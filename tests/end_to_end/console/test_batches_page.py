@@ -70,6 +70,8 @@ def test_what_failed_is_named_and_the_rest_is_cancelled_when_asked_twice(
         page.locator("#retry").click()
         expect(page.locator("[data-count=queued]")).to_be_visible(timeout=30_000)  # behind the long one
         page.locator(f"[data-batch='{batch}']").click()
+        # Until the service has answered, the page shows the batch before, and its first question is not this one's.
+        expect(page.locator(f"[data-batch='{batch}'][aria-current=true]")).to_be_visible(timeout=30_000)
         page.locator("#cancel").click()
         page.locator("#cancel-all").click()
         expect(page.locator(f"[data-batch='{batch}'][data-state=cancelled]")).to_be_visible(timeout=30_000)
