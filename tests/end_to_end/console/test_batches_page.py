@@ -69,7 +69,7 @@ def test_what_failed_is_named_and_the_rest_is_cancelled_when_asked_twice(
         page.locator("#retry").click()
         expect(page.locator("[data-count=queued]")).to_be_visible(timeout=30_000)  # behind the long one
         page.locator(f"[data-batch='{batch}']").click()
-        page.locator(f"[data-batch='{batch}'][aria-current=true]").wait_for()  # until then the page shows the one before
+        page.locator(f"[data-batch='{batch}'][aria-current=true]").wait_for()  # the page shows the one before
         page.locator("#cancel").click()
         page.locator("#cancel-all").click()
         expect(page.locator(f"[data-batch='{batch}'][data-state=cancelled]")).to_be_visible(timeout=30_000)
