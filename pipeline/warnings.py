@@ -34,6 +34,7 @@ WARNING_CODES = (
     "masks-exchanged",
     "masks-of-alpha",
     "masks-off-edges",
+    "masks-turned",
     "moments-differ",
     "no-albedo",
     "no-bust",

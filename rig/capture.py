@@ -1,7 +1,7 @@
 """Defines a capture: one synchronised shot of every camera, in memory."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import PurePosixPath
 from types import MappingProxyType
 from typing import TypeVar
@@ -75,6 +75,15 @@ def reassign_images(
         reassign(capture.soft_masks, masks),
         {name: reassign(images, pictures) for name, images in capture.texture_sets.items()},
     )
+
+
+def turn_masks(capture: Capture, ways: Mapping[str, tuple[slice, slice]]) -> Capture:
+    """Returns the capture with some masks flipped or turned: ``ways``, by camera, are slices of rows and columns."""
+
+    def turned(masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {n: np.ascontiguousarray(of[ways[n]]) if n in ways else of for n, of in masks.items()}
+
+    return replace(capture, masks=turned(capture.masks), soft_masks=turned(capture.soft_masks))
 
 
 def _renamed(digests: Mapping[str, str], sources: Mapping[str, Mapping[str, str]]) -> dict[str, str]:

@@ -52,7 +52,7 @@ GUARDS = (
     Guard(("pictures-the-same",), ("pictures are equal in every pixel", "fewer than three differ"), "a flat head",
           kind="damaged"),
     Guard(("other-rig", "other-lenses", "other-convention", "principal-points-from-below", "rig-mirrored",
-           "pictures-flipped", "pictures-turned", "masks-turned"),
+           "pictures-flipped", "pictures-turned"),
           ("tangent planes miss the outlines", "the face's landmarks do not meet in most cameras before it"),
           "a distorted head of wrong cameras"),
     Guard(("outlines-unexplained",), ("the fitted head explains hardly any outline",

@@ -26,10 +26,10 @@ from pipeline.view_checks.camera_assignment import (
     ring_messages,
 )
 from pipeline.view_checks.guards import STRICT, Guards
-from pipeline.view_checks.mask_edges import masks_alone_exchanged, turned_masks
+from pipeline.view_checks.mask_edges import TURNS, masks_alone_exchanged, turned_masks
 from pipeline.view_checks.rig_agreement import loose_outlines, wrong_rig
 from pipeline.warnings import ReportWarning
-from rig.capture import Capture, Features, reassign_images
+from rig.capture import Capture, Features, reassign_images, turn_masks
 from rig.errors import EigenheadError
 from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
@@ -103,6 +103,13 @@ def assign_images(
         overruled.append(guards.refuse(ExchangedPictures(exchange, doubtful=False)))
     capture = reassign_images(capture, plates=plates) if plates else capture
     silhouettes = segmented(capture)
+    turned = turned_masks(capture.images, silhouettes, capture.masks)
+    if turned:
+        capture = turn_masks(capture, {name: TURNS[turn] for name, turn in turned.items()})
+        silhouettes = segmented(capture)
+    for turn in dict.fromkeys(turned.values()):
+        names = some_of([name for name in turned if turned[name] == turn])
+        overruled.append(compose("masks-turned", turn=turn, cameras=names))
     duplicates = duplicate_views(capture, silhouettes, rig)
     if len(silhouettes) - len(duplicates) < MIN_CAMERAS <= len(silhouettes):
         guards.refuse(SamePictures(duplicates, len(silhouettes)))
@@ -118,7 +125,7 @@ def assign_images(
         found = ring_messages(assignment.pictures, what)
         overruled.append(guards.refuse(ExchangedPictures(found, doubtful=not assignment.overwhelming)))
     if not assignment.pictures:
-        overruled += _check_rig(capture, rig, silhouettes, distinct, guards)
+        overruled += _check_rig(capture, rig, distinct, guards)
     pictures = {} if masks else assignment.pictures
     if masks:
         capture = reassign_images(capture, masks=masks)
@@ -133,20 +140,13 @@ def assign_images(
     return ImageAssignment(capture, _left_out(silhouettes, duplicates), pictures, plates, warnings)
 
 
-def _check_rig(
-    capture: Capture,
-    rig: Rig,
-    silhouettes: Mapping[str, Silhouette],
-    distinct: Mapping[str, Silhouette],
-    guards: Guards,
-) -> list[ReportWarning]:
+def _check_rig(capture: Capture, rig: Rig, distinct: Mapping[str, Silhouette], guards: Guards) -> list[ReportWarning]:
     """Refuses another rig's cameras, unless the face holds the rig. Returns the warnings that stand in their place."""
     wrong = wrong_rig(distinct, rig)
     if not wrong:
         return []
     face = guards.find_face(capture.images, rig)
     if face is None or not face.holds_the_rig:
-        wrong = turned_masks(capture.images, silhouettes, capture.masks) or wrong
         return [guards.refuse(WrongRig(wrong))]
     return [compose("lens-doubtful", finding=wrong)] if wrong.code == "other-lenses" else []
 

@@ -48,6 +48,7 @@ MISPLACED_AMONG = 5  # cameras; of four, one that is wrong leaves three, who hav
 FACTORS = (1.0, 0.5, 0.67, 1.5, 2.0)  # of the focal lengths, of which the best are searched from
 MAX_SEARCHED_CAMERAS = 12  # of many: the search takes time by their square, and three numbers need no more
 SEARCHES, STEPS = 2, 90  # and how often the misses are asked in each
+MIRRORED = {"rig-mirrored", "pictures-flipped"}
 STRIDE = 0.1  # of a factor's logarithm, and of a picture's side
 OTHER_FACTOR, OTHER_SHIFT = 0.15, 0.03  # of a factor's logarithm and a side: what makes a rig contradict itself
 MIN_FACTOR = 0.04  # from one; less is not told
@@ -94,7 +95,8 @@ def _contradiction(silhouettes: Mapping[str, Silhouette], seen: Rig) -> Message 
     for message, turn in () if square else _SQUARE_CONVENTIONS:  # width and height were exchanged with the pictures
         found.append((_judged_misfit(_read(hulls, seen, turn), _on_its_side(seen)), message))
     (best, message), *others = sorted(found, key=lambda one: one[0])
-    next_best = min(as_written, *(misfit for misfit, other in others if other != message))
+    kin = MIRRORED if message.code in MIRRORED else ()  # where the lens's axis is in the middle, they are one
+    next_best = min(as_written, *(misfit for misfit, other in others if other != message and other.code not in kin))
     if best <= MAX_RIGHT or (best <= MAX_CLEAR and best <= CLEARLY * next_best):
         return message
     lenses = find_lens_reading(hulls, seen, lambda read: _judged_misfit(hulls, read))
@@ -237,39 +239,16 @@ def _read(hulls: Sequence[Pixels], rig: Rig, turn: Turn) -> list[Pixels]:
     return [turn(hull, camera.intrinsics) for hull, camera in zip(hulls, rig, strict=True)]
 
 
-def _flipped_across(pixels: Pixels, k: Intrinsics) -> Pixels:
-    return np.stack([k.width - 1.0 - pixels[:, 0], pixels[:, 1]], axis=1)
-
-
-def _mirrored_across(pixels: Pixels, k: Intrinsics) -> Pixels:
-    return np.stack([2.0 * k.cx - pixels[:, 0], pixels[:, 1]], axis=1)
-
-
-def _mirrored_down(pixels: Pixels, k: Intrinsics) -> Pixels:
-    return np.stack([pixels[:, 0], 2.0 * k.cy - pixels[:, 1]], axis=1)
-
-
-def _turned_round(pixels: Pixels, k: Intrinsics) -> Pixels:
-    return (k.width - 1.0, k.height - 1.0) - pixels
-
-
-def _turned_back(pixels: Pixels, k: Intrinsics) -> Pixels:
-    """Returns the pixels after a turn of the picture by 90 degrees clockwise."""
-    return np.stack([k.height - 1.0 - pixels[:, 1], pixels[:, 0]], axis=1)
-
-
-def _turned_on(pixels: Pixels, k: Intrinsics) -> Pixels:
-    """Returns the pixels after a turn of the picture by 90 degrees anticlockwise."""
-    return np.stack([pixels[:, 1], k.width - 1.0 - pixels[:, 0]], axis=1)
-
-
+# Other ways to read a picture's pixels (x, y), each with what is said if the outlines agree so.
 _CONVENTIONS: tuple[tuple[Message, Turn], ...] = (
-    (compose("rig-mirrored"), _mirrored_across),
-    (compose("rig-mirrored"), _mirrored_down),
-    (compose("pictures-flipped"), _flipped_across),
-    (compose("pictures-turned", turn=compose("turn-180")), _turned_round),
+    (compose("rig-mirrored"), lambda p, k: p * (-1.0, 1.0) + (2.0 * k.cx, 0.0)),
+    (compose("rig-mirrored"), lambda p, k: p * (1.0, -1.0) + (0.0, 2.0 * k.cy)),
+    (compose("pictures-flipped", turn=compose("flip-across")), lambda p, k: p * (-1.0, 1.0) + (k.width - 1.0, 0.0)),
+    (compose("pictures-flipped", turn=compose("flip-down")), lambda p, k: p * (1.0, -1.0) + (0.0, k.height - 1.0)),
+    (compose("pictures-turned", turn=compose("turn-180")), lambda p, k: (k.width - 1.0, k.height - 1.0) - p),
 )
-_SQUARE_CONVENTIONS: tuple[tuple[Message, Turn], ...] = (
-    (compose("pictures-turned", turn=compose("turn-90-anticlockwise")), _turned_back),
-    (compose("pictures-turned", turn=compose("turn-90-clockwise")), _turned_on),
+_QUARTER_TURNS: tuple[tuple[Message, Turn], ...] = (
+    (compose("turn-90-anticlockwise"), lambda p, k: p[:, ::-1] * (-1.0, 1.0) + (k.height - 1.0, 0.0)),
+    (compose("turn-90-clockwise"), lambda p, k: p[:, ::-1] * (1.0, -1.0) + (0.0, k.width - 1.0)),
 )
+_SQUARE_CONVENTIONS = tuple((compose("pictures-turned", turn=turn), read) for turn, read in _QUARTER_TURNS)

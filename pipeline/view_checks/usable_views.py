@@ -19,7 +19,7 @@ from pipeline.view_checks.camera_drift import find_drift
 from pipeline.view_checks.guards import STRICT, Guards
 from pipeline.view_checks.head_size import find_low_crowns, judge_head_size
 from pipeline.view_checks.image_assignment import assign_images, common_share, thumbnail
-from pipeline.view_checks.mask_edges import masks_off_edges
+from pipeline.view_checks.mask_edges import TURNS, masks_off_edges
 from pipeline.view_checks.rig_agreement import misplaced_camera
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture
@@ -212,8 +212,7 @@ def with_picture_faults(
 
 def _turns(image: np.ndarray) -> dict[Message, np.ndarray]:
     """Returns a picture or a mask turned by 180 degrees and flipped, by what was done to it."""
-    turned = {"turned-half": image[::-1, ::-1], "flip-across": image[:, ::-1], "flip-down": image[::-1]}
-    return {compose(code): np.ascontiguousarray(pixels) for code, pixels in turned.items()}
+    return {turn: np.ascontiguousarray(image[ways]) for turn, ways in TURNS.items()}
 
 
 def turned_against_plate(capture: Capture, name: str) -> Message | None:

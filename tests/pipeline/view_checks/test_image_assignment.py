@@ -34,6 +34,10 @@ def judged(shot, capture, exchanged: Literal["repair", "refuse"] = "repair", rig
     return assign_images(capture, rig or shot.rig, segmented, exchanged=exchanged)
 
 
+def of_masks(filed: Capture):
+    return {name: silhouette_from_mask(mask) for name, mask in filed.masks.items()}
+
+
 def filed_right(shot, found):
     names = shot.rig.names
     return all(
@@ -73,15 +77,24 @@ def test_masks_alone_that_are_exchanged_are_filed_back_and_photographs_stay(half
     shot = half_size_shot
     masked = Capture(shot.capture.images, masks=shot.masks)
 
-    def segmented(filed: Capture):
-        return {name: silhouette_from_mask(mask) for name, mask in filed.masks.items()}
-
-    found = assign_images(reassign_images(masked, masks=EXCHANGE), shot.rig, segmented, exchanged="repair")
+    found = assign_images(reassign_images(masked, masks=EXCHANGE), shot.rig, of_masks, exchanged="repair")
     assert [warning.code for warning in found.warnings] == ["masks-exchanged"]
     assert "cam04 and cam06 hold each other's masks" in found.warnings[0].text
     assert found.pictures == {}
     assert all(found.capture.images[name] is shot.capture.images[name] for name in shot.rig.names)
     assert all(np.array_equal(found.silhouettes[name].mask, shot.masks[name]) for name in shot.rig.names)
+
+
+def test_masks_whose_rows_were_counted_from_the_bottom_are_turned_back(half_size_shot):
+    shot = half_size_shot
+    given = {name: np.ascontiguousarray(mask[::-1]) for name, mask in shot.masks.items()}
+    soft = {name: mask.view(np.uint8) * np.uint8(255) for name, mask in given.items()}
+    capture = Capture(shot.capture.images, masks=given, soft_masks=soft)
+    found = assign_images(capture, shot.rig, of_masks, exchanged="repair")
+    assert [warning.code for warning in found.warnings] == ["masks-turned"]
+    for name, mask in shot.masks.items():
+        assert np.array_equal(found.capture.masks[name], mask)
+        assert np.array_equal(found.capture.soft_masks[name] > 0, mask)
 
 
 def test_an_exchange_is_refused_where_the_settings_say_so(half_size_shot):

@@ -74,12 +74,12 @@ def test_masks_under_other_names_are_told_from_pictures_and_masks_together() -> 
 
 
 @pytest.mark.parametrize(
-    ("rows", "columns", "turn"),
-    [(-1, 1, "upside down"), (1, -1, "left to right"), (-1, -1, "by 180 degrees"), (1, 1, None)],
+    ("rows", "columns", "turn"), [(-1, 1, "flip-down"), (1, -1, "flip-across"), (-1, -1, "turned-half"), (1, 1, None)]
 )
 def test_masks_that_are_turned_against_the_photographs_are_named(rows: int, columns: int, turn: str | None) -> None:
     masks = {name: grown(np.ascontiguousarray(subject(k)[::rows, ::columns]), 0) for k, name in enumerate(NAMES)}
     found = turned_masks(IMAGES, masks, NAMES)
-    assert (found is None) == (turn is None)
-    assert found is None or str(turn) in found.text
-    assert turned_masks(IMAGES, masks, ()) is None
+    assert {name: said.code for name, said in found.items()} == (dict.fromkeys(NAMES, turn) if turn else {})
+    one = {**{name: grown(subject(k), 0) for k, name in enumerate(NAMES)}, "cam01": masks["cam01"]}
+    assert [*turned_masks(IMAGES, one, NAMES)] == (["cam01"] if turn else [])
+    assert turned_masks(IMAGES, masks, ()) == {}

@@ -130,6 +130,7 @@ def judge_result(person: Person, result: Reconstruction, model: HeadModel) -> Ro
     row: Row = {
         "turn_deg": pose.turn_deg,
         "shift_mm": pose.shift_mm,
+        "turn_stated_deg": float(np.degrees(np.sqrt(np.diag(result.head.fit.covariance)[-7:-4].max()))),
         "deviation_mm": float(np.median(result.refined.deviation_mm[face])),
         "level": result.refined.detail.level,
         "warnings": sorted({warning.code for warning in result.warnings}),
