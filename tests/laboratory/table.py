@@ -4,30 +4,20 @@ from tests.laboratory import inputs
 from tests.laboratory.runner import Record
 
 EXPERIMENTS = {
-    "table1": Record(
-        "experiments.paper.tables:table1", "Repeats tables 1 and 2 of the paper, and its figures 4 and 5."
-    ),
+    "table1": Record("experiments.paper.tables:table1", "Repeats tables 1 and 2 of the paper, and figures 4 and 5."),
     "table2": Record("experiments.paper.tables:table2", "Repeats table 2 of the paper alone."),
     "table3": Record("experiments.paper.tables:table3", "Repeats table 3: four arrangements of eleven cameras."),
     "cost": Record("experiments.paper.cost:cost", "Compares the paper's eqs. (4) and (5) on subjects with hair."),
     "levels": Record("experiments.paper.levels:levels", "Measures what the hierarchy of section 5.1 saves."),
     "peers": Record("experiments.peers.peers:peers", "Compares the contour solver with other solvers."),
-    "limit": Record(
-        "experiments.paper.limit:limit", "Compares errors with the Cramer-Rao bound, and counts intervals."
-    ),
-    "robustness": Record(
-        "experiments.paper.robustness:robustness", "Measures what worse input costs the contour solver."
-    ),
-    "convergence": Record(
-        "experiments.paper.convergence:convergence", "Counts how often the contour solver converges."
-    ),
+    "limit": Record("experiments.paper.limit:limit", "Compares errors with the Cramer-Rao bound, counts intervals."),
+    "robustness": Record("experiments.paper.robustness:robustness", "Measures what worse input costs the solver."),
+    "convergence": Record("experiments.paper.convergence:convergence", "Counts how often the solver converges."),
     "alignment": Record("experiments.paper.alignment:alignment", "Counts right alignments without feature points."),
     "drift": Record("experiments.faults.drift:drift", "Counts how often a turned camera, and a good one, is named."),
     "exchanges": Record("experiments.faults.exchanges:exchanges", "Counts how often exchanged pictures are repaired."),
     "false-alarms": Record("experiments.faults.exchanges:false_alarms", "Counts warnings on good captures."),
-    "posterior": Record(
-        "experiments.paper.posterior_check:posterior_check", "Compares the posterior with a Markov chain."
-    ),
+    "posterior": Record("experiments.paper.posterior_check:posterior_check", "Compares it with a Markov chain."),
     "views": Record("experiments.paper.views:views", "Plans where cameras should stand."),
     "repeat": Record("experiments.surface.repeat:repeat", "Measures how well repeated shots of one subject agree."),
     "relief": Record(
@@ -50,9 +40,7 @@ EXPERIMENTS = {
         {"captures": inputs.requested_captures, "realism": inputs.realism},
     ),
     "capped": Record("experiments.surface.capped:capped", "Measures the cranium under a swim or wig cap."),
-    "skulls": Record(
-        "experiments.surface.capped:skulls", "Counts heads called bald, and measures craniums under hair."
-    ),
+    "skulls": Record("experiments.surface.capped:skulls", "Counts heads called bald; craniums under hair."),
     "moments": Record("experiments.moments.takes:moments", "Measures takes: one person in several moments."),
     "expressions": Record("experiments.people.expressions:expressions", "Measures heads with an expression."),
     "people": Record(

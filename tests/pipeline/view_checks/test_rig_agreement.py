@@ -127,11 +127,7 @@ def test_one_camera_far_from_its_place_is_named_and_no_good_one(seen):
 
 @pytest.mark.parametrize(
     ("change", "word"),
-    [
-        (lambda mask: mask[:, ::-1], "flipped left to right"),
-        (lambda mask: mask[::-1], "flipped upside down"),
-        (lambda mask: mask[::-1, ::-1], "turned by 180 degrees"),
-    ],
+    [(lambda m: m[:, ::-1], "left to right"), (lambda m: m[::-1], "upside down"), (lambda m: m[::-1, ::-1], "by 180")],
 )
 def test_pictures_that_are_all_turned_alike_are_named(seen, change, word):
     rig, masks, _ = seen

@@ -59,10 +59,9 @@ def test_good_views_all_take_part_and_remarks_of_the_reader_are_passed_on(seen: 
 def test_a_camera_that_was_turned_takes_no_part(seen: Seen) -> None:
     rig, silhouettes = seen
     turn = RigidTransform(rotation_from_vector(np.radians([0.0, 0.5, 0.0])), np.zeros(3))
-    cameras = [
-        replace(c, camera_from_world=turn @ c.camera_from_world) if c.name == "cam03" else c for c in rig
-    ]  # fmt: skip
-    found = judged(Rig(tuple(cameras)), silhouettes)
+    cameras = {camera.name: camera for camera in rig}
+    cameras["cam03"] = replace(rig["cam03"], camera_from_world=turn @ rig["cam03"].camera_from_world)
+    found = judged(Rig(tuple(cameras.values())), silhouettes)
     assert [name for name, silhouette in found.silhouettes.items() if not silhouette.quality.usable] == ["cam03"]
     assert [warning.code for warning in found.warnings] == ["camera-moved"]
 
@@ -121,17 +120,16 @@ def test_the_remedy_is_for_what_was_given(seen: Seen, kind: str, remedy: str) ->
     assert kind != "masks" or "or supply masks/" not in str(refused.value)
 
 
-def test_a_rig_in_another_unit_is_refused_before_a_fit(seen: Seen) -> None:
+@pytest.mark.parametrize(
+    ("factor", "masked", "words"),
+    [(3.3, False, r"about 3\.\d times as large as a head"), (0.4, True, "masks of the whole head with hair and neck")],
+    ids=["before a fit", "masks that may hold the face alone come before the unit"],
+)
+def test_a_rig_in_another_unit_is_refused(seen: Seen, factor: float, masked: bool, words: str) -> None:
     rig, silhouettes = seen
-    with pytest.raises(WrongScale, match=r"about 3\.\d times as large as a head"):
-        judged(times(rig, 3.3), silhouettes)
-
-
-def test_masks_that_may_hold_the_face_alone_are_thought_of_before_the_unit(seen: Seen) -> None:
-    rig, silhouettes = seen
-    masked = Capture({}, masks={name: s.mask for name, s in silhouettes.items()})
-    with pytest.raises(WrongScale, match="masks of the whole head with hair and neck"):
-        judged(times(rig, 0.4), silhouettes, masked)
+    masks = {name: s.mask for name, s in silhouettes.items()} if masked else {}
+    with pytest.raises(WrongScale, match=words):
+        judged(times(rig, factor), silhouettes, Capture({}, masks=masks))
 
 
 def test_only_the_end_opposite_to_the_shoulders_is_a_crown() -> None:
@@ -180,6 +178,8 @@ def test_nothing_is_said_of_good_pictures(capture: Capture, outlines: dict[str, 
     assert blurred_views(capture.images, outlines) == {}
     assert [turned_against_plate(capture, name) for name in NAMES] == [None] * 4
     assert with_picture_faults(outlines, capture, NAMES, RIG) == outlines
+    unlike = {"a": capture.images["a"], "b": np.zeros_like(capture.images["b"])}
+    assert blurred_views(unlike, outlines) == {}, "two views do not tell what is sharp"
 
 
 @pytest.mark.parametrize("sigma", [3.0, 12.0])
@@ -209,10 +209,6 @@ def test_a_turned_picture_is_named_and_left_out(capture: Capture, outlines: dict
     assert not found["b"].quality.usable
     (fault,) = found["b"].quality.warnings
     assert word in fault.text
-
-
-def test_two_views_do_not_tell_what_is_sharp(capture: Capture, outlines: dict[str, Silhouette]) -> None:
-    assert blurred_views({name: capture.images[name] for name in "ab"}, outlines) == {}
 
 
 @pytest.mark.parametrize("exposure", [1.0, 1.5, 4.0, 0.25])

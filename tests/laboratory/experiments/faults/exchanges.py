@@ -118,10 +118,8 @@ def _exchanged_row(
 def _seen(
     model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, rng: np.random.Generator, *, worn: bool
 ) -> dict[str, Silhouette]:
-    style = random_look(rng).hair
-    if not worn or style is None:
-        return binary_silhouettes(model, subject, rig, renderer)
-    return worn_silhouettes(model, subject, rig, renderer, style, rng)
+    style, seen = random_look(rng).hair, (model, subject, rig, renderer)
+    return binary_silhouettes(*seen) if not worn or style is None else worn_silhouettes(*seen, style, rng)
 
 
 def _filed(silhouettes: Mapping[str, Silhouette]) -> Capture:
