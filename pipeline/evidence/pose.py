@@ -18,15 +18,17 @@ from pipeline.faces.subject import SubjectFaces
 from pipeline.warnings import ReportWarning
 from rig.geometry import Similarity
 from rig.mesh import Mesh
+from rig.messages.fault_groups import some_of
 from rig.messages.message import compose
 from rig.rig import Rig
 
 ELSEWHERE = 0.12  # of the face's size in the picture, RMS over its points; of a right head 0.01 to 0.04
 MIN_FACING = 0.5  # cosine: a camera that sees the head so far from the front must see the face, too
 MIN_VIEWS = 2
+CLEAR_FACING = 0.85  # cosine: a camera that sees all of the face
+CLEAR_SCORE = 30.0  # of the landmark network: 35 and more of 30 heads; 27 with hair in a face, turned by 3 degrees then
 ONE_SIDED = 0.95  # length of the cameras' mean direction: 0.98 for three within 12 degrees, 0.6 for the usual rig;
 # in three-brows a pose that nods by 30 degrees beat all others by 75 %
-MAX_NAMED = 4  # cameras of a warning
 RIVAL_MARGIN = 0.03  # of the cost of the outlines: a rival so near to the best is not beaten
 
 
@@ -75,9 +77,13 @@ def judge_pose(
         facing = cameras_in_front(world_from_head, rig)
         if not off and len(facing) >= MIN_VIEWS:
             warnings.append(compose("no-face", views=len(facing)))
-    if subject is not None and subject.matched is not None and len(subject.matched.detections) < MIN_VIEWS:
-        alone = next(iter(subject.matched.detections))
-        warnings.append(compose("pose-doubtful", finding=compose("pose-one-view", camera=alone)))
+    if subject is not None and subject.matched is not None:
+        detections = subject.matched.detections
+        if len(detections) < MIN_VIEWS:
+            warnings.append(compose("pose-doubtful", finding=compose("pose-one-view", camera=next(iter(detections)))))
+        clear = [detections[n].score for n in cameras_in_front(world_from_head, rig, CLEAR_FACING) if n in detections]
+        if clear and max(clear) < CLEAR_SCORE:
+            warnings.append(compose("pose-doubtful", finding=compose("pose-face-unclear")))
     if rival is not None and rival < RIVAL_MARGIN:
         warnings.append(compose("pose-doubtful", finding=compose("pose-rival", share=rival)))
     if method == "silhouettes" and fan_strength(rig) > ONE_SIDED:
@@ -103,11 +109,11 @@ def landmark_offsets(
     return offsets
 
 
-def cameras_in_front(world_from_head: Similarity, rig: Rig) -> tuple[str, ...]:
-    """Returns the names of the cameras that see the head from the front."""
+def cameras_in_front(world_from_head: Similarity, rig: Rig, least: float = MIN_FACING) -> tuple[str, ...]:
+    """Returns the names of the cameras that see the head from the front: ``least`` is the cosine of the angle."""
     facing, middle = world_from_head.rotation[:, 2], world_from_head.translation
     towards = {camera.name: camera.centre_world - middle for camera in rig}
-    return tuple(name for name, way in towards.items() if way @ facing > MIN_FACING * np.linalg.norm(way))
+    return tuple(name for name, way in towards.items() if way @ facing > least * np.linalg.norm(way))
 
 
 def _seen(subject: SubjectFaces) -> dict[str, tuple[FaceDetection, ...]]:
@@ -128,6 +134,4 @@ def _offset(pixels: Float[np.ndarray, "n 2"], found: Float[np.ndarray, "n 2"], s
 
 def _elsewhere(names: list[str], off: Mapping[str, float]) -> ReportWarning:
     worst = max(min(off[name], 10.0) for name in names)
-    more = len(names) - MAX_NAMED
-    where = compose("names-and-more", names=names[:MAX_NAMED], more=more) if more > 0 else names
-    return compose("face-elsewhere", cameras=where, sizes=worst)
+    return compose("face-elsewhere", cameras=some_of(names), sizes=worst)

@@ -12,9 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-MIN_LIKENESS = (
-    0.62  # of the others' likeness to each other: 0.73 and more in 33 clean captures, 31 open jaws below 0.63
-)
+MIN_LIKENESS = 0.62  # of the others' to each other: 0.73 and more in 33 clean captures, below 0.63 with an open jaw
 AGREEING = 0.7  # correlation of the others, below which none can be judged by them: of spectacles before a face 0.65
 MIN_SHARE = 0.28  # of a region, which a view must show to be compared: profiles show half, cameras behind a temple
 SEEN = 0.2  # of the weight of the best view, with which another one shows a vertex
