@@ -131,14 +131,14 @@ def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit,
         images = without_highlights(views.capture.images, views.silhouettes, context.rig, outlines.mesh_world)
         solved, detail, doubtful = refine_with_likely_face(solved, images, hair)
     eigenheads, model = min(settings.fitting.modes, len(model.modes)), solved.problem.model
-    relief_mm = FINE_AMPLITUDE_MM
+    relief_mm = FINE_AMPLITUDE_MM * (RELIEF_OF_OUTLINES if detail.level == "kernel" else 1.0)
+    unlike = detail.reason.code == "level-alike-too-little"  # of 150 captures three, all turned by 3 to 13 degrees
+    doubts = [compose("pose-doubtful", finding=compose("pose-unlike"))] if unlike else []
     if detail.level == "photo":
         solved = with_expression_evidence(solved, eigenheads)
     if detail.level == "span":
         wider = basis_of(model, eigenheads, kernel=True)
         fit = with_span_misfit(solved, wider, relief_mm=relief_mm)
         return Staged(HeadFit(fit, model, detail, cranium, doubtful, solved))
-    if detail.level == "kernel":
-        relief_mm *= RELIEF_OF_OUTLINES
     fit = with_estimated_prior(model, finish(solved), eigenheads, relief_mm=relief_mm)
-    return Staged(HeadFit(fit, model, detail, cranium, doubtful, solved))
+    return Staged(HeadFit(fit, model, detail, cranium, doubtful, solved), doubts)

@@ -100,7 +100,9 @@ def usable_views(
     silhouettes = with_picture_faults(assigned.silhouettes, assigned.capture, doubted, rig)
     usable = sum(silhouette.quality.usable for silhouette in silhouettes.values())
     by_face = MIN_VIEWS_OF_FACE <= usable < MIN_VIEWS <= len(silhouettes) and find_face() is not None
-    if usable < MIN_VIEWS and not by_face:
+    if by_face:
+        overruled.append(compose("pose-doubtful", finding=compose("pose-few-views", usable=usable, needed=MIN_VIEWS)))
+    elif usable < MIN_VIEWS:
         overruled.append(guards.refuse(TooFewViews(silhouettes, capture)))
         silhouettes = {name: _tried(silhouette) for name, silhouette in silhouettes.items()}
     low = find_low_crowns(silhouettes, rig, find_face)
@@ -111,8 +113,7 @@ def usable_views(
     unexplained = silhouettes
     silhouettes = with_picture_faults(silhouettes, assigned.capture, moved.keys(), rig)
     moved_warnings = [warning for name, warning in moved.items() if silhouettes[name] is unexplained[name]]
-    masks_given = bool(assigned.capture.masks)
-    size = judge_head_size(silhouettes, rig, find_face, guards=guards, masks_given=masks_given)
+    size = judge_head_size(silhouettes, rig, find_face, guards=guards, masks_given=bool(assigned.capture.masks))
     given_masks = [name for name in rig.names if name in assigned.capture.masks]
     beside = masks_off_edges(assigned.capture.images, silhouettes, given_masks)
     of_views = (*view_warnings(silhouettes), *moved_warnings)

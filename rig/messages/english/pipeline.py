@@ -202,6 +202,8 @@ TEMPLATES = {
     "outline-size-but-face": "{size}, and the face in the photographs has a head's size: masks show a part of the head or more than it, so look at the overlays",
     "pose-rival": "another pose explains the outlines almost as well (its cost is {share:.1%} higher): look at the overlays; give feature points, --front or more views",
     "pose-face-unclear": "no picture shows the face clearly: hair, a hand or a mask hides parts of it, or it is dark or blurred, so that its pose is known to some three degrees only: free the face and light it, or give feature points",
+    "pose-unlike": "photographs that show the same skin are alike on too little of the face, so that the head may be turned: look at the overlays; give feature points, or views from the front",
+    "pose-few-views": "only {usable} views have a usable silhouette, fewer than {needed}, and the face holds the pose, to some three degrees: mend the masks that were left out, or give clean plates",
     "pose-one-view": "{camera} alone shows the face: how it is turned is known to some ten degrees only: give feature points, or add views from the front",
     "pose-one-sided": "no face was found, and the cameras look from nearly one side: outlines hardly show how the head nods: give feature points, or views from the side",
     "face-elsewhere": "the head's face is not where the photographs show one: in {cameras} it lies up to {sizes:.1f} face sizes away. Do not use this head: give feature points or --front, and check calibration and masks",

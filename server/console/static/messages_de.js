@@ -719,6 +719,8 @@ export default {
   "outline-size-but-face": "{size}, und das Gesicht in den Fotos hat die Größe eines Kopfes: Die Masken zeigen einen Teil des Kopfes oder mehr als ihn; sehen Sie sich die Overlays an",
   "pose-rival": "eine andere Lage erklärt die Umrisse fast ebenso gut (ihre Kosten sind {share:.1%} höher): Überlagerungen ansehen; Merkmale setzen, --front oder mehr Ansichten geben",
   "pose-face-unclear": "kein Bild zeigt das Gesicht deutlich: Haare, eine Hand oder eine Maske verdecken Teile davon, oder es ist dunkel oder unscharf; seine Lage ist nur auf etwa drei Grad bekannt: das Gesicht frei machen und beleuchten, oder Merkmale angeben",
+  "pose-unlike": "Fotos, die dieselbe Haut zeigen, gleichen einander auf zu wenig des Gesichts; der Kopf kann verdreht sein: Überlagerungen ansehen; Merkmale angeben, oder Ansichten von vorn",
+  "pose-few-views": "nur {usable} Ansichten haben einen brauchbaren Umriss, weniger als {needed}; das Gesicht hält die Lage auf etwa drei Grad: die ausgelassenen Masken berichtigen, oder Leerbilder geben",
   "pose-one-view": "nur {camera} zeigt das Gesicht: wie es gedreht ist, ist nur auf etwa zehn Grad bekannt: Merkmale angeben oder Ansichten von vorn hinzufügen",
   "pose-one-sided": "es wurde kein Gesicht gefunden, und die Kameras blicken fast von einer Seite: Konturen sagen kaum, wie der Kopf geneigt ist: Merkmale oder Ansichten von der Seite geben",
   "face-elsewhere": "das Gesicht des Kopfes ist nicht, wo die Fotos eines zeigen: in {cameras} liegt es bis zu {sizes:.1f} Gesichtsgrößen daneben. Diesen Kopf nicht verwenden: Merkmale setzen oder --front angeben und Kalibrierung und Masken prüfen",
