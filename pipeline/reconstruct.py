@@ -77,7 +77,8 @@ def start_reconstruction(context: ReconstructionContext) -> Generator[Any, HeadF
                 judge_head(stage.context, views, faces, alignment, head, refined, texturing=texturing, pose=pose)
             )
     with run.stage("bust") as stage:
-        bust = stage.keep(colour_bust(stage.context, views, labels, surface.product, texturing.capture))
+        axes = head.fit.world_from_head.rotation
+        bust = stage.keep(colour_bust(stage.context, views, labels, surface.product, texturing.capture, axes))
         hair = stage.keep(push_out_hair(stage.context, views, refined, bust, texturing.capture))
     if any(warning.code == "pose-doubtful" for warning in run.warnings):  # of a refusal that was overruled, too
         pose = replace(pose, doubtful=True)

@@ -7,7 +7,7 @@ these are blended across the triangle. Texels that no camera sees get the vertic
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
@@ -16,7 +16,9 @@ from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings
 from pipeline.texturing.decision import Decision
+from pipeline.texturing.layout.charts import lay_out_charts
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, ModelLayout, NoLayout, model_layout, spread_texels
+from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.paint_kernels import paint_rows
 from pipeline.texturing.vertex_colours import Texture
 from pipeline.warnings import ReportWarning
@@ -25,12 +27,19 @@ from rig.messages.message import compose
 from rig.rig import Rig
 
 SIZES = (1024, 2048, 4096, 8192)
-COARSE = 512  # side of the small image that fills what no triangle covers
+BUST_SIZE = 2048  # texels at most, if the settings name no size: half a millimetre each
+COARSE = 512  # side of the small image that fills what no triangle of a head covers
 BAND_ROWS = 64
+ROUNDS = 12  # of a mean of normals: charts follow the shape of the bust, not its pores
 
 
 def paint_texture(
-    layout: Layout, mesh_world: Mesh, colours: UInt8[np.ndarray, "v 3"], decision: Decision, size: int
+    layout: Layout,
+    mesh_world: Mesh,
+    colours: UInt8[np.ndarray, "v 3"],
+    decision: Decision,
+    size: int,
+    coarse: int = COARSE,
 ) -> Atlas:
     """Paints the texture of a head, an image ``size`` texels wide and high.
 
@@ -40,9 +49,10 @@ def paint_texture(
         colours: sRGB of its vertices, for what no camera sees and for the padding.
         decision: the views of every vertex, and the photographs.
         size: of the image.
+        coarse: side of the small image that fills what no triangle covers.
     """
     stored = np.empty((size, size, 3), np.uint8)  # blue first: encoders take it as it is
-    cv2.resize(_coarse(layout, colours), (size, size), dst=stored, interpolation=cv2.INTER_NEAREST)
+    cv2.resize(_coarse(layout, colours, coarse), (size, size), dst=stored, interpolation=cv2.INTER_NEAREST)
     texels = size * layout.uv - 0.5
     choice = decision.choice(colours)
     corners = texels[layout.faces, 1]
@@ -58,10 +68,10 @@ def paint_texture(
     return Atlas(layout, stored[:, :, ::-1])
 
 
-def _coarse(layout: Layout, colours: UInt8[np.ndarray, "v 3"]) -> UInt8[np.ndarray, "s s 3"]:
+def _coarse(layout: Layout, colours: UInt8[np.ndarray, "v 3"], size: int) -> UInt8[np.ndarray, "s s 3"]:
     """Paints the vertices' colours in a small image, blue first; texels beside the layout get the nearest colour."""
-    texels, ones = COARSE * layout.uv - 0.5, np.ones(len(layout.uv))
-    _, shown = rasterise(texels, ones, layout.faces, COARSE, COARSE)
+    texels, ones = size * layout.uv - 0.5, np.ones(len(layout.uv))
+    _, shown = rasterise(texels, ones, layout.faces, size, size)
     values = np.ascontiguousarray(colours[layout.source, ::-1]).astype(np.float32)
     image = interpolate(shown, texels, ones, layout.faces, values)
     return np.rint(spread_texels(image, shown >= 0)).astype(np.uint8)
@@ -95,6 +105,27 @@ def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | Non
         return model_layout(model), []
     except NoLayout as reason:
         return None, [compose("no-texture-layout", reason=reason.message)]
+
+
+@traced
+def paint_charts(
+    mesh_world: Mesh,
+    normals: Float[np.ndarray, "v 3"],
+    coloured: Texture,
+    head_axes: Float[np.ndarray, "3 3"],
+    region: Int[np.ndarray, " n"],
+    wanted: int | None = None,
+) -> Atlas | None:
+    """Paints the texture of the closed surface ``mesh_world`` (mm) in charts along ``head_axes`` (columns, world
+    frame), as fine as the pictures in the ``region`` (vertices). Returns None if it was coloured without views for its
+    detail."""
+    if coloured.decision is None:
+        return None
+    towards = Neighbourhood.of(*neighbours(mesh_world.faces, len(normals))).calmed(normals @ head_axes, ROUNDS)
+    layout = lay_out_charts(Mesh(mesh_world.vertices @ head_axes, mesh_world.faces), towards)
+    size = texture_size(layout, mesh_world, coloured.decision.views, region, wanted=wanted)
+    size = size if wanted is not None else min(size, BUST_SIZE)
+    return paint_texture(layout, mesh_world, coloured.colours, coloured.decision, size, size // 2)
 
 
 @traced
