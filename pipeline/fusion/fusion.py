@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.compute.trace import traced
-from pipeline.fusion.contradiction import silence_contradicted
 from pipeline.fusion.crossings import without_coincidences
 from pipeline.fusion.hair import (
     STRAND_SHARE,
@@ -36,7 +35,7 @@ from pipeline.fusion.refinement import (
 from pipeline.fusion.signed_distance import Level, NoSurface, solve
 from pipeline.fusion.skin import HeadSkin, combine_with_head
 from pipeline.fusion.untangling import CLEAN, MeshFaults, mesh_faults, smooth_spots, topology_of
-from pipeline.fusion.view_stack import stack_views
+from pipeline.fusion.view_stack import silence_contradicted, stack_views
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette

@@ -98,11 +98,8 @@ def find_silent_hair(
     known = known_share(depth_maps, parts, rig)
     scatter = float(np.interp(known, SCATTERED_SHARE, (1.0, 0.0)))
     if votes is None or known >= SILENT_SHARE:
-        return (
-            None,
-            [loosened(each, parts, rig, scatter) for each in depth_maps] if scatter > 0.0 else depth_maps,
-            scatter,
-        )
+        loose = [loosened(each, parts, rig, scatter) for each in depth_maps] if scatter > 0.0 else depth_maps
+        return None, loose, scatter
 
     def split(depth_map: DepthMap) -> tuple[Float[np.ndarray, "n 3"], DepthMap]:
         points, known = points_world(depth_map), depth_map.known

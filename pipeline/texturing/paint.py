@@ -2,7 +2,7 @@
 
 A texel is a point of the fitted surface. Its pixel in a photograph is interpolated from those of the triangle's corners
 (which include lens distortion; edges are a few pixels long). The photograph is read there with a sub-pixel window, and
-the corners' correction is added (``pipeline.texturing.seam_levelling``). If the corners chose different photographs,
+the corners' correction is added (``pipeline.texturing.neighbourhood``). If the corners chose different photographs,
 these are blended across the triangle. Texels that no camera sees get the vertices' colours."""
 
 import cv2
@@ -28,18 +28,13 @@ from rig.rig import Rig
 
 SIZES = (1024, 2048, 4096, 8192)
 BUST_SIZE = 2048  # texels at most, if the settings name no size: half a millimetre each
-COARSE = 512  # side of the small image that fills what no triangle of a head covers
+COARSE = 1024  # side of the small image that fills what no triangle covers
 BAND_ROWS = 64
 ROUNDS = 12  # of a mean of normals: charts follow the shape of the bust, not its pores
 
 
 def paint_texture(
-    layout: Layout,
-    mesh_world: Mesh,
-    colours: UInt8[np.ndarray, "v 3"],
-    decision: Decision,
-    size: int,
-    coarse: int = COARSE,
+    layout: Layout, mesh_world: Mesh, colours: UInt8[np.ndarray, "v 3"], decision: Decision, size: int
 ) -> Atlas:
     """Paints the texture of a head, an image ``size`` texels wide and high.
 
@@ -49,10 +44,9 @@ def paint_texture(
         colours: sRGB of its vertices, for what no camera sees and for the padding.
         decision: the views of every vertex, and the photographs.
         size: of the image.
-        coarse: side of the small image that fills what no triangle covers.
     """
     stored = np.empty((size, size, 3), np.uint8)  # blue first: encoders take it as it is
-    cv2.resize(_coarse(layout, colours, coarse), (size, size), dst=stored, interpolation=cv2.INTER_NEAREST)
+    cv2.resize(_coarse(layout, colours), (size, size), dst=stored, interpolation=cv2.INTER_NEAREST)
     texels = size * layout.uv - 0.5
     choice = decision.choice(colours)
     corners = texels[layout.faces, 1]
@@ -68,10 +62,10 @@ def paint_texture(
     return Atlas(layout, stored[:, :, ::-1])
 
 
-def _coarse(layout: Layout, colours: UInt8[np.ndarray, "v 3"], size: int) -> UInt8[np.ndarray, "s s 3"]:
+def _coarse(layout: Layout, colours: UInt8[np.ndarray, "v 3"]) -> UInt8[np.ndarray, "s s 3"]:
     """Paints the vertices' colours in a small image, blue first; texels beside the layout get the nearest colour."""
-    texels, ones = size * layout.uv - 0.5, np.ones(len(layout.uv))
-    _, shown = rasterise(texels, ones, layout.faces, size, size)
+    texels, ones = COARSE * layout.uv - 0.5, np.ones(len(layout.uv))
+    _, shown = rasterise(texels, ones, layout.faces, COARSE, COARSE)
     values = np.ascontiguousarray(colours[layout.source, ::-1]).astype(np.float32)
     image = interpolate(shown, texels, ones, layout.faces, values)
     return np.rint(spread_texels(image, shown >= 0)).astype(np.uint8)
@@ -125,7 +119,7 @@ def paint_charts(
     layout = lay_out_charts(Mesh(mesh_world.vertices @ head_axes, mesh_world.faces), towards)
     size = texture_size(layout, mesh_world, coloured.decision.views, region, wanted=wanted)
     size = size if wanted is not None else min(size, BUST_SIZE)
-    return paint_texture(layout, mesh_world, coloured.colours, coloured.decision, size, size // 2)
+    return paint_texture(layout, mesh_world, coloured.colours, coloured.decision, size)
 
 
 @traced

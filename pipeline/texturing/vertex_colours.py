@@ -1,41 +1,35 @@
 """Computes one colour for each vertex from the photographs (section 4.5).
 
 Enters: the fitted mesh, the photographs, the silhouettes. Leaves: a colour for each vertex, and how many images it
-comes from. ``blend = "reference"`` is the paper's method: a vertex counts in an image if it projects inside the
-silhouette and nothing lies in front of it; its weight is the dot product of normal and viewing direction; its colour is
-the weighted mean.
+comes from. ``blend = "reference"`` is the paper's weighted mean: a vertex counts in an image if it projects inside the
+silhouette and nothing lies in front of it; its weight is the dot product of normal and viewing direction.
 
-The default differs, because real cameras differ and real edges are blurred. It has margins at contours and occluding
-edges (``pipeline.texturing.visibility``), sharpens photographs where they have detail, and corrects gain and offset of
-each camera (``pipeline.imaging.colour_balance``). Its mean is in linear light and gives little weight to a view that
-differs from the others in any channel, be it brighter (a highlight moves with the camera) or darker (a shadow that it
-alone sees), and less weight to cameras with a large correction. Where no camera sees the head it is filled smoothly.
+The default differs, because real cameras differ and real edges are blurred: it has margins at contours and occluding
+edges (``visibility``), sharpens photographs where they have detail, and corrects gain and offset of each camera
+(``colour_balance``). Its mean is in linear light and gives little weight to a view that differs from the others in any
+channel (a highlight, a shadow), and less to cameras with a large correction. What no camera sees is filled smoothly.
 
-A model whose eyes are openings has them closed by strips from lid to lid (``close_openings`` of imports). Every vertex
-of a strip lies on the opening's rim, which the lids hide, so that no view would be chosen for it, and the eyeball would
-be painted in the colour of the skin around it. Such a patch takes its colours from the one photograph that sees most of
-it.
+A model whose eyes are openings has them closed by strips from lid to lid, whose vertices all lie on the rim that the
+lids hide. Such a patch takes its colours from the one photograph that sees most of it.
 
-The photograph from which each part of the head takes its detail is selected after Waechter, Moehrle and Goesele, *Let
-There Be Color! Large-Scale Texturing of 3D Reconstructions* (ECCV 2014): each vertex is labelled with a view, so that
-the sum of two terms is least. The data term holds projected area and angle, the visibility of all neighbours, how far a
-view's colour is from that of the others (highlight or shadow), and how strongly the camera had to be corrected. The
-Potts term holds the edges between different labels, and costs most where the views disagree, so that seams keep out of
-eyes and lips. Unlike there, labels are at vertices instead of faces: in the ring of triangles at a seam, two
-photographs are then blended. The sum is minimised by belief propagation (Felzenszwalb and Huttenlocher, *Efficient
-Belief Propagation for Early Vision*, IJCV 2006), in sweeps over the vertices forth and back.
+The photograph from which each part takes its detail is selected after Waechter, Moehrle and Goesele, *Let There Be
+Color! Large-Scale Texturing of 3D Reconstructions* (ECCV 2014): each vertex is labelled with a view, so that the sum of
+two terms is least. The data term holds projected area and angle, the visibility of all neighbours, how far a view's
+colour is from the others', and how strongly the camera had to be corrected. The Potts term holds the edges between
+labels, and costs most where the views disagree, so that seams keep out of eyes and lips. Unlike there, labels are at
+vertices: in the ring of triangles at a seam, two photographs are blended. The sum is minimised by belief propagation
+(Felzenszwalb and Huttenlocher, *Efficient Belief Propagation for Early Vision*, IJCV 2006), forth and back.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
-from scipy.sparse.csgraph import connected_components
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
+from pipeline.fusion.net_kernels import component_of
 from pipeline.geometry.raster import camera_depths
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import Silhouette
@@ -43,9 +37,8 @@ from pipeline.part_labels.codes import Part
 from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision, pack_pictures
 from pipeline.texturing.likeness import find_unlike
-from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown
+from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown, level_views
 from pipeline.texturing.paint_kernels import Pictures
-from pipeline.texturing.seam_levelling import level_views
 from pipeline.texturing.vertex_colours_kernels import OUTLIER, blend_views
 from pipeline.texturing.view_selection_kernels import (
     NEVER,
@@ -245,11 +238,8 @@ def wide_doubtful_surface(weights: Weights, mesh_world: Mesh) -> Bool[np.ndarray
     total = weights.sum(axis=0)
     unsure = total < SURE_SHARE * np.median(total[total > 0])
     faces = mesh_world.faces[unsure[mesh_world.faces].all(axis=1)]
-    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    joined = sparse.coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(total), len(total)))
-    part = connected_components(joined, directed=False)[1]
-    normals = face_normals(mesh_world.vertices, faces)
-    area_mm2 = np.bincount(part[faces[:, 0]], 0.5 * np.linalg.norm(normals, axis=1), minlength=part.max() + 1)
+    part, normals = component_of(faces, len(total)), face_normals(mesh_world.vertices, faces)
+    area_mm2 = np.bincount(part[faces[:, 0]], 0.5 * np.linalg.norm(normals, axis=1), minlength=len(total))
     return np.asarray(unsure & (area_mm2[part] > DOUBTFUL_MM2))
 
 
@@ -456,14 +446,8 @@ def _taken(
 
 
 def _patches(faces: Faces) -> Int[np.ndarray, " f"]:
-    """Returns the patch of each triangle: the triangles of a patch are connected by edges."""
-    count = len(faces)
-    ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    _, edge = np.unique(ends, axis=0, return_inverse=True)
-    owner = np.tile(np.arange(count), 3)
-    shape = (count, int(edge.max(initial=-1)) + 1)
-    touches = sparse.csr_array((np.ones(3 * count), (owner, edge.ravel())), shape=shape)
-    return connected_components(touches @ touches.T, directed=False)[1]
+    """Returns the patch of each triangle: the triangles of a patch are connected by corners."""
+    return component_of(faces, int(faces.max(initial=-1)) + 1)[faces[:, 0]]
 
 
 def select_views(
@@ -480,7 +464,7 @@ def select_views(
     quality.
 
     ``weights``: of the views by angle and distance, 0 = not seen. ``codes``: sRGB codes of every view at every vertex,
-    gains applied. ``levelled``: the same after ``pipeline.texturing.seam_levelling``, which does not remove the edge of
+    gains applied. ``levelled``: the same after ``pipeline.texturing.neighbourhood``, which does not remove the edge of
     a shadow. ``agreed``: codes on which the views agree. ``gains``: of the cameras; their product is 1. ``around``: the
     mesh's edges. ``seam_cost``: of an edge where views differ.
     """

@@ -1,4 +1,4 @@
-"""Compiled loops of ``pipeline.texturing.vertex_colours`` and ``pipeline.texturing.seam_levelling``."""
+"""Compiled loops of ``pipeline.texturing.vertex_colours`` and ``pipeline.texturing.neighbourhood``."""
 
 import numpy as np
 

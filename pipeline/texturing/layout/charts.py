@@ -81,25 +81,15 @@ def _hidden(
 
 
 def _packed(flat: Float[np.ndarray, "n 2"], piece: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-    """Places the charts, each a ``piece`` of the layout, in the unit square, upright and all at one scale."""
+    """Places the charts, each a ``piece`` of the layout, in the unit square, all at one scale."""
     chart = np.unique(piece, return_inverse=True)[1]
-    low, size = _extents(flat, chart)
-    flat = np.where((size[:, 0] > size[:, 1])[chart, None], flat[:, ::-1] * (-1.0, 1.0), flat)
-    low, size = _extents(flat, chart)
-    side = max(float(np.sqrt(size.prod(axis=1).sum())), float(size.max()))
-    while (corner := _on_shelves(size, side)) is None:
-        side *= WIDER
-    return (flat + (corner - low)[chart]) / side
-
-
-def _extents(
-    flat: Float[np.ndarray, "n 2"], chart: Int[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, "c 2"], Float[np.ndarray, "c 2"]]:
-    """Returns the upper left corner and the size of each chart."""
     order = np.argsort(chart, kind="stable")
     starts = np.searchsorted(chart[order], np.arange(chart.max() + 1))
     low, high = (each.reduceat(flat[order], starts, axis=0) for each in (np.minimum, np.maximum))
-    return low, high - low
+    side = max(float(np.sqrt((high - low).prod(axis=1).sum())), float((high - low).max()))
+    while (corner := _on_shelves(high - low, side)) is None:
+        side *= WIDER
+    return (flat + (corner - low)[chart]) / side
 
 
 def _on_shelves(size: Float[np.ndarray, "c 2"], side: float) -> Float[np.ndarray, "c 2"] | None:

@@ -19,9 +19,8 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision, pack_pictures
 from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout
-from pipeline.texturing.neighbourhood import fill_unknown
+from pipeline.texturing.neighbourhood import fill_unknown, level_views
 from pipeline.texturing.paint import paint_texture
-from pipeline.texturing.seam_levelling import level_views
 from pipeline.texturing.sets.specular import Specular, specular_light
 from pipeline.texturing.vertex_colours_kernels import OUTLIER, blend_views
 from pipeline.texturing.visibility import FOOTPRINT_PX, LINEAR, sharpened

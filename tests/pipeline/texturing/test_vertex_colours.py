@@ -16,9 +16,8 @@ from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.settings import TextureSettings
 from pipeline.texturing.layout.uv_unwrap import unwrap
-from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown, neighbours
+from pipeline.texturing.neighbourhood import LEVELLING, Neighbourhood, fill_unknown, level_views, neighbours
 from pipeline.texturing.paint import paint_texture
-from pipeline.texturing.seam_levelling import LEVELLING, level_views
 from pipeline.texturing.vertex_colours import (
     Texture,
     add_similar_views,
