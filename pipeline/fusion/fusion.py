@@ -1,9 +1,8 @@
 """Fuses all that the cameras see to one closed surface.
 
-Enters: depth maps, silhouettes and the fitted head. Leaves: a two-manifold mesh with a standard deviation and a part
-for each vertex. A signed distance is computed on a grid (``signed_distance``); its zero becomes a mesh
-(``pipeline.geometry.surface_nets``); the vertices are moved to the depth maps (``refinement``) and to the fitted head
-(``skin``); triangles that are then turned, folded or crossing are mended (``untangling``)."""
+A signed distance is computed on a grid (``signed_distance``); its zero becomes a mesh (``surface_nets``); the vertices
+are moved to the depth maps (``refinement``), to the fitted head (``skin``) and, of hair, to its outlines (``hair``);
+triangles that are then turned, folded or crossing are mended (``untangling``)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,17 +1,13 @@
 """Decides what counts as hair, and makes its surface as smooth as pictures resolve it.
 
-Two cameras see other strands, so that windows match chance patterns: what depth says of them scatters
-over millimetres and leaves gravel with pockets and handles. That is noise, not relief. Its votes are therefore weak in
-the signed distance (``loosened``), which leaves no pockets, and its vertices take the mean of those about them.
+Windows match chance patterns of strands: their depth scatters over millimetres and leaves gravel with pockets and
+handles. Its votes are therefore weak in the signed distance (``loosened``), and its vertices take the mean of those
+about them. Strands also let through what lies behind them, so that depth is that of their dense core or of the scalp:
+where the surface turns away from a camera, it is moved to as far inside all silhouettes as strands are that one sees.
+Hair that has a surface, as a helmet has, has depth nearly everywhere, and stays as it is.
 
-Strands are thinner than a pixel and let through what lies behind them, so that windows match the dense core of the
-hair, millimetres deeper than the strands that a photograph shows. Outlines show how much is missing: where the surface
-turns away from a camera, it is moved to as far inside all silhouettes as strands are that one sees. Hair that has a
-surface, as a helmet has, has depth nearly everywhere, and stays as it is.
-
-Long hair of strands, whose depth photographs hardly show, is a smooth shell inside the visual hull. Places that match
-here and there tell together how deep inside the hull the hair lies, and that distance is smooth. The fitted head, with
-a thickness above it, says nothing of hair that hangs free.
+Long hair, whose depth photographs hardly show, is a smooth shell inside the visual hull. Places that match here and
+there tell together how deep inside the hull it lies. The fitted head says nothing of hair that hangs free.
 """
 
 from collections.abc import Mapping, Sequence

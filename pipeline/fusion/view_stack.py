@@ -1,9 +1,8 @@
-"""Packs what all views show into flat arrays for compiled loops: depth, and the signed distance to the outline; and
-ignores outlines where other views contradict them.
+"""Packs what all views show into flat arrays for compiled loops: depth, and the signed distance to the outline.
 
-A surface lies inside every silhouette. Where points of two views fall outside a third one's, it is ignored, so
-that one bad mask cuts no hole. Close to an outline the depth is wrong: windows make thin things (frames of glasses, the
-edge of a collar) wider by their own size, in every view alike.
+A surface lies inside every silhouette. Where points of two views fall outside a third one's, that one is ignored: a bad
+mask cuts no hole. Close to an outline the depth is wrong: windows make thin things (frames of glasses, the edge of a
+collar) wider by their own size, in every view alike.
 """
 
 from collections.abc import Mapping, Sequence

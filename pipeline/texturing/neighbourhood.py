@@ -1,12 +1,10 @@
 """Holds which vertices of a mesh are neighbours, in the form that compiled loops read, fills in what is unknown from
 them, and levels photographs so that they meet without a visible step.
 
-Waechter et al. (2014, section 4.3, after Lempitsky and Ivanov 2007) look for smooth additive corrections that make both
-sides of every seam agree, which leaves free what all views have in common. Here the correction of a view is a smooth
-field that brings it to the colour on which all views agree, wherever it sees the head (a screened Poisson equation): a
-view with a shadow or a highlight has no tint far from a seam either, and any views can be blended. What remains at a
-seam is blended over one ring of triangles (``pipeline.texturing.paint``). Corrections are in sRGB codes, so that
-neither dark creases nor bright skin dominate.
+Waechter et al. (2014, section 4.3) look for smooth additive corrections that make both sides of every seam agree, which
+leaves free what all views have in common. Here a view's correction is a smooth field (sRGB codes) that brings it to the
+colour on which all views agree, wherever it sees the head (a screened Poisson equation), so that any views can be
+blended.
 """
 
 from dataclasses import dataclass

@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
+from pipeline.fusion.refinement import neighbours
+from pipeline.fusion.refinement_kernels import blurred_over_mesh
 from pipeline.geometry.raster import camera_depths
 from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.head_model.model import HeadModel
@@ -18,7 +20,6 @@ from pipeline.settings import Settings
 from pipeline.texturing.decision import Decision
 from pipeline.texturing.layout.charts import lay_out_charts
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, ModelLayout, NoLayout, model_layout, spread_texels
-from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.paint_kernels import paint_rows
 from pipeline.texturing.vertex_colours import Texture
 from pipeline.warnings import ReportWarning
@@ -115,10 +116,9 @@ def paint_charts(
     detail."""
     if coloured.decision is None:
         return None
-    towards = Neighbourhood.of(*neighbours(mesh_world.faces, len(normals))).calmed(normals @ head_axes, ROUNDS)
+    towards = blurred_over_mesh(normals @ head_axes, *neighbours(mesh_world.faces, len(normals)), ROUNDS)
     layout = lay_out_charts(Mesh(mesh_world.vertices @ head_axes, mesh_world.faces), towards)
-    size = texture_size(layout, mesh_world, coloured.decision.views, region, wanted=wanted)
-    size = size if wanted is not None else min(size, BUST_SIZE)
+    size = wanted or min(BUST_SIZE, texture_size(layout, mesh_world, coloured.decision.views, region))
     return paint_texture(layout, mesh_world, coloured.colours, coloured.decision, size)
 
 

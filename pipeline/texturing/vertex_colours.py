@@ -39,10 +39,11 @@ from pipeline.texturing.decision import Decision, pack_pictures
 from pipeline.texturing.likeness import find_unlike
 from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown, level_views
 from pipeline.texturing.paint_kernels import Pictures
-from pipeline.texturing.vertex_colours_kernels import OUTLIER, blend_views
 from pipeline.texturing.view_selection_kernels import (
     NEVER,
+    OUTLIER,
     best_candidates,
+    blend_views,
     differences,
     fill_slots,
     propagate,
@@ -321,63 +322,27 @@ def _reference(
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
 ) -> Texture:
     """Colours vertices exactly by section 4.5, in the images' own codes; fills those that no camera sees."""
-    colours, weights, views = reference_colours(mesh.vertices, normals, capture, silhouettes, rig, depths)
+    from scipy.ndimage import map_coordinates  # for the paper's mean alone
+
+    total, weights, views = np.zeros((len(normals), 3)), np.zeros(len(normals)), np.zeros(len(normals), np.uint8)
+    for camera in rig:
+        pixels, depth = camera.project(mesh.vertices), depths[camera.name]
+        framed = np.logical_and(pixels >= 0, pixels <= np.array(depth.shape[::-1]) - 1).all(axis=1)  # NaN is not
+        columns, rows = np.rint(np.where(framed[:, None], pixels, 0.0)).astype(int).T
+        free = camera_depths(camera, mesh.vertices) < depth[rows, columns] + REFERENCE_HIDDEN_MM
+        towards = camera.centre_world - mesh.vertices
+        facing = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+        seen = np.flatnonzero(framed & silhouettes[camera.name].mask[rows, columns] & free & (facing > 0.0))
+        for channel in range(3):
+            plane = capture.images[camera.name][:, :, channel].astype(float)
+            total[seen, channel] += facing[seen] * map_coordinates(plane, pixels[seen, ::-1].T, order=1, mode="nearest")
+        weights[seen] += facing[seen]
+        views[seen] += 1
     known = weights > 0
     if not known.any():
         return _untextured(len(normals))
-    colours = fill_unknown(colours, known, mesh.faces)
+    colours = fill_unknown(total / np.where(known, weights, 1.0)[:, None], known, mesh.faces)
     return Texture(np.rint(colours).clip(0, 255).astype(np.uint8), views, filled=int(np.count_nonzero(~known)))
-
-
-def reference_colours(
-    points: Points,
-    normals: Points,
-    capture: Capture,
-    silhouettes: Mapping[str, Silhouette],
-    rig: Rig,
-    depths: Mapping[str, Float32[np.ndarray, "_ _"]],
-) -> tuple[Points, Float[np.ndarray, " v"], UInt8[np.ndarray, " v"]]:
-    """Computes the colours of surface points by the paper's method (section 4.5). Returns their sRGB codes, the sum of
-    weights of each (0: no camera sees the point), and the number of images."""
-    total, weights = np.zeros((len(normals), 3)), np.zeros(len(normals))
-    views = np.zeros(len(normals), np.uint8)
-    for camera in rig:
-        pixels = camera.project(points)
-        seen = _visible(camera, points, pixels, depths[camera.name], silhouettes[camera.name])
-        towards = camera.centre_world - points
-        facing = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
-        weight = np.where(seen, np.clip(facing, 0.0, None), 0.0)
-        total += weight[:, None] * _sampled(capture.images[camera.name], pixels)
-        weights += weight
-        views += weight > 0
-    return total / np.where(weights > 0, weights, 1.0)[:, None], weights, views
-
-
-def _visible(
-    camera: Camera,
-    vertices: Points,
-    pixels: Float[np.ndarray, "v 2"],
-    depth: Float32[np.ndarray, "h w"],
-    silhouette: Silhouette,
-) -> Bool[np.ndarray, " v"]:
-    """Tells which vertices lie inside the silhouette and are not occluded."""
-    height, width = depth.shape
-    framed = np.logical_and(pixels >= 0, pixels <= (width - 1, height - 1)).all(axis=1)  # NaN is not
-    columns, rows = np.rint(np.where(framed.reshape(-1, 1), pixels, 0.0)).astype(int).T
-    free = camera_depths(camera, vertices) < depth[rows, columns] + REFERENCE_HIDDEN_MM
-    return framed & silhouette.mask[rows, columns] & free
-
-
-def _sampled(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "v 2"]) -> Points:
-    """Returns bilinear samples; outside the image those of the nearest border pixel."""
-    height, width = image.shape[:2]
-    safe = np.clip(np.nan_to_num(pixels), 0, (width - 1.001, height - 1.001))
-    low = safe.astype(int)
-    fx, fy = (safe - low).T[:, :, None]
-    x, y = low.T
-    top = image[y, x] * (1 - fx) + image[y, x + 1] * fx
-    bottom = image[y + 1, x] * (1 - fx) + image[y + 1, x + 1] * fx
-    return top * (1 - fy) + bottom * fy
 
 
 def fill_unobserved_patches(

@@ -1,9 +1,8 @@
 """Lays a closed surface flat in charts, for the bust's texture.
 
 Each triangle goes to the one of six directions (along the head's axes) that its surroundings face, and is drawn as it
-is seen from there, so that texels are as wide on all of the surface, and no triangle is stretched by more than 1.8 but
-where it turns away from its surroundings. Where one sheet lies behind another (an ear before the head), the hidden one
-goes to a chart of its own. Charts are packed on shelves.
+is seen from there. Where one sheet lies behind another (an ear before the head), the hidden one goes to a chart of its
+own. Charts are packed on shelves.
 """
 
 import numpy as np
@@ -50,6 +49,8 @@ def lay_out_charts(mesh: Mesh, towards: Float[np.ndarray, "v 3"]) -> Layout:
     faces, source = mesh.faces.astype(np.int32), np.concatenate([np.arange(count), more % count]).astype(np.int32)
     faces[other] = count + which
     uv = _packed(flat[np.concatenate([first, more // count]) % 6, source], component_of(faces, len(source)))
+    faces.setflags(write=False)  # as a model's: loops are compiled for these
+    source.setflags(write=False)
     return Layout(uv, faces, source)
 
 
