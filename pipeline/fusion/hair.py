@@ -51,7 +51,7 @@ FRAME_PX = 3  # from the border of a photograph, where the outline is the photog
 STRANDS = 0.2, 0.6  # probability of hair from which on it is moved to its outlines, and wholly
 TANGENT = 0.25, 0.5  # cosine to a camera up to which its outline bounds the surface, and from which on not: there a
 # ball's of 80 mm lies 2.6 mm inside it, here 12
-INSET_MM, MOST_MM = 2.5, 12.0  # of true strands inside beard-smile's hull (median 2.7), and the farthest move
+INSET_MM, MAX_WAY_MM = 2.5, 12.0  # of true strands inside beard-smile's hull (median 2.7), and the farthest move
 STRAND_SHARE = 0.5  # standard deviation of a moved vertex, by its way: strands lie between core and outline
 # Share of the pixels of hair with a known depth, below which hair is silent: 0.25 of long strands, 0.53 of short ones
 # and a beard, 0.82 and 0.84 of solid hair.
@@ -293,7 +293,7 @@ def grown_to_outlines(
     inside_mm, facing, tangent = depth_inside_outlines(vertices, normals[rows], silhouettes, rig)
     share = np.interp(hair[rows], STRANDS, (0.0, 1.0)) * np.interp(facing, FACING, (0.0, 1.0))
     share *= np.interp(tangent, TANGENT, (1.0, 0.0))
-    moved_mm[rows] = share * np.clip(inside_mm - INSET_MM, 0.0, MOST_MM)
+    moved_mm[rows] = share * np.clip(inside_mm - INSET_MM, 0.0, MAX_WAY_MM)
     way = np.stack([mean_around(beside, moved_mm * each, np.ones(len(hair))) for each in normals.T], axis=1)
     return Mesh(mesh_world.vertices + way, mesh_world.faces), np.linalg.norm(way, axis=1)
 

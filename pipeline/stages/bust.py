@@ -148,9 +148,11 @@ def colour_bust(
     settings, rig, mesh = context.settings, context.rig, shaped.surface.mesh_world
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
     likely, seen = shaped.likely_part, shaped.surface.seen
-    shown = Shown(likely, lambda camera, rows: labels.shares(camera, mesh.vertices[rows]), measured=seen)
-    best, chosen = "glb" in settings.outputs.formats, settings.texture
-    colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=chosen, shown=shown, best_views=best)
+    best = "glb" in settings.outputs.formats
+    shown = Shown(
+        likely, lambda camera, rows: labels.shares(camera, mesh.vertices[rows]), measured=seen, best_views=best
+    )
+    colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture, shown=shown)
     atlas = paint_charts(mesh, normals, colours, head_axes, np.flatnonzero(seen), settings.outputs.texture_size)
     return Staged(Bust(shaped, normals, colours.colours, colours.views, settings.bust.spacing_mm, atlas))
 

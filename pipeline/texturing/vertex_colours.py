@@ -118,6 +118,7 @@ class Shown:
         face: where what is of no part is a mouth or a nostril, and not a backdrop.
         measured: where depth agrees with the surface; None: everywhere.
         compared: regions of the face over which views of one moment look alike.
+        best_views: whether detail is taken, without a mesh's edges, from the view that sees a vertex best.
     """
 
     likely: UInt8[np.ndarray, " v"]
@@ -126,6 +127,7 @@ class Shown:
     face: Bool[np.ndarray, " v"] | None = None
     measured: Bool[np.ndarray, " v"] | None = None
     compared: tuple[Bool[np.ndarray, " v"], ...] = ()
+    best_views: bool = False
 
     def weigh(self, weights: Weights, views: Rig) -> tuple[Weights, UInt8[np.ndarray, " v"]]:
         """Returns the views' weights, 0 where one of them, or the mean of all, hardly shows the surface; and the parts
@@ -176,7 +178,6 @@ def texture(
     *,
     settings: TextureSettings,
     around: Neighbourhood | None = None,
-    best_views: bool = False,
     dim_share: float | None = None,
     outlier: float = OUTLIER,
     shown: Shown | None = None,
@@ -184,8 +185,7 @@ def texture(
     """Computes the colour of each vertex from the photographs of the usable views. ``depths`` are the mesh's depth maps
     in these views (mm).
 
-    If ``around``, the edges of the mesh, is not None, the result also has a ``decision``: a view for each vertex; with
-    ``best_views`` it has one that costs a fifth (``take_best_views``). If
+    If ``around``, the edges of the mesh, is not None, the result also has a ``decision``: a view for each vertex. If
     ``dim_share`` is not None, it also has each vertex's colour in a dim view: views with that share of the vertex's
     weight are no brighter. A view counts half where it differs from the views' median by ``outlier`` of its level.
     With ``shown``, no view colours a vertex where it shows something before the mesh, or a guess along its rim.
@@ -218,14 +218,12 @@ def texture(
     doubtful = wide_doubtful_surface(weights, mesh_world) | (False if shown is None else shown.find_guessed(weights))
     weights[:, doubtful], seen[doubtful], hidden = 0.0, 0, hidden | doubtful
     decision = None
-    if around is not None or best_views:
+    best = shown is not None and shown.best_views
+    if around is not None or best:
         masks = {name: silhouettes[name].mask for name in views.names}
         pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world=mesh_world)
-        if around is None:
-            decision = take_best_views(views, weights, balanced, agreed, pictures)
-        else:
-            decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
-            decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, hidden)
+        decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
+        decision = decision if best else fill_unobserved_patches(decision, mesh_world, silhouettes, depths, hidden)
     whole = fill_unknown(agreed, seen > 0, mesh_world.faces, parts)
     codes, by_camera = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8), _by_name(views, gains)
     dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
@@ -263,9 +261,12 @@ def decide(
     gains: Float[np.ndarray, "k 3"],
     pictures: Pictures,
     *,
-    around: Neighbourhood,
+    around: Neighbourhood | None,
 ) -> Decision:
-    """Chooses a view for each vertex, and computes the corrections that level the seams between views."""
+    """Chooses a view for each vertex, and computes the corrections that level the seams between views: without
+    ``around`` the view that sees it best, levelled there to the colour on which all views agree."""
+    if around is None:
+        return take_best_views(views, weights, balanced, agreed, pictures)
     codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
     level_to = (255 * srgb_from_linear(np.clip(agreed, 0, 1))).astype(np.float32)
     fields = level_views(weights, codes, level_to, around)
@@ -277,8 +278,7 @@ def decide(
 
 
 def take_best_views(views: Rig, weights: Weights, balanced: Colours, agreed: Points, pictures: Pictures) -> Decision:
-    """Takes for each vertex the view that sees it best, and levels it there to the colour on which all views agree:
-    between the vertices is that view's detail, at the vertices no seam."""
+    """Takes for each vertex the view that sees it best, for the detail between vertices; at them there is no seam."""
     best, rows = weights.argmax(axis=0), np.arange(weights.shape[1])
     codes = [255 * srgb_from_linear(np.clip(each, 0, 1)) for each in (agreed, balanced[best, rows])]
     corrections = np.zeros((len(rows), 1, 4), np.float32)
@@ -327,8 +327,8 @@ def _reference(
     total, weights, views = np.zeros((len(normals), 3)), np.zeros(len(normals)), np.zeros(len(normals), np.uint8)
     for camera in rig:
         pixels, depth = camera.project(mesh.vertices), depths[camera.name]
-        framed = np.logical_and(pixels >= 0, pixels <= np.array(depth.shape[::-1]) - 1).all(axis=1)  # NaN is not
-        columns, rows = np.rint(np.where(framed[:, None], pixels, 0.0)).astype(int).T
+        framed = np.all((pixels >= 0) & (pixels <= np.array(depth.shape[::-1]) - 1), axis=1)  # NaN is not
+        columns, rows = np.rint(np.where(framed.reshape(-1, 1), pixels, 0.0)).astype(int).T
         free = camera_depths(camera, mesh.vertices) < depth[rows, columns] + REFERENCE_HIDDEN_MM
         towards = camera.centre_world - mesh.vertices
         facing = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
