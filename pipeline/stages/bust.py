@@ -141,8 +141,7 @@ def colour_bust(
     coloured: Capture,
     head_axes: Float[np.ndarray, "3 3"],
 ) -> Staged[Bust | None]:
-    """Colours the bust from the photographs of ``coloured``, and paints its texture in charts along ``head_axes``
-    (columns, world frame). Returns None without a surface."""
+    """Colours the bust from the photographs of ``coloured``; ``head_axes`` are as in ``paint_charts``."""
     if shaped is None:
         return Staged(None)
     settings, rig, mesh = context.settings, context.rig, shaped.surface.mesh_world

@@ -111,9 +111,8 @@ def paint_charts(
     region: Int[np.ndarray, " n"],
     wanted: int | None = None,
 ) -> Atlas | None:
-    """Paints the texture of the closed surface ``mesh_world`` (mm) in charts along ``head_axes`` (columns, world
-    frame), as fine as the pictures in the ``region`` (vertices). Returns None if it was coloured without views for its
-    detail."""
+    """Paints the texture of a closed surface (mm) in charts along ``head_axes`` (columns, world frame), as fine as the
+    pictures in the ``region`` (vertices). Returns None if it was coloured without a decision."""
     if coloured.decision is None:
         return None
     towards = blurred_over_mesh(normals @ head_axes, *neighbours(mesh_world.faces, len(normals)), ROUNDS)

@@ -23,8 +23,7 @@ WIDER = 1.02  # by what the square grows until all charts fit
 
 @traced
 def lay_out_charts(mesh: Mesh, towards: Float[np.ndarray, "v 3"]) -> Layout:
-    """Returns the texture layout of a closed mesh (mm, along the head's axes). ``towards`` are the normals of its
-    vertices' surroundings."""
+    """Returns the layout of a closed mesh (mm, the head's axes); ``towards``: normals of vertices' surroundings."""
     count, rows = len(mesh.vertices), np.arange(len(mesh.faces))
     seen = [_seen_from(mesh.vertices, direction) for direction in range(6)]
     flat = np.stack([each[0] for each in seen])
