@@ -67,7 +67,7 @@ def start_reconstruction(context: ReconstructionContext) -> Generator[Any, HeadF
         run.stage("fine") as stage,
     ):
         refined = stage.keep(refine_head(stage.context, views, faces, head, labels, depth))
-    votes, depth = depth.votes, None
+    votes, axes, depth = depth.votes, head.fit.world_from_head.rotation, None
     with run.beside("bust", lambda quiet: shape_bust(quiet, views, votes, refined, fused.product)) as surface:
         with run.stage("texture") as stage:
             texturing = stage.keep(texture_head(stage.context, views, head, refined, labels))
@@ -77,7 +77,7 @@ def start_reconstruction(context: ReconstructionContext) -> Generator[Any, HeadF
                 judge_head(stage.context, views, faces, alignment, head, refined, texturing=texturing, pose=pose)
             )
     with run.stage("bust") as stage:
-        bust = stage.keep(colour_bust(stage.context, views, labels, surface.product, texturing.capture))
+        bust = stage.keep(colour_bust(stage.context, views, labels, surface.product, texturing.capture, axes))
         hair = stage.keep(push_out_hair(stage.context, views, refined, bust, texturing.capture))
     if any(warning.code == "pose-doubtful" for warning in run.warnings):  # of a refusal that was overruled, too
         pose = replace(pose, doubtful=True)

@@ -1,8 +1,7 @@
 """Decides where the bust ends: along a smooth surface where photographs end, and at a plane behind what cameras see.
 
-Photographs of several cameras end at several planes, whose edges nobody wants to see in a shoulder; and what lies
-behind neck and shoulders, where no camera looks, is known by no one: outlines alone leave hoods and slabs there. The
-head itself goes on to its back, whose shape the fitted head has.
+Photographs of several cameras end at several planes, whose edges nobody wants to see in a shoulder; and behind neck
+and shoulders, where no camera looks, outlines alone leave hoods and slabs. The head goes on to the fitted head's back.
 """
 
 from dataclasses import dataclass

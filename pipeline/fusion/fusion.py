@@ -1,9 +1,8 @@
 """Fuses all that the cameras see to one closed surface.
 
-Enters: depth maps, silhouettes and the fitted head. Leaves: a two-manifold mesh with a standard deviation and a part
-for each vertex. A signed distance is computed on a grid (``signed_distance``); its zero becomes a mesh
-(``pipeline.geometry.surface_nets``); the vertices are moved to the depth maps (``refinement``) and to the fitted head
-(``skin``); triangles that are then turned, folded or crossing are mended (``untangling``)."""
+A signed distance is computed on a grid (``signed_distance``); its zero becomes a mesh (``surface_nets``); the vertices
+are moved to the depth maps (``refinement``), to the fitted head (``skin``) and, of hair, to its outlines (``hair``);
+triangles that are then turned, folded or crossing are mended (``untangling``)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.compute.trace import traced
-from pipeline.fusion.contradiction import silence_contradicted
 from pipeline.fusion.crossings import without_coincidences
 from pipeline.fusion.hair import (
     STRAND_SHARE,
@@ -36,7 +34,7 @@ from pipeline.fusion.refinement import (
 from pipeline.fusion.signed_distance import Level, NoSurface, solve
 from pipeline.fusion.skin import HeadSkin, combine_with_head
 from pipeline.fusion.untangling import CLEAN, MeshFaults, mesh_faults, smooth_spots, topology_of
-from pipeline.fusion.view_stack import stack_views
+from pipeline.fusion.view_stack import silence_contradicted, stack_views
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette

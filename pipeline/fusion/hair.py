@@ -1,17 +1,13 @@
 """Decides what counts as hair, and makes its surface as smooth as pictures resolve it.
 
-Two cameras see other strands, so that windows match chance patterns: what depth says of them scatters
-over millimetres and leaves gravel with pockets and handles. That is noise, not relief. Its votes are therefore weak in
-the signed distance (``loosened``), which leaves no pockets, and its vertices take the mean of those about them.
+Windows match chance patterns of strands: their depth scatters over millimetres and leaves gravel with pockets and
+handles. Its votes are therefore weak in the signed distance (``loosened``), and its vertices take the mean of those
+about them. Strands also let through what lies behind them, so that depth is that of their dense core or of the scalp:
+where the surface turns away from a camera, it is moved to as far inside all silhouettes as strands are that one sees.
+Hair that has a surface, as a helmet has, has depth nearly everywhere, and stays as it is.
 
-Strands are thinner than a pixel and let through what lies behind them, so that windows match the dense core of the
-hair, millimetres deeper than the strands that a photograph shows. Outlines show how much is missing: where the surface
-turns away from a camera, its outline lies as far inside the silhouette. Between these rims the missing thickness is
-interpolated. Hair that has a surface, as a helmet has, has depth nearly everywhere, and stays as it is.
-
-Long hair of strands, whose depth photographs hardly show, is a smooth shell inside the visual hull. Places that match
-here and there tell together how deep inside the hull the hair lies, and that distance is smooth. The fitted head, with
-a thickness above it, says nothing of hair that hangs free.
+Long hair, whose depth photographs hardly show, is a smooth shell inside the visual hull. Places that match here and
+there tell together how deep inside the hull it lies. The fitted head says nothing of hair that hangs free.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,13 +28,13 @@ from pipeline.fusion.skin import mean_around, skin_share
 from pipeline.fusion.view_stack import ViewStack
 from pipeline.fusion.vote_kernels import CENTRE
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.raster import depth_map
+from pipeline.geometry.projection import project_points
+from pipeline.geometry.raster import camera_depths
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
 from pipeline.part_labels.votes import PartVotes, part_shares, parts_shown
 from pipeline.stereo.depth_map import DepthMap, placing, points_world
-from rig.camera import Camera
 from rig.mesh import Mesh, face_normals
 from rig.rig import Rig
 
@@ -51,18 +47,11 @@ CELLS = 64  # about a cell, whose mean height counts: 12 mm about it
 RESOLVED_MM = 4.0  # standard deviation of the mean that a vertex of hair takes: gravel is 2 to 5 mm wide
 STEP_SHARE = 0.46  # variance of one step of a mean, by the area of a vertex
 OFF_HEAD_MM = 8.0  # from the head there is no skin: strands that hang before it have skin's colours in shade
-SURELY = 0.5  # probability from which on a vertex of a rim counts as hair
-EVERY = 4  # pixel of a rim is measured
-RIM_PX = 0.5  # by which the pixels of a rim lie inside the outline
 FRAME_PX = 3  # from the border of a photograph, where the outline is the photograph's
-FARTHEST_MM = 30.0  # beyond that the outline is something else's
-# Of the rim's places about one, this quantile counts: single hairs stand out, and outlines follow them. With the
-# median, 64 % of a beard's strands lie within 2 mm, with this 73 %, with 0.2 77 %; of all hair 59, 59 and 58 %.
-ABOUT, QUANTILE = 24, 0.35
-NEAREST, EVEN_MM = 8, 8.0  # of them count at a vertex, and the distance within which they count alike
-MIN_PLACES = 2 * ABOUT  # for a measurement
-DENSE = 8  # power of hair's probability: where scalp shows between strands, the surface stays between the two
-ROUNDS, SHARE = 2, 0.7  # the rim of what has been moved is another one: what is still missing is measured again
+STRANDS = 0.2, 0.6  # probability of hair from which on it is moved to its outlines, and wholly
+TANGENT = 0.25, 0.5  # cosine to a camera up to which its outline bounds the surface, and from which on not: there a
+# ball's of 80 mm lies 2.6 mm inside it, here 12
+INSET_MM, MAX_WAY_MM = 2.5, 12.0  # of true strands inside beard-smile's hull (median 2.7), and the farthest move
 STRAND_SHARE = 0.5  # standard deviation of a moved vertex, by its way: strands lie between core and outline
 # Share of the pixels of hair with a known depth, below which hair is silent: 0.25 of long strands, 0.53 of short ones
 # and a beard, 0.82 and 0.84 of solid hair.
@@ -105,11 +94,8 @@ def find_silent_hair(
     known = known_share(depth_maps, parts, rig)
     scatter = float(np.interp(known, SCATTERED_SHARE, (1.0, 0.0)))
     if votes is None or known >= SILENT_SHARE:
-        return (
-            None,
-            [loosened(each, parts, rig, scatter) for each in depth_maps] if scatter > 0.0 else depth_maps,
-            scatter,
-        )
+        loose = [loosened(each, parts, rig, scatter) for each in depth_maps] if scatter > 0.0 else depth_maps
+        return None, loose, scatter
 
     def split(depth_map: DepthMap) -> tuple[Float[np.ndarray, "n 3"], DepthMap]:
         points, known = points_world(depth_map), depth_map.known
@@ -299,54 +285,32 @@ def grown_to_outlines(
     Returns:
         The moved mesh, and how far (mm) each vertex was moved.
     """
-    sure = hair > SURELY
     rig = rig.subset(name for name in rig.names if name in silhouettes and silhouettes[name].quality.usable)
-    if not sure.any() or not len(rig):
-        return mesh_world, np.zeros(len(hair))
-    mesh, beside = mesh_world, neighbours(mesh_world.faces, len(hair))
-    for _ in range(ROUNDS):
-        places, missing_mm = rims(mesh, sure, silhouettes, rig)
-        if len(places) < MIN_PLACES:
-            break
-        outwards = np.zeros(len(hair))
-        outwards[hair > 0.0] = missing_thickness(mesh.vertices[hair > 0.0], places, missing_mm)
-        way = (SHARE * hair**DENSE * outwards)[:, None] * mesh.normals()
-        smooth = [mean_around(beside, way[:, axis], np.ones(len(way))) for axis in range(3)]
-        mesh = Mesh(mesh.vertices + np.stack(smooth, axis=1), mesh.faces)
-    return mesh, np.linalg.norm(mesh.vertices - mesh_world.vertices, axis=1)
+    rows, moved_mm = np.flatnonzero(hair > 0.0), np.zeros(len(hair))
+    if not len(rows) or not len(rig):
+        return mesh_world, moved_mm
+    beside, vertices, normals = neighbours(mesh_world.faces, len(hair)), mesh_world.vertices[rows], mesh_world.normals()
+    inside_mm, facing, tangent = depth_inside_outlines(vertices, normals[rows], silhouettes, rig)
+    share = np.interp(hair[rows], STRANDS, (0.0, 1.0)) * np.interp(facing, FACING, (0.0, 1.0))
+    share *= np.interp(tangent, TANGENT, (1.0, 0.0))
+    moved_mm[rows] = share * np.clip(inside_mm - INSET_MM, 0.0, MAX_WAY_MM)
+    way = np.stack([mean_around(beside, moved_mm * each, np.ones(len(hair))) for each in normals.T], axis=1)
+    return Mesh(mesh_world.vertices + way, mesh_world.faces), np.linalg.norm(way, axis=1)
 
 
-def rims(
-    mesh_world: Mesh, counts: Bool[np.ndarray, " v"], silhouettes: Mapping[str, Silhouette], rig: Rig
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Returns places (world, mm) where the surface turns away from a camera, and how far (mm) its outline there lies
-    inside the camera's silhouette; only at vertices that ``counts``."""
-
-    def seen_by(camera: Camera) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-        depth, face = depth_map(camera, mesh_world.vertices, mesh_world.faces)
-        solid = face >= 0
-        inner = cv2.erode(solid.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        rim = solid & ~inner
-        rim[:FRAME_PX], rim[-FRAME_PX:], rim[:, :FRAME_PX], rim[:, -FRAME_PX:] = False, False, False, False
-        at = np.flatnonzero(rim)[::EVERY]
-        vertex = mesh_world.faces[face.flat[at], 0]
-        apart_px = -silhouettes[camera.name].distance.flat[at] - RIM_PX
-        apart_mm = apart_px * depth.flat[at] / camera.intrinsics.fx
-        used = counts[vertex] & (np.abs(apart_mm) < FARTHEST_MM)
-        return mesh_world.vertices[vertex[used]], apart_mm[used].astype(float)
-
-    found = map_in_threads(lambda k: seen_by(rig.cameras[k]), len(rig))
-    return np.concatenate([places for places, _ in found]), np.concatenate([apart for _, apart in found])
-
-
-def missing_thickness(
-    vertices: Float[np.ndarray, "v 3"], places: Float[np.ndarray, "n 3"], missing_mm: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " v"]:
-    """Returns the thickness (mm) that is missing at each vertex: the mean of the nearest places', weighted by distance,
-    each of which has the ``QUANTILE`` of those about it, and at least 0."""
-    tree = PointTree.of(places)
-    around = nearest(tree, places, count=ABOUT)[1]
-    even_mm = np.maximum(np.quantile(missing_mm[around], QUANTILE, axis=1), 0.0)
-    far, near = nearest(tree, vertices, count=NEAREST)
-    weight = 1.0 / (far * far + EVEN_MM**2) ** 2
-    return (weight * even_mm[near]).sum(axis=1) / weight.sum(axis=1)
+def depth_inside_outlines(
+    places: Places, normals: Places, silhouettes: Mapping[str, Silhouette], rig: Rig
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Returns how far (mm, at least 0) points lie inside all silhouettes, 0 where none bounds them; and the largest
+    cosine between their normals and the directions to cameras, and the smallest absolute one."""
+    inside_mm, cosines = np.full(len(places), np.inf), np.zeros((len(rig), len(places)))
+    for k, camera in enumerate(rig):
+        distance, towards = silhouettes[camera.name].distance, camera.centre_world - places
+        height, width = distance.shape
+        column, row = np.rint(np.nan_to_num(project_points(camera, places), nan=-1.0)).astype(int).T
+        shown = (column >= FRAME_PX) & (column < width - FRAME_PX) & (row >= FRAME_PX) & (row < height - FRAME_PX)
+        off_mm = -distance[row[shown], column[shown]] * camera_depths(camera, places[shown]) / camera.intrinsics.fx
+        inside_mm[shown] = np.minimum(inside_mm[shown], off_mm)
+        cosines[k] = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+    inside_mm[np.isinf(inside_mm)] = 0.0
+    return inside_mm, cosines.max(axis=0), np.abs(cosines).min(axis=0)

@@ -1,15 +1,13 @@
 """Computes the signed distance to everything that the cameras see, on a sparse grid, from depth, silhouettes and the
 fitted head.
 
-It goes from a coarse box around the subject down to the requested spacing. Every view votes at every node
-(``vote_kernels``): with the distance to the surface that it sees there, and free space in front of it; it says nothing
-of what lies behind. Silhouettes bound the body from outside. Between votes a membrane interpolates
-(``grid_kernels``); what no camera sees is drawn to the fitted head with its hair and to the visual hull. The
-coarsest level decides what is inside; each finer level is solved around the surface of the one before.
+From a coarse box down to the requested spacing, every view votes at every node (``vote_kernels``) with the distance to
+the surface that it sees there, and with free space in front of it. Silhouettes bound the body from outside. Between
+votes a membrane interpolates (``grid_kernels``); what no camera sees is drawn to the fitted head with its hair and to
+the visual hull. Each finer level is solved around the surface of the one before.
 
 Volumetric fusion with free space: Curless and Levoy, *A volumetric method for building complex models from range
-images*, SIGGRAPH 1996. Departures: votes are combined robustly (the median, and those that agree with it), silhouettes
-are inequalities, and the membrane fills holes.
+images*, SIGGRAPH 1996; but votes are combined robustly, and silhouettes are inequalities.
 """
 
 from collections.abc import Sequence
@@ -37,8 +35,7 @@ Field = Float32[np.ndarray, " n"]
 Points = Float[np.ndarray, "m 3"]
 
 COARSEST_MM = 5.0  # the first level's step is at least this: the whole box then has half a million nodes
-# Steps before and behind a surface within which its distance counts. Distances outside are cut off so short because the
-# inside of a shoulder is no thicker: a membrane between +3 and -1 step moves its surface inwards, or away.
+# Steps before and behind a surface within which its distance counts: the inside of a shoulder is no thicker.
 REACH, BEHIND = 1.5, 2.5
 AGREEMENT = 1.0  # steps (and at least a millimetre) within which votes are of one surface
 UNIT_STEPS, FLOOR_MM = 1 / 3, 0.1  # a vote of the first deviation weighs one; none is better than the second

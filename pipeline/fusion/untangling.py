@@ -1,12 +1,11 @@
 """Repairs a head's mesh so that no triangle is turned over, folded onto its neighbour, or passes through another.
 
 Expressions, kernel modes and displacements move vertices one by one, regardless of the surface: closed lips pass
-through each other, lids that close fold behind the brow, an ear sinks into the head. Each such spot first gets the
-shape of the model's clean mean head, laid on this head: the displacement from it is replaced by the membrane through
-the displacements about the spot (every vertex has the mean of its neighbours), so that an ear remains an ear. If a spot
-is not clean then, it is enlarged by rings of triangles. Spots that are still not clean become membranes themselves:
-loops shrink to nothing, and two sheets that went through each other separate, as their borders are separate. All other
-vertices stay where they are; most of these spots lie in slits that nobody sees."""
+through each other, lids that close fold behind the brow, an ear sinks into the head. Each such spot, if need be with
+rings of triangles about it, first gets the shape of the model's clean mean head: the displacement from it is replaced
+by the membrane through the displacements about the spot, so that an ear remains an ear. Spots that are still not clean
+become membranes themselves: loops shrink to nothing, and two sheets that went through each other separate. All other
+vertices stay where they are."""
 
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,13 +1,21 @@
-"""Packs what all views show into flat arrays for compiled loops: depth, and the signed distance to the outline."""
+"""Packs what all views show into flat arrays for compiled loops: depth, and the signed distance to the outline.
+
+A surface lies inside every silhouette. Where points of two views fall outside a third one's, that one is ignored: a bad
+mask cuts no hole. Close to an outline the depth is wrong: windows make thin things (frames of glasses, the edge of a
+collar) wider by their own size, in every view alike.
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int16, Int64
+from jaxtyping import Bool, Float, Float32, Int16, Int64
 
 from pipeline.compute.threads import map_in_threads
+from pipeline.compute.trace import traced
 from pipeline.fusion.vote_kernels import (
+    BLOCK,
     FRAME,
     NORMAL,
     NORMAL_STEP,
@@ -17,6 +25,7 @@ from pipeline.fusion.vote_kernels import (
     SIGMA_STEP_MM,
     UNKNOWN,
     Pixels,
+    mark_contradicted,
     write_outline,
 )
 from pipeline.geometry.projection import packed_lens
@@ -27,6 +36,9 @@ from rig.camera import Camera
 from rig.rig import Rig
 
 MAX_STEPS = np.iinfo(np.int16).max
+MIN_VIEWS = 2  # that see something solid, for an outline to be contradicted
+WIDENED_PX = 10.0  # by windows: glasses and collars of good captures, 8 px beyond their outlines
+SILENT_PX = -1000.0  # an outline that is so far away bounds nothing
 VIEWS_SURE = 3  # a depth that only two views agree on may be a chance match ...
 ALONE_FACTOR = 3.0  # ... and has its deviation multiplied: 28 % of them are 2 mm off, 4 % of those that three agree on
 
@@ -102,3 +114,44 @@ def _packed(camera: Camera) -> Float[np.ndarray, " 19"]:
     return np.concatenate(
         [pose.rotation.ravel(), pose.translation, camera.intrinsics.values()[:4], camera.centre_world]
     )
+
+
+@traced
+def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray, " k"]]:
+    """Removes the outlines where other views contradict them. Returns the views with those pixels' outline distance set
+    to ``SILENT_PX``, and for each view the share of its crop that was contradicted."""
+
+    def wrong_pixels(v: int) -> Bool[np.ndarray, "h w"] | None:
+        height, width = views.sizes[v]
+        blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
+        mark_contradicted(v, views.packed(), blocks, width)
+        solid = np.bitwise_count(blocks) >= MIN_VIEWS
+        outline_px = PIXEL_STEP * views.shown[views.starts[v] : views.starts[v] + height * width, OUTLINE]
+        return _beyond_windows(solid, outline_px.reshape(height, width)) if solid.any() else None
+
+    wrong = map_in_threads(wrong_pixels, len(views.cameras))
+    shares = np.array([0.0 if mask is None else mask.mean() for mask in wrong])
+    if not shares.any():  # as usual: fifty megabytes need no copy
+        return views, shares
+    shown = views.shown.copy()
+    for start, mask in zip(views.starts, wrong, strict=True):
+        if mask is not None:
+            shown[start : start + mask.size, OUTLINE][mask.ravel()] = SILENT_PX / PIXEL_STEP
+    return replace(views, shown=shown), shares
+
+
+def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Returns the pixels in and next to solid blocks. Keeps only connected groups of blocks that reach farther than
+    ``WIDENED_PX`` beyond the outline, since matching windows widen things by up to that."""
+    height, width = outline_px.shape
+    count, found = cv2.connectedComponents(cv2.dilate(solid.view(np.uint8), np.ones((3, 3), np.uint8)))
+    labels = np.asarray(found, np.int32)
+    middle = BLOCK // 2
+    rows, columns = (
+        np.minimum(middle + BLOCK * np.arange(n), size - 1)
+        for n, size in zip(solid.shape, (height, width), strict=True)
+    )
+    part, farthest = np.asarray(labels, np.int32), np.zeros(count)
+    np.maximum.at(farthest, part, np.where(solid, outline_px[np.ix_(rows, columns)], 0.0))
+    wrong = farthest[part] > WIDENED_PX
+    return np.kron(wrong, np.ones((BLOCK, BLOCK), bool))[:height, :width]

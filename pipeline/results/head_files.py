@@ -123,6 +123,14 @@ def head_skin(result: Reconstruction, head: Mesh) -> Skin | None:
     return replace(skin, normal_map=png(texturing.skin.normals), tangents=tangents)
 
 
+def plain_skin(atlas: Atlas | None, kind: str) -> Skin | None:
+    """Returns a texture without maps; ``kind`` is a key of ``ENCODINGS``. None without one."""
+    if atlas is None:
+        return None
+    layout = atlas.layout
+    return Skin(layout.uv, encoded(atlas.image, kind), ENCODINGS[kind][1], layout.source, layout.faces)
+
+
 def head_mesh(result: Reconstruction) -> Mesh:
     """Returns the result's mesh in the head frame, in true millimetres: the rotation and translation of the pose are
     undone, its scale is kept."""

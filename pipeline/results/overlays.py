@@ -15,7 +15,6 @@ from pipeline.compute.threads import map_in_threads
 from pipeline.geometry.raster import picture
 from pipeline.imaging.contour_distance import chamfer
 from pipeline.imaging.masks import box_around
-from pipeline.results.overlay_kernels import tint
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.image import ImageRgb
@@ -65,9 +64,9 @@ def overlay(
 
 def tinted(image: ImageRgb, parts: Float32[np.ndarray, "h w 3"]) -> ImageRgb:
     """Returns the image with each pixel moved towards the parts' colours, in proportion to their probabilities."""
-    colours, out = np.array(list(PART_COLOURS.values()), np.float32), np.empty_like(image)
-    tint(np.ascontiguousarray(image), parts, colours, np.float32(TINT), out)
-    return out
+    colours = TINT * np.array(list(PART_COLOURS.values()), np.float32)
+    left = 1.0 - cv2.transform(parts, np.full((1, 3), TINT, np.float32))
+    return cv2.convertScaleAbs(image * left[..., None] + cv2.transform(parts, colours.T))  # it rounds
 
 
 def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> Resized:

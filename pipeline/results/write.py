@@ -24,15 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.compute.threads import task_pool
-from pipeline.results.head_files import (
-    ENCODINGS,
-    encoded,
-    head_from_world,
-    head_mesh,
-    head_skin,
-    write_formats,
-    write_head_ply,
-)
+from pipeline.results.head_files import head_from_world, head_mesh, head_skin, plain_skin, write_formats, write_head_ply
 from pipeline.results.overlays import contact_sheet, difference, overlay, turntable
 from pipeline.results.reconstruction import QUALITY, Reconstruction, asset_extras, ply_comments
 from pipeline.results.report import report_document
@@ -109,9 +101,8 @@ def _write_bust(folder: Path, result: Reconstruction, bust: Bust) -> None:
         part=bust.surface.part,
         comments=[*ply_comments(result), QUALITY, "part is 0 unseen, 1 skin, 2 hair, 3 clothes"],
     )
-    _write_glb(
-        folder / "bust.glb", result, Mesh(bust.mesh_world.vertices, bust.mesh_world.faces, bust.colours), bust.normals
-    )
+    mesh = Mesh(bust.mesh_world.vertices, bust.mesh_world.faces, bust.colours)
+    _write_glb(folder / "bust.glb", result, mesh, bust.normals, plain_skin(bust.atlas, result.settings.outputs.image))
 
 
 def _write_hair(folder: Path, result: Reconstruction, hair: HairyHead) -> None:
@@ -125,11 +116,7 @@ def _write_hair(folder: Path, result: Reconstruction, hair: HairyHead) -> None:
         views=hair.views,
         comments=[*ply_comments(result), "quality: height above the skin, mm"],
     )
-    atlas, kind = hair.atlas, result.settings.outputs.image
-    skin = None
-    if atlas is not None:
-        image = encoded(atlas.image, kind)
-        skin = Skin(atlas.layout.uv, image, ENCODINGS[kind][1], atlas.layout.source, atlas.layout.faces)
+    skin = plain_skin(hair.atlas, result.settings.outputs.image)
     _write_glb(folder / "head_hair.glb", result, mesh, hair.normals, skin)
 
 

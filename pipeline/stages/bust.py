@@ -24,7 +24,7 @@ from pipeline.stages.recorder import Staged
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.layout.uv_unwrap import Atlas
-from pipeline.texturing.paint import find_layout, paint_head
+from pipeline.texturing.paint import find_layout, paint_charts, paint_head
 from pipeline.texturing.vertex_colours import Shown, texture
 from rig.capture import Capture
 from rig.mesh import Mesh
@@ -52,13 +52,14 @@ class ShapedBust:
 class Bust:
     """Holds the closed surface of everything that the cameras see, with its colours (sRGB). ``views`` is the number of
     images that coloured each vertex; 0 if its colour was filled from its neighbours. ``spacing_mm`` is the grid's
-    spacing."""
+    spacing. ``atlas`` is its texture if the settings ask for GLB."""
 
     shaped: ShapedBust
     normals: Float[np.ndarray, "v 3"]
     colours: UInt8[np.ndarray, "v 3"]
     views: UInt8[np.ndarray, " v"]
     spacing_mm: float
+    atlas: Atlas | None = None
 
     @property
     def surface(self) -> BustSurface:
@@ -133,17 +134,26 @@ def _share(chosen: Bool[np.ndarray, " n"]) -> float:
 
 
 def colour_bust(
-    context: ReconstructionContext, views: Views, labels: PartLabels, shaped: ShapedBust | None, coloured: Capture
+    context: ReconstructionContext,
+    views: Views,
+    labels: PartLabels,
+    shaped: ShapedBust | None,
+    coloured: Capture,
+    head_axes: Float[np.ndarray, "3 3"],
 ) -> Staged[Bust | None]:
-    """Colours the bust from the photographs of ``coloured``. Returns None without a surface."""
+    """Colours the bust from the photographs of ``coloured``; ``head_axes`` are as in ``paint_charts``."""
     if shaped is None:
         return Staged(None)
     settings, rig, mesh = context.settings, context.rig, shaped.surface.mesh_world
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
     likely, seen = shaped.likely_part, shaped.surface.seen
-    shown = Shown(likely, lambda camera, rows: labels.shares(camera, mesh.vertices[rows]), measured=seen)
+    best = "glb" in settings.outputs.formats
+    shown = Shown(
+        likely, lambda camera, rows: labels.shares(camera, mesh.vertices[rows]), measured=seen, best_views=best
+    )
     colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture, shown=shown)
-    return Staged(Bust(shaped, normals, colours.colours, colours.views, settings.bust.spacing_mm))
+    atlas = paint_charts(mesh, normals, colours, head_axes, np.flatnonzero(seen), settings.outputs.texture_size)
+    return Staged(Bust(shaped, normals, colours.colours, colours.views, settings.bust.spacing_mm, atlas))
 
 
 def _likely_parts(

@@ -3,8 +3,7 @@
 Enters: the head, its photograph-like texture, linear colours of all views. Leaves: the light
 (``pipeline.texturing.light``), and an image in the texture's layout of what the skin itself reflects. Highlights move
 with the camera, so that the dimmer views of a vertex show its matt colour. The texture is multiplied, in linear light,
-by a factor interpolated from the vertices: from the texture's colour to the matt colour, divided by shading. That keeps
-the detail of every texel.
+by a factor interpolated from the vertices: to the matt colour, divided by shading. That keeps the texels' detail.
 """
 
 from dataclasses import dataclass

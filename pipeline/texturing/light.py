@@ -7,9 +7,8 @@ Maps*, SIGGRAPH 2001). Light that the head hides from itself is first subtracted
 nor skin.
 
 Skin of the face is assumed to have one colour; brows, lips and beards are outliers. A photograph cannot distinguish a
-dark head in bright light from a bright one in dim light, nor a warm lamp from warm skin. By convention the light's mean
-over the sphere is 1 in each channel, grey. Light from directions that no part of the face is turned to is unknown, and
-is drawn to that mean.
+dark head in bright light from a bright one in dim light, so that the light's mean over the sphere is 1 in each channel.
+Light from directions that no part of the face is turned to is unknown, and is drawn to that mean.
 """
 
 from dataclasses import dataclass

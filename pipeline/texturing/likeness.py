@@ -3,8 +3,6 @@
 Every view gives each vertex of the fitted head a colour. Over a region of the face, the brightness from one view is
 correlated with the mean of the others'. Views of one moment are alike but for gloss and shade (0.9 to 1.0); a mouth
 that is open in one of them makes that 0.2 to 0.6, another person -0.5 to 0.3.
-
-Enters: the views' colours and weights at the vertices. Leaves: the views that are unlike the others.
 """
 
 from collections.abc import Sequence

@@ -1,12 +1,21 @@
-"""Holds which vertices of a mesh are neighbours, in the form that compiled loops read."""
+"""Holds which vertices of a mesh are neighbours, in the form that compiled loops read, fills in what is unknown from
+them, and levels photographs so that they meet without a visible step.
+
+Waechter et al. (2014, section 4.3) look for smooth additive corrections that make both sides of every seam agree, which
+leaves free what all views have in common. Here a view's correction is a smooth field (sRGB codes) that brings it to the
+colour on which all views agree, wherever it sees the head (a screened Poisson equation), so that any views can be
+blended.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
-from jaxtyping import Bool, Float, Int, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
+from pipeline.compute.threads import in_threads
 from pipeline.texturing.inpaint_kernels import LANES, by_rings, first_guess, relax
+from pipeline.texturing.view_selection_kernels import level_view
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +53,8 @@ class Neighbourhood:
 
 
 SEAM_RINGS = 6  # of vertices, a millimetre or two apart: a hairline that nobody saw is no straight cut
+LEVELLING = 10.0  # weight of a correction's step along an edge, by one of a departure from the views' mean
+SWEEPS, FACTOR = 25, 1.7  # over-relaxed: corrections are right to 0.1 code after them
 RELAXATIONS = ((60, 1.7), (10, 1.0))  # sweeps and factor: over-relaxed, then plain, which calms what overshot
 
 
@@ -95,3 +106,29 @@ def _fill(
         relax(lanes, starts, indices, order, sweeps, factor)
     out[order] = lanes[order, : values.shape[1]]
     return out
+
+
+def level_views(
+    weights: Float32[np.ndarray, "k v"],
+    codes: Float32[np.ndarray, "k v 3"],
+    agreed: Float32[np.ndarray, "v 3"],
+    around: Neighbourhood,
+) -> Float32[np.ndarray, "k v 4"]:
+    """Computes what is added to each view at each vertex (sRGB codes; the fourth channel is 0) so that neighbouring
+    views meet without a visible step.
+
+    Args:
+        weights: how well each view sees each vertex; 0 = not seen.
+        codes: sRGB codes of every view at every vertex.
+        agreed: codes on which the views of each vertex agree.
+        around: the mesh's edges.
+    """
+    fields = np.zeros((*weights.shape, 4), np.float32)
+    fields[:, :, :3] = (agreed - codes) * (weights > 0)[:, :, None]
+
+    def work(first: int, last: int) -> None:
+        for k in range(first, last):
+            level_view(fields[k], weights[k] > 0, around.starts, around.indices, LEVELLING, SWEEPS, FACTOR)
+
+    in_threads(len(weights), work)
+    return fields

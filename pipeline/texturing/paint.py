@@ -2,20 +2,23 @@
 
 A texel is a point of the fitted surface. Its pixel in a photograph is interpolated from those of the triangle's corners
 (which include lens distortion; edges are a few pixels long). The photograph is read there with a sub-pixel window, and
-the corners' correction is added (``pipeline.texturing.seam_levelling``). If the corners chose different photographs,
+the corners' correction is added (``pipeline.texturing.neighbourhood``). If the corners chose different photographs,
 these are blended across the triangle. Texels that no camera sees get the vertices' colours."""
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
+from pipeline.fusion.refinement import neighbours
+from pipeline.fusion.refinement_kernels import blurred_over_mesh
 from pipeline.geometry.raster import camera_depths
 from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings
 from pipeline.texturing.decision import Decision
+from pipeline.texturing.layout.charts import lay_out_charts
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, ModelLayout, NoLayout, model_layout, spread_texels
 from pipeline.texturing.paint_kernels import paint_rows
 from pipeline.texturing.vertex_colours import Texture
@@ -25,8 +28,10 @@ from rig.messages.message import compose
 from rig.rig import Rig
 
 SIZES = (1024, 2048, 4096, 8192)
-COARSE = 512  # side of the small image that fills what no triangle covers
+BUST_SIZE = 2048  # texels at most, if the settings name no size: half a millimetre each
+COARSE = 1024  # side of the small image that fills what no triangle covers
 BAND_ROWS = 64
+ROUNDS = 12  # of a mean of normals: charts follow the shape of the bust, not its pores
 
 
 def paint_texture(
@@ -95,6 +100,25 @@ def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | Non
         return model_layout(model), []
     except NoLayout as reason:
         return None, [compose("no-texture-layout", reason=reason.message)]
+
+
+@traced
+def paint_charts(
+    mesh_world: Mesh,
+    normals: Float[np.ndarray, "v 3"],
+    coloured: Texture,
+    head_axes: Float[np.ndarray, "3 3"],
+    region: Int[np.ndarray, " n"],
+    wanted: int | None = None,
+) -> Atlas | None:
+    """Paints the texture of a closed surface (mm) in charts along ``head_axes`` (columns, world frame), as fine as the
+    pictures in the ``region`` (vertices). Returns None if it was coloured without a decision."""
+    if coloured.decision is None:
+        return None
+    towards = blurred_over_mesh(normals @ head_axes, *neighbours(mesh_world.faces, len(normals)), ROUNDS)
+    layout = lay_out_charts(Mesh(mesh_world.vertices @ head_axes, mesh_world.faces), towards)
+    size = wanted or min(BUST_SIZE, texture_size(layout, mesh_world, coloured.decision.views, region))
+    return paint_texture(layout, mesh_world, coloured.colours, coloured.decision, size)
 
 
 @traced

@@ -1,41 +1,35 @@
 """Computes one colour for each vertex from the photographs (section 4.5).
 
 Enters: the fitted mesh, the photographs, the silhouettes. Leaves: a colour for each vertex, and how many images it
-comes from. ``blend = "reference"`` is the paper's method: a vertex counts in an image if it projects inside the
-silhouette and nothing lies in front of it; its weight is the dot product of normal and viewing direction; its colour is
-the weighted mean.
+comes from. ``blend = "reference"`` is the paper's weighted mean: a vertex counts in an image if it projects inside the
+silhouette and nothing lies in front of it; its weight is the dot product of normal and viewing direction.
 
-The default differs, because real cameras differ and real edges are blurred. It has margins at contours and occluding
-edges (``pipeline.texturing.visibility``), sharpens photographs where they have detail, and corrects gain and offset of
-each camera (``pipeline.imaging.colour_balance``). Its mean is in linear light and gives little weight to a view that
-differs from the others in any channel, be it brighter (a highlight moves with the camera) or darker (a shadow that it
-alone sees), and less weight to cameras with a large correction. Where no camera sees the head it is filled smoothly.
+The default differs, because real cameras differ and real edges are blurred: it has margins at contours and occluding
+edges (``visibility``), sharpens photographs where they have detail, and corrects gain and offset of each camera
+(``colour_balance``). Its mean is in linear light and gives little weight to a view that differs from the others in any
+channel (a highlight, a shadow), and less to cameras with a large correction. What no camera sees is filled smoothly.
 
-A model whose eyes are openings has them closed by strips from lid to lid (``close_openings`` of imports). Every vertex
-of a strip lies on the opening's rim, which the lids hide, so that no view would be chosen for it, and the eyeball would
-be painted in the colour of the skin around it. Such a patch takes its colours from the one photograph that sees most of
-it.
+A model whose eyes are openings has them closed by strips from lid to lid, whose vertices all lie on the rim that the
+lids hide. Such a patch takes its colours from the one photograph that sees most of it.
 
-The photograph from which each part of the head takes its detail is selected after Waechter, Moehrle and Goesele, *Let
-There Be Color! Large-Scale Texturing of 3D Reconstructions* (ECCV 2014): each vertex is labelled with a view, so that
-the sum of two terms is least. The data term holds projected area and angle, the visibility of all neighbours, how far a
-view's colour is from that of the others (highlight or shadow), and how strongly the camera had to be corrected. The
-Potts term holds the edges between different labels, and costs most where the views disagree, so that seams keep out of
-eyes and lips. Unlike there, labels are at vertices instead of faces: in the ring of triangles at a seam, two
-photographs are then blended. The sum is minimised by belief propagation (Felzenszwalb and Huttenlocher, *Efficient
-Belief Propagation for Early Vision*, IJCV 2006), in sweeps over the vertices forth and back.
+The photograph from which each part takes its detail is selected after Waechter, Moehrle and Goesele, *Let There Be
+Color! Large-Scale Texturing of 3D Reconstructions* (ECCV 2014): each vertex is labelled with a view, so that the sum of
+two terms is least. The data term holds projected area and angle, the visibility of all neighbours, how far a view's
+colour is from the others', and how strongly the camera had to be corrected. The Potts term holds the edges between
+labels, and costs most where the views disagree, so that seams keep out of eyes and lips. Unlike there, labels are at
+vertices: in the ring of triangles at a seam, two photographs are blended. The sum is minimised by belief propagation
+(Felzenszwalb and Huttenlocher, *Efficient Belief Propagation for Early Vision*, IJCV 2006), forth and back.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
-from scipy.sparse.csgraph import connected_components
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
+from pipeline.fusion.net_kernels import component_of
 from pipeline.geometry.raster import camera_depths
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import Silhouette
@@ -43,13 +37,13 @@ from pipeline.part_labels.codes import Part
 from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision, pack_pictures
 from pipeline.texturing.likeness import find_unlike
-from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown
+from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown, level_views
 from pipeline.texturing.paint_kernels import Pictures
-from pipeline.texturing.seam_levelling import level_views
-from pipeline.texturing.vertex_colours_kernels import OUTLIER, blend_views
 from pipeline.texturing.view_selection_kernels import (
     NEVER,
+    OUTLIER,
     best_candidates,
+    blend_views,
     differences,
     fill_slots,
     propagate,
@@ -124,6 +118,7 @@ class Shown:
         face: where what is of no part is a mouth or a nostril, and not a backdrop.
         measured: where depth agrees with the surface; None: everywhere.
         compared: regions of the face over which views of one moment look alike.
+        best_views: whether detail is taken, without a mesh's edges, from the view that sees a vertex best.
     """
 
     likely: UInt8[np.ndarray, " v"]
@@ -132,6 +127,7 @@ class Shown:
     face: Bool[np.ndarray, " v"] | None = None
     measured: Bool[np.ndarray, " v"] | None = None
     compared: tuple[Bool[np.ndarray, " v"], ...] = ()
+    best_views: bool = False
 
     def weigh(self, weights: Weights, views: Rig) -> tuple[Weights, UInt8[np.ndarray, " v"]]:
         """Returns the views' weights, 0 where one of them, or the mean of all, hardly shows the surface; and the parts
@@ -222,11 +218,12 @@ def texture(
     doubtful = wide_doubtful_surface(weights, mesh_world) | (False if shown is None else shown.find_guessed(weights))
     weights[:, doubtful], seen[doubtful], hidden = 0.0, 0, hidden | doubtful
     decision = None
-    if around is not None:
+    best = shown is not None and shown.best_views
+    if around is not None or best:
         masks = {name: silhouettes[name].mask for name in views.names}
         pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world=mesh_world)
         decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
-        decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, hidden)
+        decision = decision if best else fill_unobserved_patches(decision, mesh_world, silhouettes, depths, hidden)
     whole = fill_unknown(agreed, seen > 0, mesh_world.faces, parts)
     codes, by_camera = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8), _by_name(views, gains)
     dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
@@ -240,11 +237,8 @@ def wide_doubtful_surface(weights: Weights, mesh_world: Mesh) -> Bool[np.ndarray
     total = weights.sum(axis=0)
     unsure = total < SURE_SHARE * np.median(total[total > 0])
     faces = mesh_world.faces[unsure[mesh_world.faces].all(axis=1)]
-    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    joined = sparse.coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(total), len(total)))
-    part = connected_components(joined, directed=False)[1]
-    normals = face_normals(mesh_world.vertices, faces)
-    area_mm2 = np.bincount(part[faces[:, 0]], 0.5 * np.linalg.norm(normals, axis=1), minlength=part.max() + 1)
+    part, normals = component_of(faces, len(total)), face_normals(mesh_world.vertices, faces)
+    area_mm2 = np.bincount(part[faces[:, 0]], 0.5 * np.linalg.norm(normals, axis=1), minlength=len(total))
     return np.asarray(unsure & (area_mm2[part] > DOUBTFUL_MM2))
 
 
@@ -267,9 +261,12 @@ def decide(
     gains: Float[np.ndarray, "k 3"],
     pictures: Pictures,
     *,
-    around: Neighbourhood,
+    around: Neighbourhood | None,
 ) -> Decision:
-    """Chooses a view for each vertex, and computes the corrections that level the seams between views."""
+    """Chooses a view for each vertex, and computes the corrections that level the seams between views: without
+    ``around`` the view that sees it best, levelled there to the colour on which all views agree."""
+    if around is None:
+        return take_best_views(views, weights, balanced, agreed, pictures)
     codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
     level_to = (255 * srgb_from_linear(np.clip(agreed, 0, 1))).astype(np.float32)
     fields = level_views(weights, codes, level_to, around)
@@ -278,6 +275,16 @@ def decide(
     slots, shares = add_similar_views(labels, options, quality, detail, weights, around=around)
     corrections = fields[np.maximum(slots, 0), np.arange(len(slots))[:, None]]
     return Decision(views, slots, shares, corrections, weights, pictures)
+
+
+def take_best_views(views: Rig, weights: Weights, balanced: Colours, agreed: Points, pictures: Pictures) -> Decision:
+    """Takes for each vertex the view that sees it best, for the detail between vertices; at them there is no seam."""
+    best, rows = weights.argmax(axis=0), np.arange(weights.shape[1])
+    codes = [255 * srgb_from_linear(np.clip(each, 0, 1)) for each in (agreed, balanced[best, rows])]
+    corrections = np.zeros((len(rows), 1, 4), np.float32)
+    corrections[:, 0, :3] = codes[0] - codes[1]
+    slots = np.where(weights[best, rows] > 0, best, -1)[:, None].astype(np.int32)
+    return Decision(views, slots, np.ones(slots.shape, np.float32), corrections, weights, pictures)
 
 
 def usable_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
@@ -315,63 +322,27 @@ def _reference(
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
 ) -> Texture:
     """Colours vertices exactly by section 4.5, in the images' own codes; fills those that no camera sees."""
-    colours, weights, views = reference_colours(mesh.vertices, normals, capture, silhouettes, rig, depths)
+    from scipy.ndimage import map_coordinates  # for the paper's mean alone
+
+    total, weights, views = np.zeros((len(normals), 3)), np.zeros(len(normals)), np.zeros(len(normals), np.uint8)
+    for camera in rig:
+        pixels, depth = camera.project(mesh.vertices), depths[camera.name]
+        framed = np.all((pixels >= 0) & (pixels <= np.array(depth.shape[::-1]) - 1), axis=1)  # NaN is not
+        columns, rows = np.rint(np.where(framed.reshape(-1, 1), pixels, 0.0)).astype(int).T
+        free = camera_depths(camera, mesh.vertices) < depth[rows, columns] + REFERENCE_HIDDEN_MM
+        towards = camera.centre_world - mesh.vertices
+        facing = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+        seen = np.flatnonzero(framed & silhouettes[camera.name].mask[rows, columns] & free & (facing > 0.0))
+        for channel in range(3):
+            plane = capture.images[camera.name][:, :, channel].astype(float)
+            total[seen, channel] += facing[seen] * map_coordinates(plane, pixels[seen, ::-1].T, order=1, mode="nearest")
+        weights[seen] += facing[seen]
+        views[seen] += 1
     known = weights > 0
     if not known.any():
         return _untextured(len(normals))
-    colours = fill_unknown(colours, known, mesh.faces)
+    colours = fill_unknown(total / np.where(known, weights, 1.0)[:, None], known, mesh.faces)
     return Texture(np.rint(colours).clip(0, 255).astype(np.uint8), views, filled=int(np.count_nonzero(~known)))
-
-
-def reference_colours(
-    points: Points,
-    normals: Points,
-    capture: Capture,
-    silhouettes: Mapping[str, Silhouette],
-    rig: Rig,
-    depths: Mapping[str, Float32[np.ndarray, "_ _"]],
-) -> tuple[Points, Float[np.ndarray, " v"], UInt8[np.ndarray, " v"]]:
-    """Computes the colours of surface points by the paper's method (section 4.5). Returns their sRGB codes, the sum of
-    weights of each (0: no camera sees the point), and the number of images."""
-    total, weights = np.zeros((len(normals), 3)), np.zeros(len(normals))
-    views = np.zeros(len(normals), np.uint8)
-    for camera in rig:
-        pixels = camera.project(points)
-        seen = _visible(camera, points, pixels, depths[camera.name], silhouettes[camera.name])
-        towards = camera.centre_world - points
-        facing = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
-        weight = np.where(seen, np.clip(facing, 0.0, None), 0.0)
-        total += weight[:, None] * _sampled(capture.images[camera.name], pixels)
-        weights += weight
-        views += weight > 0
-    return total / np.where(weights > 0, weights, 1.0)[:, None], weights, views
-
-
-def _visible(
-    camera: Camera,
-    vertices: Points,
-    pixels: Float[np.ndarray, "v 2"],
-    depth: Float32[np.ndarray, "h w"],
-    silhouette: Silhouette,
-) -> Bool[np.ndarray, " v"]:
-    """Tells which vertices lie inside the silhouette and are not occluded."""
-    height, width = depth.shape
-    framed = np.logical_and(pixels >= 0, pixels <= (width - 1, height - 1)).all(axis=1)  # NaN is not
-    columns, rows = np.rint(np.where(framed.reshape(-1, 1), pixels, 0.0)).astype(int).T
-    free = camera_depths(camera, vertices) < depth[rows, columns] + REFERENCE_HIDDEN_MM
-    return framed & silhouette.mask[rows, columns] & free
-
-
-def _sampled(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "v 2"]) -> Points:
-    """Returns bilinear samples; outside the image those of the nearest border pixel."""
-    height, width = image.shape[:2]
-    safe = np.clip(np.nan_to_num(pixels), 0, (width - 1.001, height - 1.001))
-    low = safe.astype(int)
-    fx, fy = (safe - low).T[:, :, None]
-    x, y = low.T
-    top = image[y, x] * (1 - fx) + image[y, x + 1] * fx
-    bottom = image[y + 1, x] * (1 - fx) + image[y + 1, x + 1] * fx
-    return top * (1 - fy) + bottom * fy
 
 
 def fill_unobserved_patches(
@@ -440,14 +411,8 @@ def _taken(
 
 
 def _patches(faces: Faces) -> Int[np.ndarray, " f"]:
-    """Returns the patch of each triangle: the triangles of a patch are connected by edges."""
-    count = len(faces)
-    ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    _, edge = np.unique(ends, axis=0, return_inverse=True)
-    owner = np.tile(np.arange(count), 3)
-    shape = (count, int(edge.max(initial=-1)) + 1)
-    touches = sparse.csr_array((np.ones(3 * count), (owner, edge.ravel())), shape=shape)
-    return connected_components(touches @ touches.T, directed=False)[1]
+    """Returns the patch of each triangle: the triangles of a patch are connected by corners."""
+    return component_of(faces, int(faces.max(initial=-1)) + 1)[faces[:, 0]]
 
 
 def select_views(
@@ -464,7 +429,7 @@ def select_views(
     quality.
 
     ``weights``: of the views by angle and distance, 0 = not seen. ``codes``: sRGB codes of every view at every vertex,
-    gains applied. ``levelled``: the same after ``pipeline.texturing.seam_levelling``, which does not remove the edge of
+    gains applied. ``levelled``: the same after ``pipeline.texturing.neighbourhood``, which does not remove the edge of
     a shadow. ``agreed``: codes on which the views agree. ``gains``: of the cameras; their product is 1. ``around``: the
     mesh's edges. ``seam_cost``: of an edge where views differ.
     """

@@ -132,8 +132,8 @@ def test_three_js_shows_the_head_as_we_do(
     assert found["meshes"] == 1
     assert found["triangles"] == len(head.faces)
     assert found["hasNormals"]
-    assert found["vertexColors"] == (name == "bust.glb")
-    assert found["texture"] == (0 if name == "bust.glb" else 1024)
+    assert not found["vertexColors"]
+    assert found["texture"] in (1024, 2048)
     np.testing.assert_allclose(found["high"], head.vertices.max(axis=0) / 1000, atol=1e-6)  # metres
     assert written.colours is not None
     seen = read_image(shot).astype(np.float32)
@@ -141,18 +141,12 @@ def test_three_js_shows_the_head_as_we_do(
     ours = our_drawing(shown, written.colours, FIELDS_DEG[name]).astype(np.float32)
     inside = (ours < 250).any(axis=2)
     assert np.count_nonzero(inside != (seen < 250).any(axis=2)) < 0.01 * inside.sum()
-    if name == "bust.glb":
-        # Both interpolate over 2 mm triangles, three.js in linear light and we in codes.
-        difference = np.abs(seen - ours)[inside]
-        assert np.median(difference) <= 2
-        assert np.percentile(difference, 99) < 12
-    else:
-        # Over a few pixels a texture is as bright as the vertices' colours; finer, it shows more than they can.
-        even = [cv2.GaussianBlur(image, (0, 0), 3.0) for image in (seen, ours)]
-        core = cv2.GaussianBlur(np.asarray(inside, np.float32), (0, 0), 5.0) > 0.99
-        assert np.median(np.abs(even[0] - even[1])[core]) <= 2
-        fine = [np.abs(cv2.Laplacian(image, cv2.CV_32F))[core].mean() for image in (seen, ours)]
-        assert fine[0] > 1.1 * fine[1]
+    # Over a few pixels a texture is as bright as the vertices' colours; finer, it shows more than they can.
+    even = [cv2.GaussianBlur(image, (0, 0), 3.0) for image in (seen, ours)]
+    core = cv2.GaussianBlur(np.asarray(inside, np.float32), (0, 0), 5.0) > 0.99
+    assert np.median(np.abs(even[0] - even[1])[core]) <= 2
+    fine = [np.abs(cv2.Laplacian(image, cv2.CV_32F))[core].mean() for image in (seen, ours)]
+    assert fine[0] > (1.1 if name == "head.glb" else 1.0) * fine[1]  # a bust's pixels are 2 mm wide
 
 
 def test_the_obj_on_request_is_the_world_mesh(result: Path) -> None:

@@ -1,11 +1,10 @@
 """Lays a head flat, for a texture with more detail than one colour for each vertex.
 
-The surface is cut from the nape over the back of the head to the crown, and spread on a square with the neck at the
-bottom and the face in the middle. Every inner vertex is a mean of its neighbours with mean-value weights (Floater,
-*Mean value coordinates*, CAGD 2003), so that by Tutte's theorem no two triangles overlap; the square's sides bulge a
-little, to make it strictly convex. Parts that this map makes too small, the nose and above all the ears, are enlarged
-by rounds of reweighting (Yoshizawa, Belyaev and Seidel, *A fast and simple stretch-minimizing mesh parameterization*,
-SMI 2004), which keep the weights positive.
+The surface is cut from the nape over the back of the head to the crown, and spread on a square, whose sides bulge a
+little, with the neck at the bottom. Every inner vertex is a mean of its neighbours with mean-value weights (Floater,
+*Mean value coordinates*, CAGD 2003), so that by Tutte's theorem no two triangles overlap. What becomes too small, the
+nose and the ears, is enlarged by rounds of reweighting (Yoshizawa, Belyaev and Seidel, *A fast and simple
+stretch-minimizing mesh parameterization*, SMI 2004), which keep the weights positive.
 
 The layout is made from a model's mean head, so that texels of any two subjects correspond.
 """

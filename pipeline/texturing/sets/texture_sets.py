@@ -19,11 +19,10 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision, pack_pictures
 from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout
-from pipeline.texturing.neighbourhood import fill_unknown
+from pipeline.texturing.neighbourhood import fill_unknown, level_views
 from pipeline.texturing.paint import paint_texture
-from pipeline.texturing.seam_levelling import level_views
 from pipeline.texturing.sets.specular import Specular, specular_light
-from pipeline.texturing.vertex_colours_kernels import OUTLIER, blend_views
+from pipeline.texturing.view_selection_kernels import OUTLIER, blend_views
 from pipeline.texturing.visibility import FOOTPRINT_PX, LINEAR, sharpened
 from pipeline.texturing.visibility_kernels import sample_colours
 from pipeline.warnings import ReportWarning
@@ -105,9 +104,8 @@ def set_texture(
 ) -> tuple[Atlas, Float[np.ndarray, "k 3"]]:
     """Paints the texture of one set. Also returns the gain of each camera and channel (k, 3).
 
-    ``images``: of the set, by camera. ``decision``: which views colour each vertex. ``mesh_world``: the head, mm.
-    ``silhouettes``: by camera. ``layout``: of the head, with its edges. ``size``: of the texture, texels. ``settings``:
-    of the texture.
+    ``images`` of the set and ``silhouettes`` are by camera. ``decision``: which views colour each vertex.
+    ``mesh_world``: the head, mm. ``size``: of the texture, texels.
     """
     views, weights = decision.views, decision.weights
 

@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.fusion.contradiction import SILENT_PX, WIDENED_PX, silence_contradicted
-from pipeline.fusion.view_stack import ViewStack, stack_views
+from pipeline.fusion.view_stack import SILENT_PX, WIDENED_PX, ViewStack, silence_contradicted, stack_views
 from pipeline.fusion.vote_kernels import OUTLINE, PIXEL_STEP
 from pipeline.imaging.silhouette import silhouette_from_mask
 from tests.support.ellipsoid_depths import Ellipsoid, Scene, scene

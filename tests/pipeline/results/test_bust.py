@@ -63,7 +63,7 @@ def photographed(renderer: Renderer) -> tuple[Bust, Capture, dict]:
     views = Views(capture, made.silhouettes, {})
     fused = fuse_depth(context, views, head, PartLabels({}), depth).product
     surface = shape_bust(context, views, depth.votes, refined, fused).product
-    bust = colour_bust(context, views, PartLabels({}), surface, capture).product
+    bust = colour_bust(context, views, PartLabels({}), surface, capture, np.eye(3)).product
     assert bust is not None
     return bust, capture, made.silhouettes
 
@@ -111,7 +111,7 @@ def test_files_hold_what_the_contract_says(result: Reconstruction, photographed,
     glb = trimesh.load(tmp_path / "bust.glb", force="mesh")
     assert isinstance(glb, trimesh.Trimesh)
     expected = (bust.mesh_world.vertices - PLACE.translation) @ PLACE.rotation / 1000
-    np.testing.assert_allclose(np.sort(glb.vertices[:, 1]), np.sort(expected[:, 1]), atol=1e-5)
+    np.testing.assert_allclose(glb.vertices[: len(expected)], expected, atol=1e-5)  # seams repeat some of them
     section = json.loads((tmp_path / "report.json").read_text())["bust"]
     assert section["closed"] is True
     assert section["spacing_mm"] == 3.0

@@ -40,11 +40,6 @@ def test_a_picture_is_multiplied_in_linear_light_and_clipped() -> None:
     assert found[0, 1, 2] == 255
 
 
-def test_the_identity_changes_nothing() -> None:
-    every = np.arange(256, dtype=np.uint8)[None, :, None].repeat(3, axis=2)
-    assert np.abs(in_true_colours(every, np.eye(3)).astype(int) - every).max() <= 1
-
-
 def test_a_chart_corrects_its_camera_and_the_mean_the_others() -> None:
     rig = default_layout()
     one, other, bare = rig.names[3:6]

@@ -16,9 +16,8 @@ from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.settings import TextureSettings
 from pipeline.texturing.layout.uv_unwrap import unwrap
-from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown, neighbours
+from pipeline.texturing.neighbourhood import LEVELLING, Neighbourhood, fill_unknown, level_views, neighbours
 from pipeline.texturing.paint import paint_texture
-from pipeline.texturing.seam_levelling import LEVELLING, level_views
 from pipeline.texturing.vertex_colours import (
     Texture,
     add_similar_views,
@@ -27,8 +26,7 @@ from pipeline.texturing.vertex_colours import (
     texture,
     wide_doubtful_surface,
 )
-from pipeline.texturing.vertex_colours_kernels import OUTLIER
-from pipeline.texturing.view_selection_kernels import RING_SHARE, differences, fill_slots, propagate
+from pipeline.texturing.view_selection_kernels import OUTLIER, RING_SHARE, differences, fill_slots, propagate
 from pipeline.texturing.visibility import see_weights, sharpened
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
@@ -417,23 +415,6 @@ def written_out(scene: Scene, levelled: np.ndarray) -> tuple[np.ndarray, np.ndar
         raised = abs(np.log2(gains[k].mean()))
         cost[v, k] = 1 - quality[v, k] / quality[v].max() + 2.0 * square / (1 + square) + raised
     return cost, quality, off
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_without_a_cost_of_seams_the_cheapest_view_is_chosen(seed: int) -> None:
-    scene = random_scene(seed)
-    around, weights, codes, agreed, gains = scene
-    levelled = (0.5 * (codes + agreed)).astype(np.float32)
-    labels, views, view_quality = select_views(weights, codes, levelled, agreed, gains, around=around, seam_cost=0.0)
-    cost, quality, _ = written_out(scene, levelled)
-    for v in range(40):
-        order = np.argsort(cost[v])
-        count = min(6, np.count_nonzero(np.isfinite(cost[v])))
-        assert labels[v] == order[0]
-        assert views[v, :count].tolist() == order[:count].tolist()
-        np.testing.assert_allclose(view_quality[v, :count], quality[v, order[:count]], rtol=1e-5)
-        assert (views[v, count:] == -1).all()
-        assert (view_quality[v, count:] == 0).all()
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.06, 0.4])

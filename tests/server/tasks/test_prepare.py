@@ -21,7 +21,7 @@ from tests.support.disks import small_disk
 
 LINES = (
     "fusion.grid_kernels:grown bool[3C]",
-    "texturing.vertex_colours_kernels:blend_views float32[2C] float32[3C] float64",
+    "texturing.view_selection_kernels:blend_views float32[2C] float32[3C] float64",
 )
 
 
@@ -47,7 +47,7 @@ def test_what_is_missing_is_compiled_once_and_counted_aloud(folder: Path) -> Non
     reported: list[tuple[str, float]] = []
     assert prepare_kernels(lambda stage, share: reported.append((stage, share))) == (2, 0, 2)
     assert reported == [(f"compiling {done} of 2 loops", done / 2) for done in range(3)]
-    assert {"grid_kernels.grown", "vertex_colours_kernels.blend_views"} <= kept(folder)
+    assert {"grid_kernels.grown", "view_selection_kernels.blend_views"} <= kept(folder)
     reported.clear()
     assert prepare_kernels(lambda stage, share: reported.append((stage, share))) == (0, 0, 2)
     assert reported == []

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.texturing.vertex_colours_kernels import MAX_VOTE, MIN_SHARE, blend_views
+from pipeline.texturing.view_selection_kernels import MAX_VOTE, MIN_SHARE, blend_views
 
 OUTLIER = 0.15
 
@@ -40,25 +40,6 @@ def test_blending_is_its_definition(cameras: int) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-5)
     np.testing.assert_array_equal(views, expected_views)
     assert (views == 0).any() or cameras > 5
-
-
-def test_one_highlight_among_equal_views_is_damped() -> None:
-    """Four views of 0.2 and one of 0.8, in every place: it is off by 0.6 over 0.035, so that it counts 1 of 295."""
-    for bright in range(5):
-        colours = np.full((5, 1, 3), 0.2, np.float32)
-        colours[bright] = 0.8
-        found, views = blend_views(np.ones((5, 1), np.float32), colours, OUTLIER)
-        share = 1 / (1 + (0.6 / 0.035) ** 2)
-        np.testing.assert_allclose(found[0], (0.8 + 0.8 * share) / (4 + share), rtol=1e-5)
-        assert views[0] == 5
-
-
-def test_the_median_of_two_equal_views_is_the_darker() -> None:
-    """Half of the weight is reached with the first; the other is then above it."""
-    colours = np.array([[[0.6] * 3], [[0.2] * 3]], np.float32)
-    found, _ = blend_views(np.ones((2, 1), np.float32), colours, OUTLIER)
-    share = 1 / (1 + (0.4 / 0.035) ** 2)
-    np.testing.assert_allclose(found[0], (0.2 + 0.6 * share) / (1 + share), rtol=1e-5)
 
 
 def test_a_close_up_in_a_shadow_does_not_outvote_the_others() -> None:
