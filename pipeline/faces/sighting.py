@@ -15,6 +15,7 @@ from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.subject import SearchEffort, SubjectFaces
 from rig.acquisition.face_sighting import FaceSighting
 from rig.camera import Camera
+from rig.geometry import Similarity
 from rig.image import ImageRgb
 from rig.rig import Rig
 
@@ -52,19 +53,20 @@ def sight_face(subject: SubjectFaces, rig: Rig, *, front: str) -> FaceSighting:
         return FaceSighting(len(subject.found), False, any(subject.found.values()), front)
     closed = eye_warnings(closed_by_openings(eye_openings(face, rig)))
     sighting = FaceSighting(len(subject.found), True, True, front, _missing(subject, face), remarks=tuple(closed))
+    turned = turned_deg(face.world_from_face, rig, front)
+    return sighting if turned is None else replace(sighting, left_deg=turned[0], up_deg=turned[1])
+
+
+def turned_deg(world_from_face: Similarity, rig: Rig, front: str) -> tuple[float, float] | None:
+    """Returns by how many degrees a face is turned to the subject's left and up; None without a front. From the front
+    camera, but 0 unless turned that way from the cameras' middle, too: the front one of cameras in rows stands above or
+    below that middle, and a face between rows counts as straight."""
     if not has_front(rig):
-        return sighting
-    from_front = gaze_from(face, rig[front].axis_world if front in rig.names else -_fan(rig))
-    from_middle = gaze_from(face, -_fan(rig))
-    left_deg, up_deg = (_turned(*of) for of in zip(from_front, from_middle, strict=True))
-    return replace(sighting, left_deg=left_deg, up_deg=up_deg)
-
-
-def _turned(from_front_deg: float, from_middle_deg: float) -> float:
-    """Returns the angle from the front camera; 0 unless the face is turned that way from the middle of the cameras,
-    too. The front one of cameras in rows stands above or below that middle; a face between rows counts as straight."""
-    agreed = from_front_deg * from_middle_deg > 0.0 and abs(from_middle_deg) >= MIN_OFF_MIDDLE_DEG
-    return from_front_deg if agreed else 0.0
+        return None
+    from_middle = gaze_from(world_from_face, -_fan(rig))
+    from_front = gaze_from(world_from_face, rig[front].axis_world if front in rig.names else -_fan(rig))
+    agreed = [a * b > 0.0 and abs(b) >= MIN_OFF_MIDDLE_DEG for a, b in zip(from_front, from_middle, strict=True)]
+    return from_front[0] * agreed[0], from_front[1] * agreed[1]
 
 
 def has_front(rig: Rig) -> bool:
@@ -79,10 +81,10 @@ def _fan(rig: Rig) -> Float[np.ndarray, " 3"]:
     return directions.mean(axis=0)
 
 
-def gaze_from(face: MatchedFaces, axis_world: Float[np.ndarray, " 3"]) -> tuple[float, float]:
+def gaze_from(world_from_face: Similarity, axis_world: Float[np.ndarray, " 3"]) -> tuple[float, float]:
     """Returns by how many degrees a face is turned away from an axis of view: to the subject's left, and up."""
     towards = -axis_world / np.linalg.norm(axis_world)
-    across, upwards, ahead = towards @ face.world_from_face.rotation
+    across, upwards, ahead = towards @ world_from_face.rotation
     return float(-np.degrees(np.arctan2(across, ahead))), float(-np.degrees(np.arcsin(np.clip(upwards, -1.0, 1.0))))
 
 

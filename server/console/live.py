@@ -15,6 +15,7 @@ from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 from server.console.live_frame import LiveFrame
+from server.services.live.live import document_of
 from server.services.rigs.backend import RigBackend, jpeg, reduced
 from server.services.service import Service
 from server.tasks.child import Child, WorkerContext
@@ -147,6 +148,7 @@ class LiveView:
             source.close()
 
     def _look(self, source: Source, blur: dict[str, float | None]) -> bytes:
+        began = time.monotonic()
         try:
             frames, self.fault = source.frames(), None
         except Exception as error:  # the rig may come back
@@ -158,15 +160,16 @@ class LiveView:
             if "blur_px" in frame:
                 blur[frame["name"]] = frame["blur_px"]
             frame["blur_px"] = blur.get(frame["name"])
-        return look_bytes(frames, self.fault)
+        shown = self._service.live.offer({f["name"]: data for f in frames if (data := f["jpeg"])}, began)
+        return look_bytes(frames, self.fault, document_of(shown))
 
 
-def look_bytes(frames: list[LiveFrame], fault: Message | None) -> bytes:
+def look_bytes(frames: list[LiveFrame], fault: Message | None, head: object = None) -> bytes:
     """Encodes the pictures of all cameras as one message: 4 bytes with the header's length, 4 with the length of the
     rest (both big-endian), a JSON header, and the JPEG files in the header's order. ``bytes`` in the header is the
     length of each file."""
     header = [{k: v for k, v in f.items() if k != "jpeg"} | {"bytes": len(f["jpeg"] or b"")} for f in frames]
-    text = json.dumps({"cameras": header, "fault": None if fault is None else fault.document()}).encode()
+    text = json.dumps({"cameras": header, "fault": None if fault is None else fault.document(), "head": head}).encode()
     body = b"".join(f["jpeg"] or b"" for f in frames)
     return struct.pack(">II", len(text), len(body)) + text + body
 

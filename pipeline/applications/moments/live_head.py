@@ -50,10 +50,11 @@ MESH = "p99"  # the level that is shown
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LivePerson:
-    """Holds what stays the same from look to look: the person, what the networks say of it, and the vertices of the
-    small mesh with their expressions (head frame, mm)."""
+    """Holds what stays the same from look to look: the person, its ``scale`` by the model's size, what the networks
+    say of it, and the vertices of the small mesh with their expressions (head frame, mm)."""
 
     person: SequencePerson
+    scale: float
     reference: FaceReference
     mesh: Float[np.ndarray, "v 3"]
     mesh_shapes: Float[np.ndarray, "e v 3"]
@@ -112,7 +113,7 @@ def meet(
         return None
     reference = replace(reference, open={side: max(opening, OPEN) for side, opening in reference.open.items()})
     coarse = model.levels[MESH].rows
-    who = LivePerson(person, reference, neutral[coarse], shapes[:, coarse].astype(float))
+    who = LivePerson(person, scale, reference, neutral[coarse], shapes[:, coarse].astype(float))
     return follow(LiveHead(who, motion, Sighting({}, {}), {}, ()), pictures, networks)
 
 

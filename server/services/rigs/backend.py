@@ -28,6 +28,10 @@ class RigBackend(Protocol):
         """Returns the state of the rig without opening its cameras."""
         ...
 
+    def calibrated(self) -> Rig | None:
+        """Returns the cameras as calibrated; None where they are not."""
+        ...
+
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument | SimulatedCertificate:
         """Takes a shot, writes the capture to ``folder/files`` and returns the shot's certificate.
 

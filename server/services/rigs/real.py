@@ -56,7 +56,7 @@ class RealRig:
             cameras.append(RigCamera(camera.name, camera.driver, known))
             if state is not None and state.error:
                 faults.append(compose("located", where=camera.name, fault=state.error))
-        rig = self._calibrated()
+        rig = self.calibrated()
         if rig is None:
             faults.append(compose("rig-not-calibrated"))
         return rig_state(self._config.name, "real", cameras, faults, None if rig is None else "own")
@@ -72,7 +72,7 @@ class RealRig:
             raise InputError("request", [compose("seed-of-real-rig")])
         if board:
             return self._board_shot(folder)
-        rig = self._calibrated()
+        rig = self.calibrated()
         if rig is None:
             detail = compose("capture-needs-calibration")
             raise Unavailable("not-calibrated", detail)
@@ -222,7 +222,8 @@ class RealRig:
             self._session = session
         return self._session
 
-    def _calibrated(self) -> Rig | None:
+    def calibrated(self) -> Rig | None:
+        """Returns the cameras as calibrated; None where they are not."""
         if self._calibration.is_file():
             return read_rig(self._calibration)
         with suppress(InputError):

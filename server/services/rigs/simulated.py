@@ -32,6 +32,10 @@ class SimulatedRig:
         calibrated = "own" if self._calibration.is_file() else "studio"
         return rig_state("simulated", "simulated", cameras, [], calibrated)
 
+    def calibrated(self) -> Rig:
+        """Returns the calibration that was put to use, or the studio's own layout."""
+        return read_rig(self._calibration) if self._calibration.is_file() else self._rig()
+
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> SimulatedCertificate:
         """Takes a shot of a person, also if ``board`` is set, since the studio has no board. Raises Unavailable if the
         child process fails."""
@@ -41,7 +45,7 @@ class SimulatedRig:
             except WorkFailed as error:
                 raise Unavailable("shot-failed", error.message, [error.message]) from error
         if self._calibration.is_file():
-            write_rig(read_rig(self._calibration), folder / "files" / "cameras.json")
+            write_rig(self.calibrated(), folder / "files" / "cameras.json")
         return shot
 
     def look(self) -> Mapping[str, ImageRgb]:

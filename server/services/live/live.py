@@ -1,0 +1,179 @@
+"""Keeps a head of whoever sits before the cameras, as long as somebody looks.
+
+One thread takes the newest pictures, its own or those that the console's live view offers, and hands them to a child
+process (``look``). The child has the priority of a job's, so that both go on side by side; one that dies or does not
+answer is killed and begun again with the next look. ``IDLE_S`` after the last question thread and child end.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import structlog
+
+from rig.formats.rig_toml import read_rig_config
+from rig.messages.message import Message, compose
+from rig.progress import Progress
+from rig.rig import Rig
+from server.errors import Refused
+from server.services.live.seen import LiveShown, Seen, Word
+from server.services.live.words import Speaker, lamps_of
+from server.services.rigs.backend import RigBackend, jpeg
+from server.tasks.child import Child, WorkerContext
+
+EVERY_S = 0.25  # from look to look at least
+IDLE_S = 6.0  # without anybody who asks
+AGAIN_S = 1.0  # after a fault
+LOOK_S, FIRST_LOOK_S = 4.0, 40.0  # that the child may take; the first one reads model and networks
+OFFERED_S = 1.0  # pictures that are offered so lately are waited for: the cameras are looked at once
+FRESH_S = 3.0  # a look so old says nothing about now
+WAIT_S = 0.02
+NICENESS = 5  # of a job's processes
+HEAD_SHOWN = ("vertices", "triangles", "left_deg", "up_deg", "eyes_open")
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Holds the pictures of one moment as JPEG files, and when the first of them may have been taken (s, of
+    ``time.monotonic``)."""
+
+    taken_s: float
+    pictures: Mapping[str, bytes]
+
+
+class Live:
+    """Finds the head while somebody asks. ``rig_toml`` describes the rig, None for the simulated studio."""
+
+    def __init__(self, rig: RigBackend, rig_toml: Path | None) -> None:
+        self._rig = rig
+        self._config = None if rig_toml is None else read_rig_config(rig_toml)
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._asked_s = self._offered_s = 0.0
+        self._offered: Moment | None = None
+        self._shown: tuple[float, LiveShown] | None = None
+        self._number = 0
+        self._closing = False
+
+    def newest(self) -> LiveShown:
+        """Returns the newest look, and asks for the next ones. While the first is under way, and when the cameras are
+        lost, the answer has no cameras and says why. Does not block."""
+        self._asked_s = now_s = time.monotonic()
+        with self._lock:
+            if self._thread is None and not self._closing:
+                self._thread = threading.Thread(target=self._look_on, daemon=True, name="live head")
+                self._thread.start()
+        shown = self._shown
+        return shown[1] if shown is not None and now_s - shown[0] < FRESH_S else nothing(compose("live-starting"))
+
+    def offer(self, pictures: Mapping[str, bytes], taken_s: float) -> LiveShown:
+        """Takes the pictures that the live view has just got, so that the cameras need not be asked twice, and returns
+        the newest look."""
+        self._offered, self._offered_s = Moment(taken_s, pictures), time.monotonic()
+        return self.newest()
+
+    def close(self) -> None:
+        """Ends the thread and the child process."""
+        self._closing, thread = True, self._thread
+        if thread is not None:
+            thread.join(LOOK_S)
+
+    def _look_on(self) -> None:
+        speaker, child, last_s = Speaker(), Child(NICENESS, {"OPENBLAS_NUM_THREADS": "1"}), 0.0
+        try:
+            while not self._is_idle():
+                time.sleep(max(WAIT_S, last_s + EVERY_S - time.monotonic()))
+                try:
+                    moment = self._moment(last_s)
+                    if moment is not None:
+                        last_s = moment.taken_s
+                        self._show(moment, child, speaker)
+                except Exception as error:  # cameras and child may come back
+                    self._shown = (
+                        time.monotonic(),
+                        nothing(error.detail if isinstance(error, Refused) else compose("live-again")),
+                    )
+                    log.warning("no live head", error=str(error)[:300])
+                    time.sleep(AGAIN_S)
+        finally:
+            child.close()
+
+    def _is_idle(self) -> bool:
+        with self._lock:
+            idle = self._closing or time.monotonic() - self._asked_s > IDLE_S
+            if idle:
+                self._thread, self._shown, self._offered = None, None, None
+            return idle
+
+    def _moment(self, last_s: float) -> Moment | None:
+        """Returns pictures that are newer than ``last_s``; None where they are to be waited for."""
+        offered = self._offered
+        if offered is not None and time.monotonic() - self._offered_s < OFFERED_S:
+            return offered if offered.taken_s > last_s else None
+        taken_s = time.monotonic()
+        return Moment(taken_s, {name: jpeg(image) for name, image in self._rig.look().items()})
+
+    def _show(self, moment: Moment, child: Child, speaker: Speaker) -> None:
+        starting = not child.runs
+        until_s = time.monotonic() + (FIRST_LOOK_S if starting else LOOK_S)
+        late: Callable[[], bool] = lambda: self._closing or time.monotonic() > until_s  # noqa: E731
+        seen: Seen = child.remote(look, cancelled=late)(
+            pictures=moment.pictures,
+            rig=self._rig.calibrated(),
+            front=None if self._config is None else self._config.front,
+            plates=self._plates(),
+        )
+        now_s = time.monotonic()
+        self._number += 1
+        words, steady = speaker.words(seen, moment.taken_s), speaker.steady(seen.head, moment.taken_s)
+        opened = seen.head is not None and seen.head.eyes_open is True
+        shown = LiveShown(
+            time=datetime.fromtimestamp(time.time() + moment.taken_s - now_s, UTC).isoformat(timespec="milliseconds"),
+            age_s=round(now_s - moment.taken_s, 3),
+            number=self._number,
+            cameras=lamps_of(seen),
+            head=seen.head,
+            steady=steady,
+            words=words,
+            ready=steady and opened and not words,
+        )
+        self._shown = (now_s, shown)
+
+    def _plates(self) -> tuple[str, str] | None:
+        in_use = next((version for version in self._rig.plates() if version.in_use), None)
+        return None if in_use is None or self._config is None else (str(self._config.plates_folder), in_use.id)
+
+
+def nothing(why: Message) -> LiveShown:
+    """Returns a look that found nothing."""
+    return LiveShown("", 0.0, 0, {}, None, False, (Word(why),), False)
+
+
+def look(
+    context: WorkerContext,
+    report: Progress,
+    *,
+    pictures: Mapping[str, bytes],
+    rig: Rig | None,
+    front: str | None,
+    plates: tuple[str, str] | None,
+) -> Seen:
+    """Finds the head in the child process, as ``looking.look``."""
+    from server.services.live import looking
+
+    return looking.look(context, pictures, rig, front, plates)
+
+
+def document_of(shown: LiveShown) -> dict[str, object]:
+    """Returns a look as JSON types, for a page."""
+    return {
+        **{name: getattr(shown, name) for name in ("time", "age_s", "number", "steady", "ready")},
+        "cameras": {name: asdict(lamps) for name, lamps in shown.cameras.items()},
+        "head": None if shown.head is None else {name: getattr(shown.head, name) for name in HEAD_SHOWN},
+        "words": [{**word.message.document(), "camera": word.camera} for word in shown.words],
+    }
