@@ -103,7 +103,8 @@ def _of_head(head: HeadSeen) -> Iterator[Word]:
     )
     for off_mm, room_mm, beyond, before in ways:
         if abs(off_mm) > room_mm:
-            yield Word(compose(beyond if off_mm > 0.0 else before, cm=abs(off_mm) / 10.0))
+            code = beyond if off_mm > 0.0 else before
+            yield Word(compose(code, cm=abs(off_mm) / 10.0))
     if head.eyes_open is False:
         yield Word(compose("live-eyes-shut"))
 

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -30,7 +31,7 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import View, view_light
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.sensor import drift, expose
-from server.services.work import RECONSTRUCT
+from server.settings import RECONSTRUCT
 from server.tasks.moving_subject import JOINT_MM, Film, Person, Pose, of_model
 from tests.laboratory.experiments.records import Bench, Outcome
 from tests.support.services import served_client
@@ -171,7 +172,7 @@ def measured(
         for done, (name, (streams, code, camera)) in enumerate(planted.items()):
             bench.report(name, 0.5 + 0.08 * done)
             show(studio, streams)
-            figures[f"named_{name}_s"] = watch.until(lambda answer: says(answer, code, camera), NAMED_MOST_S)
+            figures[f"named_{name}_s"] = watch.until(partial(says, code, camera), NAMED_MOST_S)
             show(studio, fine)
             figures[f"over_{name}_s"] = watch.until(lambda answer: not answer["words"], NAMED_MOST_S)
             time.sleep(2.0)
@@ -188,7 +189,7 @@ def show(studio: StudioDevices, streams: Streams) -> None:
         studio.streams.show(name, stream)
 
 
-def says(answer: dict, code: str, camera: str | None) -> bool:
+def says(code: str, camera: str | None, answer: dict) -> bool:
     """Tells whether an answer has a word."""
     return any((word["code"], word["camera"]) == (code, camera) for word in answer["words"])
 
