@@ -63,9 +63,15 @@ class FaceReference:
 
 
 def sight(
-    person: SequencePerson, networks: FaceNetworks, pictures: Pictures, motion: Motion, views: int = VIEWS
+    person: SequencePerson,
+    networks: FaceNetworks,
+    pictures: Pictures,
+    motion: Motion,
+    views: int = VIEWS,
+    eyes: int | None = None,
 ) -> Sighting:
-    """Looks for the face where ``motion`` says that it is, in the ``views`` cameras that see it best."""
+    """Looks for the face where ``motion`` says that it is, in the ``views`` cameras that see it best, and for the lids
+    in the first ``eyes`` of them (None: in all)."""
     placed = Similarity.from_rigid(motion.world_from_head)
     facing = {
         name: float(direction_from_face(placed, person.rig[name])[2]) for name in person.rig.names if name in pictures
@@ -83,6 +89,8 @@ def sight(
         if score < MIN_SCORE:
             continue
         pixels[name] = in_picture(found[:, :2], crop.picture_from_crop(LANDMARK_SIZE))
+        if eyes is not None and len(pixels) > eyes:
+            continue
         box = np.concatenate([pixels[name].min(axis=0), pixels[name].max(axis=0)])
         face = find_eyes(pyramid, FaceDetection(pixels[name], found[:, 2], score, box, crop.roll_deg), networks)
         assert face.lids_px is not None

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.alignment.face_alignment import align_to_face
-from pipeline.applications.moments.face_evidence import FaceReference, Sighting, landmarks_of, refer, sight, terms_of
+from pipeline.applications.moments.face_evidence import FaceReference, Sighting, refer, sight, terms_of
 from pipeline.applications.moments.sequence_person import Motion, SequencePerson, tracked_names
 from pipeline.applications.moments.track_frame import POSE, WeightPrior, after, room
 from pipeline.contour_fit.head_problem import apply_step
@@ -29,7 +29,7 @@ from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.terms import Problem, Residuals
 from pipeline.faces.landmark_map import landmark_map
 from pipeline.faces.matching import MatchedFaces
-from pipeline.faces.networks import FaceNetworks
+from pipeline.faces.networks import LANDMARKS, FaceNetworks
 from pipeline.faces.points import direction_from_face
 from pipeline.geometry.projection import project_points
 from pipeline.head_model.model import HeadModel
@@ -40,6 +40,7 @@ from rig.rig import Rig
 MODES = 40  # of the shape; landmarks tell nothing of finer ones
 SHAPE_LIMITS, MOTION_LIMITS = Limits(8, 0.1), Limits(4, 0.05)
 MIN_VIEWS = 2
+EYES = 3  # cameras in which lids are looked at
 LOOKS = 3  # at one moment, each from where the one before has found the head
 FAR_DEG, FAR_MM = 4.0, 12.0  # of a motion: a crop so far off misplaces the landmarks
 COARSE = 8.0  # of the landmarks' deviation, for a head that may have moved far
@@ -51,13 +52,13 @@ MESH = "p99"  # the level that is shown
 @dataclass(frozen=True, slots=True, eq=False)
 class LivePerson:
     """Holds what stays the same from look to look: the person, its ``scale`` by the model's size, what the networks
-    say of it, and the vertices of the small mesh with their expressions (head frame, mm)."""
+    say of it, and the vertices of the small mesh, then the 468 landmarks, with their expressions (head frame, mm)."""
 
     person: SequencePerson
     scale: float
     reference: FaceReference
-    mesh: Float[np.ndarray, "v 3"]
-    mesh_shapes: Float[np.ndarray, "e v 3"]
+    points: Float[np.ndarray, "n 3"]
+    shapes: Float[np.ndarray, "e n 3"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +71,7 @@ class LiveHead:
         sighting: pixels of the landmarks by camera, and the openings of the lids.
         facing: cosine between where the face looks and each camera.
         strangers: cameras that show landmarks where this head has none.
+        points_world: the vertices of the small mesh, then the 468 landmarks (mm).
     """
 
     who: LivePerson
@@ -77,17 +79,17 @@ class LiveHead:
     sighting: Sighting
     facing: Mapping[str, float]
     strangers: tuple[str, ...]
+    points_world: Float[np.ndarray, "n 3"]
 
     @property
     def vertices_world(self) -> Float[np.ndarray, "v 3"]:
         """Returns the vertices of the small mesh (mm)."""
-        moved = np.tensordot(self.motion.weights, self.who.mesh_shapes, axes=1)
-        return self.motion.world_from_head.apply(self.who.mesh + moved)
+        return self.points_world[:-LANDMARKS]
 
     @property
     def landmarks_world(self) -> Float[np.ndarray, "468 3"]:
         """Returns the 468 landmarks on the head (mm)."""
-        return self.motion.world_from_head.apply(landmarks_of(self.who.person, self.motion.weights))
+        return self.points_world[-LANDMARKS:]
 
 
 def mesh_faces(model: HeadModel) -> Int[np.ndarray, "f 3"]:
@@ -112,9 +114,11 @@ def meet(
     if len(reference.bias) < MIN_VIEWS:
         return None
     reference = replace(reference, open={side: max(opening, OPEN) for side, opening in reference.open.items()})
-    coarse = model.levels[MESH].rows
-    who = LivePerson(person, scale, reference, neutral[coarse], shapes[:, coarse].astype(float))
-    return follow(LiveHead(who, motion, Sighting({}, {}), {}, ()), pictures, networks)
+    coarse, places = model.levels[MESH].rows, landmark_map(model)
+    points = np.concatenate([neutral[coarse], places.points(neutral)])
+    moved = np.stack([np.concatenate([shape[coarse], places.points(shape)]) for shape in shapes])
+    who = LivePerson(person, scale, reference, points, moved)
+    return follow(LiveHead(who, motion, Sighting({}, {}), {}, (), points), pictures, networks)
 
 
 def _shaped(observed: LandmarkObservations, start: Similarity, modes: int) -> State:
@@ -145,7 +149,7 @@ def follow(head: LiveHead, pictures: Mapping[str, ImageRgb], networks: FaceNetwo
     motion, found, strangers = head.motion, head.sighting, tuple[str, ...]()
     for _ in range(LOOKS):
         before = motion
-        found = sight(person, networks, pictures, before, len(person.rig))
+        found = sight(person, networks, pictures, before, len(person.rig), EYES)
         if len(found.pixels) < MIN_VIEWS:
             return None
         motion = _fitted(who, found, before)
@@ -158,7 +162,8 @@ def follow(head: LiveHead, pictures: Mapping[str, ImageRgb], networks: FaceNetwo
     seen = {name: pixels for name, pixels in found.pixels.items() if name not in strangers}
     placed = Similarity.from_rigid(motion.world_from_head)
     facing = {camera.name: float(direction_from_face(placed, camera)[2]) for camera in person.rig}
-    return LiveHead(who, motion, replace(found, pixels=seen), facing, strangers)
+    points = motion.world_from_head.apply(who.points + np.tensordot(motion.weights, who.shapes, axes=1))
+    return LiveHead(who, motion, replace(found, pixels=seen), facing, strangers, points)
 
 
 def _fitted(who: LivePerson, found: Sighting, start: Motion) -> Motion:

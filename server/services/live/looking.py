@@ -22,7 +22,6 @@ from pipeline.faces.sighting import GLANCE, reduce_picture, turned_deg
 from pipeline.faces.subject import find_subject
 from pipeline.head_model.model import HeadModel, load_model
 from rig.acquisition.image_checks import blur_px, exposure
-from rig.acquisition.judgement import plate_level
 from rig.acquisition.plates import read_plates
 from rig.camera import Camera
 from rig.capture import ImageRgb
@@ -37,9 +36,10 @@ BLUR_WIDTH_PX = 640  # of a picture in whose pixels sharpness is told
 ROOM, DEPTH = 0.15, 0.07  # of the front picture's height, of its distance: how far the head may be from where all look
 MIDDLE = 0.25  # of the picture's sides: the face's middle is no nearer to an edge
 WHOLE = 0.97  # share of the head's vertices in the picture
+MIN_FACE_PX = 40  # of a face, for its sharpness to be measured
 FACE_MARGIN = 0.15  # of the face's size, about the landmarks: sharpness is measured there
 SAME = 8.0  # largest change of a thumbnail of pictures without a head: they are not searched again
-THUMBNAIL = (16, 12)  # pixels
+THUMBNAIL, PARTS = (16, 12), (64, 48)  # pixels
 SHOWN = 6  # every sixth landmark is handed out
 
 
@@ -49,7 +49,7 @@ class Kept:
 
     rig: Rig | None = None  # as calibrated
     head: LiveHead | None = None
-    levels: tuple[str, Mapping[str, float]] = ("", field(default_factory=dict))  # of a version of the clean plates
+    plates: tuple[str, Mapping[str, np.ndarray]] = ("", {})  # the light of a version of the clean plates
     fruitless: Mapping[str, np.ndarray] = field(default_factory=dict)  # thumbnails in which no head was found
     searched: int = 0  # cameras in which strangers were searched, in turn
 
@@ -72,10 +72,10 @@ def look(
         name: np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB))
         for name, data in pictures.items()
     }
-    levels = _levels(kept, plates, tuple(pictures))
+    empty = _plates(kept, plates, tuple(pictures))
     if rig is None:
         return Seen(
-            {name: _measured(image, levels.get(name), None) for name, image in images.items()}, None, False, False
+            {name: _measured(image, empty.get(name), None) for name, image in images.items()}, None, False, False
         )
     cameras = {name: rig[name] for name in images if name in rig and _fits(rig[name], images[name])}
     small = {name: _small(images[name], camera) for name, camera in cameras.items()}
@@ -83,7 +83,7 @@ def look(
     faces = _find(context, kept, {name: image for name, (image, _) in small.items()}, scaled)
     head = kept.head
     seen = {
-        name: _camera(image, levels.get(name), scaled[name] if scaled and name in small else None, head)
+        name: _camera(image, empty.get(name), scaled[name] if scaled and name in small else None, head)
         for name, image in images.items()
     }
     if head is None or scaled is None:
@@ -105,18 +105,23 @@ def _small(image: ImageRgb, camera: Camera) -> tuple[ImageRgb, Camera]:
     return reduce_picture(image, at_size, SMALL_PX)
 
 
-def _levels(kept: Kept, plates: tuple[str, str] | None, names: tuple[str, ...]) -> Mapping[str, float]:
-    """Returns the mean value of each camera's clean plate."""
+def _plates(kept: Kept, plates: tuple[str, str] | None, names: tuple[str, ...]) -> Mapping[str, np.ndarray]:
+    """Returns the clean plates, reduced to their light."""
     if plates is None:
         return {}
     folder, version = plates
-    if kept.levels[0] != version:
+    if kept.plates[0] != version:
         try:
             read = read_plates(Path(folder), names).first
         except InputError:
             read = {}
-        kept.levels = (version, {name: plate_level(plate) for name, plate in read.items()})
-    return kept.levels[1]
+        kept.plates = (version, {name: _light(plate) for name, plate in read.items()})
+    return kept.plates[1]
+
+
+def _light(image: ImageRgb) -> Float[np.ndarray, "h w"]:
+    """Returns the light of a picture in parts, each an average of many pixels."""
+    return cv2.resize(image, PARTS, interpolation=cv2.INTER_AREA).mean(axis=2) + 1.0
 
 
 def _find(context: WorkerContext, kept: Kept, small: Mapping[str, ImageRgb], rig: Rig | None) -> bool:
@@ -157,27 +162,32 @@ def _alike(thumbs: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]) -
     )
 
 
-def _measured(image: ImageRgb, level: float | None, face: Float[np.ndarray, "n 2"] | None) -> CameraSeen:
-    """Measures a picture; its sharpness on the ``face`` (its landmarks' pixels), if it shows one."""
-    light, scale = exposure(image), max(1.0, BLUR_WIDTH_PX / image.shape[1])
+def _measured(
+    image: ImageRgb, plate: Float[np.ndarray, "h w"] | None, face: Float[np.ndarray, "n 2"] | None
+) -> CameraSeen:
+    """Measures a picture's light, and its sharpness on the ``face`` (its landmarks' pixels), if it shows one."""
+    light, blur = exposure(image), None
+    share = None if plate is None else float(np.median(_light(image) / plate))  # most of it is background
     if face is not None:
         margin = FACE_MARGIN * float(np.ptp(face, axis=0).max())
         low = np.maximum(face.min(axis=0) - margin, 0.0).astype(int)
         high = np.maximum(face.max(axis=0) + margin, 0.0).astype(int)
         part = image[low[1] : high[1], low[0] : high[0]]
-        image = np.ascontiguousarray(part) if min(part.shape[:2]) > SMALL_PX // 8 else image
-    blur = blur_px(image)
-    return CameraSeen(light.mean, level, light.clipped_share, None if blur is None else scale * blur)
+        blur = blur_px(np.ascontiguousarray(part)) if min(part.shape[:2]) > MIN_FACE_PX else None
+    scale = max(1.0, BLUR_WIDTH_PX / image.shape[1])
+    return CameraSeen(light.mean, share, light.clipped_share, None if blur is None else scale * blur)
 
 
-def _camera(image: ImageRgb, level: float | None, camera: Camera | None, head: LiveHead | None) -> CameraSeen:
+def _camera(
+    image: ImageRgb, plate: Float[np.ndarray, "h w"] | None, camera: Camera | None, head: LiveHead | None
+) -> CameraSeen:
     """Measures a picture, and where the head is in it."""
     if head is None or camera is None:
-        return _measured(image, level, None)
+        return _measured(image, plate, None)
     size = np.array([camera.intrinsics.width, camera.intrinsics.height], float)
     vertices, face = camera.project(head.vertices_world), camera.project(head.landmarks_world)
     if not (np.isfinite(vertices).all() and np.isfinite(face).all()):
-        return replace(_measured(image, level, None), facing=head.facing[camera.name], centred=False)
+        return replace(_measured(image, plate, None), facing=head.facing[camera.name], centred=False)
     own = head.sighting.pixels.get(camera.name)
     inside = ((vertices > -0.5) & (vertices < size - 0.5)).all(axis=1).mean()
     middle = (face.mean(axis=0) + 0.5) / size
@@ -185,7 +195,7 @@ def _camera(image: ImageRgb, level: float | None, camera: Camera | None, head: L
         head.facing[camera.name] >= LOOKING,
         inside >= WHOLE and bool((np.abs(middle - 0.5) < 0.5 - MIDDLE).all()),
     )
-    measured = _measured(image, level, (face + 0.5) * image.shape[1] / size[0] - 0.5)
+    measured = _measured(image, plate, (face + 0.5) * image.shape[1] / size[0] - 0.5)
     return replace(
         measured,
         facing=head.facing[camera.name],
@@ -214,9 +224,8 @@ def _head(head: LiveHead, rig: Rig, scaled: Rig, front: str | None) -> HeadSeen:
     face, _ = place_face(head.landmarks_world)
     left_deg, up_deg = turned_deg(face, rig, name) or (0.0, 0.0)  # all around, no way is the front
     view = camera.camera_from_world.rotation
-    # cameras may be aimed at the head's middle or at the face: both are right
-    ends = np.stack([pose.translation - centre, face.translation - centre]) @ view.T
-    off = np.where((ends > 0).all(axis=0), ends.min(axis=0), np.where((ends < 0).all(axis=0), ends.max(axis=0), 0.0))
+    middle = (pose.translation + face.translation) / 2.0  # cameras are aimed at the head's middle, or at the face
+    off = view @ (middle - centre)
     distance = float(np.linalg.norm(camera.centre_world - centre))
     vertices, openings = (head.vertices_world - pose.translation) @ view.T, head.sighting.openings
     return HeadSeen(

@@ -13,7 +13,7 @@ class CameraSeen:
     """Holds what one camera shows.
 
     Attributes:
-        mean: of the picture, 0 to 255; ``level``: what it should be, from the clean plate; None without one.
+        mean: of the picture, 0 to 255; ``light``: its brightness by the clean plate's; None without one.
         clipped: share of the picture at full white.
         blur_px: spread of edges on the face, pixels of a picture 640 wide; None where there are none to measure.
         facing: cosine between where the face looks and the camera; None without a head, as the next two.
@@ -24,7 +24,7 @@ class CameraSeen:
     """
 
     mean: float
-    level: float | None
+    light: float | None
     clipped: float
     blur_px: float | None
     facing: float | None = None

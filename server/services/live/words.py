@@ -18,9 +18,10 @@ from server.services.live.seen import CameraSeen, HeadSeen, Lamps, Seen, Word
 HOLD_S = 0.4  # longer than a blink
 STEADY_S, STEADY_MM, STEADY_DEG = 0.7, 2.5, 1.2  # a still head's landmarks move it by a third of that
 SOFT_PX = 1.2  # on the face, picture 640 wide: sharp ones have 0 to 0.5, 4 px of 1024 out of focus 1.4 to 1.6
-DARKER, BRIGHTER = 0.6, 1.7  # than its clean plate, by the median camera: with a subject seated 0.9 to 1.1
+DARKER, BRIGHTER = 0.75, 1.35  # than its clean plate, by the median camera: 0.97 to 1.03 on a subject of the studio
+DARKER_SEEN, BRIGHTER_SEEN = 0.6, 1.7  # than the other cameras, without clean plates: they see other things
 ALL_DARK = 0.4  # of the median camera against its plate
-BLACK = 0.05
+BLACK = 0.1
 LEVEL = 64.0  # of a studio's pictures, where there are no plates (rig.acquisition.judgement)
 CLIPPED = 0.05  # share of the picture
 LOOKING = 0.5  # cosine: both eyes are seen
@@ -124,19 +125,19 @@ def _of_camera(name: str, camera: CameraSeen) -> Iterator[Word]:
 
 def _light(seen: Seen) -> Iterator[tuple[str, Word]]:
     """Yields the cameras whose light is wrong: against their clean plates, else against the other cameras."""
-    plated = all(camera.level is not None for camera in seen.cameras.values())
-    ratios = {name: camera.mean / (camera.level or LEVEL) for name, camera in seen.cameras.items()}
+    plated = all(camera.light is not None for camera in seen.cameras.values())
+    ratios = {name: camera.light if plated else camera.mean / LEVEL for name, camera in seen.cameras.items()}
     common = median(ratios.values()) if ratios else 1.0
     if common < ALL_DARK:
         yield from ((name, Word(compose("live-lights", percent=100.0 * common))) for name in ratios)
         return
     for name, ratio in ratios.items():
-        share = ratio / common if len(ratios) > 2 or not plated else ratio
+        share = ratio / common if len(ratios) > 2 else ratio
         if ratio < BLACK:
             yield name, Word(compose("live-black", camera=name), name)
-        elif share < DARKER:
+        elif share < (DARKER if plated else DARKER_SEEN):
             code = "live-darker" if plated else "live-darker-than-others"
             yield name, Word(compose(code, camera=name, percent=100.0 * share), name)
-        elif share > BRIGHTER:
+        elif share > (BRIGHTER if plated else BRIGHTER_SEEN):
             code = "live-brighter" if plated else "live-brighter-than-others"
             yield name, Word(compose(code, camera=name, percent=100.0 * share), name)
