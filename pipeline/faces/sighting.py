@@ -58,15 +58,20 @@ def sight_face(subject: SubjectFaces, rig: Rig, *, front: str) -> FaceSighting:
 
 
 def turned_deg(world_from_face: Similarity, rig: Rig, front: str) -> tuple[float, float] | None:
-    """Returns by how many degrees a face is turned to the subject's left and up; None without a front. From the front
-    camera, but 0 unless turned that way from the cameras' middle, too: the front one of cameras in rows stands above or
-    below that middle, and a face between rows counts as straight."""
+    """Returns by how many degrees a face is turned to the subject's left and up from the front camera; None without a
+    front."""
     if not has_front(rig):
         return None
-    from_middle = gaze_from(world_from_face, -_fan(rig))
-    from_front = gaze_from(world_from_face, rig[front].axis_world if front in rig.names else -_fan(rig))
-    agreed = [a * b > 0.0 and abs(b) >= MIN_OFF_MIDDLE_DEG for a, b in zip(from_front, from_middle, strict=True)]
-    return from_front[0] * agreed[0], from_front[1] * agreed[1]
+    left, up = gaze_from(world_from_face, rig[front].axis_world if front in rig.names else -_fan(rig))
+    middle_left, middle_up = gaze_from(world_from_face, -_fan(rig))
+    return _turned(left, middle_left), _turned(up, middle_up)
+
+
+def _turned(from_front_deg: float, from_middle_deg: float) -> float:
+    """Returns the angle from the front camera; 0 unless the face is turned that way from the middle of the cameras,
+    too. The front one of cameras in rows stands above or below that middle; a face between rows counts as straight."""
+    agreed = from_front_deg * from_middle_deg > 0.0 and abs(from_middle_deg) >= MIN_OFF_MIDDLE_DEG
+    return from_front_deg if agreed else 0.0
 
 
 def has_front(rig: Rig) -> bool:

@@ -6,7 +6,6 @@ import struct
 import threading
 import time
 from collections.abc import AsyncIterator
-from typing import Protocol
 
 import structlog
 
@@ -28,19 +27,6 @@ LOOK_S = 0.05
 WIDTH = 640  # of a picture on the wire: a tile is 320 points wide, twice as many pixels on a dense screen
 
 log = structlog.get_logger()
-
-
-class Source(Protocol):
-    """Declares where the live view gets its pictures: from real cameras or the simulated studio. Methods block."""
-
-    def frames(self) -> list[LiveFrame]:
-        """Returns the present picture of each camera, with its measurements. ``jpeg`` is None if the camera delivers
-        none."""
-        ...
-
-    def close(self) -> None:
-        """Releases what the source holds."""
-        ...
 
 
 class StudioSource:
@@ -76,7 +62,6 @@ class RigSource:
 
     def close(self) -> None:
         """Does nothing: the rig stays open for shots."""
-        pass
 
 
 def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
@@ -129,7 +114,7 @@ class LiveView:
 
     def _look_around(self) -> None:
         simulated = self._service.rig.describe().kind == "simulated"
-        source: Source = StudioSource() if simulated else RigSource(self._service.rig)
+        source = StudioSource() if simulated else RigSource(self._service.rig)
         blur: dict[str, float | None] = {}
         try:
             while True:
@@ -147,7 +132,7 @@ class LiveView:
         finally:
             source.close()
 
-    def _look(self, source: Source, blur: dict[str, float | None]) -> bytes:
+    def _look(self, source: StudioSource | RigSource, blur: dict[str, float | None]) -> bytes:
         began = time.monotonic()
         try:
             frames, self.fault = source.frames(), None

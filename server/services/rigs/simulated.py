@@ -29,8 +29,7 @@ class SimulatedRig:
         """Returns the state of the studio, whose cameras are always ready."""
         rig = self._rig()
         cameras = [RigCamera(name, "simulated", "ready") for name in rig.names]
-        calibrated = "own" if self._calibration.is_file() else "studio"
-        return rig_state("simulated", "simulated", cameras, [], calibrated)
+        return rig_state("simulated", "simulated", cameras, [], "own" if self._calibration.is_file() else "studio")
 
     def calibrated(self) -> Rig:
         """Returns the calibration that was put to use, or the studio's own layout."""
