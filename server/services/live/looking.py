@@ -1,6 +1,6 @@
 """Looks at one moment's pictures, in a child process that keeps the head from look to look.
 
-Pictures come as JPEG files of at most 640 pixels of width. Sharpness and exposure are measured on them, the face is
+Pictures come reduced. Light and sharpness are measured on them, the latter in every other camera in turn; the face is
 found in them at ``SMALL_PX``. A face that is missing where it should be seen is searched anew in one camera a look.
 """
 
@@ -16,7 +16,7 @@ from pipeline.applications.moments.live_head import LiveHead, follow, meet, mesh
 from pipeline.faces.crops import make_pyramid
 from pipeline.faces.detection import find_large_faces
 from pipeline.faces.eyes import closed_by_openings
-from pipeline.faces.networks import FaceNetworks, load_networks
+from pipeline.faces.networks import LANDMARKS, FaceNetworks, load_networks
 from pipeline.faces.points import place_face
 from pipeline.faces.sighting import GLANCE, reduce_picture, turned_deg
 from pipeline.faces.subject import find_subject
@@ -52,44 +52,46 @@ class Kept:
     plates: tuple[str, Mapping[str, np.ndarray]] = ("", {})  # the light of a version of the clean plates
     fruitless: Mapping[str, np.ndarray] = field(default_factory=dict)  # thumbnails in which no head was found
     searched: int = 0  # cameras in which strangers were searched, in turn
+    looks: int = 0
+    blur: dict[str, float | None] = field(default_factory=dict)  # as measured last
 
 
 def look(
     context: WorkerContext,
-    pictures: Mapping[str, bytes],
+    pictures: Mapping[str, bytes | ImageRgb],
     rig: Rig | None,
     front: str | None,
     plates: tuple[str, str] | None,
 ) -> Seen:
     """Finds the head, and measures every camera.
 
-    ``pictures``: JPEG files by camera; ``rig``: the cameras as calibrated, at whatever size; ``front``: the camera that
-    the subject looks at; ``plates``: folder and version of the clean plates.
+    ``pictures``: by camera, those in bytes as JPEG files; ``rig``: the cameras as calibrated, at whatever size;
+    ``front``: the camera that the subject looks at; ``plates``: folder and version of the clean plates.
     """
     kept: Kept = context.keep("live", Kept)
     cv2.setNumThreads(1)  # a job may run beside
-    images = {
-        name: np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB))
-        for name, data in pictures.items()
-    }
+    images = {name: _read(picture) for name, picture in pictures.items()}
     empty = _plates(kept, plates, tuple(pictures))
+    seen = {name: _lit(image, empty.get(name)) for name, image in images.items()}
     if rig is None:
-        return Seen(
-            {name: _measured(image, empty.get(name), None) for name, image in images.items()}, None, False, False
-        )
+        return Seen(seen, None, False, False)
     cameras = {name: rig[name] for name in images if name in rig and _fits(rig[name], images[name])}
     small = {name: _small(images[name], camera) for name, camera in cameras.items()}
     scaled = Rig(tuple(camera for _, camera in small.values())) if small else None
     faces = _find(context, kept, {name: image for name, (image, _) in small.items()}, scaled)
     head = kept.head
-    seen = {
-        name: _camera(image, empty.get(name), scaled[name] if scaled and name in small else None, head)
-        for name, image in images.items()
-    }
     if head is None or scaled is None:
         return Seen(seen, None, faces, True)
+    seen |= {camera.name: _with_head(seen[camera.name], camera, head) for camera in scaled}
+    _measure_sharpness(kept, seen, images, scaled, head)
     _search_stranger(context, kept, seen, small)
     return Seen(seen, _head(head, rig, scaled, front), faces, True)
+
+
+def _read(picture: bytes | ImageRgb) -> ImageRgb:
+    if isinstance(picture, bytes):
+        return np.asarray(cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR_RGB), np.uint8)
+    return picture
 
 
 def _fits(camera: Camera, image: ImageRgb) -> bool:
@@ -162,48 +164,53 @@ def _alike(thumbs: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]) -
     )
 
 
-def _measured(
-    image: ImageRgb, plate: Float[np.ndarray, "h w"] | None, face: Float[np.ndarray, "n 2"] | None
-) -> CameraSeen:
-    """Measures a picture's light, and its sharpness on the ``face`` (its landmarks' pixels), if it shows one."""
-    light, blur = exposure(image), None
-    share = None if plate is None else float(np.median(_light(image) / plate))  # most of it is background
-    if face is not None:
-        margin = FACE_MARGIN * float(np.ptp(face, axis=0).max())
-        low = np.maximum(face.min(axis=0) - margin, 0.0).astype(int)
-        high = np.maximum(face.max(axis=0) + margin, 0.0).astype(int)
-        part = image[low[1] : high[1], low[0] : high[0]]
-        blur = blur_px(np.ascontiguousarray(part)) if min(part.shape[:2]) > MIN_FACE_PX else None
-    scale = max(1.0, BLUR_WIDTH_PX / image.shape[1])
-    return CameraSeen(light.mean, share, light.clipped_share, None if blur is None else scale * blur)
+def _lit(image: ImageRgb, plate: Float[np.ndarray, "h w"] | None) -> CameraSeen:
+    """Measures a picture's light, against its clean plate: most of it is background."""
+    light = exposure(image)
+    share = None if plate is None else float(np.median(_light(image) / plate))
+    return CameraSeen(light.mean, share, light.clipped_share, None)
 
 
-def _camera(
-    image: ImageRgb, plate: Float[np.ndarray, "h w"] | None, camera: Camera | None, head: LiveHead | None
-) -> CameraSeen:
-    """Measures a picture, and where the head is in it."""
-    if head is None or camera is None:
-        return _measured(image, plate, None)
+def _with_head(seen: CameraSeen, camera: Camera, head: LiveHead) -> CameraSeen:
+    """Adds where the head is in a picture."""
     size = np.array([camera.intrinsics.width, camera.intrinsics.height], float)
-    vertices, face = camera.project(head.vertices_world), camera.project(head.landmarks_world)
-    if not (np.isfinite(vertices).all() and np.isfinite(face).all()):
-        return replace(_measured(image, plate, None), facing=head.facing[camera.name], centred=False)
-    own = head.sighting.pixels.get(camera.name)
-    inside = ((vertices > -0.5) & (vertices < size - 0.5)).all(axis=1).mean()
-    middle = (face.mean(axis=0) + 0.5) / size
-    looked, centred = (
-        head.facing[camera.name] >= LOOKING,
-        inside >= WHOLE and bool((np.abs(middle - 0.5) < 0.5 - MIDDLE).all()),
-    )
-    measured = _measured(image, plate, (face + 0.5) * image.shape[1] / size[0] - 0.5)
+    facing, own = head.facing[camera.name], head.sighting.pixels.get(camera.name)
+    pixels = camera.project(head.points_world)
+    if not np.isfinite(pixels).all():
+        return replace(seen, facing=facing, centred=False)
+    inside = ((pixels > -0.5) & (pixels < size - 0.5)).all(axis=1).mean()
+    middle = (pixels[-LANDMARKS:].mean(axis=0) + 0.5) / size
     return replace(
-        measured,
-        facing=head.facing[camera.name],
-        face=True if own is not None else False if looked else None,
-        centred=centred,
+        seen,
+        facing=facing,
+        face=True if own is not None else False if facing >= LOOKING else None,
+        centred=bool(inside >= WHOLE and (np.abs(middle - 0.5) < 0.5 - MIDDLE).all()),
         stranger=camera.name in head.strangers,
         points=() if own is None else tuple(_rounded((point + 0.5) / size, 4) for point in own[::SHOWN]),
     )
+
+
+def _measure_sharpness(
+    kept: Kept, seen: dict[str, CameraSeen], images: Mapping[str, ImageRgb], rig: Rig, head: LiveHead
+) -> None:
+    """Measures the sharpness of the head's face in every other camera in turn, and adds what is known of each."""
+    kept.looks += 1
+    for camera in rig.cameras[kept.looks % 2 :: 2]:
+        image = images[camera.name]
+        face = (camera.project(head.landmarks_world) + 0.5) * image.shape[1] / camera.intrinsics.width - 0.5
+        kept.blur[camera.name] = _blur_px(image, face) if np.isfinite(face).all() else None
+    for camera in rig:
+        seen[camera.name] = replace(seen[camera.name], blur_px=kept.blur.get(camera.name))
+
+
+def _blur_px(image: ImageRgb, face: Float[np.ndarray, "n 2"]) -> float | None:
+    """Measures the sharpness of a face, whose landmarks are at these pixels."""
+    margin = FACE_MARGIN * float(np.ptp(face, axis=0).max())
+    low = np.maximum(face.min(axis=0) - margin, 0.0).astype(int)
+    high = np.maximum(face.max(axis=0) + margin, 0.0).astype(int)
+    part = image[low[1] : high[1], low[0] : high[0]]
+    blur = blur_px(np.ascontiguousarray(part)) if min(part.shape[:2]) > MIN_FACE_PX else None
+    return None if blur is None else BLUR_WIDTH_PX / image.shape[1] * blur
 
 
 def _search_stranger(
