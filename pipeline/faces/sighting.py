@@ -52,16 +52,14 @@ def sight_face(subject: SubjectFaces, rig: Rig, *, front: str) -> FaceSighting:
     if face is None:
         return FaceSighting(len(subject.found), False, any(subject.found.values()), front)
     closed = eye_warnings(closed_by_openings(eye_openings(face, rig)))
-    sighting = FaceSighting(len(subject.found), True, True, front, _missing(subject, face), remarks=tuple(closed))
-    turned = turned_deg(face.world_from_face, rig, front)
-    return sighting if turned is None else replace(sighting, left_deg=turned[0], up_deg=turned[1])
+    left_deg, up_deg = turned_deg(face.world_from_face, rig, front)
+    return FaceSighting(len(subject.found), True, True, front, _missing(subject, face), left_deg, up_deg, tuple(closed))
 
 
-def turned_deg(world_from_face: Similarity, rig: Rig, front: str) -> tuple[float, float] | None:
-    """Returns by how many degrees a face is turned to the subject's left and up from the front camera; None without a
-    front."""
+def turned_deg(world_from_face: Similarity, rig: Rig, front: str) -> tuple[float, float] | tuple[None, None]:
+    """Returns by how many degrees a face is turned to its left and up from the front camera; None without a front."""
     if not has_front(rig):
-        return None
+        return None, None
     left, up = gaze_from(world_from_face, rig[front].axis_world if front in rig.names else -_fan(rig))
     middle_left, middle_up = gaze_from(world_from_face, -_fan(rig))
     return _turned(left, middle_left), _turned(up, middle_up)

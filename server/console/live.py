@@ -15,7 +15,7 @@ from rig.messages.message import Message, compose
 from rig.progress import Progress
 from server.console.live_frame import LiveFrame
 from server.services.live.live import document_of
-from server.services.rigs.backend import RigBackend, jpeg, reduced
+from server.services.rigs.backend import PREVIEW_WIDTH, RigBackend, jpeg, reduced
 from server.services.service import Service
 from server.tasks.child import Child, WorkerContext
 from server.wire.problems import problem_from
@@ -24,7 +24,6 @@ EVERY_S = 0.25  # four looks a second at most
 IDLE_S = 3.0  # without anybody who watches: then nobody looks at the cameras either
 KEEP_S = 300.0  # and so long the studio stays drawn, for the next who comes
 LOOK_S = 0.05
-WIDTH = 640  # of a picture on the wire: a tile is 320 points wide, twice as many pixels on a dense screen
 
 log = structlog.get_logger()
 
@@ -67,7 +66,7 @@ class RigSource:
 def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
     if picture is None:
         return {"name": name, "jpeg": None, "fault": compose("camera-shows-nothing").document()}
-    small = reduced(picture, WIDTH)
+    small = reduced(picture, PREVIEW_WIDTH)  # a tile is 320 points wide, twice as many pixels on a dense screen
     level = exposure(small)
     frame: LiveFrame = {
         "name": name,
@@ -113,8 +112,7 @@ class LiveView:
                 self._thread.start()
 
     def _look_around(self) -> None:
-        simulated = self._service.rig.describe().kind == "simulated"
-        source = StudioSource() if simulated else RigSource(self._service.rig)
+        source = StudioSource() if self._service.rig.describe().kind == "simulated" else RigSource(self._service.rig)
         blur: dict[str, float | None] = {}
         try:
             while True:

@@ -25,6 +25,7 @@ TEMPLATES = {
     "live-darker-than-others": "{camera} is darker than the other cameras: {percent:.0f} %",
     "live-brighter-than-others": "{camera} is brighter than the other cameras: {percent:.0f} %",
     "live-burnt-out": "{camera} is burnt out in {percent:.0f} % of its picture",
+    "live-no-picture": "{camera} delivers no picture: check its cable and power",
     "live-soft": "{camera} is out of focus",
     "live-stranger": "{camera} sees another person, or the face elsewhere",
     "live-no-face": "{camera} sees no face, though you look its way: see what hides it",

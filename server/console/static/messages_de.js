@@ -1199,6 +1199,7 @@ export default {
   "live-darker-than-others": "{camera} ist dunkler als die anderen Kameras: {percent:.0f} %",
   "live-brighter-than-others": "{camera} ist heller als die anderen Kameras: {percent:.0f} %",
   "live-burnt-out": "{camera} ist in {percent:.0f} % des Bildes überbelichtet",
+  "live-no-picture": "{camera} liefert kein Bild: Kabel und Strom prüfen",
   "live-soft": "{camera} ist unscharf",
   "live-stranger": "{camera} sieht eine andere Person oder das Gesicht anderswo",
   "live-no-face": "{camera} sieht kein Gesicht, obwohl Sie dorthin sehen: nachsehen, was es verdeckt",

@@ -1,13 +1,14 @@
 """Keeps a head of whoever sits before the cameras, as long as somebody looks.
 
-One thread takes the newest pictures, its own or those that the console's live view offers, and hands them to a child
-process (``look``). The child has the priority of a job's, so that both go on side by side; one that dies or does not
-answer is killed and begun again with the next look. ``IDLE_S`` after the last question thread and child end.
+One thread takes pictures, unless the console's live view offers its own; another hands the newest ones to a child
+process (``look``) and says what it found. The cameras are asked for the next pictures so early that they come when the
+child is done. The child has the priority of a job's, so that both go on side by side; one that dies or does not answer
+is killed and begun again with the next look. ``IDLE_S`` after the last question threads and child end.
 """
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -44,10 +45,11 @@ log = structlog.get_logger()
 @dataclass(frozen=True, slots=True)
 class Moment:
     """Holds the pictures of one moment, some of them JPEG files, and when the first of them may have been taken (s, of
-    ``time.monotonic``)."""
+    ``time.monotonic``). ``fault``: why there are none."""
 
     taken_s: float
     pictures: Mapping[str, bytes | ImageRgb]
+    fault: Message | None = None
 
 
 class Live:
@@ -59,7 +61,8 @@ class Live:
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._asked_s = self._offered_s = 0.0
-        self._offered: Moment | None = None
+        self._moment: Moment | None = None
+        self._begun, self._child_s = threading.Event(), 0.0  # whether the child looks at the newest; how long it took
         self._shown: tuple[float, LiveShown] | None = None
         self._number = 0
         self._closing = False
@@ -78,62 +81,74 @@ class Live:
     def offer(self, pictures: Mapping[str, bytes], taken_s: float) -> LiveShown:
         """Takes the pictures that the live view has just got, so that the cameras need not be asked twice, and returns
         the newest look."""
-        self._offered, self._offered_s = Moment(taken_s, pictures), time.monotonic()
+        self._moment, self._offered_s = Moment(taken_s, pictures), time.monotonic()
         return self.newest()
 
     def close(self) -> None:
-        """Ends the thread and the child process."""
+        """Ends the threads and the child process."""
         self._closing, thread = True, self._thread
         if thread is not None:
             thread.join(LOOK_S)
 
     def _look_on(self) -> None:
         speaker, child, last_s = Speaker(), Child(NICENESS, {"OPENBLAS_NUM_THREADS": "1"}), 0.0
+        ended = threading.Event()
+        threading.Thread(target=self._watch_cameras, args=(ended,), daemon=True, name="live pictures").start()
         try:
             while not self._is_idle():
-                time.sleep(max(WAIT_S, last_s + EVERY_S - time.monotonic()))
+                moment = self._moment
+                if moment is None or moment.taken_s <= last_s:
+                    time.sleep(WAIT_S)
+                    continue
+                last_s = moment.taken_s
+                self._begun.set()
                 try:
-                    moment = self._moment(last_s)
-                    if moment is not None:
-                        last_s = moment.taken_s
-                        self._show(moment, child, speaker)
-                except Exception as error:  # cameras and child may come back
-                    self._shown = (
-                        time.monotonic(),
-                        nothing(error.detail if isinstance(error, Refused) else compose("live-again")),
-                    )
+                    self._show(moment, child, speaker)
+                except Exception as error:  # the child is begun again
+                    self._shown = (time.monotonic(), nothing(compose("live-again")))
                     log.warning("no live head", error=str(error)[:300])
-                    time.sleep(AGAIN_S)
         finally:
+            ended.set()
             child.close()
+
+    def _watch_cameras(self, ended: threading.Event) -> None:
+        while not ended.is_set():
+            begun_s = time.monotonic()
+            if begun_s - self._offered_s < OFFERED_S:
+                ended.wait(WAIT_S)
+                continue
+            self._begun.clear()
+            try:
+                self._moment = Moment(begun_s, {name: halved(image) for name, image in self._rig.look().items()})
+            except Exception as error:  # the cameras may come back
+                told = error.detail if isinstance(error, Refused) else compose("live-no-pictures")
+                self._moment = Moment(begun_s, {}, told)
+                ended.wait(AGAIN_S)
+            took_s = time.monotonic() - begun_s
+            self._begun.wait(LOOK_S)
+            ended.wait(max(WAIT_S, self._child_s - took_s, begun_s + EVERY_S - time.monotonic()))
 
     def _is_idle(self) -> bool:
         with self._lock:
             idle = self._closing or time.monotonic() - self._asked_s > IDLE_S
             if idle:
-                self._thread, self._shown, self._offered = None, None, None
+                self._thread, self._shown, self._moment = None, None, None
             return idle
 
-    def _moment(self, last_s: float) -> Moment | None:
-        """Returns pictures that are newer than ``last_s``; None where they are to be waited for."""
-        offered = self._offered
-        if offered is not None and time.monotonic() - self._offered_s < OFFERED_S:
-            return offered if offered.taken_s > last_s else None
-        taken_s = time.monotonic()
-        return Moment(taken_s, {name: halved(image) for name, image in self._rig.look().items()})
-
     def _show(self, moment: Moment, child: Child, speaker: Speaker) -> None:
-        starting = not child.runs
-        until_s = time.monotonic() + (FIRST_LOOK_S if starting else LOOK_S)
-        late: Callable[[], bool] = lambda: self._closing or time.monotonic() > until_s  # noqa: E731
-        seen: Seen = child.remote(look, cancelled=late)(
+        if moment.fault is not None:
+            self._shown = (time.monotonic(), nothing(moment.fault))
+            return
+        begun_s = time.monotonic()
+        until_s = begun_s + (LOOK_S if child.runs else FIRST_LOOK_S)
+        seen: Seen = child.remote(look, cancelled=lambda: self._closing or time.monotonic() > until_s)(
             pictures=moment.pictures,
             rig=self._rig.calibrated(),
             front=None if self._config is None else self._config.front,
             plates=self._plates(),
         )
         now_s = time.monotonic()
-        self._number += 1
+        self._child_s, self._number = now_s - begun_s, self._number + 1
         words, steady = speaker.words(seen, moment.taken_s), speaker.steady(seen.head, moment.taken_s)
         opened = seen.head is not None and seen.head.eyes_open is True
         shown = LiveShown(

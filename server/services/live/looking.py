@@ -80,12 +80,13 @@ def look(
     scaled = Rig(tuple(camera for _, camera in small.values())) if small else None
     faces = _find(context, kept, {name: image for name, (image, _) in small.items()}, scaled)
     head = kept.head
+    missing = tuple(name for name in rig.names if name not in images)
     if head is None or scaled is None:
-        return Seen(seen, None, faces, True)
+        return Seen(seen, None, faces, True, missing)
     seen |= {camera.name: _with_head(seen[camera.name], camera, head) for camera in scaled}
     _measure_sharpness(kept, seen, images, scaled, head)
     _search_stranger(context, kept, seen, small)
-    return Seen(seen, _head(head, rig, scaled, front), faces, True)
+    return Seen(seen, _head(head, rig, scaled, front), faces, True, missing)
 
 
 def _read(picture: bytes | ImageRgb) -> ImageRgb:
@@ -229,7 +230,7 @@ def _head(head: LiveHead, rig: Rig, scaled: Rig, front: str | None) -> HeadSeen:
     pose, name = head.motion.world_from_head, front if front in rig.names else rig.front_camera()
     camera, centre = rig[name], rig.centre_world()
     face, _ = place_face(head.landmarks_world)
-    left_deg, up_deg = turned_deg(face, rig, name) or (0.0, 0.0)  # all around, no way is the front
+    left_deg, up_deg = turned_deg(face, rig, name)  # None where cameras stand all around: no way is the front
     view = camera.camera_from_world.rotation
     middle = (pose.translation + face.translation) / 2.0  # cameras are aimed at the head's middle, or at the face
     off = view @ (middle - centre)
@@ -239,8 +240,8 @@ def _head(head: LiveHead, rig: Rig, scaled: Rig, front: str | None) -> HeadSeen:
         _rounded(pose.rotation.ravel(), 5),
         _rounded(pose.translation, 2),
         round(head.who.scale, 4),
-        round(left_deg, 1),
-        round(up_deg, 1),
+        round(left_deg or 0.0, 1),
+        round(up_deg or 0.0, 1),
         round(float(off[0]), 1),
         round(float(off[1]), 1),
         round(float(off[2]), 1),

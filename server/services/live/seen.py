@@ -69,12 +69,13 @@ class HeadSeen:
 @dataclass(frozen=True, slots=True)
 class Seen:
     """Holds what one look finds. ``faces``: whether some camera shows a face, although no head follows from them;
-    ``calibrated``: whether the cameras' places are known."""
+    ``calibrated``: whether the cameras' places are known; ``missing``: cameras that deliver no picture."""
 
     cameras: Mapping[str, CameraSeen]
     head: HeadSeen | None
     faces: bool
     calibrated: bool
+    missing: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,6 +85,7 @@ def reasons_of(seen: Seen) -> Iterator[Word]:
     light = dict(_light(seen))
     about_all = [word for word in light.values() if word.camera is None]
     yield from about_all[:1] or light.values()
+    yield from (Word(compose("live-no-picture", camera=name), name) for name in seen.missing)
     for name, camera in seen.cameras.items():
         if name not in light:
             yield from _of_camera(name, camera)
@@ -125,8 +126,9 @@ def _of_camera(name: str, camera: CameraSeen) -> Iterator[Word]:
 
 def _light(seen: Seen) -> Iterator[tuple[str, Word]]:
     """Yields the cameras whose light is wrong: against their clean plates, else against the other cameras."""
-    plated = all(camera.light is not None for camera in seen.cameras.values())
-    ratios = {name: camera.light if plated else camera.mean / LEVEL for name, camera in seen.cameras.items()}
+    against = {name: camera.light for name, camera in seen.cameras.items() if camera.light is not None}
+    plated = len(against) == len(seen.cameras)
+    ratios = against if plated else {name: camera.mean / LEVEL for name, camera in seen.cameras.items()}
     common = median(ratios.values()) if ratios else 1.0
     if common < ALL_DARK:
         yield from ((name, Word(compose("live-lights", percent=100.0 * common))) for name in ratios)

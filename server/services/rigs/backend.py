@@ -98,8 +98,8 @@ def check_names(rig: Rig, names: tuple[str, ...]) -> None:
     ``names``."""
     if set(rig.names) != set(names):
         differing = sorted(set(rig.names) ^ set(names))
-        detail = compose("calibration-of-other-rig")
-        raise Conflict("other-rig", detail, [compose("camera-in-one-alone", camera=name) for name in differing])
+        faults = [compose("camera-in-one-alone", camera=name) for name in differing]
+        raise Conflict("other-rig", compose("calibration-of-other-rig"), faults)
 
 
 def rig_state(

@@ -74,8 +74,7 @@ class RealRig:
             return self._board_shot(folder)
         rig = self.calibrated()
         if rig is None:
-            detail = compose("capture-needs-calibration")
-            raise Unavailable("not-calibrated", detail)
+            raise Unavailable("not-calibrated", compose("capture-needs-calibration"))
         with self._lock:
             session = self._opened()
             shot = session.shoot()
@@ -174,8 +173,9 @@ class RealRig:
                 detail = compose("plates-occupied", version=error.version)
                 raise Conflict("plates-occupied", detail, faults) from error
             except ShotFailed as error:
-                faults = [fault.message() for fault in error.faults]
-                raise Unavailable("plates-failed", error.message, faults) from error
+                raise Unavailable(
+                    "plates-failed", error.message, [fault.message() for fault in error.faults]
+                ) from error
         return CleanPlates(tuple(sorted(plates.files)), self._config.shot.plates, None)
 
     def plates(self) -> list[PlatesVersion]:
@@ -217,8 +217,7 @@ class RealRig:
             except EigenheadError as error:
                 session.close()
                 raise Unavailable("rig-unavailable", error.message, [error.message]) from error
-            if self._calibration.is_file():
-                session.rig = read_rig(self._calibration)
+            session.rig = self.calibrated()
             self._session = session
         return self._session
 

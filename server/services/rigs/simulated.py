@@ -27,8 +27,7 @@ class SimulatedRig:
 
     def describe(self) -> RigState:
         """Returns the state of the studio, whose cameras are always ready."""
-        rig = self._rig()
-        cameras = [RigCamera(name, "simulated", "ready") for name in rig.names]
+        cameras = [RigCamera(name, "simulated", "ready") for name in self._rig().names]
         return rig_state("simulated", "simulated", cameras, [], "own" if self._calibration.is_file() else "studio")
 
     def calibrated(self) -> Rig:
@@ -110,5 +109,4 @@ class SimulatedRig:
 
 
 def _fixed_studio() -> Conflict:
-    detail = compose("simulated-rig-fixed")
-    return Conflict("simulated-rig", detail)
+    return Conflict("simulated-rig", compose("simulated-rig-fixed"))

@@ -15,6 +15,7 @@ from tests.server.services.live.conftest import DrawnRig
 from tests.support.services import RunningService, served_client
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]
+NICE = str(NICENESS).encode()
 
 
 def until(client: httpx.Client, fits: Callable[[dict], bool], timeout_s: float = 60.0) -> dict:
@@ -41,7 +42,11 @@ def children(service: RunningService) -> list[int]:
             command = (folder / "cmdline").read_bytes()
         except OSError:
             continue
-        if int(fields[1]) == service.process.pid and b"tasks.child" in command and int(fields[16]) >= NICENESS:
+        if (
+            int(fields[1]) == service.process.pid
+            and b"server.tasks.child" in command
+            and command.split(b"\0")[-3] == NICE
+        ):
             found.append(int(folder.name))
     return found
 
