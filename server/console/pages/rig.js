@@ -212,13 +212,13 @@ export default spoken({
           </div>
         </article>
         <aside class="panel pad stack scroll" aria-label="State of the rig">
+          <div class="line" id="live-head" style="align-items: start"><canvas ref="head" width="112" height="112" role="img" aria-label="The head as the front camera sees it"></canvas>
+            <div class="stack small grow" style="gap: .2rem" role="status"><strong>{{ state_of_head }}</strong>
+              <ul v-if="words.length" class="faults"><li v-for="word in words" :key="word.code + word.camera" :data-code="word.code" :class="word.camera ? 'warn' : 'accent'">{{ say(word) }}</li></ul></div></div>
           <h2>{{ say(busy === 'capture' ? 'Taking the pictures' : advice.length ? 'To do' : looked ? 'Ready to capture' : 'Starting') }}</h2>
           <p v-if="busy === 'capture'" class="muted small" role="status" id="taking">{{ taking }}</p>
           <ul v-else-if="advice.length" class="faults small"><li v-for="(a, i) in advice" :key="i" :class="a.kind">{{ a.text }}</li></ul>
           <p v-else class="muted small">{{ ready }}</p>
-          <div class="line" id="live-head" style="align-items: start"><canvas ref="head" width="112" height="112" role="img" aria-label="The head as the front camera sees it"></canvas>
-            <div class="stack small grow" style="gap: .2rem"><strong>{{ state_of_head }}</strong>
-              <ul v-if="words.length" class="faults" role="status" id="words"><li v-for="word in words" :key="word.code + word.camera" :data-code="word.code" :class="word.camera ? 'warn' : 'accent'">{{ say(word) }}</li></ul></div></div>
           <label class="check small"><input type="checkbox" id="auto" v-model="auto" @change="takeWhenReady">Capture once when steady, with open eyes</label>
           <div class="small stack" style="gap: .3rem; margin-top: auto">
             <label class="field">Session<select v-model="session" id="session"><option value="">none</option><option v-for="s in state.sessions || []" :key="s.id" :value="s.id">{{ sessionName(s, state.sessions) }}</option></select></label>

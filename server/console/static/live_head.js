@@ -4,6 +4,7 @@ import { say } from "/console/static/language.js";
 
 const LAMPS = { face: "face", sharp: "sharp", exposed: "light", centred: "middle", looking: "looks" };
 const KINDS = { true: "good", false: "warn", null: "" };
+const QUIET = new Set(["looking"]); // no face looks into all cameras
 const SIZE_MM = 330; // of the picture of the head
 const SUN = [0.35, -0.5, -0.79]; // towards the light: right, down, away
 
@@ -30,7 +31,12 @@ export const liveHead = {
       const seen = this.head?.cameras?.[name] || {};
       return Object.entries(LAMPS).map(([lamp, text]) => {
         const lit = seen[lamp] ?? null;
-        return { lamp, kind: KINDS[lit], text: say(text), told: lit === null ? "-" : say(lit ? "yes" : "no") };
+        return {
+          lamp,
+          kind: lit === false && QUIET.has(lamp) ? "" : KINDS[lit],
+          text: say(text),
+          told: lit === null ? "-" : say(lit ? "yes" : "no"),
+        };
       });
     },
     takeWhenReady() {

@@ -2,8 +2,8 @@
 
 One thread takes pictures, unless the console's live view offers its own; another hands the newest ones to a child
 process (``look``) and says what it found. The cameras are asked for the next pictures so early that they come when the
-child is done. The child has the priority of a job's, so that both go on side by side; one that dies or does not answer
-is killed and begun again with the next look. ``IDLE_S`` after the last question threads and child end.
+child is done. The child goes before a job's processes, whose two cores it takes a quarter of at most; one that dies or
+does not answer is killed and begun again with the next look. ``IDLE_S`` after the last question threads and child end.
 """
 
 import threading
@@ -28,7 +28,7 @@ from server.services.live.words import Speaker, lamps_of
 from server.services.rigs.backend import RigBackend
 from server.tasks.child import Child, WorkerContext
 
-EVERY_S = 0.25  # from look to look at least
+EVERY_S = 0.3  # from look to look at least
 IDLE_S = 6.0  # without anybody who asks
 AGAIN_S = 1.0  # after a fault
 LOOK_S, FIRST_LOOK_S = 4.0, 40.0  # that the child may take; the first one reads model and networks
@@ -36,7 +36,7 @@ OFFERED_S = 1.0  # pictures that are offered so lately are waited for: the camer
 FRESH_S = 3.0  # a look so old says nothing about now
 WAIT_S = 0.02
 WIDTH_PX = 480  # of pictures that the child gets, at least
-NICENESS = 5  # of a job's processes
+NICENESS = 2  # a job's processes have 5: half a core of 0.15 s a look must not wait for their two
 HEAD_SHOWN = ("vertices", "triangles", "left_deg", "up_deg", "eyes_open")
 
 log = structlog.get_logger()

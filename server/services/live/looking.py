@@ -169,7 +169,7 @@ def _lit(image: ImageRgb, plate: Float[np.ndarray, "h w"] | None) -> CameraSeen:
     """Measures a picture's light, against its clean plate: most of it is background."""
     light = exposure(image)
     share = None if plate is None else float(np.median(_light(image) / plate))
-    return CameraSeen(light.mean, share, light.clipped_share, None)
+    return CameraSeen(light.mean, share, float(light.clipped_share), None)
 
 
 def _with_head(seen: CameraSeen, camera: Camera, head: LiveHead) -> CameraSeen:

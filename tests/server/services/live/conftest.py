@@ -4,11 +4,13 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from jaxtyping import Float
 
 from rig.acquisition.commands import take_plates
 from rig.formats.cameras.cameras_json import write_rig
@@ -16,9 +18,11 @@ from rig.formats.rig_toml import read_rig_config
 from rig.image import ImageRgb
 from rig.studio.devices.serve import StudioDevices
 from rig.studio.devices.streams import Film
-from tests.support.drawn_studio import drawn_pictures, drawn_studio, hidden_from
+from tests.support.drawn_faces import WALL
+from tests.support.drawn_studio import LENS, drawn_pictures, drawn_studio
 
 NOISE = 1.5  # grey levels: no two pictures of a camera are alike
+NEAR = 3.0  # grey levels from the wall
 
 
 @dataclass
@@ -30,9 +34,17 @@ class DrawnSitter:
     _rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(1))
 
     def __call__(self, camera: str, time_s: float) -> ImageRgb:
-        shown = drawn_pictures(self.left_deg)
-        picture = (shown if self.seated else hidden_from(list(shown), shown))[camera].astype(float)
+        picture = drawn_pictures(self.left_deg)[camera].astype(float)
+        wall = np.linalg.norm(picture - WALL, axis=2) < NEAR if self.seated else np.ones(picture.shape[:2], bool)
+        picture[wall] = (WALL + pattern(camera))[wall]
         return np.clip(picture + self._rng.normal(0.0, NOISE, picture.shape), 0, 255).astype(np.uint8)
+
+
+@cache
+def pattern(camera: str) -> Float[np.ndarray, "h w 1"]:
+    """What is painted on the wall behind the head: without it no camera's view is known again."""
+    drawn = np.random.default_rng(int(camera[-1])).normal(0.0, 14.0, (LENS.height // 6, LENS.width // 6))
+    return cv2.resize(drawn, (LENS.width, LENS.height), interpolation=cv2.INTER_CUBIC)[:, :, None]
 
 
 @dataclass

@@ -15,7 +15,6 @@ from tests.server.services.live.conftest import DrawnRig
 from tests.support.services import RunningService, served_client
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]
-NICE = str(NICENESS).encode()
 
 
 def until(client: httpx.Client, fits: Callable[[dict], bool], timeout_s: float = 60.0) -> dict:
@@ -33,21 +32,16 @@ def said(answer: dict) -> set[str]:
 
 
 def children(service: RunningService) -> list[int]:
-    """The live head's child processes: the service's own with their niceness."""
-    assert service.process is not None
+    """The live head's child processes, told by their niceness and the service's environment."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
-            fields = (folder / "stat").read_text().rpartition(")")[2].split()
-            command = (folder / "cmdline").read_bytes()
+            command, environment = ((folder / name).read_bytes() for name in ("cmdline", "environ"))
         except OSError:
             continue
-        if (
-            int(fields[1]) == service.process.pid
-            and b"server.tasks.child" in command
-            and command.split(b"\0")[-3] == NICE
-        ):
-            found.append(int(folder.name))
+        words = command.rstrip(b"\0").split(b"\0")
+        if words[-4:-3] == [b"server.tasks.child"] and words[-2] == str(NICENESS).encode():
+            found += [int(folder.name)] * (f"EIGENHEAD_DATA={service.data}\0".encode() in environment + b"\0")
     return found
 
 

@@ -22,6 +22,7 @@ def test_the_page_says_what_to_do_and_captures_when_the_head_is_steady(tmp_path:
     ):
         v = visit(browser, service.url)
         page = v.go("/")
+        page.get_by_role("button", name="Skip the tour").click()
         expect(page.locator("[data-code=live-nobody]")).to_be_visible(timeout=LONG_MS)
         rig.devices.seat(True)
         expect(page.locator("[data-code=live-nobody]")).to_be_hidden(timeout=LONG_MS)
