@@ -215,7 +215,7 @@ export default spoken({
           <div class="line" id="live-head" style="align-items: start"><canvas ref="head" width="112" height="112" role="img" aria-label="The head as the front camera sees it"></canvas>
             <div class="stack small grow" style="gap: .2rem" role="status"><strong>{{ state_of_head }}</strong>
               <ul v-if="words.length" class="faults"><li v-for="word in words" :key="word.code + word.camera" :data-code="word.code" :class="word.camera ? 'warn' : 'accent'">{{ say(word) }}</li></ul></div></div>
-          <h2>{{ say(busy === 'capture' ? 'Taking the pictures' : advice.length ? 'To do' : looked ? 'Ready to capture' : 'Starting') }}</h2>
+          <h2>{{ say(busy === 'capture' ? 'Taking the pictures' : advice.length || words.length ? 'To do' : looked ? 'Ready to capture' : 'Starting') }}</h2>
           <p v-if="busy === 'capture'" class="muted small" role="status" id="taking">{{ taking }}</p>
           <ul v-else-if="advice.length" class="faults small"><li v-for="(a, i) in advice" :key="i" :class="a.kind">{{ a.text }}</li></ul>
           <p v-else class="muted small">{{ ready }}</p>

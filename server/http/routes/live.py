@@ -1,6 +1,5 @@
 """Declares the route of the live head: lamps of the cameras, the head of whoever sits before them, what is to do."""
 
-import json
 from collections.abc import AsyncIterator
 from typing import Annotated
 
@@ -11,7 +10,7 @@ from fastapi.responses import StreamingResponse
 from server.http.auth import ServiceOf, require
 from server.http.schemas import Answer, MessageOut
 from server.services.keys import Caller
-from server.services.live.seen import Word
+from server.services.live.seen import LiveShown, Word
 from server.services.service import Service
 from server.wire.problems import documented
 
@@ -85,9 +84,8 @@ def word_of(word: Word) -> WordOut:
     return WordOut(code=message.code, text=message.text, camera=word.camera, message=MessageOut.model_validate(message))
 
 
-def newest(service: Service) -> LiveOut:
-    """Returns the newest look, and asks for more of them."""
-    shown = service.live.newest()
+def described(shown: LiveShown) -> LiveOut:
+    """Returns a look as HTTP answers it."""
     head = None if shown.head is None else HeadOut.model_validate(shown.head)
     cameras = {name: LampsOut.model_validate(lamps) for name, lamps in shown.cameras.items()}
     words = [word_of(word) for word in shown.words]
@@ -122,14 +120,14 @@ def rig_live(
     if EVENTS in accept:
         return StreamingResponse(_events(service, seconds), media_type=EVENTS, headers=UNKEPT)
     response.headers.update(UNKEPT)
-    return newest(service)
+    return described(service.live.newest())
 
 
 async def _events(service: Service, seconds: float) -> AsyncIterator[str]:
     until, sent = anyio.current_time() + seconds, -1
     while anyio.current_time() < until:
-        looked = newest(service)
-        if looked.number != sent:
-            sent = looked.number
-            yield f"event: look\nid: {sent}\ndata: {json.dumps(looked.model_dump())}\n\n"
+        shown = service.live.newest()
+        if shown.number != sent:
+            sent = shown.number
+            yield f"event: look\nid: {sent}\ndata: {described(shown).model_dump_json()}\n\n"
         await anyio.sleep(LOOK_S)

@@ -18,7 +18,7 @@ from pipeline.faces.detection import find_large_faces
 from pipeline.faces.eyes import closed_by_openings
 from pipeline.faces.networks import LANDMARKS, FaceNetworks, load_networks
 from pipeline.faces.points import place_face
-from pipeline.faces.sighting import GLANCE, reduce_picture, turned_deg
+from pipeline.faces.sighting import GLANCE, MUST_SEE, reduce_picture, turned_deg
 from pipeline.faces.subject import find_subject
 from pipeline.head_model.model import HeadModel, load_model
 from rig.acquisition.image_checks import blur_px, exposure
@@ -28,7 +28,6 @@ from rig.capture import ImageRgb
 from rig.errors import InputError
 from rig.rig import Rig
 from server.services.live.seen import CameraSeen, HeadSeen, Numbers, Seen
-from server.services.live.words import LOOKING
 from server.tasks.child import WorkerContext
 
 SMALL_PX = 320
@@ -184,9 +183,9 @@ def _with_head(seen: CameraSeen, camera: Camera, head: LiveHead) -> CameraSeen:
     return replace(
         seen,
         facing=facing,
-        face=True if own is not None else False if facing >= LOOKING else None,
+        face=True if own is not None else False if facing >= MUST_SEE else None,
         centred=bool(inside >= WHOLE and (np.abs(middle - 0.5) < 0.5 - MIDDLE).all()),
-        stranger=camera.name in head.strangers,
+        stranger=camera.name in head.strangers and facing >= MUST_SEE,
         points=() if own is None else tuple(_rounded((point + 0.5) / size, 4) for point in own[::SHOWN]),
     )
 
