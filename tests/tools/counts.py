@@ -179,8 +179,7 @@ def count_documents(root: Path = ROOT) -> tuple[int, int]:
 
 def count_all(root: Path = ROOT) -> dict[str, int]:
     """Returns the totals that tests/test_size.py holds."""
-    sizes = measure_rooms(root)
-    pages, words = count_documents(root)
+    sizes, (pages, words) = measure_rooms(root), count_documents(root)
     return {
         "product_lines": sizes["product"].lines,
         "product_modules": sizes["product"].modules,

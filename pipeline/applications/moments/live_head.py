@@ -153,10 +153,10 @@ def follow(head: LiveHead, pictures: Mapping[str, ImageRgb], networks: FaceNetwo
         if len(found.pixels) < MIN_VIEWS:
             return None
         motion = _fitted(who, found, before)
-        own = {name for name, misfit in _misfits(who, found, motion).items() if misfit < MAX_MISFIT}
-        if len(own) < MIN_VIEWS:
+        theirs = {name for name, misfit in _misfits(who, found, motion).items() if misfit < MAX_MISFIT}
+        if len(theirs) < MIN_VIEWS:
             return None
-        strangers = tuple(name for name in found.pixels if name not in own)
+        strangers = tuple(name for name in found.pixels if name not in theirs)
         if not _moved_far(before, motion):
             break
     seen = {name: pixels for name, pixels in found.pixels.items() if name not in strangers}

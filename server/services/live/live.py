@@ -121,8 +121,8 @@ class Live:
             try:
                 self._moment = Moment(begun_s, {name: halved(image) for name, image in self._rig.look().items()})
             except Exception as error:  # the cameras may come back
-                told = error.detail if isinstance(error, Refused) else compose("live-no-pictures")
-                self._moment = Moment(begun_s, {}, told)
+                fault = error.detail if isinstance(error, Refused) else compose("live-no-pictures")
+                self._moment = Moment(begun_s, {}, fault)
                 ended.wait(AGAIN_S)
             took_s = time.monotonic() - begun_s
             self._begun.wait(LOOK_S)

@@ -51,7 +51,7 @@ class Kept:
     plates: tuple[str, Mapping[str, np.ndarray]] = ("", {})  # the light of a version of the clean plates
     fruitless: Mapping[str, np.ndarray] = field(default_factory=dict)  # thumbnails in which no head was found
     searched: int = 0  # cameras in which strangers were searched, in turn
-    looks: int = 0
+    count: int = 0  # of looks
     blur: dict[str, float | None] = field(default_factory=dict)  # as measured last
 
 
@@ -174,7 +174,7 @@ def _lit(image: ImageRgb, plate: Float[np.ndarray, "h w"] | None) -> CameraSeen:
 def _with_head(seen: CameraSeen, camera: Camera, head: LiveHead) -> CameraSeen:
     """Adds where the head is in a picture."""
     size = np.array([camera.intrinsics.width, camera.intrinsics.height], float)
-    facing, own = head.facing[camera.name], head.sighting.pixels.get(camera.name)
+    facing, landmarks_px = head.facing[camera.name], head.sighting.pixels.get(camera.name)
     pixels = camera.project(head.points_world)
     if not np.isfinite(pixels).all():
         return replace(seen, facing=facing, centred=False)
@@ -183,10 +183,12 @@ def _with_head(seen: CameraSeen, camera: Camera, head: LiveHead) -> CameraSeen:
     return replace(
         seen,
         facing=facing,
-        face=True if own is not None else False if facing >= MUST_SEE else None,
+        face=True if landmarks_px is not None else False if facing >= MUST_SEE else None,
         centred=bool(inside >= WHOLE and (np.abs(middle - 0.5) < 0.5 - MIDDLE).all()),
         stranger=camera.name in head.strangers and facing >= MUST_SEE,
-        points=() if own is None else tuple(_rounded((point + 0.5) / size, 4) for point in own[::SHOWN]),
+        points=()
+        if landmarks_px is None
+        else tuple(_rounded((point + 0.5) / size, 4) for point in landmarks_px[::SHOWN]),
     )
 
 
@@ -194,8 +196,8 @@ def _measure_sharpness(
     kept: Kept, seen: dict[str, CameraSeen], images: Mapping[str, ImageRgb], rig: Rig, head: LiveHead
 ) -> None:
     """Measures the sharpness of the head's face in every other camera in turn, and adds what is known of each."""
-    kept.looks += 1
-    for camera in rig.cameras[kept.looks % 2 :: 2]:
+    kept.count += 1
+    for camera in rig.cameras[kept.count % 2 :: 2]:
         image = images[camera.name]
         face = (camera.project(head.landmarks_world) + 0.5) * image.shape[1] / camera.intrinsics.width - 0.5
         kept.blur[camera.name] = _blur_px(image, face) if np.isfinite(face).all() else None

@@ -200,17 +200,17 @@ def says(code: str, camera: str | None, answer: dict) -> bool:
 
 def of_good(answers: list[tuple[float, dict]]) -> dict[str, float]:
     """Returns the figures of a subject without mistakes."""
-    looks = [answer for _, answer in answers if answer["head"] is not None]
-    ages = np.array([answer["age_s"] for answer in looks])
+    with_head = [answer for _, answer in answers if answer["head"] is not None]
+    ages = np.array([answer["age_s"] for answer in with_head])
     spans = np.diff([came for came, _ in answers])
-    told = {(word["code"], word["camera"]) for _, answer in answers for word in answer["words"]}
+    words = {(word["code"], word["camera"]) for _, answer in answers for word in answer["words"]}
     return {
-        "heads_a_second": len(looks) / (answers[-1][0] - answers[0][0]),
+        "heads_a_second": len(with_head) / (answers[-1][0] - answers[0][0]),
         "longest_gap_s": float(spans.max()),
         "age_median_s": float(np.median(ages)),
         "age_95_s": float(np.quantile(ages, 0.95)),
-        "steady_share": float(np.mean([answer["steady"] for answer in looks])),
-        "false_words": float(len(told)),
+        "steady_share": float(np.mean([answer["steady"] for answer in with_head])),
+        "false_words": float(len(words)),
     }
 
 

@@ -32,12 +32,12 @@ def with_camera(**changes: object) -> Seen:
     return replace(GOOD, cameras={**CAMERAS, "cam2": replace(CAMERA, **changes)})
 
 
-def told(seen: Seen) -> list[tuple[str, str | None]]:
+def codes(seen: Seen) -> list[tuple[str, str | None]]:
     return [(word.message.code, word.camera) for word in reasons_of(seen)]
 
 
 def test_nothing_is_said_of_a_good_subject() -> None:
-    assert told(GOOD) == []
+    assert codes(GOOD) == []
     assert {lamp for lamps in lamps_of(GOOD).values() for lamp in (lamps.face, lamps.sharp, lamps.exposed)} == {True}
 
 
@@ -77,28 +77,28 @@ def test_the_subject_is_told_what_to_do(changes: dict[str, object], code: str, t
 )
 def test_a_camera_is_named_and_its_lamp_goes_out(changes: dict[str, object], code: str, lamp: str) -> None:
     seen = with_camera(**changes)
-    assert told(seen) == [(code, "cam2")]
+    assert codes(seen) == [(code, "cam2")]
     assert [name for name, lamps in lamps_of(seen).items() if getattr(lamps, lamp) is False] == ["cam2"]
 
 
 def test_light_is_judged_by_the_other_cameras_without_plates() -> None:
     bare = {name: replace(CAMERA, light=None) for name in CAMERAS}
-    assert told(replace(GOOD, cameras=bare)) == []
-    assert told(replace(GOOD, cameras={**bare, "cam2": replace(CAMERA, light=None, mean=60.0)})) == [
+    assert codes(replace(GOOD, cameras=bare)) == []
+    assert codes(replace(GOOD, cameras={**bare, "cam2": replace(CAMERA, light=None, mean=60.0)})) == [
         ("live-darker-than-others", "cam2")
     ]
 
 
 def test_lamps_that_are_off_are_told_once() -> None:
     dark = {name: replace(CAMERA, light=0.1, mean=12.0) for name in CAMERAS}
-    assert told(replace(GOOD, cameras=dark)) == [("live-lights", None)]
+    assert codes(replace(GOOD, cameras=dark)) == [("live-lights", None)]
 
 
 def test_it_is_said_when_there_is_no_head() -> None:
-    assert told(replace(GOOD, head=None, faces=False)) == [("live-nobody", None)]
-    assert told(replace(GOOD, head=None)) == [("live-faces-differ", None)]
-    assert told(replace(GOOD, head=None, calibrated=False)) == [("live-uncalibrated", None)]
-    assert told(Seen({}, None, False, True)) == [("live-no-pictures", None)]
+    assert codes(replace(GOOD, head=None, faces=False)) == [("live-nobody", None)]
+    assert codes(replace(GOOD, head=None)) == [("live-faces-differ", None)]
+    assert codes(replace(GOOD, head=None, calibrated=False)) == [("live-uncalibrated", None)]
+    assert codes(Seen({}, None, False, True)) == [("live-no-pictures", None)]
 
 
 def test_a_blink_is_not_told() -> None:
