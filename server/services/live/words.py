@@ -22,6 +22,7 @@ DARKER, BRIGHTER = 0.75, 1.35  # than its clean plate, by the median camera: 0.9
 DARKER_SEEN, BRIGHTER_SEEN = 0.6, 1.7  # than the other cameras, without clean plates: they see other things
 ALL_DARK = 0.4  # of the median camera against its plate
 BLACK = 0.1
+CHIN_DEG = 25.0  # up or down; a stranger's face is known to 9 degrees that way on six drawn heads, to 2 sideways
 LEVEL = 64.0  # of a studio's pictures, where there are no plates (rig.acquisition.judgement)
 CLIPPED = 0.05  # share of the picture
 LOOKING = 0.5  # cosine: both eyes are seen
@@ -96,8 +97,8 @@ def _of_head(head: HeadSeen) -> Iterator[Word]:
         yield Word(
             compose("live-turn-right" if head.left_deg > 0.0 else "live-turn-left", angle_deg=abs(head.left_deg))
         )
-    if abs(head.up_deg) > TURNED_DEG:
-        yield Word(compose("live-chin-down" if head.up_deg > 0.0 else "live-chin-up", angle_deg=abs(head.up_deg)))
+    if abs(head.up_deg) > CHIN_DEG:
+        yield Word(compose("live-chin-down" if head.up_deg > 0.0 else "live-chin-up"))
     ways = (
         (head.away_mm, head.depth_mm, "live-closer", "live-back"),
         (head.down_mm, head.room_mm, "live-higher", "live-lower"),

@@ -46,8 +46,8 @@ def test_nothing_is_said_of_a_good_subject() -> None:
     [
         ({"left_deg": 20.4}, "live-turn-right", "turn right by 20 degrees"),
         ({"left_deg": -20.4}, "live-turn-left", "turn left by 20 degrees"),
-        ({"up_deg": 18.0}, "live-chin-down", "lower your chin by 18 degrees"),
-        ({"up_deg": -18.0}, "live-chin-up", "raise your chin by 18 degrees"),
+        ({"up_deg": 28.0}, "live-chin-down", "lower your chin"),
+        ({"up_deg": -28.0}, "live-chin-up", "raise your chin"),
         ({"away_mm": 120.0}, "live-closer", "come closer by 12 cm"),
         ({"away_mm": -120.0}, "live-back", "go back by 12 cm"),
         ({"down_mm": 70.0}, "live-higher", "sit higher by 7 cm"),
