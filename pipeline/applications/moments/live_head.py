@@ -46,6 +46,7 @@ FAR_DEG, FAR_MM = 4.0, 12.0  # of a motion: a crop so far off misplaces the land
 COARSE = 8.0  # of the landmarks' deviation, for a head that may have moved far
 OPEN = 0.18  # an open eye's opening, at least (``faces.eyes``): the first look may have met closed ones
 MAX_MISFIT = 0.08  # RMS by the face's size in the picture: beyond it the landmarks are another face's
+NEAR = 0.03  # the same of a head that has hardly moved, in every camera
 MESH = "p99"  # the level that is shown
 
 
@@ -118,7 +119,7 @@ def meet(
     points = np.concatenate([neutral[coarse], places.points(neutral)])
     moved = np.stack([np.concatenate([shape[coarse], places.points(shape)]) for shape in shapes])
     who = LivePerson(person, scale, reference, points, moved)
-    return follow(LiveHead(who, motion, Sighting({}, {}), {}, (), points), pictures, networks)
+    return follow(LiveHead(who, motion, Sighting({}, {}), {}, (), pose.apply(points)), pictures, networks)
 
 
 def _shaped(observed: LandmarkObservations, start: Similarity, modes: int) -> State:
@@ -146,13 +147,14 @@ class ShapePrior:
 def follow(head: LiveHead, pictures: Mapping[str, ImageRgb], networks: FaceNetworks) -> LiveHead | None:
     """Returns the same person's head in the next pictures. Returns None where it is lost."""
     who, person = head.who, head.who.person
-    motion, found, strangers = head.motion, head.sighting, tuple[str, ...]()
+    motion, points, found, strangers = head.motion, head.points_world, head.sighting, tuple[str, ...]()
     for _ in range(LOOKS):
         before = motion
-        found = sight(person, networks, pictures, before, len(person.rig), EYES)
+        found = sight(person, networks, pictures, before, len(person.rig), eyes=EYES, points=points[-LANDMARKS:])
         if len(found.pixels) < MIN_VIEWS:
             return None
         motion = _fitted(who, found, before)
+        points = motion.world_from_head.apply(who.points + np.tensordot(motion.weights, who.shapes, axes=1))
         theirs = {name for name, misfit in _misfits(who, found, motion).items() if misfit < MAX_MISFIT}
         if len(theirs) < MIN_VIEWS:
             return None
@@ -162,13 +164,13 @@ def follow(head: LiveHead, pictures: Mapping[str, ImageRgb], networks: FaceNetwo
     seen = {name: pixels for name, pixels in found.pixels.items() if name not in strangers}
     placed = Similarity.from_rigid(motion.world_from_head)
     facing = {camera.name: float(direction_from_face(placed, camera)[2]) for camera in person.rig}
-    points = motion.world_from_head.apply(who.points + np.tensordot(motion.weights, who.shapes, axes=1))
     return LiveHead(who, motion, replace(found, pixels=seen), facing, strangers, points)
 
 
 def _fitted(who: LivePerson, found: Sighting, start: Motion) -> Motion:
     rig, motion = who.person.rig, start
-    for loose in (COARSE, 1.0):
+    near = max(_misfits(who, found, start).values()) < NEAR
+    for loose in (1.0,) if near else (COARSE, 1.0):
         reference = replace(who.reference, sigma_px=loose * who.reference.sigma_px)
         terms = (*terms_of(reference, rig, found), WeightPrior())
         problem = Problem(terms, POSE + len(start.weights), after, room=room)
