@@ -60,7 +60,7 @@ class Live:
         self._config = None if rig_toml is None else read_rig_config(rig_toml)
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
-        self._asked_s = self._offered_s = 0.0
+        self._asked_s = self._offered_s = self._polled_s = 0.0
         self._moment: Moment | None = None
         self._begun, self._child_s = threading.Event(), 0.0  # whether the child looks at the newest; how long it took
         self._shown: tuple[float, LiveShown] | None = None
@@ -70,6 +70,10 @@ class Live:
     def newest(self) -> LiveShown:
         """Returns the newest look, and asks for the next ones. While the first is under way, and when the cameras are
         lost, the answer has no cameras and says why. Does not block."""
+        self._polled_s = time.monotonic()
+        return self._newest()
+
+    def _newest(self) -> LiveShown:
         self._asked_s = now_s = time.monotonic()
         with self._lock:
             if self._thread is None and not self._closing:
@@ -82,7 +86,7 @@ class Live:
         """Takes the pictures that the live view has just got, so that the cameras need not be asked twice, and returns
         the newest look."""
         self._moment, self._offered_s = Moment(taken_s, pictures), time.monotonic()
-        return self.newest()
+        return self._newest()
 
     def close(self) -> None:
         """Ends the threads and the child process."""
@@ -107,6 +111,7 @@ class Live:
                 except Exception as error:  # the child is begun again
                     self._shown = (time.monotonic(), nothing(compose("live-again")))
                     log.warning("no live head", error=str(error)[:300])
+                    ended.wait(AGAIN_S)
         finally:
             ended.set()
             child.close()
@@ -114,7 +119,7 @@ class Live:
     def _watch_cameras(self, ended: threading.Event) -> None:
         while not ended.is_set():
             begun_s = time.monotonic()
-            if begun_s - self._offered_s < OFFERED_S:
+            if begun_s - self._offered_s < OFFERED_S or begun_s - self._polled_s > IDLE_S:
                 ended.wait(WAIT_S)
                 continue
             self._begun.clear()

@@ -35,6 +35,7 @@ BLUR_WIDTH_PX = 640  # of a picture in whose pixels sharpness is told
 ROOM, DEPTH = 0.15, 0.07  # of the front picture's height, of its distance: how far the head may be from where all look
 MIDDLE = 0.25  # of the picture's sides: the face's middle is no nearer to an edge
 WHOLE = 0.97  # share of the head's vertices in the picture
+STILL_MM = 4.0  # from look to look
 MIN_FACE_PX = 40  # of a face, for its sharpness to be measured
 FACE_MARGIN = 0.15  # of the face's size, about the landmarks: sharpness is measured there
 SAME = 8.0  # largest change of a thumbnail of pictures without a head: they are not searched again
@@ -52,6 +53,7 @@ class Kept:
     fruitless: Mapping[str, np.ndarray] = field(default_factory=dict)  # thumbnails in which no head was found
     searched: int = 0  # cameras in which strangers were searched, in turn
     count: int = 0  # of looks
+    points: np.ndarray | None = None  # of the last head
     blur: dict[str, float | None] = field(default_factory=dict)  # as measured last
 
 
@@ -195,9 +197,12 @@ def _with_head(seen: CameraSeen, camera: Camera, head: LiveHead) -> CameraSeen:
 def _measure_sharpness(
     kept: Kept, seen: dict[str, CameraSeen], images: Mapping[str, ImageRgb], rig: Rig, head: LiveHead
 ) -> None:
-    """Measures the sharpness of the head's face in every other camera in turn, and adds what is known of each."""
-    kept.count += 1
-    for camera in rig.cameras[kept.count % 2 :: 2]:
+    """Measures the sharpness of the head's face in every other camera in turn, and adds what is known of each. That of a
+    head that moves is its own blur, not the lens's."""
+    before, kept.points = kept.points, head.points_world
+    still = before is not None and float(np.linalg.norm(kept.points - before, axis=1).mean()) < STILL_MM
+    kept.count += still
+    for camera in rig.cameras[kept.count % 2 :: 2] if still else ():
         image = images[camera.name]
         face = (camera.project(head.landmarks_world) + 0.5) * image.shape[1] / camera.intrinsics.width - 0.5
         kept.blur[camera.name] = _blur_px(image, face) if np.isfinite(face).all() else None

@@ -1,7 +1,7 @@
 """Says what is to do before a shot: what one look found, turned into lamps of each camera and words for the subject.
 
-All limits are stated here. A word is told when its reason has lasted ``HOLD_S``, so that a blink or one bad picture
-says nothing; it ends with its reason.
+All limits are stated here. Most words are told when their reason has lasted ``HOLD_S``, so that a blink or a turn
+in passing says nothing; they end with it.
 """
 
 from collections import deque
@@ -16,6 +16,7 @@ from rig.messages.message import compose
 from server.services.live.seen import CameraSeen, HeadSeen, Lamps, Seen, Word
 
 HOLD_S = 0.4  # longer than a blink
+AT_ONCE = frozenset({"live-black", "live-darker", "live-brighter", "live-soft"})  # no subject does that in passing
 STEADY_S, STEADY_MM, STEADY_DEG = 0.7, 2.5, 1.2  # a still head's landmarks move it by a third of that
 SOFT_PX = 1.2  # on the face, picture 640 wide: sharp ones have 0 to 0.5, 4 px of 1024 out of focus 1.4 to 1.6
 DARKER, BRIGHTER = 0.75, 1.35  # than its clean plate, by the median camera: 0.97 to 1.03 on a subject of the studio
@@ -40,7 +41,9 @@ class Speaker:
         reasons = list(reasons_of(seen))
         keys = [(word.message.code, word.camera) for word in reasons]
         self._since = {key: self._since.get(key, time_s) for key in keys}
-        return tuple(word for word, key in zip(reasons, keys, strict=True) if time_s - self._since[key] >= HOLD_S)
+        held_s = [0.0 if code in AT_ONCE else HOLD_S for code, _ in keys]
+        triples = zip(reasons, keys, held_s, strict=True)
+        return tuple(word for word, key, least_s in triples if time_s - self._since[key] >= least_s)
 
     def steady(self, head: HeadSeen | None, time_s: float) -> bool:
         """Tells whether the head has kept its pose for ``STEADY_S``."""

@@ -110,6 +110,10 @@ def test_a_blink_is_not_told() -> None:
     assert speaker.words(GOOD, 1.2) == ()
 
 
+def test_a_dark_camera_is_told_at_once() -> None:
+    assert [word.message.code for word in Speaker().words(with_camera(light=0.7), 0.0)] == ["live-darker"]
+
+
 def test_a_head_is_steady_when_it_has_kept_its_pose_for_a_while() -> None:
     speaker, times = Speaker(), np.arange(0.0, 3.0 * STEADY_S, 0.2)
     assert [speaker.steady(HEAD, time_s) for time_s in times.tolist()] == [time_s >= STEADY_S for time_s in times]
