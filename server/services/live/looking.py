@@ -197,8 +197,8 @@ def _with_head(seen: CameraSeen, camera: Camera, head: LiveHead) -> CameraSeen:
 def _measure_sharpness(
     kept: Kept, seen: dict[str, CameraSeen], images: Mapping[str, ImageRgb], rig: Rig, head: LiveHead
 ) -> None:
-    """Measures the sharpness of the head's face in every other camera in turn, and adds what is known of each. That of a
-    head that moves is its own blur, not the lens's."""
+    """Measures the sharpness of the head's face in every other camera in turn, and adds what is known of each. A head
+    that moves is not measured: that is its own blur, not the lens's."""
     before, kept.points = kept.points, head.points_world
     still = before is not None and float(np.linalg.norm(kept.points - before, axis=1).mean()) < STILL_MM
     kept.count += still
