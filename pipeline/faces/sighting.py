@@ -15,6 +15,7 @@ from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.subject import SearchEffort, SubjectFaces
 from rig.acquisition.face_sighting import FaceSighting
 from rig.camera import Camera
+from rig.geometry import Similarity
 from rig.image import ImageRgb
 from rig.rig import Rig
 
@@ -51,13 +52,17 @@ def sight_face(subject: SubjectFaces, rig: Rig, *, front: str) -> FaceSighting:
     if face is None:
         return FaceSighting(len(subject.found), False, any(subject.found.values()), front)
     closed = eye_warnings(closed_by_openings(eye_openings(face, rig)))
-    sighting = FaceSighting(len(subject.found), True, True, front, _missing(subject, face), remarks=tuple(closed))
+    left_deg, up_deg = turned_deg(face.world_from_face, rig, front)
+    return FaceSighting(len(subject.found), True, True, front, _missing(subject, face), left_deg, up_deg, tuple(closed))
+
+
+def turned_deg(world_from_face: Similarity, rig: Rig, front: str) -> tuple[float, float] | tuple[None, None]:
+    """Returns by how many degrees a face is turned to its left and up from the front camera; None without a front."""
     if not has_front(rig):
-        return sighting
-    from_front = gaze_from(face, rig[front].axis_world if front in rig.names else -_fan(rig))
-    from_middle = gaze_from(face, -_fan(rig))
-    left_deg, up_deg = (_turned(*of) for of in zip(from_front, from_middle, strict=True))
-    return replace(sighting, left_deg=left_deg, up_deg=up_deg)
+        return None, None
+    left, up = gaze_from(world_from_face, rig[front].axis_world if front in rig.names else -_fan(rig))
+    middle_left, middle_up = gaze_from(world_from_face, -_fan(rig))
+    return _turned(left, middle_left), _turned(up, middle_up)
 
 
 def _turned(from_front_deg: float, from_middle_deg: float) -> float:
@@ -79,10 +84,10 @@ def _fan(rig: Rig) -> Float[np.ndarray, " 3"]:
     return directions.mean(axis=0)
 
 
-def gaze_from(face: MatchedFaces, axis_world: Float[np.ndarray, " 3"]) -> tuple[float, float]:
+def gaze_from(world_from_face: Similarity, axis_world: Float[np.ndarray, " 3"]) -> tuple[float, float]:
     """Returns by how many degrees a face is turned away from an axis of view: to the subject's left, and up."""
     towards = -axis_world / np.linalg.norm(axis_world)
-    across, upwards, ahead = towards @ face.world_from_face.rotation
+    across, upwards, ahead = towards @ world_from_face.rotation
     return float(-np.degrees(np.arctan2(across, ahead))), float(-np.degrees(np.arcsin(np.clip(upwards, -1.0, 1.0))))
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from types import MappingProxyType, ModuleType
 from typing import Any, NotRequired, Protocol, TypedDict, Union, runtime_checkable
 
-from rig.messages.english import batch, calibration, cameras, formats, general, pipeline, rig, server
+from rig.messages.english import batch, calibration, cameras, formats, general, live, pipeline, rig, server
 from rig.text import printable
 
 FIELD = re.compile(r"\{(\w+)(?::([^{}]+))?\}")
@@ -47,7 +47,7 @@ def _written(value: object, specification: str) -> str:
     return str(value)
 
 
-AREAS: tuple[ModuleType, ...] = (batch, calibration, cameras, formats, general, pipeline, rig, server)
+AREAS: tuple[ModuleType, ...] = (batch, calibration, cameras, formats, general, live, pipeline, rig, server)
 
 
 def _all() -> dict[str, str]:

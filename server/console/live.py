@@ -6,7 +6,6 @@ import struct
 import threading
 import time
 from collections.abc import AsyncIterator
-from typing import Protocol
 
 import structlog
 
@@ -15,7 +14,8 @@ from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 from server.console.live_frame import LiveFrame
-from server.services.rigs.backend import RigBackend, jpeg, reduced
+from server.services.live.live import document_of
+from server.services.rigs.backend import PREVIEW_WIDTH, RigBackend, jpeg, reduced
 from server.services.service import Service
 from server.tasks.child import Child, WorkerContext
 from server.wire.problems import problem_from
@@ -24,22 +24,8 @@ EVERY_S = 0.25  # four looks a second at most
 IDLE_S = 3.0  # without anybody who watches: then nobody looks at the cameras either
 KEEP_S = 300.0  # and so long the studio stays drawn, for the next who comes
 LOOK_S = 0.05
-WIDTH = 640  # of a picture on the wire: a tile is 320 points wide, twice as many pixels on a dense screen
 
 log = structlog.get_logger()
-
-
-class Source(Protocol):
-    """Declares where the live view gets its pictures: from real cameras or the simulated studio. Methods block."""
-
-    def frames(self) -> list[LiveFrame]:
-        """Returns the present picture of each camera, with its measurements. ``jpeg`` is None if the camera delivers
-        none."""
-        ...
-
-    def close(self) -> None:
-        """Releases what the source holds."""
-        ...
 
 
 class StudioSource:
@@ -75,13 +61,12 @@ class RigSource:
 
     def close(self) -> None:
         """Does nothing: the rig stays open for shots."""
-        pass
 
 
 def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
     if picture is None:
         return {"name": name, "jpeg": None, "fault": compose("camera-shows-nothing").document()}
-    small = reduced(picture, WIDTH)
+    small = reduced(picture, PREVIEW_WIDTH)  # a tile is 320 points wide, twice as many pixels on a dense screen
     level = exposure(small)
     frame: LiveFrame = {
         "name": name,
@@ -127,8 +112,7 @@ class LiveView:
                 self._thread.start()
 
     def _look_around(self) -> None:
-        simulated = self._service.rig.describe().kind == "simulated"
-        source: Source = StudioSource() if simulated else RigSource(self._service.rig)
+        source = StudioSource() if self._service.rig.describe().kind == "simulated" else RigSource(self._service.rig)
         blur: dict[str, float | None] = {}
         try:
             while True:
@@ -146,7 +130,8 @@ class LiveView:
         finally:
             source.close()
 
-    def _look(self, source: Source, blur: dict[str, float | None]) -> bytes:
+    def _look(self, source: StudioSource | RigSource, blur: dict[str, float | None]) -> bytes:
+        began = time.monotonic()
         try:
             frames, self.fault = source.frames(), None
         except Exception as error:  # the rig may come back
@@ -158,15 +143,16 @@ class LiveView:
             if "blur_px" in frame:
                 blur[frame["name"]] = frame["blur_px"]
             frame["blur_px"] = blur.get(frame["name"])
-        return look_bytes(frames, self.fault)
+        shown = self._service.live.offer({f["name"]: data for f in frames if (data := f["jpeg"])}, began)
+        return look_bytes(frames, self.fault, document_of(shown))
 
 
-def look_bytes(frames: list[LiveFrame], fault: Message | None) -> bytes:
+def look_bytes(frames: list[LiveFrame], fault: Message | None, head: object = None) -> bytes:
     """Encodes the pictures of all cameras as one message: 4 bytes with the header's length, 4 with the length of the
     rest (both big-endian), a JSON header, and the JPEG files in the header's order. ``bytes`` in the header is the
     length of each file."""
     header = [{k: v for k, v in f.items() if k != "jpeg"} | {"bytes": len(f["jpeg"] or b"")} for f in frames]
-    text = json.dumps({"cameras": header, "fault": None if fault is None else fault.document()}).encode()
+    text = json.dumps({"cameras": header, "fault": None if fault is None else fault.document(), "head": head}).encode()
     body = b"".join(f["jpeg"] or b"" for f in frames)
     return struct.pack(">II", len(text), len(body)) + text + body
 

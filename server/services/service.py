@@ -17,6 +17,7 @@ from server.services.captures import Captures
 from server.services.deliveries import UNDER_WAY, destination, enqueue_delivery
 from server.services.jobs import Jobs, migrate
 from server.services.keys import Keys
+from server.services.live.live import Live
 from server.services.records import Calibration, Job, RigState
 from server.services.rigs.backend import RigBackend
 from server.services.rigs.real import RealRig
@@ -62,6 +63,7 @@ class Service:
     threads: Threads
     children: ChildProcessPool
     rig: RigBackend
+    live: Live
     captures: Captures
     sessions: Sessions
     calibrations: Calibrations
@@ -71,6 +73,7 @@ class Service:
 
     def close(self) -> None:
         """Closes the rig, ends the child processes and closes all connections to the database."""
+        self.live.close()
         self.rig.close()
         self.children.close()
         self.jobs.close()
@@ -171,6 +174,7 @@ def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
         threads=Threads(checks=settings.checks_at_once, check_s=settings.check_s),
         children=children,
         rig=rig,
+        live=Live(rig, settings.rig),
         metrics=metrics,
         known={},
     )

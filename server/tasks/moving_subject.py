@@ -92,12 +92,12 @@ def move(person: Person, frames: int, centre_world: Float[np.ndarray, " 3"], *, 
         said = {name: beats[of] * weight for name, weight in SPEECH[sounds[int(time[of] / SYLLABLE_S)]].items()}
         raised = {name: weight * max(swings[of, 3], 0.0) ** 4 for name, weight in BROWS.items()}
         shut = {} if still else {"eyeBlinkLeft": float(lids[k]), "eyeBlinkRight": float(lids[k])}
-        weights = _of_model(person.model, {**said, **raised, **shut})
+        weights = of_model(person.model, {**said, **raised, **shut})
         poses.append(Pose(weights, Similarity(1.0, rotation, centre_world + shift)))
     return poses
 
 
-def _of_model(model: HeadModel, weights: Weights) -> dict[str, float]:
+def of_model(model: HeadModel, weights: Weights) -> dict[str, float]:
     """Returns weights by Apple's names as weights of the model's own expressions."""
     parts = arkit_parts(model.expressions.names)
     return {model.expressions.names[row]: w for name, w in weights.items() if w > 0.0 for row in parts[name]}

@@ -63,15 +63,23 @@ class FaceReference:
 
 
 def sight(
-    person: SequencePerson, networks: FaceNetworks, pictures: Pictures, motion: Motion, views: int = VIEWS
+    person: SequencePerson,
+    networks: FaceNetworks,
+    pictures: Pictures,
+    motion: Motion,
+    views: int = VIEWS,
+    *,
+    eyes: int | None = None,
+    points: Float[np.ndarray, "468 3"] | None = None,
 ) -> Sighting:
-    """Looks for the face where ``motion`` says that it is, in the ``views`` cameras that see it best."""
+    """Looks for the face where ``motion`` says that it is, in the ``views`` cameras that see it best, and for the lids
+    in the first ``eyes`` of them (None: in all). ``points``: the landmarks there, if they are known (world, mm)."""
     placed = Similarity.from_rigid(motion.world_from_head)
     facing = {
         name: float(direction_from_face(placed, person.rig[name])[2]) for name in person.rig.names if name in pictures
     }
     best = sorted((name for name in facing if facing[name] > MIN_FACING), key=lambda name: -facing[name])[:views]
-    points = placed.apply(landmarks_of(person, motion.weights))
+    points = placed.apply(landmarks_of(person, motion.weights)) if points is None else points
     pixels, openings = dict[str, np.ndarray](), dict[str, list[float]]()
     for name in best:
         camera = person.rig[name]
@@ -83,6 +91,8 @@ def sight(
         if score < MIN_SCORE:
             continue
         pixels[name] = in_picture(found[:, :2], crop.picture_from_crop(LANDMARK_SIZE))
+        if eyes is not None and len(pixels) > eyes:
+            continue
         box = np.concatenate([pixels[name].min(axis=0), pixels[name].max(axis=0)])
         face = find_eyes(pyramid, FaceDetection(pixels[name], found[:, 2], score, box, crop.roll_deg), networks)
         assert face.lids_px is not None

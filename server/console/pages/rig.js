@@ -1,5 +1,6 @@
 // Eleven tiles. Pictures and their exposure and sharpness come by one stream; the rest is the page's state.
 import { liveView } from "/console/static/live.js";
+import { liveHead } from "/console/static/live_head.js";
 import { say, spoken } from "/console/static/language.js";
 import { begunHere, leaveBegun } from "/console/static/started.js";
 import { Outline, Verdict, checksOf, faultsOf } from "/console/static/verdict.js";
@@ -23,7 +24,7 @@ const EXPOSURE = { dark: 50, bright: 205, clipped: 0.02 }; // mean grey level of
 const SOFT_PX = 2.0; // spread of an edge from which a contour is measurably worse
 
 export default spoken({
-  mixins: [liveView, checksOf],
+  mixins: [liveView, liveHead, checksOf],
   components: { Outline, Verdict },
   props: { state: Object },
   emits: ["act", "choose"],
@@ -202,6 +203,7 @@ export default spoken({
             <strong>{{ camera.name }}</strong>
             <span class="cut muted" :class="{ warn: sync(camera).bad }">{{ sync(camera).text }}</span>
             <span class="line"><i :class="['dot', camera.moved ? 'warn' : calibration.kind]"></i><span :class="{ warn: camera.moved, fault: calibration.kind === 'fault' }">{{ say(camera.moved ? 'moved' : calibration.kind === 'good' ? 'calibrated' : 'uncalibrated') }}</span></span>
+            <ul class="lamps" :aria-label="say('Lamps of {name}', { name: camera.name })"><li v-for="lamp in lamps(camera.name)" :key="lamp.lamp" :data-lamp="lamp.lamp" :class="lamp.kind"><i :class="['dot', lamp.kind]"></i>{{ lamp.text }}<span class="unseen">: {{ lamp.told }}</span></li></ul>
             <div class="gauge">
               <span title="Mean grey level, 0 to 255">exp <b :class="{ warn: light(camera.name).bad }">{{ light(camera.name).text }}</b></span>
               <span title="Pixels at full white">clip <b :class="{ warn: (live[camera.name]?.clipped || 0) > limit.clipped }">{{ percent(live[camera.name]?.clipped) }}</b></span>
@@ -210,10 +212,14 @@ export default spoken({
           </div>
         </article>
         <aside class="panel pad stack scroll" aria-label="State of the rig">
-          <h2>{{ say(busy === 'capture' ? 'Taking the pictures' : advice.length ? 'To do' : looked ? 'Ready to capture' : 'Starting') }}</h2>
+          <div class="line" id="live-head" style="align-items: start"><canvas ref="head" width="112" height="112" role="img" aria-label="The head as the front camera sees it"></canvas>
+            <div class="stack small grow" style="gap: .2rem" role="status"><strong>{{ state_of_head }}</strong>
+              <ul v-if="words.length" class="faults"><li v-for="word in words" :key="word.code + word.camera" :data-code="word.code" :class="word.camera ? 'warn' : 'accent'">{{ say(word) }}</li></ul></div></div>
+          <h2>{{ say(busy === 'capture' ? 'Taking the pictures' : advice.length || words.length ? 'To do' : looked ? 'Ready to capture' : 'Starting') }}</h2>
           <p v-if="busy === 'capture'" class="muted small" role="status" id="taking">{{ taking }}</p>
           <ul v-else-if="advice.length" class="faults small"><li v-for="(a, i) in advice" :key="i" :class="a.kind">{{ a.text }}</li></ul>
           <p v-else class="muted small">{{ ready }}</p>
+          <label class="check small"><input type="checkbox" id="auto" v-model="auto" @change="takeWhenReady">Capture once when steady, with open eyes</label>
           <div class="small stack" style="gap: .3rem; margin-top: auto">
             <label class="field">Session<select v-model="session" id="session"><option value="">none</option><option v-for="s in state.sessions || []" :key="s.id" :value="s.id">{{ sessionName(s, state.sessions) }}</option></select></label>
             <div class="line" @keydown.enter="$event.target.blur()" @keydown.esc="$event.target.blur()"><label class="field grow">Label<input v-model="label" maxlength="500"></label><label class="field grow">Expression<input v-model="expression" maxlength="500" placeholder="neutral"></label></div></div>

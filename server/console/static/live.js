@@ -1,6 +1,9 @@
-// Live pictures for a page: it calls look(), keep()s a canvas a camera, and reads what is known of each in live[name].
+// Live pictures for a page: it calls look(), keep()s a canvas a camera, and reads what is known of each in live[name],
+// and of the head in `head`.
+import { mark } from "/console/static/live_head.js";
+
 export const liveView = {
-  data: () => ({ live: {}, fault: "" }),
+  data: () => ({ live: {}, fault: "", head: null }),
   created() {
     this.canvas = {};
   },
@@ -48,6 +51,7 @@ export const liveView = {
     },
     async show(document, body) {
       this.fault = document.fault;
+      if (document.head?.number !== this.head?.number || !document.head?.number) this.head = document.head;
       let start = 0;
       const drawn = document.cameras.map(async (camera) => {
         const data = body.subarray(start, start + camera.bytes);
@@ -61,7 +65,9 @@ export const liveView = {
           canvas.width = picture.width;
           canvas.height = picture.height;
         }
-        canvas.getContext("2d").drawImage(picture, 0, 0);
+        const context = canvas.getContext("2d");
+        context.drawImage(picture, 0, 0);
+        mark(context, this.head?.cameras?.[camera.name]?.points, picture.width, picture.height);
         picture.close();
       });
       await Promise.all(drawn);

@@ -28,6 +28,10 @@ class RigBackend(Protocol):
         """Returns the state of the rig without opening its cameras."""
         ...
 
+    def calibrated(self) -> Rig | None:
+        """Returns the cameras as calibrated; None where they are not."""
+        ...
+
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument | SimulatedCertificate:
         """Takes a shot, writes the capture to ``folder/files`` and returns the shot's certificate.
 
@@ -94,8 +98,8 @@ def check_names(rig: Rig, names: tuple[str, ...]) -> None:
     ``names``."""
     if set(rig.names) != set(names):
         differing = sorted(set(rig.names) ^ set(names))
-        detail = compose("calibration-of-other-rig")
-        raise Conflict("other-rig", detail, [compose("camera-in-one-alone", camera=name) for name in differing])
+        faults = [compose("camera-in-one-alone", camera=name) for name in differing]
+        raise Conflict("other-rig", compose("calibration-of-other-rig"), faults)
 
 
 def rig_state(

@@ -56,7 +56,7 @@ class RealRig:
             cameras.append(RigCamera(camera.name, camera.driver, known))
             if state is not None and state.error:
                 faults.append(compose("located", where=camera.name, fault=state.error))
-        rig = self._calibrated()
+        rig = self.calibrated()
         if rig is None:
             faults.append(compose("rig-not-calibrated"))
         return rig_state(self._config.name, "real", cameras, faults, None if rig is None else "own")
@@ -72,10 +72,9 @@ class RealRig:
             raise InputError("request", [compose("seed-of-real-rig")])
         if board:
             return self._board_shot(folder)
-        rig = self._calibrated()
+        rig = self.calibrated()
         if rig is None:
-            detail = compose("capture-needs-calibration")
-            raise Unavailable("not-calibrated", detail)
+            raise Unavailable("not-calibrated", compose("capture-needs-calibration"))
         with self._lock:
             session = self._opened()
             shot = session.shoot()
@@ -174,8 +173,9 @@ class RealRig:
                 detail = compose("plates-occupied", version=error.version)
                 raise Conflict("plates-occupied", detail, faults) from error
             except ShotFailed as error:
-                faults = [fault.message() for fault in error.faults]
-                raise Unavailable("plates-failed", error.message, faults) from error
+                raise Unavailable(
+                    "plates-failed", error.message, [fault.message() for fault in error.faults]
+                ) from error
         return CleanPlates(tuple(sorted(plates.files)), self._config.shot.plates, None)
 
     def plates(self) -> list[PlatesVersion]:
@@ -217,12 +217,12 @@ class RealRig:
             except EigenheadError as error:
                 session.close()
                 raise Unavailable("rig-unavailable", error.message, [error.message]) from error
-            if self._calibration.is_file():
-                session.rig = read_rig(self._calibration)
+            session.rig = self.calibrated()
             self._session = session
         return self._session
 
-    def _calibrated(self) -> Rig | None:
+    def calibrated(self) -> Rig | None:
+        """Returns the cameras as calibrated; None where they are not."""
         if self._calibration.is_file():
             return read_rig(self._calibration)
         with suppress(InputError):

@@ -27,10 +27,12 @@ class SimulatedRig:
 
     def describe(self) -> RigState:
         """Returns the state of the studio, whose cameras are always ready."""
-        rig = self._rig()
-        cameras = [RigCamera(name, "simulated", "ready") for name in rig.names]
-        calibrated = "own" if self._calibration.is_file() else "studio"
-        return rig_state("simulated", "simulated", cameras, [], calibrated)
+        cameras = [RigCamera(name, "simulated", "ready") for name in self._rig().names]
+        return rig_state("simulated", "simulated", cameras, [], "own" if self._calibration.is_file() else "studio")
+
+    def calibrated(self) -> Rig:
+        """Returns the calibration that was put to use, or the studio's own layout."""
+        return read_rig(self._calibration) if self._calibration.is_file() else self._rig()
 
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> SimulatedCertificate:
         """Takes a shot of a person, also if ``board`` is set, since the studio has no board. Raises Unavailable if the
@@ -41,7 +43,7 @@ class SimulatedRig:
             except WorkFailed as error:
                 raise Unavailable("shot-failed", error.message, [error.message]) from error
         if self._calibration.is_file():
-            write_rig(read_rig(self._calibration), folder / "files" / "cameras.json")
+            write_rig(self.calibrated(), folder / "files" / "cameras.json")
         return shot
 
     def look(self) -> Mapping[str, ImageRgb]:
@@ -107,5 +109,4 @@ class SimulatedRig:
 
 
 def _fixed_studio() -> Conflict:
-    detail = compose("simulated-rig-fixed")
-    return Conflict("simulated-rig", detail)
+    return Conflict("simulated-rig", compose("simulated-rig-fixed"))

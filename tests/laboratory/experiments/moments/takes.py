@@ -36,6 +36,7 @@ from rig.studio.scene.simulate import simulate
 from rig.studio.scene.subject import Subject, random_look
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
+from tests.laboratory.experiments.moments.live import live as watch_live
 from tests.laboratory.experiments.moments.sequences import sequences
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.drawn_expressions import drawn_weights
@@ -56,6 +57,7 @@ def moments(
     moments: int = MOMENTS,
     cameras: Sequence[int] = (3, 11),
     sequence: int = 0,
+    live: bool = False,
     folder: Path | None,
     scratch: Path,
 ) -> Outcome:
@@ -63,10 +65,13 @@ def moments(
     the joint error by the single one) and ``<cameras>_weights_...``, over all subjects of both models.
 
     ``subjects``: of each model. ``moments``: of each subject. ``cameras``: how many there are. ``sequence``: frames of
-    a film, which is measured instead (``sequences``); films are kept in the folder of ``--out``.
+    a film, which is measured instead (``sequences``); films are kept in the folder of ``--out``. ``live``: the live
+    head is measured instead (``live``).
     """
     if sequence:
         return sequences(models["default"], renderer, bench, folder or scratch, sequence)
+    if live:
+        return watch_live(models["default"], renderer, bench, scratch)
     settings = replace(Settings(), detail="photo", outputs=OutputSettings(surface="head"))
     code = (*CONTOUR, arrow, joint_fit, refine, depth_search)
     rows: list[Row] = []

@@ -1,0 +1,210 @@
+"""Keeps a head of whoever sits before the cameras, as long as somebody looks.
+
+One thread takes pictures, unless the console's live view offers its own; another hands the newest ones to a child
+process (``look``) and says what it found. The cameras are asked for the next pictures so early that they come when the
+child is done. The child goes before a job's processes, whose two cores it takes a quarter of at most; one that dies or
+does not answer is killed and begun again with the next look. ``IDLE_S`` after the last question threads and child end.
+"""
+
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import cv2
+import numpy as np
+import structlog
+
+from rig.formats.rig_toml import read_rig_config
+from rig.image import ImageRgb
+from rig.messages.message import Message, compose
+from rig.progress import Progress
+from rig.rig import Rig
+from server.errors import Refused
+from server.services.live.seen import LiveShown, Seen, Word
+from server.services.live.words import Speaker, lamps_of
+from server.services.rigs.backend import RigBackend
+from server.tasks.child import Child, WorkerContext
+
+EVERY_S = 0.3  # from look to look at least
+IDLE_S = 6.0  # without anybody who asks
+AGAIN_S = 1.0  # after a fault
+LOOK_S, FIRST_LOOK_S = 4.0, 40.0  # that the child may take; the first one reads model and networks
+OFFERED_S = 1.0  # pictures that are offered so lately are waited for: the cameras are looked at once
+FRESH_S = 3.0  # a look so old says nothing about now
+WAIT_S = 0.02
+WIDTH_PX = 480  # of pictures that the child gets, at least
+NICENESS = 2  # a job's processes have 5: half a core of 0.15 s a look must not wait for their two
+HEAD_SHOWN = ("vertices", "triangles", "left_deg", "up_deg", "eyes_open")
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Holds the pictures of one moment, some of them JPEG files, and when the first of them may have been taken (s, of
+    ``time.monotonic``). ``fault``: why there are none."""
+
+    taken_s: float
+    pictures: Mapping[str, bytes | ImageRgb]
+    fault: Message | None = None
+
+
+class Live:
+    """Finds the head while somebody asks. ``rig_toml`` describes the rig, None for the simulated studio."""
+
+    def __init__(self, rig: RigBackend, rig_toml: Path | None) -> None:
+        self._rig = rig
+        self._config = None if rig_toml is None else read_rig_config(rig_toml)
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._asked_s = self._offered_s = self._polled_s = 0.0
+        self._moment: Moment | None = None
+        self._begun, self._child_s = threading.Event(), 0.0  # whether the child looks at the newest; how long it took
+        self._shown: tuple[float, LiveShown] | None = None
+        self._number = 0
+        self._closing = False
+
+    def newest(self) -> LiveShown:
+        """Returns the newest look, and asks for the next ones. While the first is under way, and when the cameras are
+        lost, the answer has no cameras and says why. Does not block."""
+        self._polled_s = time.monotonic()
+        return self._newest()
+
+    def _newest(self) -> LiveShown:
+        self._asked_s = now_s = time.monotonic()
+        with self._lock:
+            if self._thread is None and not self._closing:
+                self._thread = threading.Thread(target=self._look_on, daemon=True, name="live head")
+                self._thread.start()
+        shown = self._shown
+        return shown[1] if shown is not None and now_s - shown[0] < FRESH_S else nothing(compose("live-starting"))
+
+    def offer(self, pictures: Mapping[str, bytes], taken_s: float) -> LiveShown:
+        """Takes the pictures that the live view has just got, so that the cameras need not be asked twice, and returns
+        the newest look."""
+        self._moment, self._offered_s = Moment(taken_s, pictures), time.monotonic()
+        return self._newest()
+
+    def close(self) -> None:
+        """Ends the threads and the child process."""
+        self._closing, thread = True, self._thread
+        if thread is not None:
+            thread.join(LOOK_S)
+
+    def _look_on(self) -> None:
+        speaker, child, last_s = Speaker(), Child(NICENESS, {"OPENBLAS_NUM_THREADS": "1"}), 0.0
+        ended = threading.Event()
+        threading.Thread(target=self._watch_cameras, args=(ended,), daemon=True, name="live pictures").start()
+        try:
+            while not self._is_idle():
+                moment = self._moment
+                if moment is None or moment.taken_s <= last_s:
+                    time.sleep(WAIT_S)
+                    continue
+                last_s = moment.taken_s
+                self._begun.set()
+                try:
+                    self._show(moment, child, speaker)
+                except Exception as error:  # the child is begun again
+                    self._shown = (time.monotonic(), nothing(compose("live-again")))
+                    log.warning("no live head", error=str(error)[:300])
+                    ended.wait(AGAIN_S)
+        finally:
+            ended.set()
+            child.close()
+
+    def _watch_cameras(self, ended: threading.Event) -> None:
+        while not ended.is_set():
+            begun_s = time.monotonic()
+            if begun_s - self._offered_s < OFFERED_S or begun_s - self._polled_s > IDLE_S:
+                ended.wait(WAIT_S)
+                continue
+            self._begun.clear()
+            try:
+                self._moment = Moment(begun_s, {name: halved(image) for name, image in self._rig.look().items()})
+            except Exception as error:  # the cameras may come back
+                fault = error.detail if isinstance(error, Refused) else compose("live-no-pictures")
+                self._moment = Moment(begun_s, {}, fault)
+                ended.wait(AGAIN_S)
+            took_s = time.monotonic() - begun_s
+            self._begun.wait(LOOK_S)
+            ended.wait(max(WAIT_S, self._child_s - took_s, begun_s + EVERY_S - time.monotonic()))
+
+    def _is_idle(self) -> bool:
+        with self._lock:
+            idle = self._closing or time.monotonic() - self._asked_s > IDLE_S
+            if idle:
+                self._thread, self._shown, self._moment = None, None, None
+            return idle
+
+    def _show(self, moment: Moment, child: Child, speaker: Speaker) -> None:
+        if moment.fault is not None:
+            self._shown = (time.monotonic(), nothing(moment.fault))
+            return
+        begun_s = time.monotonic()
+        until_s = begun_s + (LOOK_S if child.runs else FIRST_LOOK_S)
+        seen: Seen = child.remote(look, cancelled=lambda: self._closing or time.monotonic() > until_s)(
+            pictures=moment.pictures,
+            rig=self._rig.calibrated(),
+            front=None if self._config is None else self._config.front,
+            plates=self._plates(),
+        )
+        now_s = time.monotonic()
+        self._child_s, self._number = now_s - begun_s, self._number + 1
+        words, steady = speaker.words(seen, moment.taken_s), speaker.steady(seen.head, moment.taken_s)
+        opened = seen.head is not None and seen.head.eyes_open is True
+        shown = LiveShown(
+            time=datetime.fromtimestamp(time.time() + moment.taken_s - now_s, UTC).isoformat(timespec="milliseconds"),
+            age_s=round(now_s - moment.taken_s, 3),
+            number=self._number,
+            cameras=lamps_of(seen),
+            head=seen.head,
+            steady=steady,
+            words=words,
+            ready=steady and opened and not words,
+        )
+        self._shown = (now_s, shown)
+
+    def _plates(self) -> tuple[str, str] | None:
+        in_use = next((version for version in self._rig.plates() if version.in_use), None)
+        return None if in_use is None or self._config is None else (str(self._config.plates_folder), in_use.id)
+
+
+def nothing(why: Message) -> LiveShown:
+    """Returns a look that found nothing."""
+    return LiveShown("", 0.0, 0, {}, None, False, (Word(why),), False)
+
+
+def halved(image: ImageRgb) -> ImageRgb:
+    """Returns a picture reduced by a whole factor, which is fast, to at least ``WIDTH_PX``."""
+    factor = max(1, image.shape[1] // WIDTH_PX)
+    size = (image.shape[1] // factor, image.shape[0] // factor)
+    return image if factor == 1 else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def look(
+    context: WorkerContext,
+    report: Progress,
+    *,
+    pictures: Mapping[str, bytes | ImageRgb],
+    rig: Rig | None,
+    front: str | None,
+    plates: tuple[str, str] | None,
+) -> Seen:
+    """Finds the head in the child process, as ``looking.look``."""
+    from server.services.live import looking
+
+    return looking.look(context, pictures, rig, front, plates)
+
+
+def document_of(shown: LiveShown) -> dict[str, object]:
+    """Returns a look as JSON types, for a page."""
+    return {
+        **{name: getattr(shown, name) for name in ("time", "age_s", "number", "steady", "ready")},
+        "cameras": {name: asdict(lamps) for name, lamps in shown.cameras.items()},
+        "head": None if shown.head is None else {name: getattr(shown.head, name) for name in HEAD_SHOWN},
+        "words": [{**word.message.document(), "camera": word.camera} for word in shown.words],
+    }

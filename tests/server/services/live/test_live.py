@@ -1,0 +1,98 @@
+"""The live head of a service before real streams: it begins when somebody asks, outlives its child, and ends."""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+
+from server.services.live.live import IDLE_S, NICENESS
+from tests.server.services.live.conftest import DrawnRig
+from tests.support.services import RunningService, served_client
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]
+
+
+def until(client: httpx.Client, fits: Callable[[dict], bool], timeout_s: float = 60.0) -> dict:
+    deadline, answer = time.monotonic() + timeout_s, {}
+    while time.monotonic() < deadline:
+        answer = client.get("/v1/rig/live").raise_for_status().json()
+        if fits(answer):
+            return answer
+        time.sleep(0.1)
+    raise AssertionError(answer)
+
+
+def said(answer: dict) -> set[str]:
+    return {word["code"] for word in answer["words"]}
+
+
+def children(service: RunningService) -> list[int]:
+    """The live head's child processes, told by their niceness and the service's environment."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            command, environment = ((folder / name).read_bytes() for name in ("cmdline", "environ"))
+        except OSError:
+            continue
+        words = command.rstrip(b"\0").split(b"\0")
+        if words[-4:-3] == [b"server.tasks.child"] and words[-2] == str(NICENESS).encode():
+            found += [int(folder.name)] * (f"EIGENHEAD_DATA={service.data}\0".encode() in environment + b"\0")
+    return found
+
+
+def test_a_head_is_followed_while_somebody_asks(rig: DrawnRig, tmp_path: Path) -> None:
+    with served_client(tmp_path / "data", worker=False, rig=str(rig.toml)) as (service, client):
+        first = client.get("/v1/rig/live").json()
+        assert (said(first), first["head"], first["cameras"]) == ({"live-starting"}, None, {})
+        assert said(until(client, lambda answer: bool(answer["cameras"]) and bool(answer["words"]))) == {"live-nobody"}
+
+        rig.devices.seat(True)
+        seated = until(client, lambda answer: answer["head"] is not None and answer["steady"])
+        assert abs(seated["head"]["left_deg"]) < 10.0
+        assert [seated["cameras"][name]["face"] for name in ("cam0", "cam1", "cam2", "cam5")] == [
+            True,
+            True,
+            True,
+            None,
+        ]
+        assert not seated["cameras"]["cam5"]["looking"]
+        assert len(seated["head"]["vertices"]) > 100
+        assert max(max(corners) for corners in seated["head"]["triangles"]) < len(seated["head"]["vertices"])
+
+        rig.turn(30.0)
+        turned = until(client, lambda answer: "live-turn-right" in said(answer), 10.0)
+        (word,) = (word for word in turned["words"] if word["code"] == "live-turn-right")
+        assert word["message"]["parameters"]["angle_deg"] == pytest.approx(30.0, abs=8.0)
+        assert word["text"] == word["message"]["message"]
+        rig.turn(0.0)
+        until(client, lambda answer: "live-turn-right" not in said(answer), 10.0)
+
+        (child,) = children(service)
+        os.kill(child, signal.SIGKILL)
+        until(client, lambda answer: "live-again" in said(answer), 10.0)
+        until(client, lambda answer: answer["head"] is not None)
+        assert children(service) not in ([], [child])
+
+        with client.stream("GET", "/v1/rig/live?seconds=2", headers={"Accept": "text/event-stream"}) as stream:
+            events = [line for line in stream.iter_lines() if line.startswith("data: ")]
+        assert json.loads(events[-1].removeprefix("data: "))["head"] is not None
+
+        deadline = time.monotonic() + IDLE_S + 10.0
+        while children(service) and time.monotonic() < deadline:
+            time.sleep(0.2)
+        assert children(service) == []
+
+
+def test_an_answer_never_waits_for_the_cameras(rig: DrawnRig, tmp_path: Path) -> None:
+    """A camera that hangs, and the model that is being read, do not hold up who asks."""
+    with served_client(tmp_path / "data", worker=False, rig=str(rig.toml)) as (_, client):
+        for _ in range(30):
+            begun = time.monotonic()
+            client.get("/v1/rig/live").raise_for_status()
+            assert time.monotonic() - begun < 2.0
+            time.sleep(0.1)
