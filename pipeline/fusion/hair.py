@@ -312,5 +312,4 @@ def depth_inside_outlines(
         off_mm = -distance[row[shown], column[shown]] * camera_depths(camera, places[shown]) / camera.intrinsics.fx
         inside_mm[shown] = np.minimum(inside_mm[shown], off_mm)
         cosines[k] = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
-    inside_mm[np.isinf(inside_mm)] = 0.0
-    return inside_mm, cosines.max(axis=0), np.abs(cosines).min(axis=0)
+    return np.where(np.isinf(inside_mm), 0.0, inside_mm), cosines.max(axis=0), np.abs(cosines).min(axis=0)

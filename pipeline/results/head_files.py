@@ -127,8 +127,8 @@ def plain_skin(atlas: Atlas | None, kind: str) -> Skin | None:
     """Returns a texture without maps; ``kind`` is a key of ``ENCODINGS``. None without one."""
     if atlas is None:
         return None
-    layout = atlas.layout
-    return Skin(layout.uv, encoded(atlas.image, kind), ENCODINGS[kind][1], layout.source, layout.faces)
+    of, mime = atlas.layout, ENCODINGS[kind][1]
+    return Skin(of.uv, encoded(atlas.image, kind), mime, of.source, of.faces)
 
 
 def head_mesh(result: Reconstruction) -> Mesh:

@@ -137,20 +137,18 @@ def masks_alone_exchanged(
 def turned_masks(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], ready: Collection[str]
 ) -> dict[str, Message]:
-    """Returns, by camera, what was done (a key of ``TURNS``) to each given mask that follows its photograph only once
-    that is undone, as to those of programs that count rows from the bottom.
+    """Returns, by camera, what was done (a key of ``TURNS``) to each mask of ``ready`` that follows its photograph only
+    once that is undone, as to those of programs that count rows from the bottom.
 
-    Of 103 right masks of eight captures none was named; flipped or turned, 101 or more were. ``images``: by camera.
-    ``silhouettes``: by camera. ``ready``: cameras whose mask was given.
-    """
+    Of 103 right masks of eight captures none was named; flipped or turned, 101 or more were."""
     turns = {}
     for name in (name for name in ready if name in images and name in silhouettes):
         as_given = _height_at_outline(images[name], silhouettes[name])
         if as_given >= CLEAR:
             continue
         heights = {turn: _height_at_outline(images[name], _turned(silhouettes[name], turn)) for turn in TURNS}
-        turn = max(heights, key=lambda one: heights[one])
-        if heights[turn] >= max(CLEAR, OWN_GAIN * as_given):
+        turn, height = max(heights.items(), key=lambda one: one[1])
+        if height >= max(CLEAR, OWN_GAIN * as_given):
             turns[name] = turn
     for turn in TURNS:
         if 2 * [*turns.values()].count(turn) > len(ready):  # what is as good both ways was turned with the others

@@ -98,7 +98,7 @@ def usable_views(
     overruled: list[ReportWarning] = []
     doubted = [name for name, s in assigned.silhouettes.items() if s.quality.warnings or not s.quality.usable]
     silhouettes = with_picture_faults(assigned.silhouettes, assigned.capture, doubted, rig)
-    usable = sum(silhouette.quality.usable for silhouette in silhouettes.values())
+    usable = sum(s.quality.usable for s in silhouettes.values())
     by_face = MIN_VIEWS_OF_FACE <= usable < MIN_VIEWS <= len(silhouettes) and find_face() is not None
     if by_face:
         overruled.append(compose("pose-doubtful", finding=compose("pose-few-views", usable=usable, needed=MIN_VIEWS)))

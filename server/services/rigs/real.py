@@ -173,9 +173,8 @@ class RealRig:
                 detail = compose("plates-occupied", version=error.version)
                 raise Conflict("plates-occupied", detail, faults) from error
             except ShotFailed as error:
-                raise Unavailable(
-                    "plates-failed", error.message, [fault.message() for fault in error.faults]
-                ) from error
+                faults = [fault.message() for fault in error.faults]
+                raise Unavailable("plates-failed", error.message, faults) from error
         return CleanPlates(tuple(sorted(plates.files)), self._config.shot.plates, None)
 
     def plates(self) -> list[PlatesVersion]:
