@@ -71,7 +71,7 @@ def look(
     """
     kept: Kept = context.keep("live", Kept)
     cv2.setNumThreads(1)  # a job may run beside
-    images = {name: _read(picture) for name, picture in pictures.items()}
+    images = {name: image for name, picture in pictures.items() if (image := _read(picture)) is not None}
     empty = _plates(kept, plates, tuple(pictures))
     seen = {name: _lit(image, empty.get(name)) for name, image in images.items()}
     if rig is None:
@@ -90,10 +90,12 @@ def look(
     return Seen(seen, _head(head, rig, scaled, front), faces, True, missing)
 
 
-def _read(picture: bytes | ImageRgb) -> ImageRgb:
-    if isinstance(picture, bytes):
-        return np.asarray(cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR_RGB), np.uint8)
-    return picture
+def _read(picture: bytes | ImageRgb) -> ImageRgb | None:
+    """Returns a picture; None of a file that cannot be decoded, whose camera then counts as one without a picture."""
+    if not isinstance(picture, bytes):
+        return picture
+    pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR_RGB) if picture else None
+    return None if pixels is None else np.asarray(pixels, np.uint8)
 
 
 def _fits(camera: Camera, image: ImageRgb) -> bool:
