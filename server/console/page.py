@@ -128,7 +128,7 @@ class Page(Element):
         self.frame, self.caller, self.service = frame, caller, service_of_pages()
         self.choice = initial
         self.props["state"] = {"loading": True}
-        self._in_turn = anyio.Lock()
+        self._in_turn, self._looking = anyio.Lock(), anyio.Lock()
         self._told: Message | None = None
         self._started: tuple[list[str], bool] = ([], False)
         self._followed: list[str] = []
@@ -160,7 +160,8 @@ class Page(Element):
         """Reads the state of the page and sends it to the browser if it has changed. An error is shown once, and the
         page keeps its last state."""
         try:
-            state = await anyio.to_thread.run_sync(self.look, limiter=_threads, abandon_on_cancel=True)
+            async with self._looking:  # what was read before a choice must not be shown after it
+                state = await anyio.to_thread.run_sync(self.look, limiter=_threads, abandon_on_cancel=True)
             detail = None
         except Exception as error:  # the page stays, says so once, and looks again
             problem = problem_from(error)
