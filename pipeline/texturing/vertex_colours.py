@@ -192,7 +192,7 @@ def texture(
     """
     views, normals = usable_views(capture, silhouettes, rig), mesh_world.normals()
     if settings.blend == "reference":
-        return _reference(mesh_world, normals, capture, silhouettes, views, depths)
+        return blend_as_paper(mesh_world, normals, capture, silhouettes, views, depths)
     if not len(views):
         return _untextured(len(normals))
 
@@ -313,7 +313,7 @@ def _untextured(count: int) -> Texture:
     return Texture(np.full((count, 3), code, np.uint8), np.zeros(count, np.uint8), filled=count, warnings=(warning,))
 
 
-def _reference(
+def blend_as_paper(
     mesh: Mesh,
     normals: Points,
     capture: Capture,

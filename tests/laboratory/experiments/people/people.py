@@ -125,12 +125,13 @@ def run_job(capture: Capture, rig: Rig, model: HeadModel, settings: Settings, re
 
 def judge_result(person: Person, result: Reconstruction, model: HeadModel) -> Row:
     """Computes the figures of a delivered head."""
-    pose = face_pose_error(person, result, model)
+    pose, fit = face_pose_error(person, result, model), result.head.fit
+    assert fit.covariance is not None
     face = model.levels["full"].face_region
     row: Row = {
         "turn_deg": pose.turn_deg,
         "shift_mm": pose.shift_mm,
-        "turn_stated_deg": float(np.degrees(np.sqrt(np.diag(result.head.fit.covariance)[-7:-4].max()))),
+        "turn_stated_deg": float(np.degrees(np.sqrt(np.diag(fit.covariance)[-7:-4].max()))),
         "deviation_mm": float(np.median(result.refined.deviation_mm[face])),
         "level": result.refined.detail.level,
         "warnings": sorted({warning.code for warning in result.warnings}),

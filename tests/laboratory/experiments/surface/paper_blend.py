@@ -8,7 +8,7 @@ from jaxtyping import Float32, UInt8
 from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.texturing.layout.uv_unwrap import Layout
-from pipeline.texturing.vertex_colours import reference_colours
+from pipeline.texturing.vertex_colours import blend_as_paper
 from rig.capture import Capture
 from rig.mesh import Mesh
 from rig.rig import Rig
@@ -31,7 +31,7 @@ def paper_texture(
     values = np.concatenate([mesh_world.vertices, mesh_world.normals()], axis=1)[layout.source].astype(np.float32)
     surface = interpolate(shown, texels, ones, layout.faces, values)[shown >= 0].astype(float)
     normals = surface[:, 3:] / np.linalg.norm(surface[:, 3:], axis=1, keepdims=True)
-    colours, weights, _ = reference_colours(surface[:, :3], normals, capture, silhouettes, rig, depths)
-    out = np.array(filled)
-    out[shown >= 0] = np.where(weights[:, None] > 0, np.rint(colours), out[shown >= 0])
+    points = Mesh(surface[:, :3], np.zeros((0, 3), np.int32))
+    blend, out = blend_as_paper(points, normals, capture, silhouettes, rig, depths), np.array(filled)
+    out[shown >= 0] = np.where(blend.views[:, None] > 0, blend.colours, out[shown >= 0])
     return out
