@@ -166,7 +166,16 @@ def encoded(image: UInt8[np.ndarray, "s s 3"], kind: str) -> bytes:
 
 
 def printable(head: Mesh) -> Mesh:
-    """Returns the head (head frame, mm) as a closed mesh for printing: z up, standing on z = 0.
+    """Returns the head (head frame, mm) as a closed mesh for printing: z up, standing on z = 0. Raises NotAManifold if
+    a border touches itself."""
+    closed = close_borders(head)
+    points = closed.vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
+    points[:, 2] -= points[:, 2].min()
+    return Mesh(points, closed.faces)
+
+
+def close_borders(head: Mesh) -> Mesh:
+    """Returns the head (head frame, mm) as a closed mesh.
 
     The neck is closed by triangles around the middle of its border; open lids and lips are closed by a strip from
     corner to corner. Raises NotAManifold if a border touches itself.
@@ -182,9 +191,7 @@ def printable(head: Mesh) -> Mesh:
         added.append(np.stack([np.roll(ring, -1), ring, np.full(len(ring), count)], axis=1).astype(np.int32))
         vertices.append(border.mean(axis=0, keepdims=True))
         count += 1
-    points = np.concatenate(vertices)[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
-    points[:, 2] -= points[:, 2].min()
-    return Mesh(points, np.concatenate(added))
+    return Mesh(np.concatenate(vertices), np.concatenate(added))
 
 
 def write_set_textures(folder: Path, sets: SetTextures) -> None:

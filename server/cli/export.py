@@ -14,9 +14,11 @@ if TYPE_CHECKING:
     from rig.formats.meshes.markups import Axes
 
 app = typer.Typer(rich_markup_mode=None)
+LONGEST_PSEUDONYM = 64  # letters that DICOM's names and numbers of patients take
 
-
-ExportFormat = Literal["glb", "ply", "obj", "usdz", "stl", "3mf", "slicer", "nerfstudio", "gaussian-avatars"]
+ExportFormat = Literal[
+    "glb", "ply", "obj", "usdz", "stl", "3mf", "slicer", "dicom", "nifti", "nerfstudio", "gaussian-avatars"
+]
 
 
 @app.command(
@@ -40,10 +42,13 @@ def export(
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
     axes: Annotated[Literal["LPS", "RAS"], typer.Option(help="For slicer.")] = "LPS",
-    plane: Annotated[Literal["head", "frankfurt"], typer.Option(help="For slicer.")] = "head",
+    plane: Annotated[Literal["head", "frankfurt"], typer.Option(help="For slicer, dicom and nifti.")] = "head",
     marked: Annotated[
-        Path | None, file_in("For slicer: porion and orbitale, marked over an export without a plane, .mrk.json.")
+        Path | None, file_in("For these: porion and orbitale, marked over an export without a plane, .mrk.json.")
     ] = None,
+    patient: Annotated[
+        str, typer.Option(help="For dicom and nifti: a pseudonym of letters and digits, all that names the person.")
+    ] = "anonymous",
     template: TemplateName = None,
     morphs: Morphs = False,
     albedo: Albedo = False,
@@ -53,15 +58,20 @@ def export(
 ) -> None:
     """Write a finished head, or a capture, for other programs.
 
-    A head in another format, without a new job; for 3D Slicer mesh and landmarks in a patient's axes, mm. A capture as
-    a data set: undistorted pictures, masks and cameras in metres."""
+    A head in another format, without a new job; for 3D Slicer mesh and landmarks in a patient's axes, mm; for a
+    hospital's programs without name and date. A capture as a data set: undistorted pictures, masks and cameras in
+    metres."""
     from pipeline.settings import FORMATS, OutputSettings
 
     if form in FORMATS:
         outputs = OutputSettings(formats=(form,), template=template, morphs=morphs, albedo="file" if albedo else "none")
         _export_head(source, out, outputs, overwrite=overwrite, json_out=json_out)
-    elif form == "slicer":
-        _export_patient(source, out, axes, plane, marked=marked, overwrite=overwrite, json_out=json_out)
+    elif form in ("slicer", "dicom", "nifti"):
+        if not (patient.isascii() and patient.isalnum() and len(patient) <= LONGEST_PSEUDONYM):
+            raise typer.BadParameter(f"at most {LONGEST_PSEUDONYM} letters and digits", param_hint="--patient")
+        _export_patient(
+            source, out, form, axes, plane, marked=marked, patient=patient, overwrite=overwrite, json_out=json_out
+        )
     else:
         _export_dataset(source, out, form, result=result, settings=settings, overwrite=overwrite, json_out=json_out)
 
@@ -113,10 +123,20 @@ def _export_dataset(
 
 
 def _export_patient(
-    result: Path, out: Path, axes: "Axes", plane: str, *, marked: Path | None, overwrite: bool, json_out: bool
+    result: Path,
+    out: Path,
+    form: "Literal['slicer', 'dicom', 'nifti']",
+    axes: "Axes",
+    plane: str,
+    *,
+    marked: Path | None,
+    patient: str,
+    overwrite: bool,
+    json_out: bool,
 ) -> None:
     """Writes a result's head in a patient's axes."""
     from pipeline.applications.clinic.anatomical_frame import frankfurt_axes, head_axes
+    from pipeline.applications.clinic.hospital_files import HOSPITAL_AXES, write_hospital_files
     from pipeline.applications.clinic.patient_files import FRAME_FILE, marked_points, write_patient_files
     from pipeline.applications.clinic.visit import read_visit
 
@@ -124,10 +144,14 @@ def _export_patient(
         raise Overwrites(out / FRAME_FILE)
     visit = read_visit(result)
     points = marked_points(marked, visit, axes)
+    axes = axes if form == "slicer" else HOSPITAL_AXES[form]
     in_plane = plane == "frankfurt" or marked is not None
     frame = frankfurt_axes(visit.measured, axes, points) if in_plane else head_axes(visit.measured, axes)
     prepare_folder(out)
-    document = write_patient_files(out, visit, frame)
+    if form == "slicer":
+        document = write_patient_files(out, visit, frame)
+    else:
+        document = write_hospital_files(out, visit, frame, form, patient)
     lines = [f"{out}  {frame.axes}, {'Frankfurt plane' if in_plane else 'the attitude of the head frame'}"]
     if frame.tilt_deg is not None:
         lines.append(

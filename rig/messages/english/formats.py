@@ -234,6 +234,7 @@ TEMPLATES = {
     "results-of-other-version": "the results were made with another version of {model} than is at hand: import it again, or reconstruct anew",
     "result-doubtful": "warns {warnings}",
     "ply-bytes": "has {held} bytes of vertices and faces; its header states {wanted}",
+    "clinic-not-installed": "heads as DICOM or NIfTI need pydicom and nibabel: {remedy}",
     "usd-not-installed": "head.usdz needs usd-core: {remedy}; or leave usdz out of the formats",
     "install-extra": "run `deploy/setup.sh --extra {extra}`, or install eigenhead[{extra}] where a wheel was installed",
     "a-picture": "picture",

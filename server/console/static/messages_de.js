@@ -1073,6 +1073,7 @@ export default {
   "results-of-other-version": "die Ergebnisse wurden mit einer anderen Fassung von {model} gemacht als der vorhandenen: sie neu einlesen, oder neu rekonstruieren",
   "result-doubtful": "warnt {warnings}",
   "ply-bytes": "hat {held} Bytes an Punkten und Flächen, wo {wanted} angegeben sind",
+  "clinic-not-installed": "Köpfe als DICOM oder NIfTI brauchen pydicom und nibabel: {remedy}",
   "usd-not-installed": "head.usdz braucht usd-core: {remedy}; oder usdz aus den Formaten weglassen",
   "install-extra": "`deploy/setup.sh --extra {extra}` aufrufen, oder eigenhead[{extra}] installieren, wo ein Wheel installiert wurde",
   "no-rig-toml": "lässt sich nicht lesen ({reason}); mit deploy/rig.example.toml anfangen",

@@ -57,6 +57,16 @@ def test_an_export_says_which_plane_and_by_what(result: Path, tmp_path: Path) ->
     assert "frame.json is there already" in str(again.exception)
 
 
+def test_a_hospital_s_file_has_a_pseudonym_of_letters_and_digits(result: Path, tmp_path: Path) -> None:
+    words = ["export", str(result), "--as", "nifti", "--out", str(tmp_path / "out"), "--patient"]
+    done = CliRunner().invoke(app, [*words, "Anna Example"])
+    assert done.exit_code == 2
+    assert "at most 64 letters and digits" in done.output
+    done = CliRunner().invoke(app, [*words, "P017"])
+    assert done.exit_code == 0, done.output
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"frame.json", "sub-P017_desc-head_mask.nii.gz"}
+
+
 def test_a_folder_that_is_no_result_is_refused(tmp_path: Path) -> None:
     for words in (["export", str(tmp_path), "--as", "slicer"], ["compare", str(tmp_path), str(tmp_path)]):
         done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
