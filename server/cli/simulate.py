@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.studio.sensor.faults import KINDS
-from server.cli.answers import Json, Overwrite, Overwrites, answer, number, prepare_file, progress_bar, wrong_usage
+from server.cli.answers import Json, Overwrite, Overwrites, answer, number, prepare_folder, progress_bar, wrong_usage
 from server.cli.moments import film_sequence
 
 if TYPE_CHECKING:
@@ -180,7 +180,7 @@ def _make_way(out: Path, overwrite: bool, sign: str = "cameras.json") -> None:
     occupied = out.exists() and (not out.is_dir() or any(out.iterdir()))
     if occupied and not (overwrite and (out / sign).is_file()):
         raise Overwrites(out)
-    prepare_file(out)
+    prepare_folder(out)
     if occupied:
         shutil.rmtree(out)
         shutil.rmtree(out.with_name(out.name + ".truth"), ignore_errors=True)

@@ -25,6 +25,7 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.sensor.preset import CLEAN
 from server.cli.main import app
 from server.tasks.moving_subject import FPS, Person, simulate_sequence
+from tests.support.services import small_capture
 
 FRAMES, LOST, PIXELS = 7, 4, 320 * 240
 CAMERAS = ["cam00", "cam01", "cam03", "cam04", "cam07"]
@@ -152,9 +153,11 @@ def test_what_is_wrong_with_a_folder_is_said(film: Path, tmp_path: Path) -> None
         open_footage(tmp_path)
 
 
-def test_the_studio_films_a_subject(tmp_path: Path, model: HeadModel) -> None:
-    out = tmp_path / "film"
-    result = CliRunner().invoke(app, ["simulate", str(out), "--sequence", "2", "--seed", "3", "--json"])
+def test_the_studio_films_a_subject_over_an_earlier_capture(tmp_path: Path, model: HeadModel) -> None:
+    out = small_capture(tmp_path / "film")
+    words = ["simulate", str(out), "--sequence", "2", "--seed", "3", "--json"]
+    assert CliRunner().invoke(app, words).exit_code == 1  # it is there already
+    result = CliRunner().invoke(app, [*words, "--overwrite"])
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout) == {"sequence": str(out), "truth": str(tmp_path / "film.truth")}
     footage = open_footage(out)
