@@ -53,9 +53,9 @@ class FittingSettings:
     modes: int = 60  # of the eigenheads (section 3.1); lower it where few cameras see the head
     robust_px: float = 1.5  # residual at which an outline counts a quarter; raise it to six times the noise of outlines
     # that are worse than 0.25 px; 3 lets hair at the temples pull
-    contour_noise_px: float | None = None  # of the outlines; null estimates it from the residuals, the model's misfit
-    # included; give it for masks whose error you know
-    contour_correlation_px: float | None = None  # of that noise along the outline; null estimates it; give both or none
+    contour_noise_px: float | None = None  # noise of outlines; null: estimated from the residuals, model misfit
+    # included; set it if you know the masks' error
+    contour_correlation_px: float | None = None  # its length along the outline; null: estimated; set both or none
     calibration_px: float = 0.2  # prior of a camera without a covariance of its own; raise it to your calibration's
     # reprojection error where that is larger
 

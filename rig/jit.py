@@ -1,4 +1,4 @@
-"""Compiled loops, kept by content: what one process compiled, every later process of this machine finds.
+"""Caches compiled loops under a hash of their content, for all later processes of this machine.
 
 ``njit`` here is Numba's, with another place for what it compiles. Numba's own cache (an index for each function, beside
 the sources) begins anew in every checkout, does not see that a loop in another file changed that it calls, loses or

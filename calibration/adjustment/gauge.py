@@ -177,8 +177,8 @@ def effective_pose(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Fl
 
 def image_sigma(rig: Rig, covariance: Float[np.ndarray, "c 15 c 15"]) -> Float[np.ndarray, " c"]:
     """Computes for each camera the standard deviation (px, 2D) of where it sees the subject's region, worlds aligned,
-    under the joint covariance of all intrinsics (first nine) and poses. It predicts ``image_distance`` to the true
-    rig."""
+    under the joint covariance of all intrinsics (first nine) and poses. It estimates
+    ``image_distance(rig, true rig)``."""
     points, count = subject_points(rig), len(rig)
     by_pose = [pose_jacobian(camera, points).reshape(-1, 6) for camera in rig]
     by_lens = [intrinsics_jacobian(camera, points).reshape(-1, 9) for camera in rig]

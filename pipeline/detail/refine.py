@@ -259,7 +259,7 @@ def observe(
     limits: Round,
     floor_mm: float,
 ) -> PointObservations:
-    """Returns the observations that points give of the head at ``current``: their offsets (mm) from ``base``. Points of
+    """Returns how points observe the head at ``current``: offsets (mm) from ``base``. Points of
     hair count only where the head reaches beyond them.
 
     The normal of an observation is half the point's and half the head's (Rusinkiewicz 2019, *A symmetric objective

@@ -417,7 +417,7 @@ def believed(eyes: Mapping[str, Iris | UnseenEye], ahead: Float[np.ndarray, " 3"
 
 
 def looking_together(right: Iris, left: Iris, face_axes: Float[np.ndarray, "3 3"]) -> tuple[Iris, Iris]:
-    """Returns both irises once they look at one point, as far as their deviations let them. ``face_axes`` has the
+    """Returns both irises turned towards one point, as far as their deviations allow. ``face_axes`` has the
     face's axes as columns: to the subject's left, up, ahead."""
     across, up = face_axes[:, 0], face_axes[:, 1]
     covariance = np.zeros((14, 14))

@@ -77,8 +77,7 @@ class BustSurface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthSurface:
-    """Holds the surface as the depth maps show it, in one piece and without the windows' bias; it may still cross
-    itself."""
+    """Holds the depth maps' surface in one piece, corrected for the matching windows' bias; it may cross itself."""
 
     mesh_world: Mesh
     safe_world: Float[np.ndarray, "v 3"]  # places (mm) with which the mesh cannot cross itself

@@ -239,8 +239,7 @@ def _without_specks(
     """Returns the alpha of the subject's own component with holes of noise filled, and the number of holes left.
 
     A hole is noise if it is small, or if the ``coarse`` probability, in which the sensor's noise averages out, is high
-    all over it: shaded skin before a backdrop of its colour. A real gap in hair of that size is seen at the coarse
-    level too.
+    all over it: shaded skin before a backdrop of its colour. A real gap that large would show at the coarse level too.
     """
     mask = alpha > 0.5
     labels, areas = _labelled(mask, 4)

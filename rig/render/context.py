@@ -2,8 +2,8 @@
 project.
 
 Row order: OpenGL counts rows from below. Everything in ``rig.render`` draws image row v into framebuffer row v (the
-projection in ``shaders/camera.glsl`` maps v = 0 to y = -1). What is read back, lowest row first, then has row 0 on top,
-and no image is ever flipped. In exchange anticlockwise triangles arrive clockwise, so that the context takes clockwise
+projection in ``shaders/camera.glsl`` maps v = 0 to y = -1). Reading back, lowest row first, thus gives row 0 on top; no
+image is flipped. In exchange anticlockwise triangles arrive clockwise, so that the context takes clockwise
 as front.
 
 Pixel centre: a fragment's centre is at half-integer window coordinates, while pixel (0, 0) of this project is a centre,

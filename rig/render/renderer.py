@@ -213,8 +213,7 @@ def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
     """Tells whether a mesh is closed: every edge has its counterpart. Its front faces alone then make the whole
     silhouette.
 
-    Along any line such a surface is entered as often as it is left, so that where a back face covers a pixel a front
-    face does, too.
+    A line enters such a surface as often as it leaves it, so every pixel that a back face covers has a front face too.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     base = int(edges.max(initial=0)) + 1

@@ -53,7 +53,7 @@ class Blob:
 
 class CaptureBlobs:
     """Stores and fetches the files of captures. Methods block, and may be called by several processes at once. Each
-    raises StoreUnavailable where the store does not do its part, and StoreDenied where it will not."""
+    raises StoreUnavailable if the store fails, and StoreDenied if it refuses."""
 
     def __init__(self, objects: WatchedObjects, engine: sa.Engine) -> None:
         self._objects, self._engine = objects, engine

@@ -1,4 +1,4 @@
-"""Turns a head into a patient's axes: LPS or RAS, in the head frame's attitude or in the Frankfurt plane.
+"""Moves a head to LPS or RAS axes, oriented by the head frame or by the Frankfurt plane.
 
 The Frankfurt plane holds both porions (the upper edges of the ears' openings) and the lowest points of the orbits'
 rims, the orbitalia. Both are bone, which photographs do not show. Where nobody marked them they are substituted, and

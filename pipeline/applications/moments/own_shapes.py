@@ -7,7 +7,7 @@ At each vertex, the head of moment k is what the model says of it plus what the 
 with u the relief that all moments have, d_e how far the person's shape e differs from the model's S_e, and w_ke the
 weights. The noise is each head's deviation; the share ``COMMON`` of its variance is the same in all moments (cameras,
 hair, light), and more moments do not remove it. Vertices are independent of each other: neighbours agree since the
-heads are smooth. All of it is Gaussian, so the K x K matrix of the y_k at each vertex gives everything.
+heads are smooth. All is Gaussian, so the K x K covariance of the y_k at each vertex suffices.
 """
 
 from dataclasses import dataclass

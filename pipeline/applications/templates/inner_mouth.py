@@ -177,7 +177,7 @@ def _about(
 def meeting_triangles(
     mesh: Places, triangles: Int[np.ndarray, "g 3"], vertices: Mapping[str, Float[np.ndarray, "n 3"]], inner: InnerMouth
 ) -> Bool[np.ndarray, " g"]:
-    """Tells which triangles of a mesh some of the parts cross, whose vertices are given."""
+    """Tells which mesh triangles the inner parts cross; ``vertices``: of the parts."""
     points = np.concatenate([vertices[name] for name in inner.parts])
     starts = np.cumsum([0, *(len(vertices[name]) for name in inner.parts)])
     faces = np.concatenate([part.faces + start for part, start in zip(inner.parts.values(), starts, strict=False)])

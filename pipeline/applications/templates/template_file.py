@@ -36,8 +36,8 @@ CARRIER = {"rest": "f", "skin": "i", "anchors": "i", "wholes": "i", "whole_ancho
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Template(TemplateHeader):
-    """Holds a mesh registered to a head model. ``mesh.vertices`` is ``surface_binding.rest``; ``flame`` is the model
-    whose mesh it is, if its file was one."""
+    """Holds a mesh registered to a head model. ``mesh.vertices`` is ``surface_binding.rest``; ``flame``: the FLAME
+    model, if the mesh came from one."""
 
     mesh: PolygonMesh
     surface_binding: SurfaceBinding

@@ -214,8 +214,8 @@ def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
 
 
 def _check_metadata(data: bytes) -> None:
-    """Raises InputError for a JPEG with more metadata before its pixels than a camera writes: Pillow joins segments of
-    EXIF in a time that grows with their square. Steps from segment to segment as Pillow does."""
+    """Raises InputError for a JPEG with more metadata before its pixels than a camera writes: Pillow joins EXIF
+    segments in quadratic time. Steps from segment to segment as Pillow does."""
     if not data.startswith(JPEG):
         return
     at, segments, exif = 2, 0, 0
