@@ -1,6 +1,8 @@
-"""Implements the commands for one person and many moments: take, sequence."""
+"""Implements the commands for one person and many moments: take, sequence, clock."""
 
+import json
 from contextlib import ExitStack
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +14,7 @@ from server.cli.answers import (
     Json,
     Overwrite,
     answer,
+    prepare_file,
     prepare_folder,
     progress_bar,
     terminated_like_interrupted,
@@ -125,3 +128,45 @@ def film_sequence(out: Path, frames: int, seed: int, preset: "Preset", json_out:
     with progress_bar() as report, Renderer.create() as renderer:
         truth = simulate_sequence(out, person, studio, preset, frames, renderer=renderer, report=report)
     answer({"sequence": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
+
+
+@app.command(
+    epilog="Example: eigenhead clock --page clock.html   then, with pictures of that page: eigenhead clock shots --out "
+    "clock.json"
+)
+def clock(
+    shots: Annotated[Path | None, typer.Argument(help="SHOTS/CAMERA/SHOT.png.", exists=True, file_okay=False)] = None,
+    *,
+    page: Annotated[Path | None, typer.Option(help="Write the page of the clock, for any browser.")] = None,
+    rate: Annotated[float, typer.Option(help="Refreshes of the screen in a second; the page shows them.", min=20)] = 60,
+    out: Annotated[Path | None, typer.Option(help="Also write a JSON file.", dir_okay=False)] = None,
+    overwrite: Overwrite = False,
+    json_out: Json = False,
+) -> None:
+    """Measure how much later each free camera exposes than the others.
+
+    All cameras see one screen with the page. Take 40 shots or more, a second apart, or films. The error of the mean is
+    2 ms where cameras and screen run at their own rates, 5 ms where they are in step."""
+    from calibration.board.picture_files import list_pictures
+    from rig.acquisition.screen_clock import clock_page, measure_shots
+    from rig.atomic_write import write_atomically
+
+    if (shots is None) == (page is None):
+        raise typer.BadParameter("either a folder of shots, or --page", param_hint="SHOTS")
+    if page is not None:
+        prepare_file(page, overwrite=overwrite, option="--page")
+        write_atomically(page, clock_page().encode())
+        return answer({"page": str(page)}, json_out, [str(page)])
+    assert shots is not None
+    if out is not None:
+        prepare_file(out, overwrite=overwrite)
+    skews = measure_shots(list_pictures(shots), rate)
+    document = {"format": "eigenhead-clock/1", "rate_hz": rate, "cameras": {n: asdict(s) for n, s in skews.items()}}
+    if out is not None:
+        write_atomically(out, (json.dumps(document, indent=1) + "\n").encode())
+    lines = [
+        f"{name}: {skew.mean_ms:+.1f} ms (standard deviation {skew.std_ms:.1f}), "
+        f"{skew.scatter_ms:.1f} from shot to shot, {skew.shots} shots"
+        for name, skew in skews.items()
+    ]
+    answer(document, json_out, lines)

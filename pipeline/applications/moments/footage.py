@@ -1,11 +1,12 @@
 """Reads a sequence: cameras.json, and either ``images/<camera>/<frame>.<ext>`` or ``videos/<camera>.<ext>``.
 
-Beside them may lie clean plates (``background/``, as in a capture), masks (``masks/<camera>/<frame>.<ext>``), and
-``times.csv`` with the columns frame and time_s. Frames are read small, one after another, for tracking; single ones
-also as a capture, at the size of a single job.
+Beside them may lie clean plates (``background/``, as in a capture), masks (``masks/<camera>/<frame>.<ext>``),
+``times.csv`` with the columns frame and time_s, and ``clock.json`` of `eigenhead clock`. Frames are read small, one
+after another, for tracking; single ones also as a capture, at the size of a single job.
 """
 
 import csv
+import json
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,7 +31,7 @@ from rig.rig import Rig
 TRACKED_PIXELS = 640 * 480  # of a picture that is tracked: a pixel covers 0.9 mm of the usual rig's head
 FPS = 25.0  # where neither times.csv nor a video says it
 MIN_FRAMES = 2
-IMAGES, VIDEOS, TIMES = "images", "videos", "times.csv"
+IMAGES, VIDEOS, TIMES, CLOCK = "images", "videos", "times.csv", "clock.json"
 Pictures = Mapping[str, ImageRgb]  # by camera; one that lacks the frame is left out
 
 
@@ -46,6 +47,7 @@ class Footage:
     times_s: Float[np.ndarray, " n"]
     files: Mapping[str, Mapping[str, Path]]
     videos: Mapping[str, Path]
+    spread_s: float = 0.0  # between the first and the last camera's exposure of a frame; 0 without clock.json
 
     def read(self, first: int = 0, cameras: Sequence[str] = ()) -> Iterator[Pictures]:
         """Yields the small pictures of every frame from ``first`` on, of all ``cameras`` if none is named. A picture
@@ -141,7 +143,20 @@ def open_footage(folder: Path) -> Footage:
         raise InputError("sequence", faults)
     rate = next((each for each in rates if each > 0.0), FPS)
     times = _times(folder / TIMES, frames, rate)
-    return Footage(folder, rig, work_rig(rig, TRACKED_PIXELS), frames, times, files, videos)
+    spread = _spread(folder / CLOCK, rig)
+    return Footage(folder, rig, work_rig(rig, TRACKED_PIXELS), frames, times, files, videos, spread)
+
+
+def _spread(path: Path, rig: Rig) -> float:
+    """Returns how much later (s) the last of the cameras exposes than the first. Raises InputError."""
+    if not path.is_file():
+        return 0.0
+    try:
+        measured = json.loads(path.read_text(encoding="utf-8"))["cameras"]
+        later = [float(measured[name]["mean_ms"]) for name in rig.names]
+    except (KeyError, TypeError, ValueError):
+        raise InputError("sequence", [compose("sequence-clock-wrong")]) from None
+    return (max(later) - min(later)) / 1000.0
 
 
 def _times(path: Path, frames: tuple[str, ...], rate: float) -> Float[np.ndarray, " n"]:

@@ -2,7 +2,8 @@
 
 sequence.npz    frames (t), times_s, expressions (e), weights and weight_deviations (t e), rotations (t 3 3),
                 translations (t 3, mm; world_from_head), pose_deviations (t 6: rad, mm), alike (t: correlation of the
-                skin's texture), failed (t); all smoothed
+                skin's texture), failed (t), skew_mm (t: how far the face moves between the first and the last
+                camera's exposure, by clock.json); all smoothed
 person.npz      names (e), neutral (v 3, head frame, mm), shapes (e v 3, mm at weight 1), the corrected cameras; the
                 head of a frame is rotation (neutral + sum of weights times shapes) + translation
 sequence.glb    the head, animated: its expressions as morph targets, its pose relative to the first frame
@@ -44,6 +45,7 @@ from rig.render.renderer import Renderer
 FORMAT = "eigenhead-sequence/1"
 FILES = ("sequence.npz", "person.npz", "sequence.glb", "preview.mp4", "report.json")
 CHUNKS = ".chunks"
+SKEWED_MM, SKEWED_SHARE = 1.0, 0.05  # motion between exposures that warns, in more than this share of the frames
 USED = 0.02  # largest weight of an expression that is left out of sequence.glb
 CLAY, LIGHT = np.array([198.0, 176.0, 158.0]), np.array([-0.35, 0.45, 0.82])  # colour; direction to it, camera's axes
 
@@ -69,6 +71,7 @@ def make_sequence(folder: Path, out: Path, *, model: str, settings: Settings, re
         pose_deviations=found.deviations[:, :POSE],
         alike=found.alike,
         failed=found.failed,
+        skew_mm=skew_mm(person, footage, found),
     )
     shutil.copyfile(out / CHUNKS / "person.npz", out / "person.npz")
     write_atomically(out / "sequence.glb", animation_of(person, footage, found))
@@ -78,10 +81,24 @@ def make_sequence(folder: Path, out: Path, *, model: str, settings: Settings, re
     return document
 
 
+def skew_mm(person: SequencePerson, footage: Footage, course: Course) -> Float[np.ndarray, " t"]:
+    """Returns how far landmarks move in the mean, in each frame, between the first and the last camera's exposure."""
+    rows = list(person.model.landmarks.values())
+    moved = person.neutral[rows] + np.einsum("te,emx->tmx", course.weights, person.shapes[:, rows])
+    places = np.einsum("txy,tmy->tmx", course.rotations, moved) + course.translations[:, None]
+    speed_mm_s = np.linalg.norm(np.gradient(places, footage.times_s, axis=0), axis=2).mean(axis=1)
+    return footage.spread_s * speed_mm_s
+
+
 def document_of(person: SequencePerson, footage: Footage, course: Course) -> dict[str, Any]:
     """Returns the content of a sequence's report.json."""
     failed = [frame for frame, lost in zip(footage.frames, course.failed, strict=True) if lost]
     lost = compose("sequence-frames-failed", count=len(failed), all=len(course), frames=failed[:10])
+    skewed = np.count_nonzero(skew_mm(person, footage, course) > SKEWED_MM)
+    torn = compose(
+        "sequence-skewed", count=skewed, all=len(course), spread_ms=1000.0 * footage.spread_s, most_mm=SKEWED_MM
+    )
+    warnings = [said for said, holds in ((lost, failed), (torn, skewed > SKEWED_SHARE * len(course))) if holds]
     turn, shift = (np.median(course.deviations[:, rows], axis=0) for rows in (slice(3), slice(3, POSE)))
     return {
         "format": FORMAT,
@@ -97,7 +114,7 @@ def document_of(person: SequencePerson, footage: Footage, course: Course) -> dic
             "median": float(np.median(course.alike)),
             "least": float(course.alike[~course.failed].min(initial=1.0)),
         },
-        "warnings": documents_of([lost] if failed else []),
+        "warnings": documents_of(warnings),
     }
 
 

@@ -10,6 +10,8 @@ TEMPLATES = {
     "sequence-times-wrong": "times.csv must give every frame a time_s, each later than the one before: columns frame,time_s.",
     "sequence-video-unread": "{file} cannot be decoded: give single pictures, images/CAMERA/FRAME.png.",
     "sequence-without-face": "The head was found in no frame: see whether the cameras are those of the pictures.",
+    "sequence-clock-wrong": "clock.json must state mean_ms of every camera: measure again with eigenhead clock",
+    "sequence-skewed": "The cameras expose {spread_ms:.0f} ms apart: in {count} of {all} frames the face moves more than {most_mm:.0f} mm in between. Trigger them together.",
     "sequence-frames-failed": "{count} of {all} frames failed and were interpolated: {frames}.",
     "no-bust": "{reason}",
     "bust-guessed": "{share:.0%} of the face in bust.ply were measured neither by depth nor by the head's fine level, and follow the fitted head: add cameras that see the face, or light with more texture",

@@ -33,13 +33,15 @@ CAMERAS = ["cam00", "cam01", "cam03", "cam04", "cam07"]
 
 @pytest.fixture(scope="module")
 def film(model: HeadModel, renderer: Renderer, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The film; its frame ``LOST`` has no pictures but one."""
+    """The film; its frame ``LOST`` has no pictures but one, and its cameras are said to expose 100 ms apart."""
     folder = tmp_path_factory.mktemp("film") / "anna"
     person = Person(model, 0.8 * np.random.default_rng(4).standard_normal(len(model.modes)), 3)
     rig, preset = work_rig(default_layout().subset(CAMERAS), PIXELS), replace(CLEAN, noise=0.005, plates=2)
     simulate_sequence(folder, person, rig, preset, FRAMES, renderer=renderer, report=lambda stage, share: None)
     for name in CAMERAS[1:]:
         (folder / "images" / name / f"{LOST:05}.png").unlink()
+    later = {name: {"mean_ms": 25.0 * number - 50.0} for number, name in enumerate(CAMERAS)}
+    (folder / "clock.json").write_text(json.dumps({"cameras": later}))
     return folder
 
 
@@ -64,11 +66,11 @@ def done(film: Path, few: Any, tmp_path_factory: pytest.TempPathFactory) -> tupl
     return out, run(film, out)
 
 
-def test_every_frame_has_the_heads_pose(done: tuple[Path, dict[str, Any]], film: Path) -> None:
+def test_every_frame_has_the_heads_pose(done: tuple[Path, dict[str, Any]], film: Path, model: HeadModel) -> None:
     out, document = done
     assert document == json.loads((out / "report.json").read_text())
     assert document["failed"] == [f"{LOST:05}"]
-    assert [each["code"] for each in document["warnings"]] == ["sequence-frames-failed"]
+    assert [each["code"] for each in document["warnings"]] == ["sequence-frames-failed", "sequence-skewed"]
     with np.load(out / "sequence.npz") as found, np.load(film.with_name("anna.truth") / "truth.npz") as truth:
         assert found["frames"].tolist() == [f"{k:05}" for k in range(FRAMES)]
         assert np.flatnonzero(found["failed"]).tolist() == [LOST]
@@ -78,6 +80,9 @@ def test_every_frame_has_the_heads_pose(done: tuple[Path, dict[str, Any]], film:
         turn = np.degrees(vector_from_rotation(truth["rotations"][-1] @ truth["rotations"][0].T))
         jaw = [list(each["expressions"]).index("jawOpen") for each in (found, truth)]
         weights = found["weights"][:, jaw[0]], truth["weights"][:, jaw[1]]
+        marks = truth["vertices"][:, list(model.landmarks.values())]
+        moved_mm = 0.1 * FPS * np.linalg.norm(np.gradient(marks, axis=0), axis=2).mean(axis=1)
+        assert found["skew_mm"].mean() == pytest.approx(moved_mm.mean(), rel=0.25)
         spread = found["pose_deviations"]
         assert (spread[LOST] > np.minimum(spread[LOST - 1], spread[LOST + 1])).all()
     assert np.linalg.norm(turn) > 2.0  # else the test shows nothing
@@ -148,9 +153,11 @@ def test_what_is_wrong_with_a_folder_is_said(film: Path, tmp_path: Path) -> None
         open_footage(tmp_path)
     for name in CAMERAS[1:]:
         shutil.copytree(film / "images" / name, tmp_path / "images" / name)
-    (tmp_path / "times.csv").write_text("frame,time_s\n00000,0.0\n")
-    with pytest.raises(InputError, match=r"times\.csv"):
-        open_footage(tmp_path)
+    for name, text in (("times.csv", "frame,time_s\n00000,0.0\n"), ("clock.json", '{"cameras": {}}')):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=name.replace(".", r"\.")):
+            open_footage(tmp_path)
+        (tmp_path / name).unlink()
 
 
 def test_the_studio_films_a_subject_over_an_earlier_capture(tmp_path: Path, model: HeadModel) -> None:
