@@ -32,7 +32,6 @@ from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import vertex_areas
-from pipeline.multiview.visual_hull import visual_hull
 from pipeline.reconstruct import fit_shape
 from pipeline.segmentation.segment import segment
 from pipeline.settings import Settings, document_from_settings
@@ -59,6 +58,7 @@ from rig.studio.sensor.preset import PRESET, Preset
 from tests.laboratory.experiments.paper.span import weighted_quantile
 from tests.laboratory.experiments.records import Bench, Outcome, Row
 from tests.laboratory.experiments.surface.visible_surface import read_visible
+from tests.laboratory.experiments.visual_hull import visual_hull
 
 Level = Literal["span", "kernel", "photo"]
 LEVELS: tuple[Level, ...] = ("span", "kernel", "photo")

@@ -27,7 +27,7 @@ import numpy as np
 
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.visual_hull import hull_extent, visual_hull
+from pipeline.multiview.visual_hull import hull_extent
 from pipeline.reconstruct import reconstruct
 from pipeline.segmentation.segment import segment
 from pipeline.settings import Settings
@@ -44,6 +44,7 @@ from tests.laboratory.experiments.paper.detail import Known, every_level, read_k
 from tests.laboratory.experiments.peers.openmvs import PeerFailed, programs_in, surface_by_openmvs
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.visible_surface import score_visible
+from tests.laboratory.experiments.visual_hull import visual_hull
 
 POISSON_DEPTH = 9  # of its octree: cells of 1 to 1.5 mm about a bust
 SURE_MM = 1.0  # points with a larger deviation stay out
