@@ -11,7 +11,6 @@ import asyncio
 import json
 import threading
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypedDict, cast
 
@@ -138,7 +137,7 @@ def checks(who: Reader, capture_id: str) -> Response:
 @pages.get("/console/captures/{capture_id}/holdings")
 def holdings(who: Reader, capture_id: str) -> Response:
     """Returns what removing the capture would take away and what would stay."""
-    return JSONResponse(asdict(who[0].captures.holdings(capture_id)), headers={"Cache-Control": "no-store"})
+    return JSONResponse(who[0].captures.holdings(capture_id).model_dump(), headers={"Cache-Control": "no-store"})
 
 
 @pages.get("/console/captures/{capture_id}/{camera}.image")

@@ -18,7 +18,7 @@ from nicegui.events import GenericEventArguments
 from starlette.responses import RedirectResponse
 
 from rig.errors import InputError
-from rig.messages.message import Message, MessageDocument, compose, documents_of, texts_of
+from rig.messages.message import Message, MessageDocument, compose
 from server.console.head_pictures import draw_first_view, warm_up
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.removal import removals
@@ -28,8 +28,9 @@ from server.problem_types import type_of_failure
 from server.services.bulk import each
 from server.services.health import readiness
 from server.services.keys import Caller
-from server.services.records import Failure
+from server.services.records import JobError
 from server.services.service import Service
+from server.storage.records import JsonObject
 from server.tasks.child import WorkFailed
 from server.wire.problems import Problem, problem_from
 
@@ -372,31 +373,12 @@ def status_of(service: Service, caller: Caller) -> Status | None:
     return {**shown, "local": caller.key == "local"}
 
 
-class ErrorDocument(TypedDict):
-    """Holds why a job failed, as HTTP answers it: English texts, and the same as messages for translation."""
-
-    type: str
-    detail: str
-    errors: list[str]
-    detail_message: MessageDocument
-    error_messages: list[MessageDocument]
-
-
 def shown_detail(detail: Message) -> Message:
     """Returns the message of a refusal as a page shows it: without the advice to send a document again."""
     faults = detail.parameters.get("found")
     return faults if detail.code == "input-unusable" and isinstance(faults, Message) else detail
 
 
-def shown_failure(failure: Failure | None) -> ErrorDocument | None:
+def shown_failure(failure: JobError | None) -> JsonObject | None:
     """Returns the document of a job's failure as a page shows it; None for None."""
-    if failure is None:
-        return None
-    detail = shown_detail(failure.detail)
-    return {
-        "type": failure.type,
-        "detail": detail.text,
-        "errors": texts_of(failure.errors),
-        "detail_message": detail.document(),
-        "error_messages": documents_of(failure.errors),
-    }
+    return failure and failure.model_copy(update={"detail": shown_detail(failure.detail)}).model_dump()

@@ -20,7 +20,7 @@ from rig.errors import InputError
 from rig.formats.captures.archive import ArchiveLimits
 from rig.messages.message import compose
 from server.errors import Conflict, NotFound
-from server.services.erasure import Holdings, erase_captures, holdings
+from server.services.erasure import HoldingsOut, erase_captures, holdings
 from server.services.jobs import Jobs
 from server.services.records import Found
 from server.services.rigs.backend import SHOT_BYTES, RigBackend
@@ -249,7 +249,7 @@ class Captures:
         self.check_unused(identity)
         self._store.remove_capture(identity)
 
-    def holdings(self, identity: str) -> Holdings:
+    def holdings(self, identity: str) -> HoldingsOut:
         """Returns what removing a capture would take away and what would stay. Raises NotFound."""
         return holdings(self._store, self._jobs, identity)
 

@@ -16,7 +16,7 @@ from server.console.pages.rig import read_report
 from server.console.removal import removals
 from server.errors import NotFound
 from server.services.job_rows import STATUSES
-from server.services.records import Job
+from server.services.records import JobOut
 from server.services.service import Service
 from server.storage.job_index import JobQuery
 from server.storage.records import JsonObject
@@ -88,7 +88,7 @@ def heads_of_subject(service: Service, head: JsonObject) -> list[JsonObject]:
     return result_lines(service, service.jobs.of([job for job in done[:SUBJECTS_HEADS] if job not in removals]))
 
 
-def result_lines(service: Service, jobs: Iterable[Job]) -> list[JsonObject]:
+def result_lines(service: Service, jobs: Iterable[JobOut]) -> list[JsonObject]:
     """Converts jobs that have a result to entries of the page's list, with the capture and the subject of each."""
     files = []
     for listed in listed_jobs(service, jobs):
@@ -128,7 +128,7 @@ def head_of(service: Service, job: JsonObject) -> JsonObject:
         "level": None if report is None else report.get("detail", {}).get("level"),
         "model_name": None if report is None else report["model"]["name"],
         "truth": truth.is_file(),
-        "files": {name: file["bytes"] for name, file in files.items() if "/" not in name},
+        "files": {name: file.bytes for name, file in files.items() if "/" not in name},
     }
 
 

@@ -21,7 +21,7 @@ from server.console.removal import removals
 from server.console.work_form import WorkForm, chosen_work
 from server.errors import Conflict, NotFound
 from server.services.captures import CaptureMetadata
-from server.services.records import Calibration
+from server.services.records import CalibrationOut
 from server.services.service import Service
 from server.storage.records import JsonObject
 from server.tasks.simulate import SimulatedSync
@@ -194,7 +194,7 @@ def calibration_in_use(service: Service) -> InUse | None:
     it."""
     if service.calibrations.in_use() is None:
         return None
-    known: list[Calibration] = shared.get("calibrations", 2.0, service.calibrations.find)
+    known: list[CalibrationOut] = shared.get("calibrations", 2.0, service.calibrations.find)
     for camera in known:
         if camera.in_use:
             return {

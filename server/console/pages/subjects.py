@@ -1,7 +1,6 @@
 """The page Subjects: people as cards, each with a picture of the newest head and links to shots and heads."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import TypedDict, cast, get_args
 
 from nicegui import ui
@@ -42,7 +41,7 @@ def subjects_state(service: Service, requested: Mapping[str, str | None]) -> Sub
         requested["find"] or "", order, SHOWN, requested["after"], tag=requested["tag"]
     )
     return {
-        "subjects": [asdict(subject) for subject in subjects.items],
+        "subjects": [subject.model_dump() for subject in subjects.items],
         "tags": shared.get("tags", 1.0, service.captures.tags),
         "next": subjects.next,
         "total": subjects.total,
