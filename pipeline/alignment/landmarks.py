@@ -23,13 +23,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.alignment.feature_points import features_as_wholes, locate_features
-from pipeline.geometry.registration.procrustes import block_diagonal, generalised_procrustes, procrustes
+from pipeline.geometry.registration.procrustes import (
+    block_diagonal,
+    generalised_procrustes,
+    procrustes,
+    rigid_procrustes,
+)
 from pipeline.head_model.landmarks import LANDMARK_NOISE_MM, NAMES, SEVEN_POINTS, mirrored
 from pipeline.head_model.model import HeadModel
 from pipeline.multiview.triangulation import CLICK_NOISE_PX, TriangulatedPoint
 from rig.capture import Features
 from rig.errors import EigenheadError
-from rig.geometry import RigidTransform, Similarity
+from rig.geometry import Similarity
 from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.rig import Rig
@@ -159,24 +164,18 @@ def consensus(source: Points, target: Points, expected_mm: Float[np.ndarray, " n
         chosen = list(triple)
         if min(flatness(source[chosen]), flatness(target[chosen])) < MIN_TRIANGLE_MM:
             continue
-        fitted = _rigid(source[chosen], target[chosen])
+        fitted = rigid_procrustes(source[chosen], target[chosen])
         squared = ((target - fitted.apply(source)) ** 2).sum(axis=1) / expected_mm**2
         cost = float(np.minimum(squared, OUTLIER_SIGMAS**2).sum())
         if cost < best:
             best, agreed = cost, squared < OUTLIER_SIGMAS**2
             agreed[chosen] = True
     for _ in range(3) if agreed is not None else ():
-        fitted = _rigid(source[agreed], target[agreed])
+        fitted = rigid_procrustes(source[agreed], target[agreed])
         near = ((target - fitted.apply(source)) ** 2).sum(axis=1) < (OUTLIER_SIGMAS * expected_mm) ** 2
         if near.sum() >= MIN_POINTS and flatness(source[near]) >= MIN_TRIANGLE_MM:
             agreed = near
     return agreed
-
-
-def _rigid(source: Points, target: Points) -> RigidTransform:
-    # Scale stays 1 here: three points fit too well when they may also shrink.
-    fitted = procrustes(source, target)
-    return RigidTransform(fitted.rotation, target.mean(axis=0) - fitted.rotation @ source.mean(axis=0))
 
 
 def flatness(points: Points) -> float:

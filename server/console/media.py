@@ -201,7 +201,7 @@ def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Li
     path = result_folder(who[0], job_id) / f"{surface}.ply"
     if not path.is_file():
         raise NotFound(compose("thing-surface"), surface)
-    return _floats(comparison.ply_property(path, name))
+    return _floats(comparison.vertex_numbers(path, name))
 
 
 @pages.get("/console/jobs/{job_id}/portrait.jpg")

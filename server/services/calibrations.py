@@ -19,6 +19,7 @@ from typing import cast
 from dbos import DBOSClient, EnqueueOptions, WorkflowStatus
 
 from rig.atomic_write import write_atomically
+from rig.digest import sha256_of
 from rig.errors import InputError
 from rig.messages.message import Message, compose, read_message
 from server.errors import Conflict, NotFound
@@ -28,7 +29,6 @@ from server.services.records import CalibrationOut
 from server.services.texts import check_texts
 from server.storage.events import EventLog
 from server.storage.folders import move_durably
-from server.storage.objects import sha256_of
 from server.storage.records import CALIBRATION, CalibrationOutcome, CalibrationRecord, EventDocument
 from server.storage.store import Store, StoredFile, new_id
 from server.tasks.calibrate import BOARD, check_scale, is_of_board

@@ -13,8 +13,9 @@ from tempfile import TemporaryDirectory
 
 import structlog
 
+from rig.digest import sha256_of
 from server.errors import Refused
-from server.storage.objects import ObjectMissing, ObjectStore, sha256_of
+from server.storage.objects import ObjectMissing, ObjectStore
 from server.storage.store import is_id
 
 OWNER = "owner"

@@ -18,12 +18,13 @@ from pathlib import Path
 import sqlalchemy as sa
 import structlog
 
+from rig.digest import sha256_of
 from rig.messages.message import compose
 from server.errors import Conflict
 from server.settings import ServiceSettings
 from server.storage.database import blobs, capture_files, capture_index
 from server.storage.object_places import open_objects
-from server.storage.objects import Admission, ObjectMissing, StoreDenied, StoreUnavailable, sha256_of
+from server.storage.objects import Admission, ObjectMissing, StoreDenied, StoreUnavailable
 from server.storage.watched_objects import WatchedObjects
 
 NAME = re.compile(r"[0-9a-f]{64}-[0-9a-f]{16}")

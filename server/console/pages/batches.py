@@ -4,12 +4,9 @@ sheet."""
 from collections.abc import Callable, Mapping
 from typing import TypedDict, cast, get_args
 
-from nicegui import ui
-from starlette.responses import RedirectResponse
-
 from rig.messages.message import Message, MessageDocument, compose, documents_of
 from server.batch.table import has_parquet
-from server.console.page import Action, Chosen, Page, shared, show
+from server.console.page import Action, Chosen, Page, serve_page, shared
 from server.console.pages.jobs import listed_jobs
 from server.services.batches import BatchRequest, Selection
 from server.services.job_rows import STATUSES
@@ -130,7 +127,4 @@ BatchesPage.actions = {
 }
 
 
-@ui.page("/batches")
-async def batches_page(batch: str = "", find: str = "", state: str = "") -> RedirectResponse | None:
-    """Serves the page Batches. ``batch`` selects a batch; ``find`` and ``state`` restrict the list."""
-    return await show("batches", BatchesPage, batch=batch, find=find, state=state)
+serve_page("batches", BatchesPage, asked=("batch", "find", "state"), paths=("/batches",))

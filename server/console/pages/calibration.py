@@ -4,13 +4,10 @@ import threading
 from collections.abc import Mapping
 from typing import NotRequired, TypedDict
 
-from nicegui import ui
-from starlette.responses import RedirectResponse
-
 from rig.errors import InputError
 from rig.messages.message import Message, MessageDocument, compose
 from server.console.coverage import Corners, Coverage, advice, detect_shot, summary
-from server.console.page import Action, Chosen, Page, remove_later, shared, show, shown_failure
+from server.console.page import Action, Chosen, Page, remove_later, serve_page, shared, shown_failure
 from server.console.removal import removals
 from server.errors import Conflict, InvalidInput
 from server.services.captures import CaptureMetadata
@@ -226,7 +223,4 @@ CalibrationPage.actions = {
 }
 
 
-@ui.page("/calibration")
-async def calibration_page(calibration: str = "") -> RedirectResponse | None:
-    """Serves the page Calibration. ``calibration`` selects one."""
-    return await show("calibration", CalibrationPage, calibration=calibration)
+serve_page("calibration", CalibrationPage, asked=("calibration",), paths=("/calibration",))

@@ -5,16 +5,23 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NotRequired, TypedDict, cast, get_args
 
-from nicegui import ui
-from starlette.responses import RedirectResponse
-
 from pipeline.head_model.model_names import list_models
 from rig.errors import InputError
 from rig.messages.message import Message, MessageDocument, compose
-from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show, shown_failure
+from server.console.page import (
+    Action,
+    Chosen,
+    Page,
+    remove_all_later,
+    remove_later,
+    said_unless_refused,
+    serve_page,
+    shared,
+    shown_failure,
+)
 from server.console.pages.rig import read_report
 from server.console.removal import removals
-from server.errors import Conflict, InvalidInput
+from server.errors import Conflict
 from server.services.bulk import each
 from server.services.job_rows import FINISHED, STATUSES
 from server.services.records import JobOut
@@ -258,10 +265,7 @@ def bulk(page: Page, event: BulkForm) -> Message:
     shared.forget("jobs")
     count = len(done.done)
     said = compose("jobs-cancelled", count=count) if action == "cancel" else compose("jobs-queued-again", count=count)
-    if done.refused:
-        faults = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
-        raise InvalidInput("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
-    return said
+    return said_unless_refused(said, done)
 
 
 JobsPage.actions = {
@@ -272,9 +276,4 @@ JobsPage.actions = {
 }
 
 
-@ui.page("/jobs")
-async def jobs_page(
-    job: str = "", find: str = "", state: str = "", sort: str = "", batch: str = ""
-) -> RedirectResponse | None:
-    """Serves the page Jobs. ``job`` selects one; the other parameters restrict or order the list."""
-    return await show("jobs", JobsPage, job=job, find=find, state=state, sort=sort, batch=batch)
+serve_page("jobs", JobsPage, asked=("job", "find", "state", "sort", "batch"), paths=("/jobs",))

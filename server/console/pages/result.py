@@ -5,12 +5,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypedDict
 
-from nicegui import ui
 from nicegui.elements import scene
-from starlette.responses import RedirectResponse
 
 from pipeline.results.report_types import Report
-from server.console.page import Page, shared, show
+from server.console.page import Page, serve_page, shared
 from server.console.pages.jobs import ListedJob, listed_jobs
 from server.console.pages.rig import read_report
 from server.console.removal import removals
@@ -141,8 +139,4 @@ def clear_residuals(report: Report) -> list[float]:
     return [residual for residual in residuals if residual is not None]
 
 
-@ui.page("/result")
-@ui.page("/result/{job}")
-async def result_page(job: str = "", find: str = "") -> RedirectResponse | None:
-    """Serves the page Result. ``job`` selects a head, ``find`` searches for others."""
-    return await show("result", ResultPage, job=job or None, find=find)
+serve_page("result", ResultPage, asked=("job", "find"), paths=("/result", "/result/{job}"))

@@ -6,16 +6,13 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import TypedDict, cast
 
-from nicegui import ui
-from starlette.responses import RedirectResponse
-
 from pipeline.results.report_types import Report
 from rig.acquisition.plates import PlatesVersion
 from rig.acquisition.shot import CameraSyncDocument
 from rig.messages.message import Message, MessageDocument, compose, documents_of
 from server.console.capture_lines import capture_line, sessions_list, sync_of
 from server.console.media import live_view
-from server.console.page import Action, Chosen, Page, shared, show, shown_detail
+from server.console.page import Action, Chosen, Page, serve_page, shared, shown_detail
 from server.console.pages.captures import SessionEditForm, SessionForm, discard, edit_consent, new_session
 from server.console.removal import removals
 from server.console.work_form import WorkForm, chosen_work
@@ -305,7 +302,4 @@ RigPage.actions = {
 }
 
 
-@ui.page("/")
-async def rig_page(job: str = "", shot: str = "") -> RedirectResponse | None:
-    """Serves the page of the rig. ``job`` and ``shot`` are shown as if they had been started here."""
-    return await show("rig", RigPage, job=job or None, shot=shot or None)
+serve_page("rig", RigPage, asked=("job", "shot"), paths=("/",))

@@ -3,13 +3,11 @@
 from datetime import UTC, datetime
 from typing import TypedDict
 
-from nicegui import ui
 from nicegui.events import GenericEventArguments
-from starlette.responses import RedirectResponse
 
 from rig.errors import InputError
 from rig.messages.message import Message, MessageDocument, compose
-from server.console.page import Action, Chosen, Page, remove_all_later, shared, show
+from server.console.page import Action, Chosen, Page, remove_all_later, serve_page, shared
 from server.errors import Conflict
 from server.services.keys import LOCAL, SCOPES, Caller
 from server.services.retention import clear_caches, sweep, upcoming
@@ -210,7 +208,4 @@ ServicePage.actions = {
 }
 
 
-@ui.page("/service")
-async def service_page() -> RedirectResponse | None:
-    """Serves the page about the service itself."""
-    return await show("service", ServicePage)
+serve_page("service", ServicePage, paths=("/service",))

@@ -3,11 +3,8 @@
 from collections.abc import Mapping
 from typing import TypedDict, cast, get_args
 
-from nicegui import ui
-from starlette.responses import RedirectResponse
-
 from rig.messages.message import Message
-from server.console.page import Action, Page, shared, show
+from server.console.page import Action, Page, serve_page, shared
 from server.console.pages.captures import SessionForm, new_session
 from server.services.service import Service
 from server.storage.library import SubjectOrder
@@ -58,7 +55,4 @@ def begin(page: Page, event: SessionForm) -> Message:
 SubjectsPage.actions = {"new_session": Action("capture", begin)}
 
 
-@ui.page("/subjects")
-async def subjects_page(find: str = "", tag: str = "", sort: str = "") -> RedirectResponse | None:
-    """Serves the page Subjects. ``find`` and ``tag`` restrict the list, ``sort`` orders it."""
-    return await show("subjects", SubjectsPage, find=find, tag=tag, sort=sort)
+serve_page("subjects", SubjectsPage, asked=("find", "tag", "sort"), paths=("/subjects",))

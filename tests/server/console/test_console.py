@@ -23,8 +23,7 @@ from rig.messages.message import compose, verbatim
 from rig.rig import Rig
 from server.console import comparison, coverage, guides, live
 from server.console.identity import cookie_secret, is_foreign, is_rebound
-from server.console.live import look_bytes
-from server.console.live_frame import LiveFrame
+from server.console.live import LiveFrame, look_bytes
 from server.console.mount import path_below
 from server.console.pages.jobs import SettingsForm, chosen_settings, log_lines
 from server.console.removal import Removals
@@ -175,9 +174,9 @@ def test_quality_and_distance_come_in_the_order_of_the_vertices(tmp_path: Path) 
     mesh = grid()
     quality = np.linspace(0.1, 3.0, len(mesh.vertices))
     mine = write_head(tmp_path / "mine", mesh, quality)
-    np.testing.assert_array_equal(comparison.ply_property(mine / "head.ply", "quality"), quality.astype(np.float32))
+    np.testing.assert_array_equal(comparison.vertex_numbers(mine / "head.ply", "quality"), quality.astype(np.float32))
     with pytest.raises(NotFound):
-        comparison.ply_property(mine / "head.ply", "curvature")
+        comparison.vertex_numbers(mine / "head.ply", "curvature")
     lifted = Mesh(mesh.vertices + [0, 0, 2.5], mesh.faces)
     theirs = write_head(tmp_path / "theirs", lifted, quality)
     np.testing.assert_allclose(comparison.to_surface(mine, theirs / "head.ply"), 2.5, atol=1e-5)
