@@ -12,7 +12,7 @@ Eq. (3) trusts all points alike and takes the subject for the mean head. Step 2 
 covariance of the triangulated point and with the model's covariance of its landmarks: a wide jaw is expected together
 with wide cheeks, and must not turn the head.
 
-The paper's alignment is ``FeatureAlignment.procrustes``.
+The paper's alignment is ``pipeline.geometry.registration.procrustes``.
 """
 
 from collections.abc import Mapping
@@ -72,14 +72,11 @@ class TooFewFeatures(EigenheadError):
 class FeatureAlignment:
     """Holds the pose ``world_from_head`` and the points it was found from.
 
-    ``procrustes`` is the paper's alignment to the same points. ``residuals_mm`` is the distance of every point,
-    outliers too, from the mean head's landmark; ``used`` says whether the point counted.
+    ``used`` says whether a point counted; outliers do not.
     """
 
     world_from_head: Similarity
-    procrustes: Similarity
     points: Mapping[str, TriangulatedPoint]
-    residuals_mm: Mapping[str, float]
     used: Mapping[str, bool]
     remarks: tuple[Message, ...]
 
@@ -112,10 +109,13 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig) -> Feature
         raise TooFewFeatures(points, compose("points-on-line"), remarks)
     if _sides_exchanged(model, names, target, noise, kept):
         raise WrongFeatures(compose("features-sides-exchanged"))
-    procrustes_only = procrustes(source[kept], target[kept])
     rows = np.flatnonzero(np.repeat(kept, 3))
     aligned = generalised_procrustes(
-        source[kept], target[kept], spread[np.ix_(rows, rows)], block_diagonal(noise[kept]), start=procrustes_only
+        source[kept],
+        target[kept],
+        spread[np.ix_(rows, rows)],
+        block_diagonal(noise[kept]),
+        start=procrustes(source[kept], target[kept]),
     )
     distances = np.linalg.norm(target - aligned.apply(source), axis=1)
     remarks += tuple(
@@ -123,9 +123,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig) -> Feature
         for name, distance, keep in zip(names, distances, kept, strict=True)
         if not keep
     )
-    residuals = dict(zip(names, distances.tolist(), strict=True))
-    used = dict(zip(names, kept.tolist(), strict=True))
-    return FeatureAlignment(aligned, procrustes_only, points, residuals, used, remarks)
+    return FeatureAlignment(aligned, points, dict(zip(names, kept.tolist(), strict=True)), remarks)
 
 
 def _sides_exchanged(
