@@ -42,7 +42,7 @@ from rig.render.renderer import Renderer
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.paper.detail import Known, every_level, read_known, surface_error
 from tests.laboratory.experiments.peers.openmvs import PeerFailed, programs_in, surface_by_openmvs
-from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of, means_by
 from tests.laboratory.experiments.surface.visible_surface import score_visible
 from tests.laboratory.experiments.visual_hull import visual_hull
 
@@ -178,12 +178,7 @@ def by_openmvs(shown: Shown, *, programs: Mapping[str, Path]) -> tuple[Mesh, flo
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:
     """Returns the numbers of all rows by name: capture, surface and column joined."""
-    return {
-        f"{row['name']}_{row['peer']}_{key}": value
-        for row in rows
-        for key, value in row.items()
-        if isinstance(value, float)
-    }
+    return means_by([row | {"surface": f"{row['name']}_{row['peer']}"} for row in rows], "surface")
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
