@@ -6,14 +6,13 @@ import struct
 import threading
 import time
 from collections.abc import AsyncIterator
-from typing import NotRequired, TypedDict
 
 import structlog
 
-from rig.acquisition.image_checks import blur_px, exposure
 from rig.image import ImageRgb
-from rig.messages.message import Message, MessageDocument, compose
+from rig.messages.message import Message, compose
 from rig.progress import Progress
+from server.console.live_frame import LiveFrame, measured_frame
 from server.services.live.live import document_of
 from server.services.rigs.backend import PREVIEW_WIDTH, RigBackend, jpeg, reduced
 from server.services.service import Service
@@ -27,34 +26,6 @@ LOOK_S = 0.05
 AGAIN_S = 1.0  # after an error
 
 log = structlog.get_logger()
-
-
-class LiveFrame(TypedDict):
-    """Holds a camera's picture as a JPEG file (None: it delivers none) and what was measured on it: ``mean`` (0 to
-    255), share of ``clipped`` pixels, ``blur_px``."""
-
-    name: str
-    jpeg: bytes | None
-    mean: NotRequired[float]
-    clipped: NotRequired[float]
-    blur_px: NotRequired[float | None]
-    fault: NotRequired[MessageDocument]
-
-
-def measured_frame(name: str, picture: ImageRgb, data: bytes, large: ImageRgb | None) -> LiveFrame:
-    """Returns a camera's frame: ``data`` is its ``picture`` as a JPEG file, and in ``large``, the picture in full size,
-    its sharpness is measured."""
-    level = exposure(picture)
-    frame: LiveFrame = {
-        "name": name,
-        "mean": round(level.mean, 1),
-        "clipped": round(level.clipped_share, 4),
-        "jpeg": data,
-    }
-    if large is not None:
-        blur = blur_px(large)
-        frame["blur_px"] = None if blur is None else round(blur, 2)
-    return frame
 
 
 class StudioSource:

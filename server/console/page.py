@@ -307,13 +307,13 @@ async def signed_in() -> Caller | None:
     return await anyio.to_thread.run_sync(caller_of, service_of_pages(), stored, limiter=_threads)
 
 
-def serve_page(name: str, page: type[Page], *, paths: Sequence[str], asked: Sequence[str] = ()) -> None:
-    """Serves ``page`` at its paths. What an address says of the names ``asked``, behind its ``?`` or in a path's
+def serve_page(name: str, page: type[Page], *, paths: Sequence[str], choices: Sequence[str] = ()) -> None:
+    """Serves ``page`` at its paths. What an address says of the names ``choices``, behind its ``?`` or in a path's
     braces, is the page's first choice: what is selected, searched, and in which order."""
 
     async def serve(request: Request) -> RedirectResponse | None:
         said = {**request.query_params, **request.path_params}
-        return await show(name, page, **{key: said.get(key) or None for key in asked})
+        return await show(name, page, **{key: said.get(key) or None for key in choices})
 
     for path in paths:
         ui.page(path)(serve)

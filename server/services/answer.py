@@ -45,7 +45,7 @@ class MessageOut(BaseModel):
 
 
 class Answer(BaseModel):
-    """The base of all documents of the service. It also reads its fields from a record that has the same fields."""
+    """Declares what all documents of the service share: they also read their fields from a record that has the same."""
 
     model_config = ConfigDict(frozen=True, from_attributes=True)
 

@@ -12,7 +12,6 @@ import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import cast
 
@@ -25,7 +24,7 @@ from rig.messages.message import Message, compose, read_message
 from server.errors import Conflict, NotFound
 from server.services.failures import failure
 from server.services.job_rows import APPLICATION_VERSION, FINISHED, STATES
-from server.services.records import CalibrationOut
+from server.services.records import CalibrationOut, moment_now
 from server.services.texts import check_texts
 from server.storage.events import EventLog
 from server.storage.folders import move_durably
@@ -51,9 +50,8 @@ class Calibrations:
         check_texts({"label": label})
         identity = new_id()
         cameras = {path.name: len(list(path.iterdir())) for path in sorted((folder / "images").iterdir())}
-        created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         kind = "board" if is_of_board(folder) else "scene"
-        record = CALIBRATION.document(CalibrationRecord(identity, created, source, label, cameras, kind))
+        record = CALIBRATION.document(CalibrationRecord(identity, moment_now(), source, label, cameras, kind))
         write_atomically(folder / "record.json", json.dumps(record, indent=1).encode())
         move_durably(folder, self._store.folder("calibrations", identity))
         self._client.enqueue(self._options(identity), identity)

@@ -41,7 +41,7 @@ from server.services.webhooks import messages_of
 from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
-from server.storage.database import alive_workers, workers
+from server.storage.database import alive_workers, portions, workers
 from server.storage.events import EventLog, JobEvent
 from server.storage.job_index import JobIndex, JobQuery
 from server.storage.library import Library
@@ -262,7 +262,7 @@ class Jobs:
     def orphans(self) -> list[str]:
         """Lists folders of results that no job of the database has made: the database is another one, or was lost."""
         there = [job_id for job_id in self._store.ids("jobs") if self._result(job_id).is_dir()]
-        known = {job_id for at in range(0, len(there), 500) for job_id in self.index.known(there[at : at + 500])}
+        known = {job_id for some in portions(there) for job_id in self.index.known(some)}
         return [job_id for job_id in there if job_id not in known]
 
     def _result(self, job_id: str) -> Path:

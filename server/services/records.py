@@ -1,5 +1,6 @@
 """Declares the documents of jobs, batches, sessions, calibrations, the rig and webhooks."""
 
+import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Generic, Literal, TypeVar
@@ -216,6 +217,11 @@ class NewWebhookOut(WebhookOut):
     secret: str = Field(description="shown this once; signs the messages (standardwebhooks.com)")
 
 
-def moment_of(milliseconds: int) -> str:
+def moment_now() -> str:
+    """Returns the time as ``moment_of`` writes it."""
+    return moment_of(1000.0 * time.time())
+
+
+def moment_of(milliseconds: float) -> str:
     """Formats a time in milliseconds since 1970 as ISO 8601 in UTC, such as 2026-01-31T12:00:00.000Z."""
     return datetime.fromtimestamp(milliseconds / 1000, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -23,6 +23,7 @@ from server.errors import NotFound
 from server.services.answer import Answer, Moment
 from server.services.deliveries import UNDER_WAY
 from server.services.job_rows import DELIVERY, FINISHED, STATUSES
+from server.services.records import moment_now, moment_of
 from server.services.service import CheckOut, Service
 from server.services.stored_captures import collect_unclaimed, tend_captures
 from server.storage.database import database_identity
@@ -132,7 +133,7 @@ def _jobs_next(service: Service, limit: int) -> list[UpcomingOut]:
     for place, job in enumerate(page.items):
         many = s.keep_jobs is not None and page.total - place > s.keep_jobs
         if full or many:
-            goes, why = _moment(time.time()), "keep_jobs" if many else "make_room"
+            goes, why = moment_now(), "keep_jobs" if many else "make_room"
         elif s.keep_results_days is not None:
             goes, why = _later(job.finished or job.created, s.keep_results_days), "keep_results_days"
         elif s.make_room or s.keep_jobs is not None:
@@ -156,11 +157,7 @@ def _captures_next(service: Service, limit: int) -> list[UpcomingOut]:
 
 
 def _later(moment: str | None, days: float) -> str | None:
-    return None if moment is None else _moment(datetime.fromisoformat(moment).timestamp() + days * DAY_S)
-
-
-def _moment(at: float) -> str:
-    return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return None if moment is None else moment_of(1000.0 * (datetime.fromisoformat(moment).timestamp() + days * DAY_S))
 
 
 def _jobs(service: Service) -> int:

@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
-from datetime import UTC, datetime
 
 from server.errors import NotFound
 from server.services.erasure import erase_captures
 from server.services.jobs import Jobs
-from server.services.records import Found, PersonOut, SessionOut
+from server.services.records import Found, PersonOut, SessionOut, moment_now
 from server.services.texts import check_texts
 from server.storage.library import Library, SubjectOrder, subject_of
 from server.storage.records import SessionRecord
@@ -25,8 +24,7 @@ class Sessions:
         """Makes a session and returns it. ``consent`` is the note of the subject's consent, empty if there is none.
         Raises InputError for invalid texts."""
         check_texts({"label": label, "consent": consent})
-        created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        record = SessionRecord(new_id(), created, label, consent)
+        record = SessionRecord(new_id(), moment_now(), label, consent)
         self._store.add_session(record)
         return _with_captures(record, [])
 

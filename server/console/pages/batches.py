@@ -127,4 +127,4 @@ BatchesPage.actions = {
 }
 
 
-serve_page("batches", BatchesPage, asked=("batch", "find", "state"), paths=("/batches",))
+serve_page("batches", BatchesPage, choices=("batch", "find", "state"), paths=("/batches",))

@@ -223,4 +223,4 @@ CalibrationPage.actions = {
 }
 
 
-serve_page("calibration", CalibrationPage, asked=("calibration",), paths=("/calibration",))
+serve_page("calibration", CalibrationPage, choices=("calibration",), paths=("/calibration",))

@@ -248,5 +248,5 @@ CapturesPage.actions = {
 
 
 serve_page(
-    "captures", CapturesPage, asked=("capture", "find", "session", "verdict", "tag", "sort"), paths=("/captures",)
+    "captures", CapturesPage, choices=("capture", "find", "session", "verdict", "tag", "sort"), paths=("/captures",)
 )

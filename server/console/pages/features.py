@@ -304,7 +304,7 @@ FeaturesPage.actions = {
 }
 
 
-serve_page("features", FeaturesPage, asked=("capture",), paths=("/features", "/features/{capture}"))
+serve_page("features", FeaturesPage, choices=("capture",), paths=("/features", "/features/{capture}"))
 
 
 def open_suggestions(suggested: PixelsOfPoints, points: PixelsOfPoints) -> PixelsOfPoints:

@@ -276,4 +276,4 @@ JobsPage.actions = {
 }
 
 
-serve_page("jobs", JobsPage, asked=("job", "find", "state", "sort", "batch"), paths=("/jobs",))
+serve_page("jobs", JobsPage, choices=("job", "find", "state", "sort", "batch"), paths=("/jobs",))

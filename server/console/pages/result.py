@@ -139,4 +139,4 @@ def clear_residuals(report: Report) -> list[float]:
     return [residual for residual in residuals if residual is not None]
 
 
-serve_page("result", ResultPage, asked=("job", "find"), paths=("/result", "/result/{job}"))
+serve_page("result", ResultPage, choices=("job", "find"), paths=("/result", "/result/{job}"))

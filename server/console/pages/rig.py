@@ -302,4 +302,4 @@ RigPage.actions = {
 }
 
 
-serve_page("rig", RigPage, asked=("job", "shot"), paths=("/",))
+serve_page("rig", RigPage, choices=("job", "shot"), paths=("/",))

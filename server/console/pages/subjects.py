@@ -55,4 +55,4 @@ def begin(page: Page, event: SessionForm) -> Message:
 SubjectsPage.actions = {"new_session": Action("capture", begin)}
 
 
-serve_page("subjects", SubjectsPage, asked=("find", "tag", "sort"), paths=("/subjects",))
+serve_page("subjects", SubjectsPage, choices=("find", "tag", "sort"), paths=("/subjects",))

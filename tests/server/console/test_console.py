@@ -23,7 +23,8 @@ from rig.messages.message import compose, verbatim
 from rig.rig import Rig
 from server.console import comparison, coverage, guides, live
 from server.console.identity import cookie_secret, is_foreign, is_rebound
-from server.console.live import LiveFrame, look_bytes
+from server.console.live import look_bytes
+from server.console.live_frame import LiveFrame
 from server.console.mount import path_below
 from server.console.pages.jobs import SettingsForm, chosen_settings, log_lines
 from server.console.removal import Removals
