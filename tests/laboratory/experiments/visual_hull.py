@@ -45,7 +45,7 @@ def visual_hull(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Mesh:
     volume = field.reshape((count,) * 3)
     for axis in range(3):  # a closed mesh, also where the images cut the subject off
         np.moveaxis(volume, axis, 0)[[0, -1]] = OUTSIDE_MM
-    near = maximum_filter(volume < 0, 3) & ~minimum_filter(volume < 0, 3)  # nodes of all cells that the surface crosses
+    near = maximum_filter(volume < 0, 3) != minimum_filter(volume < 0, 3)  # nodes of all cells that the surface crosses
     index = np.argwhere(near).astype(np.int32)
-    net = surface_net(volume[near], index, link_nodes(index, (count,) * 3))
+    net = surface_net(volume[near], index, link_nodes(index, (count, count, count)))
     return Mesh(net.vertices * step + corner, net.faces)

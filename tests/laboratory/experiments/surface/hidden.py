@@ -224,9 +224,9 @@ def reached_from_outside(mesh: Mesh) -> Bool[np.ndarray, " v"]:
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:
     """Returns means over the subjects of each group, and over those of all populations together."""
-    pooled = [row | {"group": POOLED[row["group"]]} for row in rows if row["group"] in POOLED]
-    levels = [(f"{row['group']}_{level}", row.get(level, {})) for row in (*rows, *pooled) for level in LEVELS]
-    return means_by([of | {"of": name} for name, of in levels], "of")
+    pooled: list[Row] = [row | {"group": POOLED[row["group"]]} for row in rows if row["group"] in POOLED]
+    every = [row.get(level, {}) | {"of": f"{row['group']}_{level}"} for row in (*rows, *pooled) for level in LEVELS]
+    return means_by(every, "of")
 
 
 def as_markdown(found: Mapping[str, float]) -> str:
