@@ -301,7 +301,6 @@ def _judged(
         rig=rig,
         board=detections.board,
         front=front or rig.front_camera(),
-        pose_covariance=covariance,
         intrinsics_sigma=intrinsics_sigma,
         pose_sigma_px=dict(zip(rig.names, pose_sigma.tolist(), strict=True)),
         misses=_misses(fit),

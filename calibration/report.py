@@ -1,6 +1,5 @@
 """Writes the report of a calibration: one self-contained HTML page, and the same content as JSON."""
 
-import json
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
@@ -27,12 +26,9 @@ tr:nth-child(even) td { background: #f4f5f7 } svg { background: #fbfbfc; border:
 """
 
 
-def write_report(calibration: Calibration, html: Path, document: Path | None = None) -> None:
-    """Writes the page to ``html`` and, unless ``document`` is None, the JSON that ``calibrate --json`` prints to
-    ``document``."""
+def write_report(calibration: Calibration, html: Path) -> None:
+    """Writes the page to ``html``."""
     write_atomically(html, report_page(calibration).encode())
-    if document is not None:
-        write_atomically(document, json.dumps(calibration.document(), indent=1).encode())
 
 
 def report_page(calibration: Calibration) -> str:

@@ -117,9 +117,7 @@ class Calibration:
 
     Attributes:
         rig: the cameras, each with the covariance of its pose.
-        pose_covariance: joint covariance of all poses (left perturbations, rad and mm), the lenses' uncertainty
-            included.
-        pose_sigma_px: its size at the subject, by camera.
+        pose_sigma_px: the size of that covariance at the subject, by camera; the lenses' uncertainty is part of it.
         intrinsics_sigma: standard deviations of fx fy cx cy k1 k2 p1 p2 k3, by camera.
         misses: for each camera and shot, the used corners' numbers, pixels, and projected less detected pixels.
     """
@@ -127,7 +125,6 @@ class Calibration:
     rig: Rig
     board: Board
     front: str
-    pose_covariance: Float[np.ndarray, "p p"]
     intrinsics_sigma: dict[str, Float[np.ndarray, " 9"]]
     pose_sigma_px: dict[str, float]
     misses: dict[tuple[str, str], tuple[np.ndarray, np.ndarray, np.ndarray]]

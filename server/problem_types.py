@@ -209,7 +209,6 @@ FAILURE_TYPES = {
     "ExchangedPictures": "exchanged-pictures",
     "ImageTooLarge": "image-too-large",
     "ImplausibleResult": "implausible-result",
-    "NoHull": "no-hull",
     "NoLandmarkMap": "no-landmark-map",
     "NoLayout": "no-layout",
     "NoPoint": "no-point",

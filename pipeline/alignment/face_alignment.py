@@ -28,12 +28,10 @@ FORGIVEN_SIGMAS = 2.5  # a residual of that many deviations has twice its varian
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceAlignment:
-    """Holds the pose of the mean head on a face and the landmarks it was fitted to. ``rms_sigmas``: RMS distance
-    between the landmarks and the mean head, in expected standard deviations."""
+    """Holds the pose of the mean head on a face and the landmarks it was fitted to."""
 
     world_from_head: Similarity
     landmarks: LandmarkObservations
-    rms_sigmas: float
 
 
 def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> FaceAlignment:
@@ -47,7 +45,7 @@ def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> 
     target, point_covariances = face.points_world[which], face.covariances[which]
     source = mean + places.offset_mm[which]
     expected = np.diag(idea + shape).reshape(-1, 3).sum(axis=1) + point_covariances.trace(axis1=1, axis2=2)
-    pose, squares = procrustes(source, target, 1.0 / expected), np.zeros(len(which))
+    pose = procrustes(source, target, 1.0 / expected)
     noise = np.zeros_like(idea)
     for _ in range(ROUNDS):
         squares = ((target - pose.apply(source)) ** 2).sum(axis=1) / expected
@@ -61,7 +59,7 @@ def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> 
     position = target - pose.scale * places.offset_mm[which] @ pose.rotation.T
     covariance = noise + turn @ idea @ turn.T
     landmarks = observe_landmarks(model, places.rows[which], places.weights[which], position, covariance)
-    return FaceAlignment(pose, landmarks, float(np.sqrt(squares.mean())))
+    return FaceAlignment(pose, landmarks)
 
 
 def spread_points(places: LandmarkMap) -> Int[np.ndarray, " n"]:

@@ -12,7 +12,7 @@ Eq. (3) trusts all points alike and takes the subject for the mean head. Step 2 
 covariance of the triangulated point and with the model's covariance of its landmarks: a wide jaw is expected together
 with wide cheeks, and must not turn the head.
 
-The paper's alignment is ``FeatureAlignment.procrustes``.
+The paper's alignment is ``pipeline.geometry.registration.procrustes``.
 """
 
 from collections.abc import Mapping
@@ -23,13 +23,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.alignment.feature_points import features_as_wholes, locate_features
-from pipeline.geometry.registration.procrustes import block_diagonal, generalised_procrustes, procrustes
+from pipeline.geometry.registration.procrustes import (
+    block_diagonal,
+    generalised_procrustes,
+    procrustes,
+    rigid_procrustes,
+)
 from pipeline.head_model.landmarks import LANDMARK_NOISE_MM, NAMES, SEVEN_POINTS, mirrored
 from pipeline.head_model.model import HeadModel
 from pipeline.multiview.triangulation import CLICK_NOISE_PX, TriangulatedPoint
 from rig.capture import Features
 from rig.errors import EigenheadError
-from rig.geometry import RigidTransform, Similarity
+from rig.geometry import Similarity
 from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.rig import Rig
@@ -67,14 +72,11 @@ class TooFewFeatures(EigenheadError):
 class FeatureAlignment:
     """Holds the pose ``world_from_head`` and the points it was found from.
 
-    ``procrustes`` is the paper's alignment to the same points. ``residuals_mm`` is the distance of every point,
-    outliers too, from the mean head's landmark; ``used`` says whether the point counted.
+    ``used`` says whether a point counted; outliers do not.
     """
 
     world_from_head: Similarity
-    procrustes: Similarity
     points: Mapping[str, TriangulatedPoint]
-    residuals_mm: Mapping[str, float]
     used: Mapping[str, bool]
     remarks: tuple[Message, ...]
 
@@ -107,10 +109,13 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig) -> Feature
         raise TooFewFeatures(points, compose("points-on-line"), remarks)
     if _sides_exchanged(model, names, target, noise, kept):
         raise WrongFeatures(compose("features-sides-exchanged"))
-    procrustes_only = procrustes(source[kept], target[kept])
     rows = np.flatnonzero(np.repeat(kept, 3))
     aligned = generalised_procrustes(
-        source[kept], target[kept], spread[np.ix_(rows, rows)], block_diagonal(noise[kept]), start=procrustes_only
+        source[kept],
+        target[kept],
+        spread[np.ix_(rows, rows)],
+        block_diagonal(noise[kept]),
+        start=procrustes(source[kept], target[kept]),
     )
     distances = np.linalg.norm(target - aligned.apply(source), axis=1)
     remarks += tuple(
@@ -118,9 +123,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig) -> Feature
         for name, distance, keep in zip(names, distances, kept, strict=True)
         if not keep
     )
-    residuals = dict(zip(names, distances.tolist(), strict=True))
-    used = dict(zip(names, kept.tolist(), strict=True))
-    return FeatureAlignment(aligned, procrustes_only, points, residuals, used, remarks)
+    return FeatureAlignment(aligned, points, dict(zip(names, kept.tolist(), strict=True)), remarks)
 
 
 def _sides_exchanged(
@@ -159,24 +162,18 @@ def consensus(source: Points, target: Points, expected_mm: Float[np.ndarray, " n
         chosen = list(triple)
         if min(flatness(source[chosen]), flatness(target[chosen])) < MIN_TRIANGLE_MM:
             continue
-        fitted = _rigid(source[chosen], target[chosen])
+        fitted = rigid_procrustes(source[chosen], target[chosen])
         squared = ((target - fitted.apply(source)) ** 2).sum(axis=1) / expected_mm**2
         cost = float(np.minimum(squared, OUTLIER_SIGMAS**2).sum())
         if cost < best:
             best, agreed = cost, squared < OUTLIER_SIGMAS**2
             agreed[chosen] = True
     for _ in range(3) if agreed is not None else ():
-        fitted = _rigid(source[agreed], target[agreed])
+        fitted = rigid_procrustes(source[agreed], target[agreed])
         near = ((target - fitted.apply(source)) ** 2).sum(axis=1) < (OUTLIER_SIGMAS * expected_mm) ** 2
         if near.sum() >= MIN_POINTS and flatness(source[near]) >= MIN_TRIANGLE_MM:
             agreed = near
     return agreed
-
-
-def _rigid(source: Points, target: Points) -> RigidTransform:
-    # Scale stays 1 here: three points fit too well when they may also shrink.
-    fitted = procrustes(source, target)
-    return RigidTransform(fitted.rotation, target.mean(axis=0) - fitted.rotation @ source.mean(axis=0))
 
 
 def flatness(points: Points) -> float:

@@ -44,14 +44,12 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Holds how a search ended. ``predicted_fall``: the fall of the cost predicted for the last step, in squared
-    standard deviations."""
+    """Holds how a search ended."""
 
     termination_reason: Reason
     evaluations: int
     steps: int
     cost: float
-    predicted_fall: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,7 +96,7 @@ def minimise(
     recent, damping, evaluations, predicted = [now.cost], limits.first_damping, 1, np.inf
 
     def ended(reason: Reason) -> Solution[Value]:
-        return Solution(best.value, best.at, Evidence(reason, evaluations, len(recent) - 1, best.cost, predicted))
+        return Solution(best.value, best.at, Evidence(reason, evaluations, len(recent) - 1, best.cost))
 
     for _ in range(limits.steps):
         watch()

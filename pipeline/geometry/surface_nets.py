@@ -2,7 +2,7 @@
 
 Gibson, *Constrained elastic surface nets*, 1998, the naive kind: a vertex in every cell with corners of both signs, at
 the mean of the points where the cell's edges cross zero; and a quadrilateral over every edge with both signs. Enters: a
-field, negative inside, at the nodes of a sparse grid or of a whole volume, positive on the outermost ones. Leaves:
+field, negative inside, at the nodes of a sparse grid, positive on the outermost ones. Leaves:
 vertices in grid steps, triangles facing outwards. The mesh is closed; it is a manifold if the signs are well composed
 (``pipeline.fusion.net_kernels``).
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64
 
-from pipeline.geometry.surface_nets_kernels import linked, net_faces, net_vertices, nodes_about_surface
+from pipeline.geometry.surface_nets_kernels import linked, net_faces, net_vertices
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,14 +52,4 @@ def surface_net(
         neighbours: the result of ``link_nodes``; every cell with both signs must be complete.
     """
     vertices, of_cell = net_vertices(field, index, neighbours)
-    return SurfaceNet(vertices, net_faces(field, neighbours, vertices, of_cell, True), of_cell)
-
-
-def volume_net(field: Float32[np.ndarray, "nx ny nz"]) -> tuple[Float32[np.ndarray, "v 3"], Int32[np.ndarray, "f 3"]]:
-    """Builds the mesh of the zero level in a whole volume; all quadrilaterals are split the same way."""
-    nx, ny, nz = field.shape
-    index = nodes_about_surface(field)
-    neighbours = link_nodes(index, (nx, ny, nz))
-    values = field[tuple(index.T)]
-    vertices, of_cell = net_vertices(values, index, neighbours)
-    return vertices.astype(np.float32), net_faces(values, neighbours, vertices, of_cell, False)
+    return SurfaceNet(vertices, net_faces(field, neighbours, vertices, of_cell), of_cell)

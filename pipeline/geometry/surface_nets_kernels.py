@@ -54,34 +54,6 @@ def linked(index: np.ndarray, keys: np.ndarray, ny: int, nz: int) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def nodes_about_surface(field: np.ndarray) -> np.ndarray:
-    """Returns the positions (n, 3; int32, by rank) of all corners of those cells of a volume that have corners of both
-    signs."""
-    nx, ny, nz = field.shape
-    wanted, count = np.zeros(field.shape, np.bool_), 0
-    for i in range(nx - 1):
-        for j in range(ny - 1):
-            for k in range(nz - 1):
-                inside = 0
-                for c in range(8):
-                    inside += field[i + (c >> 2), j + ((c >> 1) & 1), k + (c & 1)] < 0
-                if inside == 0 or inside == 8:
-                    continue
-                for c in range(8):
-                    a, b, d = i + (c >> 2), j + ((c >> 1) & 1), k + (c & 1)
-                    count += not wanted[a, b, d]
-                    wanted[a, b, d] = True
-    index, made = np.empty((count, 3), np.int32), 0
-    for i in range(nx):
-        for j in range(ny):
-            for k in range(nz):
-                if wanted[i, j, k]:
-                    index[made, 0], index[made, 1], index[made, 2] = i, j, k
-                    made += 1
-    return index
-
-
-@njit(cache=True, nogil=True)
 def net_vertices(field: np.ndarray, index: np.ndarray, neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the vertices (float64, in grid steps) of the surface net: in each cell that the surface crosses, the mean
     of the points where it crosses the cell's edges. Also returns the vertex (int32) of each node's cell, -1 for
@@ -113,15 +85,10 @@ def net_vertices(field: np.ndarray, index: np.ndarray, neighbours: np.ndarray) -
 
 
 @njit(cache=True, nogil=True)
-def net_faces(
-    field: np.ndarray, neighbours: np.ndarray, vertices: np.ndarray, of_cell: np.ndarray, shorter: bool
-) -> np.ndarray:
+def net_faces(field: np.ndarray, neighbours: np.ndarray, vertices: np.ndarray, of_cell: np.ndarray) -> np.ndarray:
     """Returns the triangles (int32, facing outwards) of the surface net: two for every edge of the grid whose ends
-    differ in sign, joining the vertices of the four cells around it.
-
-    The quadrilateral is split along its shorter diagonal if ``shorter``; else along the one from the cell that is
-    lowest in both other axes.
-    """
+    differ in sign, joining the vertices of the four cells around it. The quadrilateral is split along its shorter
+    diagonal."""
     faces = np.empty((6 * len(vertices) + 16, 3), np.int32)
     made = 0
     for n in range(len(field)):
@@ -134,7 +101,7 @@ def net_faces(
             a, b, c, d = of_cell[neighbours[along, second]], of_cell[neighbours[n, second]], of_cell[n], of_cell[along]
             if field[n] >= 0:  # the outside lies towards the low end of the edge
                 b, d = d, b
-            if shorter and _distance2(vertices, a, c) > _distance2(vertices, b, d):
+            if _distance2(vertices, a, c) > _distance2(vertices, b, d):
                 a, b, c, d = b, c, d, a
             faces[made, 0], faces[made, 1], faces[made, 2] = a, b, c
             faces[made + 1, 0], faces[made + 1, 1], faces[made + 1, 2] = a, c, d

@@ -1,10 +1,10 @@
 """Lists the available head models and their files. Loads no model: the command line calls it."""
 
-import hashlib
 from functools import lru_cache
 from pathlib import Path
 
 from pipeline.head_model.data_folder import models_folder
+from rig.digest import sha256_of
 from rig.errors import EigenheadError
 
 PACKS = Path(__file__).parent / "packs"
@@ -61,8 +61,7 @@ def model_sha256(path: Path) -> str:
 
 @lru_cache(maxsize=64)
 def _sha256(path: Path, changed_ns: int, size: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return sha256_of(path)
 
 
 def remove_model(name: str) -> Path:

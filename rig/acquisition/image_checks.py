@@ -31,12 +31,10 @@ _SCALE_MOST = 0.03  # a camera 1.2 m away would have to be moved 36 mm along its
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """Holds the mean value of a picture (0 to 255) and the shares of clipped pixels (every channel 255) and black ones
-    (every channel at most 2)."""
+    """Holds the mean value of a picture (0 to 255) and the share of clipped pixels (every channel 255)."""
 
     mean: float
     clipped_share: float
-    black_share: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +61,10 @@ class Registration:
 
 
 def exposure(image: ImageRgb) -> Exposure:
-    """Measures the mean value of a picture and the shares of clipped and black pixels."""
+    """Measures the mean value of a picture and the share of clipped pixels."""
     red, green, blue = cv2.split(image)
-    low, high = cv2.min(cv2.min(red, green), blue), cv2.max(cv2.max(red, green), blue)
-    clipped, lit = np.count_nonzero(low == 255), np.count_nonzero(high > 2)
-    return Exposure(sum(cv2.mean(image)[:3]) / 3, clipped / low.size, 1 - lit / low.size)
+    low = cv2.min(cv2.min(red, green), blue)
+    return Exposure(sum(cv2.mean(image)[:3]) / 3, np.count_nonzero(low == 255) / low.size)
 
 
 def noise_of(plates: Sequence[ImageRgb]) -> float | None:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
+from rig.digest import sha256_of
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import find_rig_file
 from rig.formats.captures.shot_files import ASIDE, listed_pictures
@@ -251,8 +252,8 @@ def capture_sha256(path: Path) -> str:
     """Computes the SHA-256 of a capture: of an archive's bytes, or of the names and bytes of all files in a folder.
     Raises OSError."""
     if not path.is_dir():
-        return _file_sha256(path)
-    return files_sha256({name: _file_sha256(file) for name, file in _files(path, "", frozenset())})
+        return sha256_of(path)
+    return files_sha256({name: sha256_of(file) for name, file in _files(path, "", frozenset())})
 
 
 def files_sha256(files: Mapping[str, str]) -> str:
@@ -276,8 +277,3 @@ def _files(folder: Path, prefix: str, within: frozenset[tuple[int, int]]) -> Ite
             yield from _files(Path(found.path), f"{prefix}{found.name}/", within | {here})
         elif found.is_file():
             yield f"{prefix}{found.name}", Path(found.path)
-
-
-def _file_sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

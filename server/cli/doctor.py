@@ -16,12 +16,12 @@ from pipeline.compute.threads import THREADS, thread_count
 from pipeline.head_model.data_folder import MODELS, models_folder
 from pipeline.head_model.model_names import model_path
 from rig.cache_folder import CACHE, cache_folder
+from rig.digest import sha256_of
 from rig.errors import EigenheadError
 from rig.text import suggest
 from server.address import is_loopback
 from server.settings import PREFIX, ServiceSettings
 from server.storage.folders import STOPPED
-from server.storage.objects import sha256_of
 from server.tasks.child import Child, WorkFailed
 from server.tasks.egl import try_compute, try_egl
 

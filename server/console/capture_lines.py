@@ -10,7 +10,7 @@ from rig.messages.message import MessageDocument, compose, documents_of
 from server.console.page import shared
 from server.console.removal import removals
 from server.errors import NotFound
-from server.services.records import Session
+from server.services.records import SessionOut
 from server.services.service import Service
 from server.storage.records import CaptureRecord, JsonObject
 from server.tasks.simulate import SimulatedCertificate, SimulatedSync
@@ -101,7 +101,7 @@ def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | Sim
 def sessions_list(service: Service, chosen: str | None = None) -> list[JsonObject]:
     """Returns the newest ``SESSIONS_SHOWN`` sessions, newest first, and the session ``chosen`` even if it is older."""
 
-    def make() -> list[Session]:
+    def make() -> list[SessionOut]:
         return [*service.sessions.page(limit=SESSIONS_SHOWN).items]
 
     sessions = shared.get("sessions", 0.5, make)
@@ -111,6 +111,6 @@ def sessions_list(service: Service, chosen: str | None = None) -> list[JsonObjec
     return [session_line(session) for session in sessions]
 
 
-def session_line(session: Session) -> JsonObject:
+def session_line(session: SessionOut) -> JsonObject:
     """Converts a session to an entry of a list. ``captures`` counts them, without those that are being removed."""
-    return asdict(session) | {"captures": sum(capture not in removals for capture in session.captures)}
+    return session.model_dump() | {"captures": sum(capture not in removals for capture in session.captures)}

@@ -28,7 +28,6 @@ from rig.formats.pictures.images import write_image
 from rig.geometry import RigidTransform, look_at
 from rig.mesh import Mesh, vertex_normals
 from rig.messages.message import compose
-from server.console.comparison import ply_property
 from server.errors import Conflict, NotFound
 from server.services.service import Service
 
@@ -151,12 +150,12 @@ def portrait(result: Path) -> UInt8[np.ndarray, "h w 3"]:
     head_from_world = placed(result)
     head = head_from_world.apply(read_mesh(result / "head.ply").vertices)
     mesh = read_mesh(result / name)
-    colours = np.stack([ply_property(result / name, part) for part in ("red", "green", "blue")], axis=1)
     middle, half = (head.min(axis=0) + head.max(axis=0)) / 2, MARGIN * (head.max(axis=0) - head.min(axis=0)) / 2
     shown = Mesh(head_from_world.apply(mesh.vertices), mesh.faces)
     box = (middle - half, middle + half)
-    rgb = colours.astype(np.uint8)
-    return clay(shown, colours=rgb, azimuth_deg=AZIMUTH_DEG, panel=PANEL, box=box, paper=PAPER, darkest=DARKEST)
+    return clay(
+        shown, colours=mesh.colours, azimuth_deg=AZIMUTH_DEG, panel=PANEL, box=box, paper=PAPER, darkest=DARKEST
+    )
 
 
 def placed(result: Path) -> RigidTransform:

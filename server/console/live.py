@@ -9,11 +9,10 @@ from collections.abc import AsyncIterator
 
 import structlog
 
-from rig.acquisition.image_checks import blur_px, exposure
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 from rig.progress import Progress
-from server.console.live_frame import LiveFrame
+from server.console.live_frame import LiveFrame, measured_frame
 from server.services.live.live import document_of
 from server.services.rigs.backend import PREVIEW_WIDTH, RigBackend, jpeg, reduced
 from server.services.service import Service
@@ -24,6 +23,7 @@ EVERY_S = 0.25  # four looks a second at most
 IDLE_S = 3.0  # without anybody who watches: then nobody looks at the cameras either
 KEEP_S = 300.0  # and so long the studio stays drawn, for the next who comes
 LOOK_S = 0.05
+AGAIN_S = 1.0  # after an error
 
 log = structlog.get_logger()
 
@@ -67,17 +67,7 @@ def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
     if picture is None:
         return {"name": name, "jpeg": None, "fault": compose("camera-shows-nothing").document()}
     small = reduced(picture, PREVIEW_WIDTH)  # a tile is 320 points wide, twice as many pixels on a dense screen
-    level = exposure(small)
-    frame: LiveFrame = {
-        "name": name,
-        "mean": round(level.mean, 1),
-        "clipped": round(level.clipped_share, 4),
-        "jpeg": jpeg(small),
-    }
-    if sharp:
-        blur = blur_px(picture)
-        frame["blur_px"] = None if blur is None else round(blur, 2)
-    return frame
+    return measured_frame(name, small, jpeg(small), picture if sharp else None)
 
 
 class LiveView:
@@ -112,7 +102,7 @@ class LiveView:
                 self._thread.start()
 
     def _look_around(self) -> None:
-        source = StudioSource() if self._service.rig.describe().kind == "simulated" else RigSource(self._service.rig)
+        source: StudioSource | RigSource | None = None
         blur: dict[str, float | None] = {}
         try:
             while True:
@@ -125,26 +115,34 @@ class LiveView:
                     self._latest = (self._latest[0], b"")  # who comes next must not take it for the present
                     time.sleep(LOOK_S)
                     continue
-                self._latest = (self._latest[0] + 1, self._look(source, blur))
+                try:
+                    source = source or self._opened()
+                    message = self._look(source, blur)
+                except Exception as error:  # the rig may come back
+                    problem = problem_from(error)
+                    log.warning("no live view", error=problem.detail.text)
+                    self.fault, message = problem.detail, look_bytes([], problem.detail)
+                    time.sleep(AGAIN_S)
+                self._latest = (self._latest[0] + 1, message)
                 time.sleep(max(0.0, EVERY_S - (time.monotonic() - began)))
         finally:
-            source.close()
+            if source is not None:
+                source.close()
+
+    def _opened(self) -> StudioSource | RigSource:
+        rig = self._service.rig
+        return StudioSource() if rig.describe().kind == "simulated" else RigSource(rig)
 
     def _look(self, source: StudioSource | RigSource, blur: dict[str, float | None]) -> bytes:
         began = time.monotonic()
-        try:
-            frames, self.fault = source.frames(), None
-        except Exception as error:  # the rig may come back
-            problem = problem_from(error)
-            log.warning("no live view", error=problem.detail.text)
-            frames, self.fault = [], problem.detail
-            time.sleep(1.0)
+        frames = source.frames()
         for frame in frames:
             if "blur_px" in frame:
                 blur[frame["name"]] = frame["blur_px"]
             frame["blur_px"] = blur.get(frame["name"])
         shown = self._service.live.offer({f["name"]: data for f in frames if (data := f["jpeg"])}, began)
-        return look_bytes(frames, self.fault, document_of(shown))
+        self.fault = None
+        return look_bytes(frames, None, document_of(shown))
 
 
 def look_bytes(frames: list[LiveFrame], fault: Message | None, head: object = None) -> bytes:

@@ -11,7 +11,6 @@ import asyncio
 import json
 import threading
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypedDict, cast
 
@@ -138,7 +137,7 @@ def checks(who: Reader, capture_id: str) -> Response:
 @pages.get("/console/captures/{capture_id}/holdings")
 def holdings(who: Reader, capture_id: str) -> Response:
     """Returns what removing the capture would take away and what would stay."""
-    return JSONResponse(asdict(who[0].captures.holdings(capture_id)), headers={"Cache-Control": "no-store"})
+    return JSONResponse(who[0].captures.holdings(capture_id).model_dump(), headers={"Cache-Control": "no-store"})
 
 
 @pages.get("/console/captures/{capture_id}/{camera}.image")
@@ -202,7 +201,7 @@ def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Li
     path = result_folder(who[0], job_id) / f"{surface}.ply"
     if not path.is_file():
         raise NotFound(compose("thing-surface"), surface)
-    return _floats(comparison.ply_property(path, name))
+    return _floats(comparison.vertex_numbers(path, name))
 
 
 @pages.get("/console/jobs/{job_id}/portrait.jpg")

@@ -15,21 +15,23 @@ from nicegui import app as pages
 from nicegui import ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
+from starlette.requests import Request
 from starlette.responses import RedirectResponse
 
 from rig.errors import InputError
-from rig.messages.message import Message, MessageDocument, compose, documents_of, texts_of
+from rig.messages.message import Message, MessageDocument, compose
 from server.console.head_pictures import draw_first_view, warm_up
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.removal import removals
 from server.console.theme import Frame, page_frame
-from server.errors import Gone
+from server.errors import Gone, InvalidInput
 from server.problem_types import type_of_failure
-from server.services.bulk import each
+from server.services.bulk import BulkOut, each
 from server.services.health import readiness
 from server.services.keys import Caller
-from server.services.records import Failure
+from server.services.records import JobError
 from server.services.service import Service
+from server.storage.records import JsonObject
 from server.tasks.child import WorkFailed
 from server.wire.problems import Problem, problem_from
 
@@ -278,6 +280,14 @@ def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: M
     shared.clear()
 
 
+def said_unless_refused(said: Message, done: BulkOut) -> Message:
+    """Returns what is said of an action on many things. Raises InvalidInput with the reasons if some were refused."""
+    if done.refused:
+        faults = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
+        raise InvalidInput("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
+    return said
+
+
 def as_problem(error: Exception) -> Problem:
     """Converts an error to the problem that a page shows. An InputError with a single fault is shown as that fault
     alone."""
@@ -295,6 +305,18 @@ async def signed_in() -> Caller | None:
     """Returns the caller who opens the page; None if an API key must be given first."""
     stored = dict(pages.storage.user)
     return await anyio.to_thread.run_sync(caller_of, service_of_pages(), stored, limiter=_threads)
+
+
+def serve_page(name: str, page: type[Page], *, paths: Sequence[str], choices: Sequence[str] = ()) -> None:
+    """Serves ``page`` at its paths. What an address says of the names ``choices``, behind its ``?`` or in a path's
+    braces, is the page's first choice: what is selected, searched, and in which order."""
+
+    async def serve(request: Request) -> RedirectResponse | None:
+        said = {**request.query_params, **request.path_params}
+        return await show(name, page, **{key: said.get(key) or None for key in choices})
+
+    for path in paths:
+        ui.page(path)(serve)
 
 
 async def show(name: str, page: type[Page], **initial: str | None) -> RedirectResponse | None:
@@ -372,31 +394,12 @@ def status_of(service: Service, caller: Caller) -> Status | None:
     return {**shown, "local": caller.key == "local"}
 
 
-class ErrorDocument(TypedDict):
-    """Holds why a job failed, as HTTP answers it: English texts, and the same as messages for translation."""
-
-    type: str
-    detail: str
-    errors: list[str]
-    detail_message: MessageDocument
-    error_messages: list[MessageDocument]
-
-
 def shown_detail(detail: Message) -> Message:
     """Returns the message of a refusal as a page shows it: without the advice to send a document again."""
     faults = detail.parameters.get("found")
     return faults if detail.code == "input-unusable" and isinstance(faults, Message) else detail
 
 
-def shown_failure(failure: Failure | None) -> ErrorDocument | None:
+def shown_failure(failure: JobError | None) -> JsonObject | None:
     """Returns the document of a job's failure as a page shows it; None for None."""
-    if failure is None:
-        return None
-    detail = shown_detail(failure.detail)
-    return {
-        "type": failure.type,
-        "detail": detail.text,
-        "errors": texts_of(failure.errors),
-        "detail_message": detail.document(),
-        "error_messages": documents_of(failure.errors),
-    }
+    return failure and failure.model_copy(update={"detail": shown_detail(failure.detail)}).model_dump()

@@ -10,13 +10,12 @@ import cv2
 import numpy as np
 
 from pipeline.head_model.model import load_model
-from rig.acquisition.image_checks import blur_px, exposure
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import Scene, build_scene, view_light
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.sensor import Sensor, expose
-from server.console.live_frame import LiveFrame
+from server.console.live_frame import LiveFrame, measured_frame
 from server.tasks.child import WorkerContext
 from server.tasks.subjects import drawn_subject
 
@@ -56,16 +55,7 @@ def _frame(
 ) -> LiveFrame:
     sensor, light, small = lit
     picture = expose(small, sensor, rng)
-    level = exposure(picture)
     done, data = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     assert done
-    frame: LiveFrame = {
-        "name": name,
-        "mean": round(level.mean, 1),
-        "clipped": round(level.clipped_share, 4),
-        "jpeg": data.tobytes(),
-    }
-    if sharp:
-        blur = blur_px(expose(light.astype(np.float32), sensor, rng))
-        frame["blur_px"] = None if blur is None else round(blur, 2)
-    return frame
+    large = expose(light.astype(np.float32), sensor, rng) if sharp else None
+    return measured_frame(name, picture, data.tobytes(), large)

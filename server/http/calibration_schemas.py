@@ -4,7 +4,9 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field, model_validator
 
-from server.http.schemas import EXAMPLE_ID, Answer, Id, JobError, MessageOut, Moment, Received, State, Text, Texts
+from server.http.schemas import EXAMPLE_ID, Id, Received, Text
+from server.services.answer import Answer
+from server.services.records import CalibrationOut
 from server.storage.records import JsonObject
 
 
@@ -46,32 +48,6 @@ class UseCalibration(Received):
 
     calibration_id: Id
     poor: bool = Field(False, description="use it although its verdict is poor")
-
-
-class CalibrationOut(Answer):
-    """Describes a calibration: the state of its job and, once it has succeeded, figures, checks and the verdict.
-    ``progress`` runs from 0 to 1; ``eta_s`` is the estimated remaining time in seconds."""
-
-    id: str
-    created: Moment
-    source: Literal["upload", "rig"]
-    label: str
-    pictures: dict[str, int] = Field(description="number of pictures by camera")
-    kind: Literal["board", "scene"] = Field("board", description="what the pictures show")
-    state: State
-    stage: str | None = None
-    progress: float = Field(0.0, ge=0, le=1)
-    eta_s: float | None = None
-    error: JobError | None
-    verdict: Literal["good", "usable", "poor"] | None = Field(None, description="null: not judged")
-    missing: Texts = Field([], description="what would make the verdict better, most urgent first")
-    missing_messages: list[MessageOut] = Field([], validation_alias="missing")
-    figures: JsonObject
-    checks: list[JsonObject]
-    warnings: Texts
-    warning_messages: list[MessageOut] = Field(validation_alias="warnings")
-    front: str | None
-    in_use: bool
 
 
 class CalibrationList(Answer):

@@ -13,10 +13,10 @@ from pydantic import TypeAdapter
 
 from pipeline.settings import SPACING_RANGE_MM, Settings
 from pipeline.warnings import WARNING_CODES
+from server.services.answer import SETTINGS
 from server.storage.records import JsonObject
 from server.wire import problems
 
-SETTINGS = {"type": "object", "title": "Settings"}  # placeholder of settings, until ``_name_settings`` replaces it
 REFERENCE = "#/components/schemas/{model}"
 CHANGES = frozenset({"PUT", "PATCH", "DELETE"})  # methods that If-Match makes conditional
 TEXTUAL = ("application/json", problems.MEDIA_TYPE, "text/")

@@ -1,31 +1,11 @@
 """Defines the JSON documents about the rig, its cameras and clean plates, and about what a capture's pictures show."""
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from server.http.schemas import Answer, MessageOut, Moment, Received, Texts
-
-
-class CameraOut(Answer):
-    """Describes a camera of the rig. ``closed``: not used since the start; ``ready``: simulated."""
-
-    name: str
-    driver: str
-    state: Literal["ready", "open", "closed", "missing"]
-
-
-class RigOut(Answer):
-    """Describes the rig. ``calibration``: ``own`` if it has a calibration, ``studio`` for the simulated studio without
-    one, null for a real rig without one."""
-
-    id: str
-    kind: Literal["simulated", "real"]
-    ready: bool
-    cameras: list[CameraOut]
-    faults: Texts
-    fault_messages: list[MessageOut] = Field(validation_alias="faults")
-    calibration: str | None
+from server.http.schemas import Received
+from server.services.answer import Answer, MessageOut, Moment, Said, as_data
 
 
 class CameraSettingsEdit(Received):
@@ -37,16 +17,6 @@ class CameraSettingsEdit(Received):
     exposure_ms: float | None = Field(None, ge=0.001, le=60_000)
     gain_db: float | None = Field(None, ge=-60, le=60)
     white_balance_k: int | None = Field(None, ge=1000, le=20_000)
-
-
-class CameraSettingsOut(Answer):
-    """Holds the settings requested of a camera (null: the camera decides), and which of them it did not accept."""
-
-    exposure_ms: float | None
-    gain_db: float | None
-    white_balance_k: int | None
-    unmet: Texts = Field(description="what the camera did not take, and why")
-    unmet_messages: list[MessageOut] = Field(validation_alias="unmet")
 
 
 class Lights(Received):
@@ -84,25 +54,14 @@ class CaptureChecks(Answer):
     cameras: dict[str, ViewChecksOut]
 
 
-class HoldingsOut(Answer):
-    """Lists what is stored of a capture. A removal deletes the pictures, an erasure everything."""
-
-    pictures: int
-    bytes: int = Field(description="of images, clean plates and caches")
-    heads: list[str] = Field(description="jobs whose results stay after a removal, photographs in their overlays too")
-    head_bytes: int
-    jobs: list[str] = Field(description="the other jobs")
-    active: list[str] = Field(description="jobs that are queued or running: a removal is refused, an erasure ends them")
-
-
 class PlatesOut(Answer):
     """Describes a version of the clean plates that is stored."""
 
     id: str
     taken: Moment
     cameras: list[str]
-    refused: Texts = Field(description="why they were not put to use")
-    refused_messages: list[MessageOut] = Field(validation_alias="refused")
+    refused: tuple[Said, ...] = Field(description="why they were not put to use")
+    refused_messages = as_data("refused", list[MessageOut])
     in_use: bool
 
 

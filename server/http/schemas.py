@@ -1,16 +1,17 @@
-"""Defines what the JSON documents of HTTP have in common (messages appear as English text, and beside it as code and
-parameters), and those of captures, sessions, jobs, results, lists and actions on many things."""
+"""Defines what requests of HTTP have in common, those about captures, sessions and jobs, and answers that the services
+do not make themselves: captures, results and lists."""
 
 import base64
 import binascii
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import Header, Query
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
-from rig.messages.message import Message
-from server.http.openapi import SETTINGS
+from rig.acquisition.verdict import Verdict
+from server.services.answer import Answer, JobSettings, MessageOut, Moment, Said, as_data
+from server.services.records import FileOut, JobOut, PersonOut, SessionOut
 from server.services.texts import PLAIN, TAG_MOST, TAGS_MOST, TEXT_MOST
 from server.storage.records import JsonObject
 
@@ -18,13 +19,8 @@ Id = Annotated[str, Field(pattern="^[0-9a-f]{28}$", description="28 hex digits")
 Text = Annotated[str, Field(max_length=TEXT_MOST, pattern=PLAIN)]
 Tag = Annotated[str, Field(min_length=1, max_length=TAG_MOST, pattern="^[^\\x00-\\x1f\\x7f,]*$")]
 Tags = Annotated[list[Tag], Field(max_length=TAGS_MOST, description="without commas and control characters")]
-Moment = Annotated[str, Field(json_schema_extra={"format": "date-time"})]
-JobSettings = Annotated[JsonObject, WithJsonSchema(SETTINGS)]
 Idempotency = Annotated[str | None, Header(alias="Idempotency-Key", min_length=1, max_length=200)]
-State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 EXAMPLE_ID = "0198c0de" + 20 * "0"
-TextOf = Annotated[str, BeforeValidator(lambda shown: shown.text if isinstance(shown, Message) else shown)]
-Texts = list[TextOf]
 Limit = Annotated[int, Query(ge=1, le=1000)]
 Cursor = Annotated[str | None, Query(max_length=2000, description="``next`` of the page before, in the same order")]
 Key = Annotated[str | None, Query(max_length=64, pattern=PLAIN)]
@@ -32,20 +28,6 @@ WithTag = Annotated[
     str | None, Query(max_length=200, pattern=PLAIN, description="only what bears this tag, in whatever case")
 ]
 Sought = Annotated[str, Query(max_length=200, pattern=PLAIN, description="words that must all be found")]
-
-
-class MessageOut(BaseModel):
-    """Holds a message of the service as data. A program can show it in another language by its ``code`` and
-    ``parameters``."""
-
-    code: str = Field(description="stable; decides what parameters there are")
-    message: str = Field(description="in English")
-    parameters: JsonObject = Field(default_factory=dict, description="what stands in the message, by name")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_message(cls, value: Any) -> Any:
-        return value.document() if isinstance(value, Message) else value
 
 
 class WarningOut(MessageOut):
@@ -58,12 +40,6 @@ class Received(BaseModel):
     """Refuses unknown keys; the base of all request bodies."""
 
     model_config = ConfigDict(extra="forbid")
-
-
-class Answer(BaseModel):
-    """Reads its fields from a record of the service that has the same fields; the base of all response bodies."""
-
-    model_config = ConfigDict(from_attributes=True)
 
 
 class NewSession(Received):
@@ -217,9 +193,9 @@ class FaultOut(Answer):
 
     code: str = Field(description="as in docs/rig.md, among them moved, overexposed, blurred, setting, plates, cut-off")
     camera: str | None = Field(description="null: the rig as a whole")
-    detail: TextOf
-    remedy: TextOf
-    detail_message: MessageOut = Field(validation_alias="detail")
+    detail: Said
+    detail_message = as_data("detail")
+    remedy: Said
 
 
 class CaptureOut(Answer):
@@ -238,7 +214,7 @@ class CaptureOut(Answer):
     bytes: int
     inputs: dict[str, str] = Field(description="sha256 of every file, by name")
     shot: JsonObject | None = Field(None, description="the rig's sync certificate")
-    verdict: Literal["good", "usable", "poor"] | None = Field(
+    verdict: Verdict | None = Field(
         None, description="good: no fault; poor: shoot again; null: not judged (of the board, or of an earlier version)"
     )
     faults: list[FaultOut] = Field(default_factory=list, description="every fault that the verdict follows from")
@@ -246,33 +222,6 @@ class CaptureOut(Answer):
         default_factory=list, description="of cameras that were found from the photographs; report.json repeats them"
     )
     tags: list[str] = Field(default_factory=list, description="what people find it by")
-
-
-class SessionOut(Answer):
-    """Describes a session with the ids of its captures, newest first."""
-
-    id: str
-    created: Moment
-    label: str
-    consent: str
-    captures: list[str]
-
-
-class JobError(Answer):
-    """Describes why a job failed. ``type`` and ``detail`` are as in a problem document."""
-
-    type: str
-    detail: TextOf
-    errors: Texts
-    detail_message: MessageOut = Field(validation_alias="detail")
-    error_messages: list[MessageOut] = Field(validation_alias="errors")
-
-
-class FileOut(Answer):
-    """Describes a file by its size in bytes and its SHA-256."""
-
-    bytes: int
-    sha256: str
 
 
 class ResultFile(FileOut):
@@ -288,44 +237,6 @@ class ResultList(Answer):
 
     job_id: str
     files: list[ResultFile]
-
-
-class DeliveryOut(Answer):
-    """Says where a job's result is delivered to."""
-
-    to: str = Field(description="where the files lie once they are delivered; delivery.json is the last of them")
-    state: Literal["waiting", "delivering", "delivered", "failed", "cancelled"]
-    error: JobError | None
-
-
-class JobOut(Answer):
-    """Describes a job: its request, state and progress and, once it has succeeded, the files of its result. ``eta_s``
-    is the estimated remaining time in seconds."""
-
-    id: str
-    name: str
-    state: State
-    stage: str
-    progress: float = Field(ge=0, le=1)
-    eta_s: float | None
-    error: JobError | None
-    notice: TextOf | None = Field(None, description="why a queued job cannot begin or a result is gone; what to do")
-    notice_message: MessageOut | None = Field(None, validation_alias="notice")
-    capture_id: str | None
-    session: str | None
-    model: str | None
-    settings: JobSettings
-    restart_of: str | None
-    queue: str | None
-    priority: int
-    ahead: int | None = Field(
-        None, validation_alias="queue_position", description="jobs of its queue that go before a queued one"
-    )
-    created: Moment | None
-    started: Moment | None
-    finished: Moment | None
-    files: dict[str, FileOut]
-    delivery: DeliveryOut | None = None
 
 
 class Listed(Answer):
@@ -347,23 +258,6 @@ class SessionList(Listed):
     sessions: list[SessionOut]
 
 
-class PersonOut(Answer):
-    """Describes a person whose sessions have the same name. ``captures`` counts captures, ``heads`` jobs that made a
-    head."""
-
-    id: str = Field(description="of the newest session")
-    label: str
-    created: Moment
-    sessions: list[str]
-    captures: int
-    heads: int
-    running: int = Field(description="jobs that are queued or running")
-    head: str | None = Field(description="newest job with a result")
-    capture: str | None = Field(description="newest capture")
-    consent: bool = Field(description="whether every session has a note of it")
-    tags: list[str] = Field(description="of their captures")
-
-
 class SubjectList(Listed):
     """Holds one page of people."""
 
@@ -380,22 +274,6 @@ class JobBatch(Answer):
     """Holds the jobs that one request has queued, one for each capture."""
 
     jobs: list[JobOut]
-
-
-class RefusedOne(Answer):
-    """Describes why an action was refused for one of the ids in a request."""
-
-    id: str
-    type: str = Field(description="as of a problem document")
-    detail: TextOf
-    detail_message: MessageOut = Field(validation_alias="detail")
-
-
-class BulkOut(Answer):
-    """Holds the result of an action on many things. Each id is in one of the two lists."""
-
-    done: list[str]
-    refused: list[RefusedOne]
 
 
 Ids = Annotated[list[Id], Field(min_length=1, max_length=1000)]

@@ -17,12 +17,12 @@ from server.batch.summary import Outcome, expressions_of, sheet_card, table_row
 from server.batch.table import Column, Row, columns_of
 from server.problem_types import URN
 from server.services.batches import Batches
-from server.services.records import Batch, Job
+from server.services.records import BatchOut, JobOut
 from server.storage.records import CaptureRecord, SessionRecord
 from server.storage.store import Store
 
 
-def batch_columns(batch: Batch) -> tuple[Column, ...]:
+def batch_columns(batch: BatchOut) -> tuple[Column, ...]:
     """Returns the columns of a batch's table: those of every head, and one for each expression of the batch's model.
     Columns of expressions are left out if the model was removed since."""
     expressions: list[str] = []
@@ -31,31 +31,31 @@ def batch_columns(batch: Batch) -> tuple[Column, ...]:
     return columns_of(expressions)
 
 
-def batch_rows(batches: Batches, store: Store, batch: Batch, columns: Sequence[Column]) -> Iterator[Row]:
+def batch_rows(batches: Batches, store: Store, batch: BatchOut, columns: Sequence[Column]) -> Iterator[Row]:
     """Yields the rows of a batch's table, in the order of its captures. A capture that was erased, or whose head is not
     made yet, has a row, too."""
     return (table_row(outcome, columns) for outcome in _outcomes(batches, store, batch))
 
 
-def batch_sheet(batches: Batches, store: Store, batch: Batch) -> Iterator[str]:
+def batch_sheet(batches: Batches, store: Store, batch: BatchOut) -> Iterator[str]:
     """Yields the lines of a batch's contact sheet, a self-contained HTML page with one card for each capture. A card
     links to the console's page of the result."""
     return sheet_lines(batch.label or batch.id, _cards(batches, store, batch))
 
 
-def batch_sheet_pdf(batches: Batches, store: Store, batch: Batch) -> bytes:
+def batch_sheet_pdf(batches: Batches, store: Store, batch: BatchOut) -> bytes:
     """Returns a batch's contact sheet as PDF."""
     from server.batch.sheet_pdf import sheet_pdf  # its library takes a while to load
 
     return sheet_pdf(batch.label or batch.id, _cards(batches, store, batch))
 
 
-def _cards(batches: Batches, store: Store, batch: Batch) -> list[Card]:
+def _cards(batches: Batches, store: Store, batch: BatchOut) -> list[Card]:
     columns = batch_columns(batch)
     return [sheet_card(outcome, table_row(outcome, columns)) for outcome in _outcomes(batches, store, batch)]
 
 
-def _outcomes(batches: Batches, store: Store, batch: Batch) -> Iterator[Outcome]:
+def _outcomes(batches: Batches, store: Store, batch: BatchOut) -> Iterator[Outcome]:
     subjects: dict[str, str] = {}
     for identity, job in batches.captures(batch.id):
         record = None if identity is None else store.found("captures", identity)
@@ -75,7 +75,7 @@ def _capture(store: Store, record: CaptureRecord, subjects: dict[str, str]) -> B
     return BatchCapture(record.id, Path(), subjects.get(session) or record.label, session)
 
 
-def _outcome(store: Store, capture: BatchCapture, job: Job | None, input_sha256: str) -> Outcome:
+def _outcome(store: Store, capture: BatchCapture, job: JobOut | None, input_sha256: str) -> Outcome:
     if job is None:
         return Outcome(capture, Path(), "")
     result, link = store.folder("jobs", job.id) / "result", f"/result/{job.id}"

@@ -24,7 +24,7 @@ from server.errors import Conflict, DiskFull, NotFound, TooMany
 from server.services.deliveries import destination
 from server.services.job_rows import STATES, STATUSES
 from server.services.jobs import Jobs
-from server.services.records import Batch, Found, Job, moment_of
+from server.services.records import BatchCounts, BatchOut, Found, JobOut, moment_of
 from server.services.texts import check_texts
 from server.services.webhooks import Webhooks
 from server.services.work import ReconstructionRequest
@@ -91,7 +91,7 @@ class Batches:
         self._settings, self._engine, self._store, self._jobs = settings, engine, store, jobs
         self._library, self._webhooks, self._index = library, webhooks, jobs.batches
 
-    def submit(self, wanted: BatchRequest, *, key: str = "local", idempotency_key: str | None = None) -> Batch:
+    def submit(self, wanted: BatchRequest, *, key: str = "local", idempotency_key: str | None = None) -> BatchOut:
         """Begins a batch and returns it. A repeated request with the same idempotency key returns the batch that the
         first request made.
 
@@ -129,39 +129,39 @@ class Batches:
             raise Conflict("idempotency-conflict", compose("idempotency-key-reused"))
         return self._batches([first])[0]
 
-    def get(self, identity: str) -> Batch:
+    def get(self, identity: str) -> BatchOut:
         """Returns a batch with its present state. Raises NotFound."""
         return self._batches([self._known(identity)])[0]
 
     def page(
         self, sought: str = "", state: BatchState | None = None, limit: int = 100, cursor: str | None = None
-    ) -> Found[Batch]:
+    ) -> Found[BatchOut]:
         """Returns one page of the batches with all words of ``sought`` in their label, newest first. Raises InputError
         for a cursor of another list."""
         page = self._index.page(sought, state, limit, cursor)
         return Found(tuple(self._batches(self._index.of(page.ids))), page.next, page.total)
 
-    def of(self, ids: Sequence[str]) -> list[Batch]:
+    def of(self, ids: Sequence[str]) -> list[BatchOut]:
         """Returns the batches with these ids, in their order; ids of no batch are left out."""
         return self._batches(self._index.of(ids))
 
-    def pause(self, identity: str) -> Batch:
+    def pause(self, identity: str) -> BatchOut:
         """Starts no further job of a batch; jobs that run already continue. Queued jobs are taken back at the next call
         of ``serve``. Raises NotFound, and Conflict for a batch that has ended."""
         return self._change(identity, "paused")
 
-    def resume(self, identity: str) -> Batch:
+    def resume(self, identity: str) -> BatchOut:
         """Continues a paused batch. Raises NotFound, and Conflict for a batch that has ended."""
         return self._change(identity, "running")
 
-    def cancel(self, identity: str) -> Batch:
+    def cancel(self, identity: str) -> BatchOut:
         """Cancels all jobs of a batch that have not ended, at the next call of ``serve``. A batch that has ended stays
         as it is. Raises NotFound."""
         self._known(identity)
         self._index.change(identity, "cancelled")
         return self.get(identity)
 
-    def retry(self, identity: str) -> Batch:
+    def retry(self, identity: str) -> BatchOut:
         """Makes a new job for every capture whose job failed. Raises NotFound, and Conflict if no job failed or the
         batch was cancelled."""
         if self._known(identity).wish == "cancelled":
@@ -207,7 +207,7 @@ class Batches:
                 self._webhooks.announce_batch(row.id, row.rounds, self._jobs.client.enqueue)
                 self._index.finish(row, _now_ms())
 
-    def captures(self, identity: str) -> Iterator[tuple[str | None, Job | None]]:
+    def captures(self, identity: str) -> Iterator[tuple[str | None, JobOut | None]]:
         """Yields the captures of a batch in their order: the id (None if the capture was erased) and its latest job
         (None if it has none)."""
         for items in self._index.items(identity):
@@ -221,7 +221,7 @@ class Batches:
             raise NotFound(compose("thing-batch"), identity)
         return row
 
-    def _change(self, identity: str, wish: Literal["running", "paused"]) -> Batch:
+    def _change(self, identity: str, wish: Literal["running", "paused"]) -> BatchOut:
         self._known(identity)
         if not self._index.change(identity, wish):
             raise Conflict("batch-ended", compose("batch-ended"))
@@ -302,12 +302,12 @@ class Batches:
                     self._jobs.delete(job_id)
             self._index.settle_recall(identity, job_id, taken=taken)
 
-    def _batches(self, rows: Sequence[BatchRow]) -> list[Batch]:
+    def _batches(self, rows: Sequence[BatchRow]) -> list[BatchOut]:
         tallies = self._index.tallies([row.id for row in rows])
         slots = slots_by_queue(self._engine, self._settings.silent_s)
         return [self._batch(row, tallies[row.id], slots.get(row.queue, 0)) for row in rows]
 
-    def _batch(self, row: BatchRow, tally: Tally, slots: int) -> Batch:
+    def _batch(self, row: BatchRow, tally: Tally, slots: int) -> BatchOut:
         counts: dict[str, int] = dict.fromkeys(ITEM_STATES, 0)
         special = {GONE: "removed", WAITING: "cancelled" if row.wish == "cancelled" else "waiting"}
         for status, count in tally.statuses.items():
@@ -317,7 +317,7 @@ class Batches:
         undone, eta_s = sum(counts[name] for name in UNDONE), None
         if state == "running" and undone and slots and tally.mean_s is not None:
             eta_s = tally.mean_s * undone / min(slots, undone)
-        return Batch(
+        return BatchOut(
             id=row.id,
             label=row.label,
             state=state,
@@ -326,10 +326,10 @@ class Batches:
             queue=row.queue,
             priority=row.priority,
             model=row.model,
-            settings=row.settings,
+            settings=dict(row.settings),
             deliver_to=row.deliver_to,
             total=sum(counts.values()),
-            counts=counts,
+            counts=BatchCounts(**counts),
             eta_s=eta_s,
             notice=self._jobs.queue_notice(row.queue) if state == "running" and undone else None,
         )

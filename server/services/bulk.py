@@ -1,33 +1,33 @@
 """Does one action on many things, each of which succeeds or is refused by itself."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+
+from pydantic import Field
 
 from rig.errors import EigenheadError, InputError
-from rig.messages.message import Message, compose
+from rig.messages.message import compose
 from server.errors import Refused, unusable_input
 from server.problem_types import URN
+from server.services.answer import Answer, Said, as_data
 
 
-@dataclass(frozen=True, slots=True)
-class RefusedOne:
-    """Holds why an action was refused for one thing. ``type`` and ``detail`` are those of the problem document (RFC
-    9457) that a request for this thing alone would have been answered with."""
+class RefusedOne(Answer):
+    """Describes why an action was refused for one of the ids in a request."""
 
     id: str
-    type: str
-    detail: Message
+    type: str = Field(description="as of a problem document")
+    detail: Said
+    detail_message = as_data("detail")
 
 
-@dataclass(frozen=True, slots=True)
-class Bulk:
-    """Holds the outcome of one action on many things: the ids for which it was done, and the refusals."""
+class BulkOut(Answer):
+    """Holds the result of an action on many things. Each id is in one of the two lists."""
 
-    done: tuple[str, ...]
-    refused: tuple[RefusedOne, ...]
+    done: list[str]
+    refused: list[RefusedOne]
 
 
-def each(ids: Iterable[str], action: Callable[[str], object]) -> Bulk:
+def each(ids: Iterable[str], action: Callable[[str], object]) -> BulkOut:
     """Calls ``action`` once for every different id and collects the outcomes. A refusal for one id does not stop the
     others. Exceptions that are no EigenheadError pass through."""
     done, refused = [], []
@@ -39,5 +39,5 @@ def each(ids: Iterable[str], action: Callable[[str], object]) -> Bulk:
             problem = unusable_input(error) if isinstance(error, InputError) else error
             kind = problem.kind if isinstance(problem, Refused) else "internal-error"
             detail = compose("several", messages=error.faults) if isinstance(error, InputError) else problem.message
-            refused.append(RefusedOne(identity, URN + kind, detail))
-    return Bulk(tuple(done), tuple(refused))
+            refused.append(RefusedOne(id=identity, type=URN + kind, detail=detail))
+    return BulkOut(done=done, refused=refused)

@@ -12,28 +12,29 @@ import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
+from typing import cast
 
 from dbos import DBOSClient, EnqueueOptions, WorkflowStatus
 
 from rig.atomic_write import write_atomically
+from rig.digest import sha256_of
 from rig.errors import InputError
 from rig.messages.message import Message, compose, read_message
 from server.errors import Conflict, NotFound
 from server.services.failures import failure
 from server.services.job_rows import APPLICATION_VERSION, FINISHED, STATES
-from server.services.records import Calibration
+from server.services.records import CalibrationOut, moment_now
 from server.services.texts import check_texts
 from server.storage.events import EventLog
 from server.storage.folders import move_durably
-from server.storage.objects import sha256_of
 from server.storage.records import CALIBRATION, CalibrationOutcome, CalibrationRecord, EventDocument
 from server.storage.store import Store, StoredFile, new_id
 from server.tasks.calibrate import BOARD, check_scale, is_of_board
 from server.tasks.photographs import SCALE
 
 WORKFLOW = "calibrate"
+NO_OUTCOME: CalibrationOutcome = {"figures": {}, "checks": [], "warnings": [], "front": None, "sha256": ""}
 
 
 class Calibrations:
@@ -42,22 +43,21 @@ class Calibrations:
     def __init__(self, store: Store, client: DBOSClient, queue: str, events: EventLog) -> None:
         self._store, self._client, self._queue, self._events = store, client, queue, events
 
-    def add(self, folder: Path, source: str, label: str) -> Calibration:
+    def add(self, folder: Path, source: str, label: str) -> CalibrationOut:
         """Moves ``folder`` to its final place in the data folder and queues its calibration. The folder holds images/,
         and board.toml if they show a board; ``source`` says where they come from ("upload", "rig"). If the process is
         killed before the job is queued, ``get`` queues it. Raises InputError for an invalid label."""
         check_texts({"label": label})
         identity = new_id()
         cameras = {path.name: len(list(path.iterdir())) for path in sorted((folder / "images").iterdir())}
-        created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         kind = "board" if is_of_board(folder) else "scene"
-        record = CALIBRATION.document(CalibrationRecord(identity, created, source, label, cameras, kind))
+        record = CALIBRATION.document(CalibrationRecord(identity, moment_now(), source, label, cameras, kind))
         write_atomically(folder / "record.json", json.dumps(record, indent=1).encode())
         move_durably(folder, self._store.folder("calibrations", identity))
         self._client.enqueue(self._options(identity), identity)
         return self.get(identity)
 
-    def add_shots(self, board: Mapping[str, object], captures: list[str], label: str) -> Calibration:
+    def add_shots(self, board: Mapping[str, object], captures: list[str], label: str) -> CalibrationOut:
         """Queues a calibration from captures that show the board. ``board``: the content of a ``board.toml``. Raises
         NotFound for an unknown capture, and InputError for a wrong board or captures without images."""
         from calibration.board.board import board_from_document, write_board
@@ -70,7 +70,7 @@ class Calibrations:
             write_board(described, target / BOARD)
             return self.add(target, "rig", label)
 
-    def add_scene(self, captures: list[str], scale: Mapping[str, object] | None, label: str) -> Calibration:
+    def add_scene(self, captures: list[str], scale: Mapping[str, object] | None, label: str) -> CalibrationOut:
         """Queues a calibration from captures of any scene. ``scale``: the content of a ``scale.json``. Raises NotFound
         for an unknown capture, and InputError for a wrong scale or captures without images."""
         with self._store.incoming() as folder:
@@ -82,7 +82,7 @@ class Calibrations:
             check_scale(target)
             return self.add(target, "rig", label)
 
-    def get(self, identity: str) -> Calibration:
+    def get(self, identity: str) -> CalibrationOut:
         """Returns a calibration with its progress or its outcome. Queues the job anew if the service was killed before
         it was queued. Raises NotFound."""
         record = self._store.calibration(identity)
@@ -90,33 +90,26 @@ class Calibrations:
         state = STATES[row.status] if row else "queued"
         if row is None:  # the service was killed between accepting and queueing
             self._client.enqueue(self._options(identity), identity)
-        found: CalibrationOutcome | None = row.output if row is not None and state == "succeeded" else None
-        error = failure(row) if row is not None and state == "failed" else None
-        if found is None:
-            latest = self._events.latest([identity]).get(identity) if state == "running" else None
-            document: EventDocument = {} if latest is None else latest.document
-            return Calibration(
-                **asdict(record),
-                state=state,
-                stage=document.get("stage"),
-                progress=document.get("progress", 0.0),
-                eta_s=document.get("eta_s"),
-                error=error,
-            )
-        return Calibration(
+        outcome = NO_OUTCOME if row is None or state != "succeeded" else cast(CalibrationOutcome, row.output)
+        latest = self._events.latest([identity]).get(identity) if state == "running" else None
+        document: EventDocument = {} if latest is None else latest.document
+        return CalibrationOut(
             **asdict(record),
             state=state,
-            progress=1.0,
-            verdict=found.get("verdict"),
-            missing=_messages(found.get("missing_messages") or found.get("missing", [])),
-            figures=found["figures"],
-            checks=tuple(found["checks"]),
-            warnings=_messages(found.get("warning_messages") or found["warnings"]),
-            front=found.get("front"),
-            in_use=self.in_use() == found["sha256"],
+            stage=document.get("stage"),
+            progress=1.0 if state == "succeeded" else document.get("progress", 0.0),
+            eta_s=document.get("eta_s"),
+            error=failure(row) if row is not None and state == "failed" else None,
+            verdict=outcome.get("verdict"),
+            missing=_messages(outcome.get("missing_messages") or outcome.get("missing", [])),
+            figures=dict(outcome["figures"]),
+            checks=tuple(map(dict, outcome["checks"])),
+            warnings=_messages(outcome.get("warning_messages") or outcome["warnings"]),
+            front=outcome.get("front"),
+            in_use=self.in_use() == outcome["sha256"],
         )
 
-    def find(self) -> list[Calibration]:
+    def find(self) -> list[CalibrationOut]:
         """Returns all calibrations, newest first."""
         found = []
         for identity in self._store.ids("calibrations"):

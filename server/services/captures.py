@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import cast
 
@@ -20,9 +19,9 @@ from rig.errors import InputError
 from rig.formats.captures.archive import ArchiveLimits
 from rig.messages.message import compose
 from server.errors import Conflict, NotFound
-from server.services.erasure import Holdings, erase_captures, holdings
+from server.services.erasure import HoldingsOut, erase_captures, holdings
 from server.services.jobs import Jobs
-from server.services.records import Found
+from server.services.records import Found, moment_now
 from server.services.rigs.backend import SHOT_BYTES, RigBackend
 from server.services.rigs.simulated import SimulatedRig
 from server.services.texts import check_texts, checked_tags, typed_tags
@@ -249,7 +248,7 @@ class Captures:
         self.check_unused(identity)
         self._store.remove_capture(identity)
 
-    def holdings(self, identity: str) -> Holdings:
+    def holdings(self, identity: str) -> HoldingsOut:
         """Returns what removing a capture would take away and what would stay. Raises NotFound."""
         return holdings(self._store, self._jobs, identity)
 
@@ -287,7 +286,7 @@ class Captures:
         self._store.put_checks(folder, all_checks(shot, content))
         record = CaptureRecord(
             id=new_id(),
-            created=datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+            created=moment_now(),
             source=source,
             session=about.session,
             label=about.label,

@@ -7,15 +7,16 @@ A result lies in a folder of its job's id; the manifest, ``delivery.json``, come
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from dbos import DBOSClient, EnqueueOptions, WorkflowStatus
 
 from rig.messages.message import compose
 from server.errors import Forbidden
+from server.services.answer import State
 from server.services.failures import failure
 from server.services.job_rows import APPLICATION_VERSION, STATES
-from server.services.records import Delivery
+from server.services.records import DeliveryOut
 from server.settings import ServiceSettings
 from server.storage.object_places import locate
 from server.storage.records import DeliveryRequest, JobRequest, JobWebhook
@@ -25,7 +26,13 @@ DELIVER = "deliver-result"
 MANIFEST = "delivery.json"
 MANIFEST_FORMAT = "eigenhead-delivery/1"
 HOUR_S = 3600.0
-STATE_OF = {"queued": "waiting", "running": "delivering", "succeeded": "delivered"}
+STATE_OF: Mapping[State, Literal["waiting", "delivering", "delivered", "failed", "cancelled"]] = {
+    "queued": "waiting",
+    "running": "delivering",
+    "succeeded": "delivered",
+    "failed": "failed",
+    "cancelled": "cancelled",
+}
 UNDER_WAY = ("waiting", "delivering")
 
 
@@ -71,7 +78,7 @@ class Deliveries:
 
     client: DBOSClient
 
-    def of(self, jobs: Collection[str]) -> dict[str, Delivery]:
+    def of(self, jobs: Collection[str]) -> dict[str, DeliveryOut]:
         """Returns the deliveries that were begun, by job."""
         ids = [delivery_id(job_id) for job_id in jobs]
         rows = self.client.list_workflows(name=DELIVER, workflow_ids=ids, load_output=True) if ids else []
@@ -84,14 +91,18 @@ class Deliveries:
         self.client.delete_workflow(delivery_id(job_id))
 
 
-def delivery_of(job_id: str, state: str, request: JobRequest | None, begun: Mapping[str, Delivery]) -> Delivery | None:
+def delivery_of(
+    job_id: str, state: str, request: JobRequest | None, begun: Mapping[str, DeliveryOut]
+) -> DeliveryOut | None:
     """Returns the delivery of a job in this state: the one that was begun, else the one that it asks for."""
     if job_id in begun or request is None or "deliver_to" not in request:
         return begun.get(job_id)
     place = f"{request['deliver_to']}{job_id}/"
-    return Delivery(place, "cancelled" if state in ("failed", "cancelled") else "waiting", None)
+    ended = state in ("failed", "cancelled")
+    return DeliveryOut(to=place, state="cancelled" if ended else "waiting", error=None)
 
 
-def _delivery(wanted: DeliveryRequest, row: WorkflowStatus) -> Delivery:
+def _delivery(wanted: DeliveryRequest, row: WorkflowStatus) -> DeliveryOut:
     state = STATES[row.status]
-    return Delivery(place_of(wanted), STATE_OF.get(state, state), failure(row) if state == "failed" else None)
+    error = failure(row) if state == "failed" else None
+    return DeliveryOut(to=place_of(wanted), state=STATE_OF[state], error=error)

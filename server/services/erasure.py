@@ -3,10 +3,12 @@ would take."""
 
 import time
 from collections.abc import Collection
-from dataclasses import dataclass
+
+from pydantic import Field
 
 from rig.messages.message import compose
 from server.errors import Unavailable
+from server.services.answer import Answer
 from server.services.job_rows import FINISHED
 from server.services.jobs import Jobs
 from server.storage.folders import folder_bytes
@@ -15,36 +17,30 @@ from server.storage.store import Store
 CANCEL_S = 5.0  # a cancelled job lets go of its files within one second
 
 
-@dataclass(frozen=True, slots=True)
-class Holdings:
-    """Holds what is stored of a capture.
-
-    ``pictures``: number of its cameras; ``bytes``: size of its pictures and caches, which a removal deletes. ``heads``
-    are the ids of jobs that made a head, with the size of their files; they show the face and stay until the capture is
-    erased. ``jobs`` are its other jobs, ``active`` the queued and running ones among them.
-    """
+class HoldingsOut(Answer):
+    """Lists what is stored of a capture. A removal deletes the pictures, an erasure everything."""
 
     pictures: int
-    bytes: int
-    heads: tuple[str, ...]
+    bytes: int = Field(description="of images, clean plates and caches")
+    heads: list[str] = Field(description="jobs whose results stay after a removal, photographs in their overlays too")
     head_bytes: int
-    jobs: tuple[str, ...]
-    active: tuple[str, ...]
+    jobs: list[str] = Field(description="the other jobs")
+    active: list[str] = Field(description="jobs that are queued or running: a removal is refused, an erasure ends them")
 
 
-def holdings(store: Store, jobs: Jobs, capture: str) -> Holdings:
+def holdings(store: Store, jobs: Jobs, capture: str) -> HoldingsOut:
     """Counts what is stored of a capture. Raises NotFound."""
     record = store.capture(capture)
     of_capture = jobs.find(capture=capture, limit=100_000)
     held = max(record.bytes, folder_bytes(store.folder("captures", capture)))  # some may be in the store alone
-    heads = tuple(job.id for job in of_capture if job.state == "succeeded")
-    return Holdings(
+    heads = [job.id for job in of_capture if job.state == "succeeded"]
+    return HoldingsOut(
         pictures=len(record.cameras),
         bytes=held + folder_bytes(store.cache_of(capture)),
         heads=heads,
-        head_bytes=sum(file["bytes"] for job in of_capture for file in job.files.values()),
-        jobs=tuple(job.id for job in of_capture if job.state != "succeeded"),
-        active=tuple(job.id for job in of_capture if job.state not in FINISHED),
+        head_bytes=sum(file.bytes for job in of_capture for file in job.files.values()),
+        jobs=[job.id for job in of_capture if job.state != "succeeded"],
+        active=[job.id for job in of_capture if job.state not in FINISHED],
     )
 
 

@@ -17,7 +17,7 @@ from dbos._serialization import DefaultSerializer
 from rig.errors import EigenheadError
 from rig.messages.message import Message, MessageDocument, compose, documents_of, read_message
 from server.problem_types import URN
-from server.services.records import Failure
+from server.services.records import JobError
 
 Kept = str | MessageDocument  # texts are those of earlier versions
 
@@ -66,13 +66,13 @@ def _read(kept: Message | Kept) -> Message:
     return kept if isinstance(kept, Message) else read_message(kept)
 
 
-def failure(row: WorkflowStatus) -> Failure:
+def failure(row: WorkflowStatus) -> JobError:
     """Returns why the job of a workflow's row failed. An error that is no JobFailed is logged and becomes
     "internal-error"; a job that took too many workers down becomes "worker-died"."""
     error = row.error
     if (failed := restored(error)) is not None:
-        return Failure(URN + failed.kind, failed.detail, failed.errors)
+        return JobError(type=URN + failed.kind, detail=failed.detail, errors=failed.errors)
     if row.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED":
-        return Failure(URN + "worker-died", compose("worker-died"))
+        return JobError(type=URN + "worker-died", detail=compose("worker-died"), errors=())
     log.error("job failed in an unforeseen way", job=row.workflow_id, error=str(error))
-    return Failure(URN + "internal-error", compose("job-failed-unforeseen"))
+    return JobError(type=URN + "internal-error", detail=compose("job-failed-unforeseen"), errors=())

@@ -3,11 +3,11 @@
 import os
 import time
 from collections import Counter
-from dataclasses import dataclass
 from importlib.metadata import version
 
 import sqlalchemy as sa
 import structlog
+from pydantic import Field
 from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import Settings, document_from_settings
@@ -15,21 +15,21 @@ from rig.formats.cameras.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
 from rig.messages.message import compose, verbatim
 from server.errors import Refused
 from server.metrics import QueueFigures, StoreFigures
-from server.services.service import Check, Service
+from server.services.answer import Answer, JobSettings
+from server.services.service import CheckOut, Service
 from server.storage.database import alive_workers, slots_by_queue
 from server.storage.events import failure_counts
 from server.storage.folders import STOPPED
 from server.storage.job_index import Queued
-from server.storage.records import JsonObject
 from server.tasks.child import WorkFailed
 from server.tasks.egl import try_egl
 
-STORE_UNKNOWN = Check(ok=True, detail=compose("not-examined"))
+STORE_UNKNOWN = CheckOut(ok=True, detail=compose("not-examined"))
 
 log = structlog.get_logger()
 
 
-def readiness(service: Service) -> dict[str, Check]:
+def readiness(service: Service) -> dict[str, CheckOut]:
     """Checks database, disk, workers, queues, OpenGL (EGL), rig, records and results. Returns one finding for each, by
     name. Tolerates a database that does not answer."""
     return {
@@ -37,56 +37,56 @@ def readiness(service: Service) -> dict[str, Check]:
         "disk": _disk(service),
         "worker": _workers(service),
         "queues": _queues(service),
-        "egl": service.known.get("egl") or Check(ok=False, detail=compose("check-starting"), starting=True),
+        "egl": service.known.get("egl") or CheckOut(ok=False, detail=compose("check-starting"), starting=True),
         "rig": _rig(service),
         "records": _records(service),
         "retention": _retention(service),
         "store": _store(service),
-        "results": service.known.get("results") or Check(ok=True, detail=compose("not-examined")),
+        "results": service.known.get("results") or CheckOut(ok=True, detail=compose("not-examined")),
     }
 
 
-def _database(service: Service) -> Check:
+def _database(service: Service) -> CheckOut:
     try:
         with service.engine.connect() as connection:
             connection.execute(sa.select(1))
     except SQLAlchemyError as error:
-        return Check(ok=False, detail=compose("silent-because", reason=str(error)[:200]))
-    return Check(ok=True, detail=verbatim(service.engine.dialect.name))
+        return CheckOut(ok=False, detail=compose("silent-because", reason=str(error)[:200]))
+    return CheckOut(ok=True, detail=verbatim(service.engine.dialect.name))
 
 
-def _disk(service: Service) -> Check:
+def _disk(service: Service) -> CheckOut:
     if not os.access(service.settings.data, os.W_OK):
-        return Check(ok=False, detail=compose("disk-unwritable"))
+        return CheckOut(ok=False, detail=compose("disk-unwritable"))
     free, spare = service.store.free_bytes(), service.settings.free_bytes
     code = "disk-free" if free > spare else "disk-too-full"
-    return Check(ok=free > spare, detail=compose(code, free_gb=free / 1e9, spare_gb=spare / 1e9))
+    return CheckOut(ok=free > spare, detail=compose(code, free_gb=free / 1e9, spare_gb=spare / 1e9))
 
 
-def _workers(service: Service) -> Check:
+def _workers(service: Service) -> CheckOut:
     try:
         with service.engine.connect() as connection:
             alive = alive_workers(connection, service.settings.silent_s)
             count = connection.scalar(sa.select(sa.func.count()).where(alive)) or 0
     except SQLAlchemyError:
-        return Check(ok=False, detail=compose("worker-unknown"))
+        return CheckOut(ok=False, detail=compose("worker-unknown"))
     if count:
-        return Check(ok=True, detail=compose("workers-alive", count=count))
+        return CheckOut(ok=True, detail=compose("workers-alive", count=count))
     if service.jobs.worker_may_start():
-        return Check(ok=False, detail=compose("worker-loading"), starting=True)
-    return Check(ok=False, detail=compose("no-worker-alive"))
+        return CheckOut(ok=False, detail=compose("worker-loading"), starting=True)
+    return CheckOut(ok=False, detail=compose("no-worker-alive"))
 
 
-def _queues(service: Service) -> Check:
+def _queues(service: Service) -> CheckOut:
     """Names queues whose jobs wait for a worker that nobody has started. The service is still ready for other work."""
     try:
         queued = service.jobs.index.queued()
         idle = {queue: found.jobs for queue, found in queued.items() if service.jobs.queue_notice(queue)}
     except SQLAlchemyError:
-        return Check(ok=True, detail=compose("queues-unknown"))
+        return CheckOut(ok=True, detail=compose("queues-unknown"))
     if not idle:
-        return Check(ok=True, detail=compose("queues-served"))
-    return Check(ok=True, detail=compose("queues-unserved", queues=sorted(idle), count=sum(idle.values())))
+        return CheckOut(ok=True, detail=compose("queues-served"))
+    return CheckOut(ok=True, detail=compose("queues-unserved", queues=sorted(idle), count=sum(idle.values())))
 
 
 def check_egl(service: Service) -> None:
@@ -94,29 +94,29 @@ def check_egl(service: Service) -> None:
     during which the call blocks; a process does it once."""
     try:
         with service.children.one() as child:
-            service.known["egl"] = Check(ok=True, detail=verbatim(child.remote(try_egl)()))
+            service.known["egl"] = CheckOut(ok=True, detail=verbatim(child.remote(try_egl)()))
     except WorkFailed as error:
-        service.known["egl"] = Check(ok=False, detail=error.message)
+        service.known["egl"] = CheckOut(ok=False, detail=error.message)
 
 
-def _rig(service: Service) -> Check:
+def _rig(service: Service) -> CheckOut:
     state = service.rig.describe()
     if state.faults:
-        return Check(ok=state.ready, detail=compose("several", messages=state.faults))
-    return Check(ok=state.ready, detail=compose("rig-described", kind=state.kind, count=len(state.cameras)))
+        return CheckOut(ok=state.ready, detail=compose("several", messages=state.faults))
+    return CheckOut(ok=state.ready, detail=compose("rig-described", kind=state.kind, count=len(state.cameras)))
 
 
-def _records(service: Service) -> Check:
+def _records(service: Service) -> CheckOut:
     names = service.store.list_quarantined()
     detail = compose("records-damaged", count=len(names), names=names[:5]) if names else compose("no-record-damaged")
-    return Check(ok=True, detail=detail)
+    return CheckOut(ok=True, detail=detail)
 
 
-def _retention(service: Service) -> Check:
+def _retention(service: Service) -> CheckOut:
     try:
-        return Check(ok=True, detail=verbatim((service.settings.data / STOPPED).read_text(encoding="utf-8")))
+        return CheckOut(ok=True, detail=verbatim((service.settings.data / STOPPED).read_text(encoding="utf-8")))
     except FileNotFoundError:
-        return Check(ok=True, detail=compose("clock-trusted"))
+        return CheckOut(ok=True, detail=compose("clock-trusted"))
 
 
 def check_store(service: Service) -> None:
@@ -132,9 +132,9 @@ def check_store(service: Service) -> None:
     except Refused as error:
         if service.known.get("store", STORE_UNKNOWN).detail.code == "store-answers":
             log.warning("the store is away", reason=error.detail.text)
-        service.known["store"] = Check(ok=True, detail=error.detail)
+        service.known["store"] = CheckOut(ok=True, detail=error.detail)
     else:
-        service.known["store"] = Check(ok=True, detail=compose("store-answers", place=", ".join(places)))
+        service.known["store"] = CheckOut(ok=True, detail=compose("store-answers", place=", ".join(places)))
 
 
 def store_places(service: Service) -> list[str]:
@@ -143,9 +143,9 @@ def store_places(service: Service) -> list[str]:
     return [place for place in places if place is not None]
 
 
-def _store(service: Service) -> Check:
+def _store(service: Service) -> CheckOut:
     if not store_places(service):
-        return Check(ok=True, detail=compose("store-none"))
+        return CheckOut(ok=True, detail=compose("store-none"))
     return service.known.get("store", STORE_UNKNOWN)
 
 
@@ -184,35 +184,33 @@ def exposition(service: Service) -> bytes:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Info:
-    """Holds what a client may want to know before it sends anything: the version, processor cores, queued and running
-    jobs, limits, and the default settings of the pipeline. Names that end in ``_most`` are upper limits."""
+class InfoOut(Answer):
+    """Describes the service: version, load, limits, and the default settings of a job."""
 
     version: str
-    cores: int
-    queued: int
-    running: int
-    cameras_least: int
-    cameras_most: int
-    body_bytes_most: int
-    image_pixels_most: int
-    jobs_per_key_most: int
-    settings: JsonObject
+    cores: int = Field(description="that this service may use; its workers may run elsewhere")
+    queued: int = Field(description="jobs")
+    running: int = Field(description="jobs")
+    cameras_least: int = Field(description="of a capture")
+    cameras_most: int = Field(description="of a capture")
+    body_bytes_most: int = Field(description="of an upload")
+    image_pixels_most: int = Field(description="of one image")
+    jobs_per_key_most: int = Field(description="queued and running")
+    settings: JobSettings = Field(description="what a job has where it gives none; its schema says what it may give")
 
 
-def about(service: Service) -> Info:
+def about(service: Service) -> InfoOut:
     """Returns the service's version, its load, its limits and the default settings of a job."""
     jobs, limits = service.jobs.counts(), service.settings
-    return Info(
-        version("eigenhead"),
-        len(os.sched_getaffinity(0)),
-        jobs["queued"],
-        jobs["running"],
-        CAMERAS_LEAST,
-        CAMERAS_MOST,
-        limits.body_bytes,
-        limits.image_pixels,
-        limits.jobs_per_key,
-        document_from_settings(Settings()),
+    return InfoOut(
+        version=version("eigenhead"),
+        cores=len(os.sched_getaffinity(0)),
+        queued=jobs["queued"],
+        running=jobs["running"],
+        cameras_least=CAMERAS_LEAST,
+        cameras_most=CAMERAS_MOST,
+        body_bytes_most=limits.body_bytes,
+        image_pixels_most=limits.image_pixels,
+        jobs_per_key_most=limits.jobs_per_key,
+        settings=document_from_settings(Settings()),
     )

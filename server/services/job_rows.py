@@ -1,10 +1,12 @@
 """Jobs as the job engine keeps them: names of its workflows, and what its rows say in our words."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import cast
 
 from dbos import EnqueueOptions, WorkflowStatus
 
+from server.services.answer import State
 from server.services.records import moment_of
 from server.storage.job_index import JobQuery
 from server.storage.records import JobRequest
@@ -13,7 +15,7 @@ APPLICATION = "eigenhead"
 APPLICATION_VERSION = "eigenhead-jobs-1"  # pinned: a job outlives an upgrade; changes only with the steps themselves
 WORKFLOW = "reconstruct"
 DELIVERY = "deliver"
-STATES = {
+STATES: Mapping[str, State] = {
     "DELAYED": "queued",
     "ENQUEUED": "queued",
     "PENDING": "running",
@@ -22,7 +24,9 @@ STATES = {
     "MAX_RECOVERY_ATTEMPTS_EXCEEDED": "failed",
     "CANCELLED": "cancelled",
 }
-STATUSES = {state: [s for s, t in STATES.items() if t == state] for state in set(STATES.values())}
+STATUSES: Mapping[str, list[str]] = {
+    state: [s for s, t in STATES.items() if t == state] for state in set(STATES.values())
+}
 FINISHED = ("succeeded", "failed", "cancelled")
 
 

@@ -19,6 +19,7 @@ from rig.messages.message import Message, compose
 from server.errors import Conflict, NotFound, TooMany
 from server.log import log_file
 from server.origins import target
+from server.services.answer import State
 from server.services.deliveries import Deliveries, delivery_of, destination
 from server.services.failures import SERIALIZER, failure
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
@@ -34,13 +35,13 @@ from server.services.job_rows import (
     moment,
     request_of,
 )
-from server.services.records import Delivery, Found, Job
+from server.services.records import DeliveryOut, Found, JobOut
 from server.services.results import Results
 from server.services.webhooks import messages_of
 from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
-from server.storage.database import alive_workers, workers
+from server.storage.database import alive_workers, portions, workers
 from server.storage.events import EventLog, JobEvent
 from server.storage.job_index import JobIndex, JobQuery
 from server.storage.library import Library
@@ -86,7 +87,7 @@ class Jobs:
         idempotency_key: str | None = None,
         queue: str | None = None,
         priority: int = 100,
-    ) -> Job:
+    ) -> JobOut:
         """Queues a reconstruction of a capture and returns the job. A repeated request with the same idempotency key
         returns the job of the first one.
 
@@ -115,7 +116,7 @@ class Jobs:
         if queue is not None and queue not in self._settings.queues:
             raise InputError("queue", [compose("queue-unknown", queue=f"{queue!r:.40}", queues=self._settings.queues)])
 
-    def submit_session(self, session: str, wanted: ReconstructionRequest, *, key: str, priority: int) -> list[Job]:
+    def submit_session(self, session: str, wanted: ReconstructionRequest, *, key: str, priority: int) -> list[JobOut]:
         """Queues a reconstruction of every capture of a session that shows a head, and returns the jobs. Raises what
         ``submit`` raises; jobs queued before the error stay queued."""
         wanted.check()  # a session without captures asks no job to
@@ -130,7 +131,7 @@ class Jobs:
         queue: str | None,
         priority: int,
         idempotency_key: str | None = None,
-    ) -> Job:
+    ) -> JobOut:
         job_id = new_id() if idempotency_key is None else repeatable_id(key, idempotency_key)
         first = None if idempotency_key is None else self._status(job_id)
         if first is None:
@@ -165,7 +166,7 @@ class Jobs:
         inputs = [capture.inputs for capture in captures if isinstance(capture, CaptureRecord)]
         return first["capture_id"] == request["capture_id"] or (len(inputs) == 2 and inputs[0] == inputs[1])
 
-    def get(self, job_id: str) -> Job:
+    def get(self, job_id: str) -> JobOut:
         """Returns a job with its present state. Raises NotFound."""
         return self._jobs([self._known(job_id)])[0]
 
@@ -173,13 +174,13 @@ class Jobs:
         """Returns what a job was submitted with, or None if that cannot be read. Raises NotFound."""
         return request_of(self._known(job_id))
 
-    def state(self, job_id: str) -> str:
-        """Returns the state of a job: "queued", "running", "succeeded", "failed" or "cancelled". Raises NotFound."""
+    def state(self, job_id: str) -> State:
+        """Returns the state of a job. Raises NotFound."""
         return STATES[self._known(job_id, load=False).status]
 
     def find(
         self, *, state: str | None = None, capture: str | None = None, session: str | None = None, limit: int = 100
-    ) -> list[Job]:
+    ) -> list[JobOut]:
         """Returns jobs, newest first, ``limit`` at most. They can be restricted to one state, capture or session."""
         ids = None if capture is None and session is None else self.index.ids_of(capture, session)
         if ids == []:
@@ -188,13 +189,13 @@ class Jobs:
         rows = self.client.list_workflows(name=WORKFLOW, workflow_ids=ids, status=status, limit=limit, sort_desc=True)
         return self._jobs(rows)
 
-    def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[Job]:
+    def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[JobOut]:
         """Returns one page of the jobs that match a query, ``limit`` at most. A word of the search that names a state
         ("failed") selects jobs in that state. Raises InputError for a cursor of another list."""
         page = self.index.page(by_state(query), limit, cursor)
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
-    def of(self, ids: Sequence[str]) -> list[Job]:
+    def of(self, ids: Sequence[str]) -> list[JobOut]:
         """Returns the jobs with these ids, in their order; ids of no job are left out."""
         if not ids:
             return []
@@ -203,7 +204,7 @@ class Jobs:
 
     def counts(self) -> dict[str, int]:
         """Returns the number of jobs by state."""
-        counts = dict.fromkeys(dict.fromkeys(STATES.values()), 0)
+        counts: dict[str, int] = {state: 0 for state in STATES.values()}
         for status, count in self.index.counts().items():
             counts[STATES[status]] += count
         return counts
@@ -221,7 +222,7 @@ class Jobs:
         )
         return [row.workflow_id for row in rows if wanted.items() <= (row.attributes or {}).items()]
 
-    def cancel(self, job_id: str) -> tuple[Job, bool]:
+    def cancel(self, job_id: str) -> tuple[JobOut, bool]:
         """Cancels a queued or running job; a finished one stays as it is. Returns the job, and whether this call
         cancelled it. A worker notices within about a second. Raises NotFound."""
         if runs := self.state(job_id) not in FINISHED:
@@ -239,7 +240,7 @@ class Jobs:
             raise Conflict("no-result", compose("job-without-result", state=job.state))
         if job.notice is not None:
             raise Conflict("result-missing", job.notice)
-        return job.files
+        return {name: FileEntry(bytes=file.bytes, sha256=file.sha256) for name, file in job.files.items()}
 
     def log(self, job_id: str) -> str:
         """Returns the log that workers wrote of a job. Raises NotFound for an unknown job and for one that has not
@@ -261,7 +262,7 @@ class Jobs:
     def orphans(self) -> list[str]:
         """Lists folders of results that no job of the database has made: the database is another one, or was lost."""
         there = [job_id for job_id in self._store.ids("jobs") if self._result(job_id).is_dir()]
-        known = {job_id for at in range(0, len(there), 500) for job_id in self.index.known(there[at : at + 500])}
+        known = {job_id for some in portions(there) for job_id in self.index.known(some)}
         return [job_id for job_id in there if job_id not in known]
 
     def _result(self, job_id: str) -> Path:
@@ -289,7 +290,7 @@ class Jobs:
             self.results.erase(job_id)
             raise NotFound(compose("thing-job"), job_id)
 
-    def restart(self, job_id: str, wanted: ReconstructionRequest, *, key: str = "local") -> Job:
+    def restart(self, job_id: str, wanted: ReconstructionRequest, *, key: str = "local") -> JobOut:
         """Queues a new job for the capture of an earlier job, and notes the earlier job's id in it. Model and settings
         that are None in ``wanted`` are the earlier job's. Raises InputError for wrong ones, NotFound if the job or its
         capture is gone, and TooMany."""
@@ -328,7 +329,7 @@ class Jobs:
         rows = self.client.list_workflows(workflow_ids=jobs, name=WORKFLOW, load_output=False)
         return {row.workflow_id: request for row in rows if (request := request_of(row)) is not None}
 
-    def _jobs(self, rows: Sequence[WorkflowStatus]) -> list[Job]:
+    def _jobs(self, rows: Sequence[WorkflowStatus]) -> list[JobOut]:
         latest = self.events.latest([row.workflow_id for row in rows])
         idle = {name: self.queue_notice(name) for name in {r.queue_name for r in rows if STATES[r.status] == "queued"}}
         places = self.index.places() if idle else {}
@@ -377,13 +378,13 @@ class Jobs:
         row: WorkflowStatus,
         event: JobEvent | None,
         places: Mapping[str, int],
-        begun: Mapping[str, Delivery],
+        begun: Mapping[str, DeliveryOut],
         idle: Mapping[str | None, Message | None],
-    ) -> Job:
+    ) -> JobOut:
         state = STATES[row.status]
         progress: EventDocument = event.document if event is not None and state == "running" else {}
         request = request_of(row)
-        return Job(
+        return JobOut(
             id=row.workflow_id,
             name="" if request is None else request.get("name", ""),
             state=state,
@@ -395,11 +396,11 @@ class Jobs:
             capture_id=None if request is None else request["capture_id"],
             session=(row.attributes or {}).get("session"),
             model=None if request is None else request.get("model"),
-            settings={} if request is None else request.get("settings") or {},
+            settings={} if request is None else dict(request.get("settings") or {}),
             restart_of=None if request is None else request.get("restart_of"),
             queue=row.queue_name,
             priority=row.priority or 0,
-            queue_position=places.get(row.workflow_id) if state == "queued" else None,
+            ahead=places.get(row.workflow_id) if state == "queued" else None,
             created=moment(row.created_at),
             started=moment(row.dequeued_at),
             finished=moment(row.completed_at) if state in FINISHED else None,

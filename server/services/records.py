@@ -1,12 +1,17 @@
-"""Declares the values that the services return to routes, pages and the command line."""
+"""Declares the documents of jobs, batches, sessions, calibrations, the rig and webhooks."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import time
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Generic, TypeVar
+from typing import Generic, Literal, TypeVar
 
+from pydantic import Field
+
+from rig.acquisition.verdict import Verdict
 from rig.messages.message import Message
-from server.storage.records import FileEntry
+from server.services.answer import Answer, JobSettings, MessageOut, Moment, Said, State, as_data
+from server.storage.batches import BatchState
+from server.storage.records import JsonObject
 
 T = TypeVar("T")
 
@@ -21,175 +26,173 @@ class Found(Generic[T]):
     total: int
 
 
-@dataclass(frozen=True, slots=True)
-class Failure:
-    """Holds why a job failed: the problem's ``type`` (a URN that stays the same across versions), what went wrong and
-    what to do, and every fault found."""
+class JobError(Answer):
+    """Describes why a job failed. ``type`` and ``detail`` are as in a problem document."""
 
     type: str
-    detail: Message
-    errors: tuple[Message, ...] = ()
+    detail: Said
+    detail_message = as_data("detail")
+    errors: tuple[Said, ...]
+    error_messages = as_data("errors", list[MessageOut])
 
 
-@dataclass(frozen=True, slots=True)
-class Delivery:
-    """States where a job's result is delivered to, and how far that is: waiting, delivering, delivered, failed or
-    cancelled."""
+class FileOut(Answer):
+    """Describes a file by its size in bytes and its SHA-256."""
 
-    to: str
-    state: str
-    error: Failure | None
+    bytes: int
+    sha256: str
 
 
-@dataclass(frozen=True, slots=True)
-class Job:
-    """Holds the state of a job at one moment.
+class DeliveryOut(Answer):
+    """Says where a job's result is delivered to."""
 
-    ``progress`` runs from 0 to 1; ``eta_s`` is the estimated remaining time (s). ``notice`` says why a queued job
-    cannot begin, or that the files of its result are gone. ``queue_position`` counts the jobs that go before a queued
-    one. ``files`` has size and SHA-256 of the result's files, by name.
-    """
+    to: str = Field(description="where the files lie once they are delivered; delivery.json is the last of them")
+    state: Literal["waiting", "delivering", "delivered", "failed", "cancelled"]
+    error: JobError | None
+
+
+class JobOut(Answer):
+    """Describes a job: its request, state and progress and, once it has succeeded, the files of its result. ``eta_s``
+    is the estimated remaining time in seconds."""
 
     id: str
     name: str
-    state: str
+    state: State
     stage: str
-    progress: float
+    progress: float = Field(ge=0, le=1)
     eta_s: float | None
-    error: Failure | None
-    notice: Message | None
+    error: JobError | None
+    notice: Said | None = Field(None, description="why a queued job cannot begin or a result is gone; what to do")
+    notice_message = as_data("notice", MessageOut | None)
     capture_id: str | None
     session: str | None
     model: str | None
-    settings: Mapping[str, object]
+    settings: JobSettings
     restart_of: str | None
     queue: str | None
     priority: int
-    queue_position: int | None
-    created: str | None
-    started: str | None
-    finished: str | None
-    files: dict[str, FileEntry]
-    delivery: Delivery | None = None
+    ahead: int | None = Field(None, description="jobs of its queue that go before a queued one")
+    created: Moment | None
+    started: Moment | None
+    finished: Moment | None
+    files: dict[str, FileOut]
+    delivery: DeliveryOut | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """Holds the state of a batch at one moment.
+class BatchCounts(Answer):
+    """Counts the captures of a batch by state."""
 
-    ``counts``: number of captures in each state of ``ITEM_STATES``; ``total``: their sum; ``eta_s``: estimated
-    remaining time (s), None if it cannot be estimated; ``notice``: why its jobs cannot begin.
-    """
+    waiting: int = Field(description="without a job yet")
+    queued: int
+    running: int
+    succeeded: int
+    failed: int
+    cancelled: int
+    removed: int = Field(description="whose capture, or whose job, is gone")
+
+
+class BatchOut(Answer):
+    """Describes a batch: its request, its state, and how many of its captures are in which state."""
 
     id: str
     label: str
-    state: str
-    created: str
-    finished: str | None
+    state: BatchState = Field(description="finished: nothing is left to do; a cancelled one stays cancelled")
+    created: Moment
+    finished: Moment | None
     queue: str
     priority: int
     model: str | None
-    settings: Mapping[str, object]
+    settings: JobSettings
     deliver_to: str | None
-    total: int
-    counts: Mapping[str, int]
-    eta_s: float | None
-    notice: Message | None
+    total: int = Field(description="captures")
+    counts: BatchCounts
+    eta_s: float | None = Field(description="by the mean of its jobs so far; null before one succeeded")
+    notice: Said | None = Field(None, description="why its jobs cannot begin; what to do")
+    notice_message = as_data("notice", MessageOut | None)
 
 
-@dataclass(frozen=True, slots=True)
-class Session:
-    """Holds a session: the ids of captures of one subject, and the note of the subject's consent."""
+class SessionOut(Answer):
+    """Describes a session with the ids of its captures, newest first."""
 
     id: str
-    created: str
+    created: Moment
     label: str
     consent: str
-    captures: tuple[str, ...]
+    captures: list[str]
 
 
-@dataclass(frozen=True, slots=True)
-class Subject:
-    """Holds a person: the sessions with the same name, newest first.
+class PersonOut(Answer):
+    """Describes a person whose sessions have the same name. ``captures`` counts captures, ``heads`` jobs that made a
+    head."""
 
-    ``id``, ``label`` and ``created`` are those of the newest session; ``captures``, ``heads`` and ``running`` count
-    captures, succeeded jobs, and queued or running jobs. ``head`` is the newest succeeded job, ``capture`` a capture to
-    show, ``consent`` whether every session has a note of it.
-    """
-
-    id: str
+    id: str = Field(description="of the newest session")
     label: str
-    created: str
-    sessions: tuple[str, ...]
+    created: Moment
+    sessions: list[str]
     captures: int
     heads: int
-    running: int
-    head: str | None
-    capture: str | None
-    consent: bool
-    tags: tuple[str, ...]
+    running: int = Field(description="jobs that are queued or running")
+    head: str | None = Field(description="newest job with a result")
+    capture: str | None = Field(description="newest capture")
+    consent: bool = Field(description="whether every session has a note of it")
+    tags: list[str] = Field(description="of their captures")
 
 
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """Holds a calibration and, once it has succeeded, its outcome.
-
-    ``pictures``: number of pictures by camera; ``kind``: what they show ("board", "scene"); ``stage``, ``progress`` (0
-    to 1) and ``eta_s`` (s): how far a running one is; ``missing``: what would improve its verdict.
-    """
+class CalibrationOut(Answer):
+    """Describes a calibration: the state of its job and, once it has succeeded, figures, checks and the verdict.
+    ``progress`` runs from 0 to 1; ``eta_s`` is the estimated remaining time in seconds."""
 
     id: str
-    created: str
-    source: str
+    created: Moment
+    source: Literal["upload", "rig"]
     label: str
-    pictures: dict[str, int]
-    kind: str
-    state: str
+    pictures: dict[str, int] = Field(description="number of pictures by camera")
+    kind: Literal["board", "scene"] = Field("board", description="what the pictures show")
+    state: State
     stage: str | None = None
-    progress: float = 0.0
+    progress: float = Field(0.0, ge=0, le=1)
     eta_s: float | None = None
-    error: Failure | None = None
-    verdict: str | None = None
-    missing: tuple[Message, ...] = ()
-    figures: Mapping[str, object] = field(default_factory=dict)
-    checks: tuple[Mapping[str, object], ...] = ()
-    warnings: tuple[Message, ...] = ()
-    front: str | None = None
-    in_use: bool = False
+    error: JobError | None
+    verdict: Verdict | None = Field(None, description="null: not judged")
+    missing: tuple[Said, ...] = Field((), description="what would make the verdict better, most urgent first")
+    missing_messages = as_data("missing", list[MessageOut])
+    figures: JsonObject
+    checks: tuple[JsonObject, ...]
+    warnings: tuple[Said, ...]
+    warning_messages = as_data("warnings", list[MessageOut])
+    front: str | None
+    in_use: bool
 
 
-@dataclass(frozen=True, slots=True)
-class RigCamera:
-    """Holds a camera of the rig and its state: "closed" before it is first used, "open", "missing", or "ready" in the
-    simulated studio."""
+class CameraOut(Answer):
+    """Describes a camera of the rig. ``closed``: not used since the start; ``ready``: simulated."""
 
     name: str
     driver: str
-    state: str
+    state: Literal["ready", "open", "closed", "missing"]
 
 
-@dataclass(frozen=True, slots=True)
-class RigState:
-    """Holds the state of the rig at one moment. ``faults`` say what it lacks. ``calibration``: "own" if the rig has a
-    cameras.json, "studio" for the simulated studio without one, None for a real rig without one."""
+class RigOut(Answer):
+    """Describes the rig. ``calibration``: ``own`` if it has a calibration, ``studio`` for the simulated studio without
+    one, null for a real rig without one."""
 
     id: str
-    kind: str
+    kind: Literal["simulated", "real"]
     ready: bool
-    cameras: tuple[RigCamera, ...]
-    faults: tuple[Message, ...]
+    cameras: list[CameraOut]
+    faults: tuple[Said, ...]
+    fault_messages = as_data("faults", list[MessageOut])
     calibration: str | None
 
 
-@dataclass(frozen=True, slots=True)
-class CameraSettings:
-    """Holds the settings that were requested of a camera (None: the camera decides). ``unmet`` has a message for each
-    setting that the camera did not take."""
+class CameraSettingsOut(Answer):
+    """Holds the settings requested of a camera (null: the camera decides), and which of them it did not accept."""
 
     exposure_ms: float | None
     gain_db: float | None
     white_balance_k: int | None
-    unmet: tuple[Message, ...]
+    unmet: tuple[Said, ...] = Field(description="what the camera did not take, and why")
+    unmet_messages = as_data("unmet", list[MessageOut])
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,21 +204,24 @@ class CleanPlates:
     note: Message | None
 
 
-@dataclass(frozen=True, slots=True)
-class Webhook:
-    """Holds a webhook: the address to which the service announces the end of jobs and batches."""
+class WebhookOut(Answer):
+    """Describes a webhook without its secret."""
 
     id: str
     url: str
 
 
-@dataclass(frozen=True, slots=True)
-class NewWebhook(Webhook):
-    """Holds a webhook that was just added, with the secret that signs its messages. The secret is not shown again."""
+class NewWebhookOut(WebhookOut):
+    """Describes a webhook that was just added, with its secret."""
 
-    secret: str
+    secret: str = Field(description="shown this once; signs the messages (standardwebhooks.com)")
 
 
-def moment_of(milliseconds: int) -> str:
+def moment_now() -> str:
+    """Returns the time as ``moment_of`` writes it."""
+    return moment_of(1000.0 * time.time())
+
+
+def moment_of(milliseconds: float) -> str:
     """Formats a time in milliseconds since 1970 as ISO 8601 in UTC, such as 2026-01-31T12:00:00.000Z."""
     return datetime.fromtimestamp(milliseconds / 1000, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -15,13 +15,14 @@ from pathlib import Path
 
 import structlog
 
+from rig.digest import sha256_of
 from rig.errors import Cancelled, EigenheadError
 from rig.messages.message import compose
 from server.errors import Conflict, Refused
 from server.services.unclaimed import COLLECT_S, DAY_S, collect
 from server.settings import ServiceSettings
 from server.storage.object_places import open_objects
-from server.storage.objects import ObjectMissing, StoreDenied, StoreUnavailable, sha256_of
+from server.storage.objects import ObjectMissing, StoreDenied, StoreUnavailable
 from server.storage.records import FileEntry
 from server.storage.store import Store, StoredFile
 from server.storage.watched_objects import StoreTally, WatchedObjects

@@ -9,19 +9,22 @@ import json
 import time
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Literal
 
 import structlog
+from pydantic import Field
 
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 from server.errors import NotFound
+from server.services.answer import Answer, Moment
 from server.services.deliveries import UNDER_WAY
 from server.services.job_rows import DELIVERY, FINISHED, STATUSES
-from server.services.service import Check, Service
+from server.services.records import moment_now, moment_of
+from server.services.service import CheckOut, Service
 from server.services.stored_captures import collect_unclaimed, tend_captures
 from server.storage.database import database_identity
 from server.storage.folders import LAST_SWEEP, STOPPED, folder_bytes, newest
@@ -106,25 +109,23 @@ def _removes_half(service: Service, passed_s: float) -> bool:
     return due >= MANY and 2 * due > sum(len(made) for _, made in kept)
 
 
-@dataclass(frozen=True, slots=True)
-class Upcoming:
-    """Holds a finished job or a capture that retention will remove. ``goes``: when, as ISO 8601, None if that depends
-    on free space or on new jobs; ``why``: the setting that removes it."""
+class UpcomingOut(Answer):
+    """Describes a capture or finished job that retention will remove."""
 
-    kind: str
+    kind: Literal["job", "capture"]
     id: str
     label: str
-    goes: str | None
-    why: str
+    goes: Moment | None = Field(description="null where that hangs on the disk or on what comes")
+    why: str = Field(description="the setting that takes it")
 
 
-def upcoming(service: Service, limit: int = 10) -> list[Upcoming]:
+def upcoming(service: Service, limit: int = 10) -> list[UpcomingOut]:
     """Returns what retention will remove next if nothing is added: at most ``limit`` jobs, then at most ``limit``
     captures. Captures that a job needs are left out."""
     return [*_jobs_next(service, limit), *_captures_next(service, limit)]
 
 
-def _jobs_next(service: Service, limit: int) -> list[Upcoming]:
+def _jobs_next(service: Service, limit: int) -> list[UpcomingOut]:
     s = service.settings
     page = service.jobs.page(JobQuery("", ENDED, order="created"), limit)
     full = s.make_room and service.store.free_bytes() < s.free_bytes
@@ -132,35 +133,31 @@ def _jobs_next(service: Service, limit: int) -> list[Upcoming]:
     for place, job in enumerate(page.items):
         many = s.keep_jobs is not None and page.total - place > s.keep_jobs
         if full or many:
-            goes, why = _moment(time.time()), "keep_jobs" if many else "make_room"
+            goes, why = moment_now(), "keep_jobs" if many else "make_room"
         elif s.keep_results_days is not None:
             goes, why = _later(job.finished or job.created, s.keep_results_days), "keep_results_days"
         elif s.make_room or s.keep_jobs is not None:
             goes, why = None, "make_room" if s.make_room else "keep_jobs"
         else:
             break
-        found.append(Upcoming("job", job.id, job.name, goes, why))
+        found.append(UpcomingOut(kind="job", id=job.id, label=job.name, goes=goes, why=why))
     return found
 
 
-def _captures_next(service: Service, limit: int) -> list[Upcoming]:
+def _captures_next(service: Service, limit: int) -> list[UpcomingOut]:
     days = service.settings.keep_captures_days
     if days is None:
         return []
     oldest = service.captures.page(CaptureQuery(order="created"), limit).items
     return [
-        Upcoming("capture", r.id, r.label, _later(r.created, days), "keep_captures_days")
+        UpcomingOut(kind="capture", id=r.id, label=r.label, goes=_later(r.created, days), why="keep_captures_days")
         for r in oldest
         if not service.jobs.active(capture=r.id)
     ]
 
 
 def _later(moment: str | None, days: float) -> str | None:
-    return None if moment is None else _moment(datetime.fromisoformat(moment).timestamp() + days * DAY_S)
-
-
-def _moment(at: float) -> str:
-    return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return None if moment is None else moment_of(1000.0 * (datetime.fromisoformat(moment).timestamp() + days * DAY_S))
 
 
 def _jobs(service: Service) -> int:
@@ -270,7 +267,7 @@ def _find_missing(service: Service) -> None:
         detail = compose("results-missing", count=len(missing), jobs=missing[:3])
     elif damaged:
         detail = compose("file-damaged", files=sorted(damaged)[:3])
-    service.known["results"] = Check(ok=True, detail=detail)
+    service.known["results"] = CheckOut(ok=True, detail=detail)
 
 
 def _age_s(moment: str | None) -> float:

@@ -8,9 +8,10 @@ from pathlib import Path
 import sqlalchemy as sa
 
 from rig.errors import InputError
-from rig.messages.message import Message, compose
+from rig.messages.message import compose
 from server.errors import Conflict
 from server.metrics import Metrics
+from server.services.answer import Answer, Said, as_data
 from server.services.batches import Batches
 from server.services.calibrations import Calibrations
 from server.services.captures import Captures
@@ -18,7 +19,7 @@ from server.services.deliveries import UNDER_WAY, destination, enqueue_delivery
 from server.services.jobs import Jobs, migrate
 from server.services.keys import Keys
 from server.services.live.live import Live
-from server.services.records import Calibration, Job, RigState
+from server.services.records import CalibrationOut, JobOut, RigOut
 from server.services.rigs.backend import RigBackend
 from server.services.rigs.real import RealRig
 from server.services.rigs.simulated import SimulatedRig
@@ -38,13 +39,13 @@ from server.tasks.child import ChildProcessPool, WorkFailed
 from server.tasks.export_archive import export_archive
 
 
-@dataclass(frozen=True, slots=True)
-class Check:
-    """Holds one finding about the service. ``detail`` says what to do where it is not well. ``starting``: it will
-    become well by itself."""
+class CheckOut(Answer):
+    """Holds one check of the service: whether it passed and, if not, what to do. ``starting``: it will pass soon by
+    itself."""
 
     ok: bool
-    detail: Message
+    detail: Said
+    detail_message = as_data("detail")
     starting: bool = False
 
 
@@ -69,7 +70,7 @@ class Service:
     calibrations: Calibrations
     storage: StorageCount
     metrics: Metrics
-    known: dict[str, Check]  # findings that are made once
+    known: dict[str, CheckOut]  # findings that are made once
 
     def close(self) -> None:
         """Closes the rig, ends the child processes and closes all connections to the database."""
@@ -79,7 +80,7 @@ class Service:
         self.jobs.close()
         self.engine.dispose()
 
-    def accept_pictures(self, source: str, archive: Path, folder: Path, label: str) -> Calibration:
+    def accept_pictures(self, source: str, archive: Path, folder: Path, label: str) -> CalibrationOut:
         """Unpacks an archive of pictures and queues a calibration: of IMAGES/ and board.toml, or where ``source`` is
         "scene" of photographs. ``folder`` is a folder of ``Store.incoming``. Raises InputError naming every fault, and
         DiskFull."""
@@ -93,7 +94,7 @@ class Service:
             unpack(archive=str(archive), folder=str(target), limits=limits)
         return self.calibrations.add(target, "upload", label)
 
-    def use_calibration(self, identity: str, *, poor: bool = False) -> RigState:
+    def use_calibration(self, identity: str, *, poor: bool = False) -> RigOut:
         """Uses a calibration for every later capture and returns the rig's state. Raises NotFound, and Conflict if the
         calibration has not succeeded, is of other cameras, or has the verdict poor and ``poor`` does not allow that."""
         if not poor:
@@ -102,7 +103,7 @@ class Service:
         self.calibrations.mark_in_use(identity)
         return self.rig.describe()
 
-    def cancel(self, job_id: str) -> Job:
+    def cancel(self, job_id: str) -> JobOut:
         """Cancels a job and queues messages to the webhooks about that. A finished job stays as it is. Raises
         NotFound."""
         job, did = self.jobs.cancel(job_id)
@@ -111,7 +112,7 @@ class Service:
             self.webhooks.announce(job_id, "cancelled", self.jobs.client.enqueue, job_webhook=webhook)
         return job
 
-    def deliver(self, job_id: str, to: str | None = None) -> Job:
+    def deliver(self, job_id: str, to: str | None = None) -> JobOut:
         """Delivers the result of a job to a place in an object store, by default the place that the job was submitted
         with. Raises NotFound, InputError without a place, InvalidInput for one that is not allowed, and Conflict for a
         job without result and while it is being delivered."""

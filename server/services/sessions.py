@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
-from datetime import UTC, datetime
 
 from server.errors import NotFound
 from server.services.erasure import erase_captures
 from server.services.jobs import Jobs
-from server.services.records import Found, Session, Subject
+from server.services.records import Found, PersonOut, SessionOut, moment_now
 from server.services.texts import check_texts
 from server.storage.library import Library, SubjectOrder, subject_of
 from server.storage.records import SessionRecord
@@ -21,16 +20,15 @@ class Sessions:
     def __init__(self, store: Store, jobs: Jobs, library: Library) -> None:
         self._store, self._jobs, self._library = store, jobs, library
 
-    def add(self, label: str, consent: str) -> Session:
+    def add(self, label: str, consent: str) -> SessionOut:
         """Makes a session and returns it. ``consent`` is the note of the subject's consent, empty if there is none.
         Raises InputError for invalid texts."""
         check_texts({"label": label, "consent": consent})
-        created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        record = SessionRecord(new_id(), created, label, consent)
+        record = SessionRecord(new_id(), moment_now(), label, consent)
         self._store.add_session(record)
         return _with_captures(record, [])
 
-    def page(self, sought: str = "", limit: int = 100, cursor: str | None = None) -> Found[Session]:
+    def page(self, sought: str = "", limit: int = 100, cursor: str | None = None) -> Found[SessionOut]:
         """Returns one page of the sessions in whose label or consent note all words of ``sought`` occur, newest first.
         Raises InputError for a cursor of another list."""
         page = self._library.sessions(sought, limit, cursor)
@@ -46,7 +44,7 @@ class Sessions:
         cursor: str | None = None,
         *,
         tag: str | None = None,
-    ) -> Found[Subject]:
+    ) -> Found[PersonOut]:
         """Returns one page of subjects. Sessions with the same label are one subject. ``tag``: only subjects with a
         capture that has this tag. Raises InputError for a cursor of another list."""
         page = self._library.subjects(sought, order, limit, cursor, tag)
@@ -59,7 +57,7 @@ class Sessions:
             if records:
                 theirs = {capture: jobs[capture] for session in sessions for capture in captures[session]}
                 theirs_tags = {tag.casefold(): tag for capture in theirs for tag in tags.get(capture, ())}
-                found.append(_subject(records, theirs, tuple(theirs_tags.values())))
+                found.append(_subject(records, theirs, list(theirs_tags.values())))
         return Found(tuple(found), page.next, page.total)
 
     def captures_of_subject(self, session: str | None) -> list[str]:
@@ -76,12 +74,12 @@ class Sessions:
             return self._store.session(identity)
         return None
 
-    def get(self, identity: str) -> Session:
+    def get(self, identity: str) -> SessionOut:
         """Returns a session with the ids of its captures. Raises NotFound."""
         record = self._store.session(identity)
         return _with_captures(record, self._library.captures_of([identity])[identity])
 
-    def edit(self, identity: str, *, label: str | None = None, consent: str | None = None) -> Session:
+    def edit(self, identity: str, *, label: str | None = None, consent: str | None = None) -> SessionOut:
         """Changes the label or the consent note of a session; None leaves it as it is. Raises NotFound, and InputError
         for invalid texts."""
         check_texts({"label": label, "consent": consent})
@@ -108,21 +106,21 @@ class Sessions:
         erase_captures(self._store, self._jobs, captures, jobs)
 
 
-def _with_captures(record: SessionRecord, captures: list[str]) -> Session:
-    return Session(**asdict(record), captures=tuple(captures))
+def _with_captures(record: SessionRecord, captures: list[str]) -> SessionOut:
+    return SessionOut(**asdict(record), captures=captures)
 
 
 def _subject(
-    records: Sequence[SessionRecord], jobs: Mapping[str, Sequence[tuple[str, str]]], tags: tuple[str, ...]
-) -> Subject:
+    records: Sequence[SessionRecord], jobs: Mapping[str, Sequence[tuple[str, str]]], tags: list[str]
+) -> PersonOut:
     """``records``: a person's sessions, newest first; ``jobs``: id and state of those of each capture."""
     all_jobs = sorted(((job, state, capture) for capture, some in jobs.items() for job, state in some), reverse=True)
     heads = [job for job, state, _ in all_jobs if state == "succeeded"]
-    return Subject(
+    return PersonOut(
         id=records[0].id,
         label=records[0].label,
         created=records[0].created,
-        sessions=tuple(record.id for record in records),
+        sessions=[record.id for record in records],
         captures=len(jobs),
         heads=len(heads),
         running=sum(state in ("queued", "running") for _, state, _ in all_jobs),

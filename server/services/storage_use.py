@@ -5,9 +5,11 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import Field
+
+from server.services.answer import Answer
 from server.services.job_rows import STATUSES
 from server.services.jobs import Jobs
 from server.settings import ServiceSettings
@@ -28,31 +30,23 @@ KINDS = {  # folders of the data folder, by what they hold
 }
 
 
-@dataclass(frozen=True, slots=True)
-class KindOfUse:
-    """Holds how much disk space one kind of data takes. ``things``: how many captures, jobs and so on there are."""
+class KindOut(Answer):
+    """Describes how much disk space one kind of data takes."""
 
     kind: str
     bytes: int
-    things: int
+    things: int = Field(description="captures, jobs, ...: what lies directly in the kind's folders")
 
 
-@dataclass(frozen=True, slots=True)
-class StorageUse:
-    """Holds how the disk of the data folder is used; sizes are in bytes.
+class StorageOut(Answer):
+    """Describes how the disk of the data folder is used."""
 
-    ``free`` and ``total`` are the disk's, ``spare`` is what uploads and jobs must leave free. ``kinds`` is None until
-    the data folder was counted, ``at`` is when that was (s since 1970). ``failed``: number of failed and cancelled
-    jobs.
-    """
-
-    data: str
-    free: int
-    total: int
-    spare: int
-    kinds: tuple[KindOfUse, ...] | None
-    at: float | None
-    failed: int
+    free: int = Field(description="bytes of the disk")
+    total: int = Field(description="bytes of the disk")
+    spare: int = Field(description="bytes that uploads and jobs leave free")
+    failed: int = Field(description="jobs that failed or were cancelled")
+    kinds: list[KindOut] | None = Field(description="null while the data folder is looked through for the first time")
+    at: float | None = Field(description="when it was looked through, seconds since 1970")
 
 
 class StorageCount:
@@ -62,24 +56,23 @@ class StorageCount:
     def __init__(self, store: Store, jobs: Jobs, settings: ServiceSettings) -> None:
         self._store, self._jobs, self._settings = store, jobs, settings
         self._looking = threading.Lock()
-        self._found: tuple[KindOfUse, ...] | None = None
+        self._found: list[KindOut] | None = None
         self._at: float | None = None
 
-    def use(self) -> StorageUse:
+    def use(self) -> StorageOut:
         """Returns the last count and the disk's present free space. Starts a new count if the last is old, and does not
         wait for it."""
         old = self._at is None or time.time() - self._at > COUNT_AGAIN_S
         if old and self._looking.acquire(blocking=False):
             threading.Thread(target=self._look, args=(self._store.data,), daemon=True).start()
         disk = shutil.disk_usage(self._store.data)
-        return StorageUse(
-            str(self._store.data.resolve()),
-            disk.free,
-            disk.total,
-            self._settings.free_bytes,
-            self._found,
-            self._at,
-            self._jobs.page(JobQuery("", FAILED), limit=1).total,
+        return StorageOut(
+            free=disk.free,
+            total=disk.total,
+            spare=self._settings.free_bytes,
+            failed=self._jobs.page(JobQuery("", FAILED), limit=1).total,
+            kinds=self._found,
+            at=self._at,
         )
 
     def forget(self) -> None:
@@ -93,16 +86,17 @@ class StorageCount:
             self._looking.release()
 
 
-def count(data: Path) -> tuple[KindOfUse, ...]:
+def count(data: Path) -> list[KindOut]:
     """Counts bytes and things in the data folder, by kind. The kind "other" is everything else in the folder, the
     database and models included."""
     known = {folder for folders in KINDS.values() for folder in folders}
     found = []
     for kind, folders in KINDS.items():
         places = [data / folder for folder in folders]
-        found.append(KindOfUse(kind, sum(map(_bytes, places)), sum(len(_names(place)) for place in places)))
+        things = sum(len(_names(place)) for place in places)
+        found.append(KindOut(kind=kind, bytes=sum(map(_bytes, places)), things=things))
     rest = [data / name for name in _names(data) if name not in known]
-    return (*found, KindOfUse("other", sum(map(_bytes, rest)), len(rest)))
+    return [*found, KindOut(kind="other", bytes=sum(map(_bytes, rest)), things=len(rest))]
 
 
 def _names(folder: Path) -> list[str]:

@@ -1,30 +1,43 @@
 """Lists templates for callers of the service: which there are, how well they fit, which models have them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+
+from pydantic import Field
 
 from pipeline.applications.templates.header import BadTemplate, TemplateHeader, read_header
 from pipeline.applications.templates.names import list_templates
 from pipeline.head_model.model_names import list_models, model_path, model_sha256
+from server.services.answer import Answer
 
 
-@dataclass(frozen=True, slots=True)
-class TemplateAtHand:
-    """Holds a template that a job can name. ``registration`` has the figures that say how well it was fitted to its
-    model."""
+class RegistrationOut(Answer):
+    """Describes how well a template was fitted to its model. Distances are in mm: the median, and the value that 95 %
+    of vertices stay below (``p95``)."""
 
-    id: str
+    skin_share: float = Field(ge=0, le=1, description="of its vertices, on the model's skin; the others follow it")
+    face_covered_share: float = Field(ge=0, le=1, description="of the model's face, that it shows")
+    unlike_median_mm: float = Field(description="between the mesh as it came and the nearest head of the model")
+    unlike_p95_mm: float
+    off_median_mm: float = Field(description="between the mesh drawn onto that head and the head")
+    off_p95_mm: float
+
+
+class TemplateOut(Answer):
+    """Describes a template: a mesh in whose vertex order a job writes its head if ``settings.outputs.template`` names
+    it."""
+
+    id: str = Field(description="what a job calls it")
     name: str
-    source: str | None  # the mesh's file, as it was called
-    sha256: str | None  # of that file
-    model: str | None  # that it was registered to
-    models: tuple[str, ...]  # what a job may call that model here; none where it is not at hand
+    source: str | None = Field(description="file of the mesh")
+    sha256: str | None = Field(description="of that file")
+    model: str | None = Field(description="that it was registered to; a job with another one is refused")
+    models: list[str] = Field(description="names of that model at /v1/models; none where it is not at hand")
     vertices: int | None
-    registration: Mapping[str, float] | None
-    fault: str | None  # of a file that cannot be used; nothing else is known of it
+    registration: RegistrationOut | None
+    fault: str | None = Field(description="why it cannot be used, and nothing else is known of it; null: it can")
 
 
-def templates_at_hand() -> list[TemplateAtHand]:
+def templates_at_hand() -> list[TemplateOut]:
     """Returns the available templates, sorted by name. One whose file cannot be used has a ``fault`` and nothing else.
     Raises OSError if a model's file disappears while it is read."""
     found, digests = [], None
@@ -32,7 +45,8 @@ def templates_at_hand() -> list[TemplateAtHand]:
         try:
             header = read_header(path)
         except BadTemplate as error:
-            found.append(TemplateAtHand(name, name, None, None, None, (), None, None, str(error.why)))
+            unknown = dict.fromkeys(("source", "sha256", "model", "vertices", "registration"))
+            found.append(TemplateOut(id=name, name=name, models=[], fault=str(error.why), **unknown))
             continue
         digests = digests or {
             model: model_sha256(path) for model, path in {"default": model_path("default"), **list_models()}.items()
@@ -41,17 +55,17 @@ def templates_at_hand() -> list[TemplateAtHand]:
     return found
 
 
-def _at_hand(name: str, header: TemplateHeader, digests: Mapping[str, str]) -> TemplateAtHand:
+def _at_hand(name: str, header: TemplateHeader, digests: Mapping[str, str]) -> TemplateOut:
     figures = dict(header.figures)
     vertices = figures.pop("vertices", None)
-    return TemplateAtHand(
+    return TemplateOut(
         id=name,
         name=name,
         source=header.source,
         sha256=header.source_sha256,
         model=header.model_name,
-        models=tuple(model for model, digest in digests.items() if digest == header.model_sha256),
+        models=[model for model, digest in digests.items() if digest == header.model_sha256],
         vertices=None if vertices is None else int(vertices),
-        registration=figures or None,
+        registration=RegistrationOut(**figures) if figures else None,
         fault=None,
     )

@@ -13,14 +13,15 @@ from tempfile import TemporaryDirectory
 
 import structlog
 
+from rig.digest import sha256_of
 from server.errors import Refused
-from server.storage.objects import ObjectMissing, ObjectStore, sha256_of
+from server.storage.database import portions
+from server.storage.objects import ObjectMissing, ObjectStore
 from server.storage.store import is_id
 
 OWNER = "owner"
 DAY_S = 86400.0
 COLLECT_S = 6 * 3600.0  # between two looks at a whole store
-AT_ONCE = 500
 
 log = structlog.get_logger()
 
@@ -41,8 +42,7 @@ def collect(
         if not _owns(objects, owner, scratch):
             return 0
         listed = [name for name in objects.folders() if is_name(name)]
-        for start in range(0, len(listed), AT_ONCE):
-            some = listed[start : start + AT_ONCE]
+        for some in portions(listed):
             for job_id in sorted({*some} - known(some)):
                 written = max((entry.written for entry in objects.entries(f"{job_id}/")), default=0.0)
                 if time.time() - written > days * DAY_S and not known([job_id]):  # submitted again under its id

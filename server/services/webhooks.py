@@ -12,7 +12,6 @@ import json
 import secrets
 import time
 from collections.abc import Callable, Collection
-from dataclasses import asdict
 from typing import Any
 
 import httpx
@@ -24,7 +23,7 @@ from rig.messages.message import compose
 from server.errors import NotFound
 from server.origins import parsed, target
 from server.services.job_rows import APPLICATION_VERSION, DELIVERY
-from server.services.records import NewWebhook, Webhook
+from server.services.records import NewWebhookOut, WebhookOut
 from server.storage.database import now_sql, webhooks
 from server.storage.records import JobWebhook, WebhookMessage
 
@@ -42,21 +41,21 @@ class Webhooks:
         """``origins``: where a job's own webhook may be."""
         self._engine, self._origins = engine, origins
 
-    def add(self, url: str) -> NewWebhook:
+    def add(self, url: str) -> NewWebhookOut:
         """Adds a webhook and returns it with its secret, which is not shown again. Raises InvalidInput for a text that
         is no web address."""
         parsed(url)
         secret = "whsec_" + base64.b64encode(secrets.token_bytes(24)).decode()
-        made = NewWebhook(secrets.token_hex(14), url, secret)
+        made = NewWebhookOut(id=secrets.token_hex(14), url=url, secret=secret)
         with self._engine.begin() as connection:
-            connection.execute(sa.insert(webhooks).values(**asdict(made), created=now_sql(connection)))
+            connection.execute(sa.insert(webhooks).values(**made.model_dump(), created=now_sql(connection)))
         return made
 
-    def all(self) -> list[Webhook]:
+    def all(self) -> list[WebhookOut]:
         """Returns all webhooks without their secrets, oldest first."""
         with self._engine.connect() as connection:
             rows = connection.execute(sa.select(webhooks.c.id, webhooks.c.url).order_by(webhooks.c.created))
-            return [Webhook(row.id, row.url) for row in rows]
+            return [WebhookOut(id=row.id, url=row.url) for row in rows]
 
     def remove(self, identity: str) -> None:
         """Removes a webhook, which gets no further messages. Raises NotFound."""

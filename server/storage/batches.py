@@ -12,11 +12,10 @@ from typing import Literal
 import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 
-from server.storage.database import batch_items, batches
+from server.storage.database import AT_ONCE, batch_items, batches, portions
 from server.storage.job_index import ENQUEUED, RUNNING, engine_jobs
 from server.storage.pages import CursorPage, Order, contains, folded, page_of, storable, words_of
 
-AT_ONCE = 500
 Wish = Literal["running", "paused", "cancelled"]
 BatchState = Literal["running", "paused", "cancelled", "finished"]
 WAITING, GONE = "waiting", "gone"  # of items, beside the engine's statuses
@@ -156,9 +155,8 @@ class BatchIndex:
         with self._engine.connect() as connection:
             rows = connection.execute(sa.select(job.workflow_uuid, job.status).where(job.status.in_(ACTIVE)))
             active = {row.workflow_uuid: row.status for row in rows}  # few; joined, all items would be gone through
-            ids = list(active)
-            for start in range(0, len(ids), AT_ONCE):
-                for row in connection.execute(query.where(item.job_id.in_(ids[start : start + AT_ONCE]))):
+            for some in portions(active):
+                for row in connection.execute(query.where(item.job_id.in_(some))):
                     found.setdefault(row.batch_id, {})[row.job_id] = active[row.job_id]
         return found
 
@@ -240,10 +238,10 @@ class BatchIndex:
     def forget_captures(self, captures: Collection[str]) -> None:
         """Removes the ids of erased captures, and of their jobs, from the items of all batches, and the label and the
         place of batches that have no other captures: they may name the subject."""
-        listed, item = list(captures), batch_items.c
+        item = batch_items.c
         with self._engine.begin() as connection:
-            for start in range(0, len(listed), AT_ONCE):
-                those = item.capture_id.in_(listed[start : start + AT_ONCE])
+            for some in portions(captures):
+                those = item.capture_id.in_(some)
                 affected = [*connection.scalars(sa.select(item.batch_id).where(those).distinct())]
                 change = sa.update(batch_items).where(those)
                 connection.execute(change.values(capture_id=None, job_id=NONE, recalled=False))
@@ -261,8 +259,8 @@ class BatchIndex:
         self, identity: str, jobs: list[str], values: Mapping[str, object], *, reopen: bool = False
     ) -> None:
         with self._engine.begin() as connection:
-            for start in range(0, len(jobs), AT_ONCE):
-                those = batch_items.c.job_id.in_(jobs[start : start + AT_ONCE])
+            for some in portions(jobs):
+                those = batch_items.c.job_id.in_(some)
                 change = sa.update(batch_items).where(batch_items.c.batch_id == identity, those)
                 connection.execute(change.values(**values))
             if reopen:

@@ -18,20 +18,18 @@ from pathlib import Path
 import sqlalchemy as sa
 import structlog
 
+from rig.digest import sha256_of
 from rig.messages.message import compose
 from server.errors import Conflict
 from server.settings import ServiceSettings
-from server.storage.database import blobs, capture_files, capture_index
+from server.storage.database import blobs, capture_files, capture_index, portions
 from server.storage.object_places import open_objects
-from server.storage.objects import Admission, ObjectMissing, StoreDenied, StoreUnavailable, sha256_of
+from server.storage.objects import Admission, ObjectMissing, StoreDenied, StoreUnavailable
 from server.storage.watched_objects import WatchedObjects
 
 NAME = re.compile(r"[0-9a-f]{64}-[0-9a-f]{16}")
 SMALL_BYTES = 1 << 16  # files up to this size stay in the data folder, and are compared before they are used
 ARRIVING_S = 3600.0  # a capture whose files are older than that and that is not there was given up
-AT_ONCE = 500
-
-log = structlog.get_logger()
 
 log = structlog.get_logger()
 
@@ -187,10 +185,8 @@ class CaptureBlobs:
     def holders(self, captures: Collection[str]) -> set[str]:
         """Returns those of the captures that have files in the store, or are about to."""
         query, found = sa.select(capture_files.c.capture_id).distinct(), set[str]()
-        ids = sorted(captures)
         with self._engine.connect() as connection:
-            for start in range(0, len(ids), AT_ONCE):
-                some = ids[start : start + AT_ONCE]
+            for some in portions(captures):
                 found |= {*connection.scalars(query.where(capture_files.c.capture_id.in_(some)))}
         return found
 

@@ -8,9 +8,10 @@ import os
 import secrets
 import sqlite3
 import time
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy import event
@@ -28,7 +29,16 @@ AWAY = (OperationalError, InterfaceError, InternalError, PoolTimeout)
 """What is raised where the database does not answer. InternalError: PostgreSQL ended a transaction that was silent for
 longer than it may be, as over a link that was cut."""
 
+AT_ONCE = 500  # rows in one statement: databases bound how many values one may have
+
 metadata = sa.MetaData()
+T = TypeVar("T")
+
+
+def portions(values: Iterable[T]) -> Iterator[list[T]]:
+    """Yields the values in lists of ``AT_ONCE`` at most."""
+    listed = list(values)
+    return (listed[start : start + AT_ONCE] for start in range(0, len(listed), AT_ONCE))
 
 
 class DatabaseUnavailable(EigenheadError):

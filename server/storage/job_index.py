@@ -12,14 +12,13 @@ from typing import Literal
 import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 
-from server.storage.database import batch_items, capture_index, job_index
+from server.storage.database import batch_items, capture_index, job_index, portions
 from server.storage.library import captures_with
 from server.storage.pages import CursorPage, Order, contains, folded, is_or_ends, page_of, words_of
 from server.storage.records import JobRequest
 
 ENQUEUED = ("DELAYED", "ENQUEUED")
 RUNNING = "PENDING"
-AT_ONCE = 500
 JobOrder = Literal["-created", "created", "-finished", "finished"]
 
 
@@ -81,8 +80,7 @@ class JobIndex:
         ``requests_of`` returns the requests of jobs by id. Returns how many rows there were."""
         with self._engine.connect() as connection:
             bare = [*connection.scalars(sa.select(job_index.c.job_id).where(job_index.c.words.is_(None)))]
-        for start in range(0, len(bare), AT_ONCE):
-            some = bare[start : start + AT_ONCE]
+        for some in portions(bare):
             requests = requests_of(some)
             words = {job: words_of_job(requests[job]) if job in requests else "" for job in some}
             change = sa.update(job_index).where(job_index.c.job_id == sa.bindparam("job"))
@@ -151,14 +149,13 @@ class JobIndex:
     def of_captures(self, captures: Collection[str]) -> dict[str, list[JobOfCapture]]:
         """Returns the jobs of each of the captures, newest first. A capture without jobs has an empty list."""
         found: dict[str, list[JobOfCapture]] = {capture: [] for capture in captures}
-        status, listed = self._status.c, list(captures)
+        status = self._status.c
         joined = job_index.join(self._status, status.workflow_uuid == job_index.c.job_id)
         query = sa.select(job_index.c.capture_id, job_index.c.job_id, status.status).select_from(joined)
         query = query.order_by(status.created_at.desc(), job_index.c.job_id.desc())
         with self._engine.connect() as connection:
-            for start in range(0, len(listed), AT_ONCE):
-                some = query.where(job_index.c.capture_id.in_(listed[start : start + AT_ONCE]))
-                for row in connection.execute(some):
+            for some in portions(captures):
+                for row in connection.execute(query.where(job_index.c.capture_id.in_(some))):
                     found[row.capture_id].append(JobOfCapture(row.job_id, row.status))
         return found
 

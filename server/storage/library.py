@@ -5,21 +5,20 @@ at each start, corrects rows that differ: after a backup was restored, a record 
 folder of an earlier version.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Literal
 
 import sqlalchemy as sa
 import structlog
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DataError
 
-from server.storage.database import capture_index, capture_tags, scrub, session_index
+from server.storage.database import capture_index, capture_tags, portions, scrub, session_index
 from server.storage.pages import CursorPage, Order, contains, folded, is_or_ends, page_of, storable, words_of
 from server.storage.records import CaptureRecord, SessionRecord
 from server.storage.store import Store
 
-AT_ONCE = 500  # rows in one statement: databases bound how many values one may have
 UNJUDGED = "none"  # the verdict of captures that were not judged
 CaptureOrder = Literal["-created", "created", "label", "-label", "verdict", "-bytes"]
 SubjectOrder = Literal["-created", "created", "label", "-label"]
@@ -27,7 +26,6 @@ SubjectOrder = Literal["-created", "created", "label", "-label"]
 log = structlog.get_logger()
 UNFIT = (DataError, OverflowError)  # of one row's values, not of the database
 Record = CaptureRecord | SessionRecord
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +108,7 @@ class Library:
         found: dict[str, list[str]] = {session: [] for session in sessions}
         query = sa.select(capture_index.c.session, capture_index.c.id).order_by(capture_index.c.id.desc())
         with self._engine.connect() as connection:
-            for some in _portions(sessions):
+            for some in portions(sessions):
                 for row in connection.execute(query.where(capture_index.c.session.in_(some))):
                     found[row.session].append(row.id)
         return found
@@ -128,7 +126,7 @@ class Library:
         found: dict[str, list[str]] = {}
         query = sa.select(capture_tags.c.capture_id, capture_tags.c.name).order_by(capture_tags.c.folded)
         with self._engine.connect() as connection:
-            for some in _portions(captures):
+            for some in portions(captures):
                 for row in connection.execute(query.where(capture_tags.c.capture_id.in_(some))):
                     found.setdefault(row.capture_id, []).append(row.name)
         return found
@@ -144,7 +142,7 @@ class Library:
         """Returns for each of the captures whether it shows the calibration board. Ids of no capture are left out."""
         table, found = capture_index.c, dict[str, bool]()
         with self._engine.connect() as connection:
-            for some in _portions(captures):
+            for some in portions(captures):
                 rows = connection.execute(sa.select(table.id, table.board).where(table.id.in_(some)))
                 found |= {row.id: row.board for row in rows}
         return found
@@ -243,7 +241,7 @@ class Library:
     def _put(self, table: sa.Table, rows: list[dict[str, object]]) -> None:
         insert = sqlite.insert if self._engine.dialect.name == "sqlite" else postgresql.insert
         with self._engine.begin() as connection:
-            for some in _portions(rows):
+            for some in portions(rows):
                 statement = insert(table)
                 new = {column.name: statement.excluded[column.name] for column in table.c if not column.primary_key}
                 connection.execute(statement.on_conflict_do_update(index_elements=["id"], set_=new), some)
@@ -253,17 +251,17 @@ class Library:
         rows = [{"capture_id": capture, "folded": tag, "name": name} for (capture, tag), name in names.items()]
         self._drop_tags([record.id for record in records])
         with self._engine.begin() as connection:
-            for some in _portions(rows):
+            for some in portions(rows):
                 connection.execute(sa.insert(capture_tags), some)
 
     def _drop_tags(self, captures: Collection[str]) -> None:
         with self._engine.begin() as connection:
-            for some in _portions(captures):
+            for some in portions(captures):
                 connection.execute(sa.delete(capture_tags).where(capture_tags.c.capture_id.in_(some)))
 
     def _drop(self, table: sa.Table, ids: Collection[str]) -> None:
         with self._engine.begin() as connection:
-            for some in _portions(ids):
+            for some in portions(ids):
                 connection.execute(sa.delete(table).where(table.c.id.in_(some)))
 
 
@@ -318,8 +316,3 @@ def _session_row(record: SessionRecord, changed: int) -> dict[str, object]:
         "words": folded(record.label, record.consent),
         "changed": changed,
     }
-
-
-def _portions(values: Iterable[T]) -> Iterable[list[T]]:
-    listed = list(values)
-    return (listed[start : start + AT_ONCE] for start in range(0, len(listed), AT_ONCE))

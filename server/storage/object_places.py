@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from rig.digest import sha256_of
 from rig.messages.message import Message, compose
 from server.errors import InvalidInput
 from server.settings import OBJECT_PREFIX, ServiceSettings
@@ -30,7 +31,6 @@ from server.storage.objects import (
     StoredObject,
     StoreUnavailable,
     any_size,
-    sha256_of,
 )
 
 KEY_BYTES_MOST = 900  # S3 takes 1024, with the prefix

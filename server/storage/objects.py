@@ -5,7 +5,6 @@ with slashes. ``ObjectStore`` has two implementations: ``FolderObjects`` here, `
 ``server.storage.object_places``.
 """
 
-import hashlib
 import os
 import shutil
 import tempfile
@@ -15,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from rig.digest import sha256_of
 from rig.messages.message import Message, compose
 from server.errors import InvalidInput, Unavailable
 
@@ -191,9 +191,3 @@ class FolderObjects:
             raise StoreDenied(self._place(key), str(error.strerror)) from error
         except OSError as error:
             raise StoreUnavailable(self._place(key), str(error.strerror or error)) from error
-
-
-def sha256_of(path: Path) -> str:
-    """Returns the SHA-256 of a file's content."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

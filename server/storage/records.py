@@ -12,7 +12,7 @@ from pydantic import PlainSerializer, PlainValidator, TypeAdapter
 
 from rig.acquisition.face_sighting import FaceSighting
 from rig.acquisition.shot import Fault, read_fault
-from rig.acquisition.verdict import ViewDocument
+from rig.acquisition.verdict import Verdict, ViewDocument
 from rig.messages.message import Message, MessageDocument, read_message
 
 JsonObject = dict[str, Any]  # what HTTP takes and gives without a shape of its own
@@ -237,7 +237,7 @@ class CalibrationOutcome(TypedDict):
     """Holds the result of a calibration, as the job engine stores it. ``sha256`` is that of cameras.json. Outcomes of
     earlier versions have no verdict."""
 
-    verdict: NotRequired[str]
+    verdict: NotRequired[Verdict]
     missing: NotRequired[list[str]]
     missing_messages: NotRequired[list[MessageDocument]]
     figures: Mapping[str, object]

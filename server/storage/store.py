@@ -35,11 +35,11 @@ import structlog
 
 from rig.acquisition.verdict import ViewDocument
 from rig.atomic_write import unfinished, write_atomically
+from rig.digest import sha256_of
 from rig.messages.message import Message, compose
 from server.errors import DiskFull, NotFound
 from server.storage.capture_blobs import CaptureBlobs
 from server.storage.folders import move_durably, newest, sync_folder
-from server.storage.objects import sha256_of
 from server.storage.records import (
     CALIBRATION,
     CAPTURE,

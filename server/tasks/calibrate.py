@@ -4,12 +4,14 @@ its report.
 A folder with board.toml shows a calibration board; any other shows a scene.
 """
 
-import hashlib
 import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from rig.atomic_write import write_atomically
+from rig.digest import sha256_of
 from rig.errors import InputError
 from rig.formats.captures.archive import ArchiveLimits, extract_archive
 from rig.formats.captures.capture_folder import capture_root
@@ -54,10 +56,7 @@ def ingest_photographs(
     root = capture_root(unpacked)
     found = find_photographs(root)
     check_sizes((path for shots in found.files.values() for path in shots.values()), image_pixels)
-    for camera, shots in found.files.items():
-        (target / "images" / camera).mkdir(parents=True)
-        for shot, path in shots.items():
-            path.rename(target / "images" / camera / f"{shot}{path.suffix}")
+    _file_pictures(found.files, target)
     if (root / SCALE).is_file():
         (root / SCALE).rename(target / SCALE)
     check_scale(target)
@@ -95,12 +94,17 @@ def ingest_board_pictures(
         raise InputError("archive", [compose("no-board-toml")])
     read_board(root / BOARD)
     pictures = next((root / name for name in ("IMAGES", "images") if (root / name).is_dir()), root)
-    for camera, shots in list_pictures(pictures).items():
+    _file_pictures(list_pictures(pictures), target)
+    (root / BOARD).rename(target / BOARD)
+    shutil.rmtree(unpacked)
+
+
+def _file_pictures(files: Mapping[str, Mapping[str, Path]], target: Path) -> None:
+    """Moves pictures, by camera and shot, to ``target/images/<camera>/<shot>``."""
+    for camera, shots in files.items():
         (target / "images" / camera).mkdir(parents=True)
         for shot, path in shots.items():
             path.rename(target / "images" / camera / f"{shot}{path.suffix}")
-    (root / BOARD).rename(target / BOARD)
-    shutil.rmtree(unpacked)
 
 
 def calibrate_folder(
@@ -140,22 +144,9 @@ def calibrate_folder(
         )
     except CalibrationRefused as error:
         raise InputError("calibration", error.reasons) from error
-    document = found.document()
     write_report(found, Path(result) / "report.html")
     write_calibration(found, Path(result) / "cameras.json")
-    write_atomically(Path(result) / "calibration.json", json.dumps(document, indent=1).encode())
-    digest = hashlib.sha256((Path(result) / "cameras.json").read_bytes()).hexdigest()
-    return {
-        "verdict": document["verdict"],
-        "missing": document["missing"],
-        "missing_messages": document["missing_messages"],
-        "figures": document["figures"],
-        "checks": [*document["checks"]],
-        "warnings": document["warnings"],
-        "warning_messages": document["warning_messages"],
-        "front": document["front"],
-        "sha256": digest,
-    }
+    return _outcome(found.document(), Path(result))
 
 
 def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | None) -> CalibrationOutcome:
@@ -174,16 +165,20 @@ def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | 
     write_scene_report(found, result / "report.html")
     write_rig(found.rig, result / "cameras.json")
     missing = {"missing": texts_of(verdict.missing), "missing_messages": documents_of(verdict.missing)}
-    judged = {"verdict": verdict.word, **missing, **found.document()}
-    write_atomically(result / "calibration.json", json.dumps(judged, indent=1).encode())
+    return _outcome({"verdict": verdict.word, **missing, **found.document()}, result)
+
+
+def _outcome(document: Mapping[str, Any], result: Path) -> CalibrationOutcome:
+    """Writes calibration.json beside cameras.json in ``result``. Returns what the calibration's record holds of it."""
+    write_atomically(result / "calibration.json", json.dumps(document, indent=1).encode())
     return {
-        "verdict": verdict.word,
-        "missing": texts_of(verdict.missing),
-        "missing_messages": documents_of(verdict.missing),
-        "figures": found.figures(),
-        "checks": [],
-        "warnings": texts_of(found.warnings),
-        "warning_messages": documents_of(found.warnings),
-        "front": found.front,
-        "sha256": hashlib.sha256((result / "cameras.json").read_bytes()).hexdigest(),
+        "verdict": document["verdict"],
+        "missing": document["missing"],
+        "missing_messages": document["missing_messages"],
+        "figures": document["figures"],
+        "checks": [*document.get("checks", ())],
+        "warnings": document["warnings"],
+        "warning_messages": document["warning_messages"],
+        "front": document["front"],
+        "sha256": sha256_of(result / "cameras.json"),
     }

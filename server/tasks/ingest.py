@@ -25,6 +25,7 @@ from rig.acquisition.face_sighting import FaceSighting
 from rig.acquisition.verdict import ViewCheck, check_view, view_faults
 from rig.camera import Camera
 from rig.capture import TEXTURE_SETS, Capture
+from rig.digest import sha256_of
 from rig.errors import EigenheadError, InputError
 from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, read_cameras, rig_file_parts
 from rig.formats.cameras.cameras_json import read_rig
@@ -59,7 +60,6 @@ from server.tasks.photographs import (
     check_sizes,
     photographs_alone,
     read_scaled_capture,
-    sha256_of,
 )
 
 if TYPE_CHECKING:

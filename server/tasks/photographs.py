@@ -4,7 +4,6 @@ Each step leaves its result in the folder ``kept``: cameras.json, calibration.js
 were made from), calibration.html, masks/. A second run with the same photographs reads them from there.
 """
 
-import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -20,6 +19,7 @@ from pipeline.warnings import ReportWarning
 from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
 from rig.capture import Capture, ReadImage
+from rig.digest import sha256_of
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
 from rig.formats.cameras.cameras_json import CAMERAS_MOST, read_rig, write_rig
@@ -206,8 +206,3 @@ def _made_of(root: Path, front: str | None) -> dict[str, str]:
     files += [path for path in (entry(root, SCALE),) if path.is_file()]
     digests = {path.relative_to(root).as_posix(): sha256_of(path) for path in files}
     return {**digests, "front": front or "", "version": version("eigenhead"), "pycolmap": version("pycolmap")}
-
-
-def sha256_of(path: Path) -> str:
-    """Returns the SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()

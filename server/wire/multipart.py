@@ -17,7 +17,7 @@ from rig.errors import InputError
 from rig.messages.message import compose
 from rig.text import suggest
 from server.services.captures import CaptureMetadata
-from server.services.records import Calibration
+from server.services.records import CalibrationOut
 from server.services.service import Service
 from server.services.threads import Threads
 from server.services.uploads import too_large
@@ -195,7 +195,7 @@ async def receive_capture(
     return record, fields
 
 
-async def receive_calibration_pictures(service: Service, request: Request, key: str) -> Calibration:
+async def receive_calibration_pictures(service: Service, request: Request, key: str) -> CalibrationOut:
     """Receives an archive in a multipart body and queues a calibration. ``key`` is the caller's. The archive holds
     IMAGES/ and board.toml or, if the field ``from`` is ``scene``, photographs. Raises InputError naming every fault,
     and what ``receive_multipart`` raises."""

@@ -10,6 +10,7 @@ from typing import Literal, cast
 import structlog
 from dbos import DBOS, PortableWorkflowError
 
+from rig.digest import sha256_of
 from rig.messages.message import compose
 from server.errors import Refused
 from server.services.deliveries import DELIVER, MANIFEST, MANIFEST_FORMAT, delivery_id, place_of
@@ -19,7 +20,7 @@ from server.services.results import Results
 from server.services.webhooks import Webhooks
 from server.settings import ServiceSettings
 from server.storage.object_places import locate, open_objects
-from server.storage.objects import ObjectStore, StoreDenied, StoreUnavailable, sha256_of
+from server.storage.objects import ObjectStore, StoreDenied, StoreUnavailable
 from server.storage.records import DeliveryRequest, FileEntry
 from server.storage.store import Store, StoredFile
 from server.worker.pauses import insist, pause

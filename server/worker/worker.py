@@ -38,6 +38,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import PHOTO_LEVELS, settings_from_document
 from rig.atomic_write import write_atomically
+from rig.digest import sha256_of
 from rig.errors import Cancelled, InputError
 from rig.messages.message import Message, MessageDocument, compose
 from rig.progress import Progress
@@ -56,7 +57,6 @@ from server.storage.database import AWAY, events, now_sql, open_database, worker
 from server.storage.events import END, EventLog
 from server.storage.folders import move_durably
 from server.storage.job_index import RUNNING, engine_jobs
-from server.storage.objects import sha256_of
 from server.storage.records import CalibrationOutcome, EventDocument, FileEntry, JobRequest, JobWebhook, WebhookMessage
 from server.storage.store import Store
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene

@@ -1,6 +1,5 @@
 """Makes a template for ``eigenhead template add``. Jobs, which only ``load`` one, do not wait for what this imports."""
 
-import hashlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from pipeline.applications.templates.template_file import Template
 from pipeline.head_model.model import HeadModel
 from pipeline.results.clay import SKIN, clay
 from pipeline.results.overlays import contact_sheet
+from rig.digest import sha256_of
 from rig.errors import InputError
 from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz, read_pickled_arrays
 from rig.formats.meshes.polygon_obj import PolygonMesh, read_polygons
@@ -34,14 +34,12 @@ def make_template(
     registration. Raises InputError that lists every fault of the file."""
     flame = read_flame(path) if path.suffix.lower() in SUFFIXES else None
     mesh = read_polygons(path) if flame is None else _polygons(flame)
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
     found = register(mesh, model, name=path.name, landmarks=landmarks, report=report)
     kept = PolygonMesh(found.surface_binding.rest, mesh.sizes, mesh.corners, mesh.uv, mesh.corner_uv, mesh.statements)
     template = Template(
         name=name,
         source=path.name,
-        source_sha256=digest,
+        source_sha256=sha256_of(path),
         model_name=model.name,
         model_sha256=model.sha256,
         mesh=kept,

@@ -5,7 +5,6 @@ What is wrong with a file is named before anything is judged by it: a scan in me
 ``judgement`` says how much of each region the scan covers.
 """
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.applications.model_building.correspondence.scans import landmark_file, read_landmarks, welded
 from pipeline.geometry.surface_index import Hits, SurfaceIndex
+from rig.digest import sha256_of
 from rig.errors import InputError
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh, boundary_edges
@@ -69,7 +69,7 @@ def read_reference(path: Path, landmarks: Path | None = None) -> Reference:
     vertices, faces = welded(read_mesh(path))
     landmarks_path = landmarks or landmark_file(path)
     marks = {} if landmarks_path is None else read_landmarks(landmarks_path)
-    return Reference.of(Mesh(vertices, faces), marks, path.name, hashlib.sha256(path.read_bytes()).hexdigest())
+    return Reference.of(Mesh(vertices, faces), marks, path.name, sha256_of(path))
 
 
 def _edge_numbers(edges: Int[np.ndarray, "e 2"], count: int) -> Int[np.ndarray, " e"]:

@@ -263,8 +263,7 @@ class Fitted:
     """Holds a template on a scan, in the frame of the model's mean head (its scale too)."""
 
     likeness: Likeness  # the model on the scan
-    carried: Float[np.ndarray, "t 3"]  # the template as that head carries it
-    vertices: Float[np.ndarray, "t 3"]  # and on the scan
+    vertices: Float[np.ndarray, "t 3"]  # the template on the scan
     met: Bool[np.ndarray, " t"]  # vertices that lie on the scan; others continue the shape
 
 
@@ -278,7 +277,7 @@ def fit_template(
     carried = template.surface_binding.on(like.vertices, model.levels["full"].faces)
     report("drawing the template", 0.6)
     vertices, met = drawn_onto(carried, template, model, scan)
-    return Fitted(like, carried, vertices, met)
+    return Fitted(like, vertices, met)
 
 
 def drawn_onto(

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from rig.geometry import Similarity, cross_matrix, nearest_rotation, rotation_from_vector
+from rig.geometry import RigidTransform, Similarity, cross_matrix, nearest_rotation, rotation_from_vector
 
 SCALE_SPREAD = 0.02  # prior on log scale: rigs are metric, and what is left is calibration's error of scale
 ITERATIONS = 20
@@ -28,6 +28,13 @@ def procrustes(
     rotation = nearest_rotation(covariance)
     scale = float((rotation * covariance).sum() / (share @ (centred**2).sum(axis=1)))
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+
+def rigid_procrustes(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> RigidTransform:
+    """Computes the rigid motion that minimises eq. (3), as ``procrustes``: of the same turn, but without a scale, which
+    fits few points too well."""
+    rotation = procrustes(source, target).rotation
+    return RigidTransform(rotation, target.mean(axis=0) - rotation @ source.mean(axis=0))
 
 
 def generalised_procrustes(

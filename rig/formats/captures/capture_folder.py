@@ -26,6 +26,7 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
 from rig.capture import TEXTURE_SETS, Capture, Features, ReadImage
+from rig.digest import sha256_of
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import find_rig_file, no_rig_fault, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras.cameras_json import CAMERAS_LEAST, write_rig
@@ -79,9 +80,9 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
         raise InputError("capture", say_once(faults, rig.names))
     digests = dict(capture.digests)
     for path in rig_file_parts(rig_file):
-        digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
+        digests[path.relative_to(folder).as_posix()] = sha256_of(path)
     if has_known_length(folder):
-        digests[SCALE] = hashlib.sha256(entry(folder, SCALE).read_bytes()).hexdigest()
+        digests[SCALE] = sha256_of(entry(folder, SCALE))
     ordered = dict(sorted(digests.items()))
     unread = [*unread_files(folder, rigs), *unread_pictures(folder, files, rig)]
     remarks = [*losses, *capture.remarks, *read.remarks, *unread]

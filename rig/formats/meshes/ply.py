@@ -19,6 +19,7 @@ PLY_VERTEX = np.dtype(
     + [(name, "u1") for name in ("red", "green", "blue")]
     + [("quality", "<f4"), ("views", "u1")]
 )
+PLY_PART_VERTEX = np.dtype([*PLY_VERTEX.descr, ("part", "u1")])
 
 
 PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
@@ -45,7 +46,7 @@ def ply_bytes(
     of each vertex along its normal, mm), ``views`` (number of images that coloured it), ``part`` (what it shows: skin,
     hair, clothes) if given, and ``corner_uv`` (of the faces' corners, v downwards; written as MeshLab's ``texcoord``, v
     upwards). ``comments`` are lines of the header."""
-    kind = PLY_VERTEX if part is None else np.dtype([*PLY_VERTEX.descr, ("part", "u1")])
+    kind = PLY_VERTEX if part is None else PLY_PART_VERTEX
     vertices = np.empty(len(mesh.vertices), kind)
     for i, axis in enumerate("xyz"):
         vertices[axis] = mesh.vertices[:, i]
@@ -96,8 +97,16 @@ def read_view_counts(path: Path) -> UInt8[np.ndarray, " v"]:
     return _head_rows(path)[0]["views"].copy()
 
 
+def read_vertex_numbers(path: Path, name: str) -> Float[np.ndarray, " v"] | None:
+    """Reads a number for each vertex from a file that ``write_ply`` wrote; None if it does not have it. Raises
+    InputError for another program's file."""
+    vertices, _ = _head_rows(path)
+    return vertices[name].astype(np.float32) if name in (vertices.dtype.names or ()) else None
+
+
 def _head_rows(path: Path) -> tuple[np.ndarray, Int[np.ndarray, "f 3"]]:
-    """Reads the records of the vertices (``PLY_VERTEX``) and the corners of the faces. Raises InputError."""
+    """Reads the records of the vertices (``PLY_VERTEX`` or ``PLY_PART_VERTEX``) and the corners of the faces. Raises
+    InputError."""
     try:
         header, end, body = path.read_bytes().partition(b"end_header\n")
     except OSError as error:
@@ -105,13 +114,14 @@ def _head_rows(path: Path) -> tuple[np.ndarray, Int[np.ndarray, "f 3"]]:
     lines = header.decode("ascii", "replace").splitlines()
     counts = [int(line.split()[2]) for line in lines if re.fullmatch(r"element (vertex|face) \d{1,9}", line)]
     names = [line.split()[-1] for line in lines if line.startswith("property") and "list" not in line]
-    ours = end and "format binary_little_endian 1.0" in lines and names == list(PLY_VERTEX.names or ())
+    vertex = PLY_PART_VERTEX if names[-1:] == ["part"] else PLY_VERTEX
+    ours = end and "format binary_little_endian 1.0" in lines and names == list(vertex.names or ())
     if not ours or len(counts) != 2:
         raise InputError(path.name, [compose("no-head-ply")])
     face = PLY_TEXTURED_FACE if "property list uchar float texcoord" in lines else PLY_FACE
-    wanted = counts[0] * PLY_VERTEX.itemsize + counts[1] * face.itemsize
+    wanted = counts[0] * vertex.itemsize + counts[1] * face.itemsize
     if len(body) != wanted:
         raise InputError(path.name, [compose("ply-bytes", held=len(body), wanted=wanted)])
-    vertices = np.frombuffer(body, PLY_VERTEX, counts[0])
-    faces = np.frombuffer(body, face, counts[1], counts[0] * PLY_VERTEX.itemsize)["corners"]
+    vertices = np.frombuffer(body, vertex, counts[0])
+    faces = np.frombuffer(body, face, counts[1], counts[0] * vertex.itemsize)["corners"]
     return vertices, faces

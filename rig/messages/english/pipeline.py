@@ -114,7 +114,6 @@ TEMPLATES = {
     "point-behind-camera": "the rays of a point meet behind a camera",
     "point-outside-lens": "a pixel lies where the lens model of its camera sees nothing",
     "point-rays-parallel": "the rays of a point are parallel",
-    "no-common-hull": "the silhouettes have no body in common: cameras.json does not belong to these images, or a mask is wrong",
     "feature-in-one-view": "features.json: {name} is picked in one view only; two are needed",
     "features-too-few": "features.json: {count} landmarks can be located, {needed} that are not on a line are needed",
     "features-on-line": "features.json: the feature points lie on one line; pick one that does not",

@@ -85,7 +85,7 @@ export default spoken({
               <span class="muted small push">{{ batch.model || say('default model') }} &middot; {{ say('queue {name}', { name: batch.queue }) }} &middot; {{ say('priority {number}', { number: batch.priority }) }}</span></div>
             <div class="line wrap"><strong class="num">{{ say('{done} of {total}', { done: done(batch), total: batch.total }) }}</strong><span v-if="batch.eta_s !== null" class="muted push">{{ say('about {time} left', { time: span(batch.eta_s) }) }}</span></div>
             <div class="bar" aria-hidden="true"><i :style="{ width: 100 * share(batch) + '%' }"></i></div>
-            <p v-if="batch.notice" class="warn">{{ say(batch.notice) }}</p>
+            <p v-if="batch.notice_message" class="warn">{{ say(batch.notice_message) }}</p>
             <table class="small" aria-label="Captures by state" style="width: auto"><tbody><tr v-for="[state, count] in counts" :key="state" :data-count="state"><td>{{ say(state, { context: 'captures' }) }}</td><td class="num" :class="{ fault: state === 'failed' }">{{ count }}</td></tr></tbody></table>
             <div class="line wrap"><a class="b" id="to-jobs" :href="'/jobs?batch=' + batch.id">Its jobs</a><a class="b" id="to-table" :href="file('heads.csv')" download>Table, CSV</a><a v-if="state.parquet" class="b" :href="file('heads.parquet')" download>Table, Parquet</a><a class="b" id="to-sheet" :href="file('sheet.html')" target="_blank" rel="noopener">Contact sheet</a><a class="b" :href="file('sheet.pdf')" target="_blank" rel="noopener">Contact sheet, PDF</a></div>
             <template v-if="state.failed.length"><h3>What failed</h3>

@@ -2,19 +2,14 @@
 sheet."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from typing import TypedDict, cast, get_args
-
-from nicegui import ui
-from starlette.responses import RedirectResponse
 
 from rig.messages.message import Message, MessageDocument, compose, documents_of
 from server.batch.table import has_parquet
-from server.console.page import Action, Chosen, Page, shared, show
+from server.console.page import Action, Chosen, Page, serve_page, shared
 from server.console.pages.jobs import listed_jobs
 from server.services.batches import BatchRequest, Selection
 from server.services.job_rows import STATUSES
-from server.services.records import Batch
 from server.services.service import Service
 from server.services.work import ReconstructionRequest
 from server.storage.batches import BatchState
@@ -72,7 +67,7 @@ class BatchesPage(Page, component="batches.js"):
         chosen = self.choice.get("batch")
         batch = next((one for one in state["batches"] if one["id"] == chosen), None)
         if batch is None and chosen:
-            batch = next((batch_line(one) for one in self.service.batches.of([chosen])), None)
+            batch = next((one.model_dump() for one in self.service.batches.of([chosen])), None)
         batch = batch or next(iter(state["batches"]), None)
         failed = [] if batch is None or not batch["counts"]["failed"] else failed_jobs(self.service, batch["id"])
         parquet = shared.get("parquet", 3600.0, has_parquet)
@@ -83,12 +78,7 @@ def batches_state(service: Service, requested: Mapping[str, str | None]) -> Batc
     """Returns one page of the list of batches, newest first."""
     state = cast(BatchState, requested["state"]) if requested["state"] in get_args(BatchState) else None
     page = service.batches.page(requested["find"] or "", state, SHOWN, requested["after"])
-    return {"batches": [batch_line(batch) for batch in page.items], "next": page.next, "total": page.total}
-
-
-def batch_line(batch: Batch) -> JsonObject:
-    """Converts a batch to an entry of the page's list."""
-    return asdict(batch) | {"notice": None if batch.notice is None else batch.notice.document()}
+    return {"batches": [batch.model_dump() for batch in page.items], "next": page.next, "total": page.total}
 
 
 def failed_jobs(service: Service, batch: str) -> list[FailedJob]:
@@ -137,7 +127,4 @@ BatchesPage.actions = {
 }
 
 
-@ui.page("/batches")
-async def batches_page(batch: str = "", find: str = "", state: str = "") -> RedirectResponse | None:
-    """Serves the page Batches. ``batch`` selects a batch; ``find`` and ``state`` restrict the list."""
-    return await show("batches", BatchesPage, batch=batch, find=find, state=state)
+serve_page("batches", BatchesPage, choices=("batch", "find", "state"), paths=("/batches",))

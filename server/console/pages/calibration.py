@@ -2,20 +2,16 @@
 
 import threading
 from collections.abc import Mapping
-from dataclasses import asdict, replace
 from typing import NotRequired, TypedDict
 
-from nicegui import ui
-from starlette.responses import RedirectResponse
-
 from rig.errors import InputError
-from rig.messages.message import Message, MessageDocument, compose, documents_of
+from rig.messages.message import Message, MessageDocument, compose
 from server.console.coverage import Corners, Coverage, advice, detect_shot, summary
-from server.console.page import Action, Chosen, Page, remove_later, shared, show, shown_failure
+from server.console.page import Action, Chosen, Page, remove_later, serve_page, shared, shown_failure
 from server.console.removal import removals
 from server.errors import Conflict, InvalidInput
 from server.services.captures import CaptureMetadata
-from server.services.records import Calibration
+from server.services.records import CalibrationOut
 from server.services.service import Service
 
 LABEL = "calibration board"
@@ -106,7 +102,7 @@ class CalibrationPage(Page, component="calibration.js"):
         return shared.get("calibration page", 0.4, lambda: calibration_state(self.service))
 
 
-def known_calibrations(service: Service, age_s: float) -> list[Calibration]:
+def known_calibrations(service: Service, age_s: float) -> list[CalibrationOut]:
     """Returns all calibrations, newest first. The list is shared by the pages and at most ``age_s`` seconds old."""
     return shared.get("calibrations", age_s, service.calibrations.find)
 
@@ -130,14 +126,9 @@ def calibration_state(service: Service) -> CalibrationState:
     }
 
 
-def calibration_line(calibration: Calibration) -> Mapping[str, object]:
-    """Returns a calibration as plain values; ``missing``, ``warnings`` and ``error`` hold messages."""
-    messages = {"missing": documents_of(calibration.missing), "warnings": documents_of(calibration.warnings)}
-    return {
-        **asdict(replace(calibration, missing=(), warnings=(), error=None)),
-        **messages,
-        "error": shown_failure(calibration.error),
-    }
+def calibration_line(calibration: CalibrationOut) -> Mapping[str, object]:
+    """Returns a calibration as JSON types, its failure as pages show it."""
+    return calibration.model_dump() | {"error": shown_failure(calibration.error)}
 
 
 def board_of(event: BoardForm) -> Mapping[str, object]:
@@ -232,7 +223,4 @@ CalibrationPage.actions = {
 }
 
 
-@ui.page("/calibration")
-async def calibration_page(calibration: str = "") -> RedirectResponse | None:
-    """Serves the page Calibration. ``calibration`` selects one."""
-    return await show("calibration", CalibrationPage, calibration=calibration)
+serve_page("calibration", CalibrationPage, choices=("calibration",), paths=("/calibration",))

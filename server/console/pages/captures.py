@@ -3,17 +3,22 @@
 from collections.abc import Mapping
 from typing import NotRequired, TypedDict, cast, get_args
 
-from nicegui import ui
-from starlette.responses import RedirectResponse
-
 from pipeline.head_model.model_names import list_models
 from rig.messages.message import Message, compose
 from server.console.capture_lines import capture_line, jobs_of, sessions_list
 from server.console.identity import permit
-from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
+from server.console.page import (
+    Action,
+    Chosen,
+    Page,
+    remove_all_later,
+    remove_later,
+    said_unless_refused,
+    serve_page,
+    shared,
+)
 from server.console.removal import removals
 from server.console.work_form import PresetLine, TemplateLine, WorkForm, chosen_work, preset_lines, template_lines
-from server.errors import InvalidInput
 from server.services.bulk import each
 from server.services.service import Service
 from server.services.texts import typed_tags
@@ -208,11 +213,7 @@ def bulk(page: Page, event: BulkForm) -> Message | None:
         if done.done:
             remove_all_later(done.done, service.captures.remove, title, "capture")
     forget_captures()
-    said = said_of(action, len(done.done))
-    if done.refused:
-        faults = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
-        raise InvalidInput("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
-    return said
+    return said_unless_refused(said_of(action, len(done.done)), done)
 
 
 def said_of(action: str, count: int) -> Message:
@@ -246,10 +247,6 @@ CapturesPage.actions = {
 }
 
 
-@ui.page("/captures")
-async def captures_page(
-    capture: str = "", find: str = "", session: str = "", verdict: str = "", tag: str = "", sort: str = ""
-) -> RedirectResponse | None:
-    """Serves the page Captures. ``capture`` selects one; the other parameters restrict or order the list."""
-    requested = {"capture": capture, "find": find, "session": session, "verdict": verdict, "tag": tag, "sort": sort}
-    return await show("captures", CapturesPage, **requested)
+serve_page(
+    "captures", CapturesPage, choices=("capture", "find", "session", "verdict", "tag", "sort"), paths=("/captures",)
+)

@@ -7,20 +7,16 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NotRequired, TypedDict
 
 import numpy as np
-from nicegui import ui
-from starlette.responses import RedirectResponse
 
 from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS
-from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
 from rig.messages.message import Message, MessageDocument, compose
-from rig.rig import Rig
 from server.console.found_faces import found_faces
 from server.console.guides import Guides, Helps, mean_landmarks, nearest_views
-from server.console.page import Action, Page, shared, show
+from server.console.media import rig_of
+from server.console.page import Action, Page, serve_page, shared
 from server.console.removal import removals
 from server.errors import Conflict, InvalidInput
 from server.services.service import Service
@@ -159,7 +155,7 @@ class FeaturesPage(Page, component="features.js"):
 
     def _picking(self, capture_id: str) -> Picking:
         record = self.service.store.capture(capture_id)
-        rig = shared.get(("cameras", capture_id), 3600.0, lambda: rig_of(self.service, capture_id))
+        rig = shared.get(("cameras", capture_id), 3600.0, lambda: rig_of(self.service.store.capture_files(capture_id)))
         picked = self.picked
         if picked is None or picked.capture != capture_id:
             saved = self.service.captures.features(capture_id)
@@ -199,14 +195,6 @@ def captures_to_pick(service: Service) -> list[CaptureChoice]:
 def choice_of(record: CaptureRecord) -> CaptureChoice:
     """Converts a capture's record to an entry of the list to choose from."""
     return {"id": record.id, "label": record.label, "created": record.created, "features": record.features}
-
-
-def rig_of(service: Service, capture_id: str) -> Rig:
-    """Reads the rig from the files of a capture. Raises NotFound for a text that is no id, and InputError for a damaged
-    file."""
-    path = find_rig_file(service.store.capture_files(capture_id))
-    assert path is not None  # it was accepted with one
-    return read_rig_file(Path(path))
 
 
 class Landmarks:
@@ -316,11 +304,7 @@ FeaturesPage.actions = {
 }
 
 
-@ui.page("/features")
-@ui.page("/features/{capture}")
-async def features_page(capture: str = "") -> RedirectResponse | None:
-    """Serves the page Features. ``capture`` selects one."""
-    return await show("features", FeaturesPage, capture=capture or None)
+serve_page("features", FeaturesPage, choices=("capture",), paths=("/features", "/features/{capture}"))
 
 
 def open_suggestions(suggested: PixelsOfPoints, points: PixelsOfPoints) -> PixelsOfPoints:

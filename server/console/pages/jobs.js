@@ -71,7 +71,7 @@ export default spoken({
     },
     waiting() {
       if (this.job.notice_message) return say(this.job.notice_message);
-      const before = this.job.queue_position || 0;
+      const before = this.job.ahead || 0;
       return before
         ? say("Waiting, {count} job before it | Waiting, {count} jobs before it", { count: before })
         : say("Waiting for the worker");
@@ -194,7 +194,7 @@ export default spoken({
       if (name === "bulk") this.picked = [];
     },
     place(j) {
-      return j.queue_position ? say("{count} before it", { count: j.queue_position }) : say("next");
+      return j.ahead ? say("{count} before it", { count: j.ahead }) : say("next");
     },
     fields() {
       return { job: this.job?.id, find: this.sought, state: this.only, sort: this.sort, batch: this.batch };

@@ -2,22 +2,29 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from typing import NotRequired, TypedDict, cast, get_args
-
-from nicegui import ui
-from starlette.responses import RedirectResponse
 
 from pipeline.head_model.model_names import list_models
 from rig.errors import InputError
 from rig.messages.message import Message, MessageDocument, compose
-from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show, shown_failure
+from server.console.page import (
+    Action,
+    Chosen,
+    Page,
+    remove_all_later,
+    remove_later,
+    said_unless_refused,
+    serve_page,
+    shared,
+    shown_failure,
+)
 from server.console.pages.rig import read_report
 from server.console.removal import removals
-from server.errors import Conflict, InvalidInput
+from server.errors import Conflict
 from server.services.bulk import each
 from server.services.job_rows import FINISHED, STATUSES
-from server.services.records import Job
+from server.services.records import JobOut
 from server.services.retention import ENDED
 from server.services.service import Service
 from server.services.work import ReconstructionRequest
@@ -98,7 +105,7 @@ class RestartForm(Chosen, SettingsForm):
 class ListedJob:
     """Holds a job with the label, time and session of its capture."""
 
-    job: Job
+    job: JobOut
     capture: str
     captured: str | None
     session: str | None = None
@@ -146,16 +153,16 @@ def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JobsSta
     }
 
 
-def active_jobs(service: Service, sought: str, batch: str | None, *, running: bool = True) -> tuple[list[Job], int]:
+def active_jobs(service: Service, sought: str, batch: str | None, *, running: bool = True) -> tuple[list[JobOut], int]:
     """Returns the jobs that run and those that begin next, ``SHOWN`` at most, and how many more wait. ``running``:
     include those that run."""
     query = JobQuery(sought, ACTIVE if running else STATUSES["queued"], batch=batch)
     matching = service.jobs.page(query, SOUGHT_MOST)
-    jobs = sorted(matching.items, key=lambda job: (job.state != "running", job.queue_position or 0, job.id))
+    jobs = sorted(matching.items, key=lambda job: (job.state != "running", job.ahead or 0, job.id))
     return jobs[:SHOWN], matching.total - min(SHOWN, len(jobs))
 
 
-def listed_jobs(service: Service, jobs: Iterable[Job]) -> list[ListedJob]:
+def listed_jobs(service: Service, jobs: Iterable[JobOut]) -> list[ListedJob]:
     """Adds to each job the label, time and session of its capture, as far as the capture exists."""
     found = []
     for job in jobs:
@@ -169,11 +176,7 @@ def listed_jobs(service: Service, jobs: Iterable[Job]) -> list[ListedJob]:
 
 def job_line(listed: ListedJob) -> JsonObject:
     """Converts a job to an entry of the page's list: its fields, with the label and time of its capture."""
-    job, notice = listed.job, listed.job.notice
-    line = asdict(replace(job, error=None, notice=None, files={}))
-    line |= {"error": shown_failure(job.error), "notice": None if notice is None else notice.text}
-    line |= {"notice_message": None if notice is None else notice.document()}
-    del line["files"]
+    line = listed.job.model_dump(exclude={"files"}) | {"error": shown_failure(listed.job.error)}
     return {**line, "capture": listed.capture, "captured": listed.captured}
 
 
@@ -262,10 +265,7 @@ def bulk(page: Page, event: BulkForm) -> Message:
     shared.forget("jobs")
     count = len(done.done)
     said = compose("jobs-cancelled", count=count) if action == "cancel" else compose("jobs-queued-again", count=count)
-    if done.refused:
-        faults = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
-        raise InvalidInput("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
-    return said
+    return said_unless_refused(said, done)
 
 
 JobsPage.actions = {
@@ -276,9 +276,4 @@ JobsPage.actions = {
 }
 
 
-@ui.page("/jobs")
-async def jobs_page(
-    job: str = "", find: str = "", state: str = "", sort: str = "", batch: str = ""
-) -> RedirectResponse | None:
-    """Serves the page Jobs. ``job`` selects one; the other parameters restrict or order the list."""
-    return await show("jobs", JobsPage, job=job, find=find, state=state, sort=sort, batch=batch)
+serve_page("jobs", JobsPage, choices=("job", "find", "state", "sort", "batch"), paths=("/jobs",))

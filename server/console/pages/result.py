@@ -5,18 +5,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypedDict
 
-from nicegui import ui
 from nicegui.elements import scene
-from starlette.responses import RedirectResponse
 
 from pipeline.results.report_types import Report
-from server.console.page import Page, shared, show
+from server.console.page import Page, serve_page, shared
 from server.console.pages.jobs import ListedJob, listed_jobs
 from server.console.pages.rig import read_report
 from server.console.removal import removals
 from server.errors import NotFound
 from server.services.job_rows import STATUSES
-from server.services.records import Job
+from server.services.records import JobOut
 from server.services.service import Service
 from server.storage.job_index import JobQuery
 from server.storage.records import JsonObject
@@ -88,7 +86,7 @@ def heads_of_subject(service: Service, head: JsonObject) -> list[JsonObject]:
     return result_lines(service, service.jobs.of([job for job in done[:SUBJECTS_HEADS] if job not in removals]))
 
 
-def result_lines(service: Service, jobs: Iterable[Job]) -> list[JsonObject]:
+def result_lines(service: Service, jobs: Iterable[JobOut]) -> list[JsonObject]:
     """Converts jobs that have a result to entries of the page's list, with the capture and the subject of each."""
     files = []
     for listed in listed_jobs(service, jobs):
@@ -128,7 +126,7 @@ def head_of(service: Service, job: JsonObject) -> JsonObject:
         "level": None if report is None else report.get("detail", {}).get("level"),
         "model_name": None if report is None else report["model"]["name"],
         "truth": truth.is_file(),
-        "files": {name: file["bytes"] for name, file in files.items() if "/" not in name},
+        "files": {name: file.bytes for name, file in files.items() if "/" not in name},
     }
 
 
@@ -141,8 +139,4 @@ def clear_residuals(report: Report) -> list[float]:
     return [residual for residual in residuals if residual is not None]
 
 
-@ui.page("/result")
-@ui.page("/result/{job}")
-async def result_page(job: str = "", find: str = "") -> RedirectResponse | None:
-    """Serves the page Result. ``job`` selects a head, ``find`` searches for others."""
-    return await show("result", ResultPage, job=job or None, find=find)
+serve_page("result", ResultPage, choices=("job", "find"), paths=("/result", "/result/{job}"))

@@ -6,22 +6,19 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import TypedDict, cast
 
-from nicegui import ui
-from starlette.responses import RedirectResponse
-
 from pipeline.results.report_types import Report
 from rig.acquisition.plates import PlatesVersion
 from rig.acquisition.shot import CameraSyncDocument
 from rig.messages.message import Message, MessageDocument, compose, documents_of
 from server.console.capture_lines import capture_line, sessions_list, sync_of
 from server.console.media import live_view
-from server.console.page import Action, Chosen, Page, shared, show, shown_detail
+from server.console.page import Action, Chosen, Page, serve_page, shared, shown_detail
 from server.console.pages.captures import SessionEditForm, SessionForm, discard, edit_consent, new_session
 from server.console.removal import removals
 from server.console.work_form import WorkForm, chosen_work
 from server.errors import Conflict, NotFound
 from server.services.captures import CaptureMetadata
-from server.services.records import Calibration
+from server.services.records import CalibrationOut
 from server.services.service import Service
 from server.storage.records import JsonObject
 from server.tasks.simulate import SimulatedSync
@@ -194,7 +191,7 @@ def calibration_in_use(service: Service) -> InUse | None:
     it."""
     if service.calibrations.in_use() is None:
         return None
-    known: list[Calibration] = shared.get("calibrations", 2.0, service.calibrations.find)
+    known: list[CalibrationOut] = shared.get("calibrations", 2.0, service.calibrations.find)
     for camera in known:
         if camera.in_use:
             return {
@@ -305,7 +302,4 @@ RigPage.actions = {
 }
 
 
-@ui.page("/")
-async def rig_page(job: str = "", shot: str = "") -> RedirectResponse | None:
-    """Serves the page of the rig. ``job`` and ``shot`` are shown as if they had been started here."""
-    return await show("rig", RigPage, job=job or None, shot=shot or None)
+serve_page("rig", RigPage, choices=("job", "shot"), paths=("/",))

@@ -1,16 +1,13 @@
 """The page about the service itself: API keys, what is kept and removed next, and what lies on the disk."""
 
-from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TypedDict
 
-from nicegui import ui
 from nicegui.events import GenericEventArguments
-from starlette.responses import RedirectResponse
 
 from rig.errors import InputError
 from rig.messages.message import Message, MessageDocument, compose
-from server.console.page import Action, Chosen, Page, remove_all_later, shared, show
+from server.console.page import Action, Chosen, Page, remove_all_later, serve_page, shared
 from server.errors import Conflict
 from server.services.keys import LOCAL, SCOPES, Caller
 from server.services.retention import clear_caches, sweep, upcoming
@@ -18,6 +15,7 @@ from server.services.service import Service
 from server.services.storage_use import FAILED
 from server.settings import PREFIX, ServiceSettings
 from server.storage.job_index import JobQuery
+from server.storage.records import JsonObject
 
 NAME_MOST = 200
 REMOVED_AT_ONCE = 1000
@@ -62,7 +60,7 @@ class ServiceShown(TypedDict):
     admin: bool
     retention: list[SettingLine]
     upcoming: list[dict[str, object]]
-    storage: dict[str, object]
+    storage: JsonObject
 
 
 class KeyForm(TypedDict):
@@ -87,8 +85,8 @@ class ServicePage(Page, component="service.js"):
             "scopes": [*SCOPES],
             "admin": admin,
             "retention": setting_lines(service.settings),
-            "upcoming": shared.get("upcoming", 5.0, lambda: [asdict(one) for one in upcoming(service)]),
-            "storage": shared.get("storage", 2.0, lambda: asdict(service.storage.use())),
+            "upcoming": shared.get("upcoming", 5.0, lambda: [one.model_dump() for one in upcoming(service)]),
+            "storage": shared.get("storage", 2.0, lambda: storage_shown(service)),
         }
 
     async def _act(self, event: GenericEventArguments) -> None:
@@ -96,6 +94,11 @@ class ServicePage(Page, component="service.js"):
         if self.secret is not None:  # over the page's socket alone, and never in the state that a look makes
             self.run_method("show_key", self.secret)
             self.secret = None
+
+
+def storage_shown(service: Service) -> JsonObject:
+    """Returns how the disk is used, with the path of the data folder."""
+    return service.storage.use().model_dump() | {"data": str(service.store.data.resolve())}
 
 
 def key_lines(service: Service, caller: Caller) -> list[KeyLine]:
@@ -205,7 +208,4 @@ ServicePage.actions = {
 }
 
 
-@ui.page("/service")
-async def service_page() -> RedirectResponse | None:
-    """Serves the page about the service itself."""
-    return await show("service", ServicePage)
+serve_page("service", ServicePage, paths=("/service",))

@@ -1,14 +1,10 @@
 """The page Subjects: people as cards, each with a picture of the newest head and links to shots and heads."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import TypedDict, cast, get_args
 
-from nicegui import ui
-from starlette.responses import RedirectResponse
-
 from rig.messages.message import Message
-from server.console.page import Action, Page, shared, show
+from server.console.page import Action, Page, serve_page, shared
 from server.console.pages.captures import SessionForm, new_session
 from server.services.service import Service
 from server.storage.library import SubjectOrder
@@ -42,7 +38,7 @@ def subjects_state(service: Service, requested: Mapping[str, str | None]) -> Sub
         requested["find"] or "", order, SHOWN, requested["after"], tag=requested["tag"]
     )
     return {
-        "subjects": [asdict(subject) for subject in subjects.items],
+        "subjects": [subject.model_dump() for subject in subjects.items],
         "tags": shared.get("tags", 1.0, service.captures.tags),
         "next": subjects.next,
         "total": subjects.total,
@@ -59,7 +55,4 @@ def begin(page: Page, event: SessionForm) -> Message:
 SubjectsPage.actions = {"new_session": Action("capture", begin)}
 
 
-@ui.page("/subjects")
-async def subjects_page(find: str = "", tag: str = "", sort: str = "") -> RedirectResponse | None:
-    """Serves the page Subjects. ``find`` and ``tag`` restrict the list, ``sort`` orders it."""
-    return await show("subjects", SubjectsPage, find=find, tag=tag, sort=sort)
+serve_page("subjects", SubjectsPage, choices=("find", "tag", "sort"), paths=("/subjects",))

@@ -478,7 +478,6 @@ export default {
   "point-behind-camera": "die Strahlen eines Punktes treffen sich hinter einer Kamera",
   "point-outside-lens": "ein Pixel liegt, wo das Objektivmodell seiner Kamera nichts sieht",
   "point-rays-parallel": "die Strahlen eines Punktes sind parallel",
-  "no-common-hull": "die Silhouetten haben keinen gemeinsamen Körper: cameras.json gehört nicht zu diesen Bildern, oder eine Maske ist falsch",
   "feature-in-one-view": "features.json: {name} ist nur in einer Ansicht gesetzt; nötig sind zwei",
   "features-too-few": "features.json: {count} Landmarken lassen sich verorten, nötig sind {needed}, die nicht auf einer Linie liegen",
   "features-on-line": "features.json: Die Merkmale liegen auf einer Linie; eines setzen, das nicht darauf liegt",

@@ -11,23 +11,20 @@ from server.http.auth import ServiceOf, require
 from server.http.schemas import (
     DELIVER_TO,
     EXAMPLE_ID,
-    Answer,
     Cursor,
     DeliverTo,
     Id,
     Idempotency,
-    JobSettings,
     Limit,
     Listed,
-    MessageOut,
-    Moment,
     Received,
     Sought,
     Text,
-    TextOf,
 )
+from server.services.answer import JobSettings
 from server.services.batches import PRIORITY, BatchRequest, Selection
 from server.services.keys import Caller
+from server.services.records import BatchOut
 from server.services.work import ReconstructionRequest
 from server.storage.batches import BatchState
 from server.wire.batch_files import PARQUET_TYPE, PDF_TYPE, SheetFormat, TableFormat, send_sheet, send_table
@@ -66,38 +63,6 @@ class NewBatch(Received):
     priority: int = Field(PRIORITY, ge=1, le=1000, description="of its jobs; lower goes first, and a job has 100")
 
 
-class BatchCounts(Answer):
-    """Counts the captures of a batch by state."""
-
-    waiting: int = Field(description="without a job yet")
-    queued: int
-    running: int
-    succeeded: int
-    failed: int
-    cancelled: int
-    removed: int = Field(description="whose capture, or whose job, is gone")
-
-
-class BatchOut(Answer):
-    """Describes a batch: its request, its state, and how many of its captures are in which state."""
-
-    id: str
-    label: str
-    state: BatchState = Field(description="finished: nothing is left to do; a cancelled one stays cancelled")
-    created: Moment
-    finished: Moment | None
-    queue: str
-    priority: int
-    model: str | None
-    settings: JobSettings
-    deliver_to: str | None
-    total: int = Field(description="captures")
-    counts: BatchCounts
-    eta_s: float | None = Field(description="by the mean of its jobs so far; null before one succeeded")
-    notice: TextOf | None = Field(None, description="why its jobs cannot begin; what to do")
-    notice_message: MessageOut | None = Field(None, validation_alias="notice")
-
-
 class BatchList(Listed):
     """Holds one page of batches."""
 
@@ -119,7 +84,7 @@ def submit_batch(
     )
     batch = service.batches.submit(request, key=caller.key, idempotency_key=idempotency_key)
     response.headers["Location"] = f"/v1/batches/{batch.id}"
-    return BatchOut.model_validate(batch)
+    return batch
 
 
 @router.get("/batches", responses=documented(400))
@@ -134,41 +99,39 @@ def list_batches(
 ) -> BatchList:
     """Lists batches in pages, newest first; ``q`` searches the label."""
     found = service.batches.page(q, state, limit, cursor)
-    return BatchList(
-        batches=[BatchOut.model_validate(batch) for batch in found.items], next=found.next, total=found.total
-    )
+    return BatchList(batches=list(found.items), next=found.next, total=found.total)
 
 
 @router.get("/batches/{batch_id}", responses=documented(404))
 def get_batch(service: ServiceOf, caller: Reader, batch_id: str) -> BatchOut:
     """Returns a batch: its state, its captures by state, and the estimated remaining seconds. ``GET /v1/jobs?batch=``
     lists its jobs."""
-    return BatchOut.model_validate(service.batches.get(batch_id))
+    return service.batches.get(batch_id)
 
 
 @router.post("/batches/{batch_id}/pause", responses=documented(404, 409))
 def pause_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
     """Pauses a batch: no further job begins, running jobs continue. Queued jobs are withdrawn within a second."""
-    return BatchOut.model_validate(service.batches.pause(batch_id))
+    return service.batches.pause(batch_id)
 
 
 @router.post("/batches/{batch_id}/resume", responses=documented(404, 409))
 def resume_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
     """Resumes a paused batch: its captures get jobs again."""
-    return BatchOut.model_validate(service.batches.resume(batch_id))
+    return service.batches.resume(batch_id)
 
 
 @router.post("/batches/{batch_id}/cancel", responses=documented(404))
 def cancel_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
     """Cancels the jobs that have not ended; they cannot be resumed. Results stay. A batch that has ended does not
     change."""
-    return BatchOut.model_validate(service.batches.cancel(batch_id))
+    return service.batches.cancel(batch_id)
 
 
 @router.post("/batches/{batch_id}/retry", responses=documented(404, 409))
 def retry_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
     """Queues a new job for each capture whose job failed; the failed jobs stay in the list of jobs."""
-    return BatchOut.model_validate(service.batches.retry(batch_id))
+    return service.batches.retry(batch_id)
 
 
 @router.delete("/batches/{batch_id}", status_code=204, responses=documented(404, 409))

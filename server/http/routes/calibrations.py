@@ -10,8 +10,9 @@ from pydantic import ValidationError
 
 from rig.messages.message import compose
 from server.http.auth import ServiceOf, require
-from server.http.calibration_schemas import CalibrationList, CalibrationOut, NewCalibration
+from server.http.calibration_schemas import CalibrationList, NewCalibration
 from server.services.keys import Caller
+from server.services.records import CalibrationOut
 from server.wire.multipart import check_length, described_form, receive_calibration_pictures
 from server.wire.patience import IDLE_TIMEOUT_S, with_idle_timeout
 from server.wire.problems import Problem, Responses, documented
@@ -45,19 +46,19 @@ async def make_calibration(service: ServiceOf, caller: Taker, request: Request, 
     else:
         made = await receive_calibration_pictures(service, request, caller.key)
     response.headers["Location"] = f"/v1/calibrations/{made.id}"
-    return CalibrationOut.model_validate(made)
+    return made
 
 
 @router.get("", responses=documented())
 def list_calibrations(service: ServiceOf, caller: Reader) -> CalibrationList:
     """Lists all calibrations, newest first."""
-    return CalibrationList(calibrations=[CalibrationOut.model_validate(found) for found in service.calibrations.find()])
+    return CalibrationList(calibrations=service.calibrations.find())
 
 
 @router.get("/{calibration_id}", responses=documented(404))
 def get_calibration(service: ServiceOf, caller: Reader, calibration_id: str) -> CalibrationOut:
     """Returns a calibration: its state and, once it has succeeded, figures and checks."""
-    return CalibrationOut.model_validate(service.calibrations.get(calibration_id))
+    return service.calibrations.get(calibration_id)
 
 
 FILE: Responses = {

@@ -12,16 +12,14 @@ from rig.errors import InputError
 from rig.messages.message import compose
 from server.errors import Forbidden
 from server.http.auth import ServiceOf, require
-from server.http.rig_schemas import CaptureChecks, HoldingsOut
+from server.http.rig_schemas import CaptureChecks
 from server.http.schemas import (
-    BulkOut,
     CaptureBulk,
     CaptureEdit,
     CaptureList,
     CaptureOut,
     Cursor,
     Idempotency,
-    JobOut,
     Key,
     Limit,
     NewCapture,
@@ -30,10 +28,12 @@ from server.http.schemas import (
     Sought,
     WithTag,
 )
-from server.services.bulk import each
+from server.services.bulk import BulkOut, each
 from server.services.captures import CaptureMetadata
+from server.services.erasure import HoldingsOut
 from server.services.imports import fetch_stored_capture
 from server.services.keys import Caller
+from server.services.records import JobOut
 from server.services.texts import PLAIN, TEXT_MOST, checked_tags
 from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureOrder, CaptureQuery
@@ -134,7 +134,7 @@ def change_captures(service: ServiceOf, caller: Taker, wanted: CaptureBulk) -> B
         "tag": lambda capture: service.captures.tag(capture, wanted.tags),
         "untag": lambda capture: service.captures.untag(capture, wanted.tags),
     }
-    return BulkOut.model_validate(each(wanted.ids, actions[wanted.action]))
+    return each(wanted.ids, actions[wanted.action])
 
 
 @router.get("/captures/{capture_id}", responses=documented(404))
@@ -198,7 +198,7 @@ def get_features(service: ServiceOf, caller: Reader, capture_id: str) -> NewFeat
 @router.get("/captures/{capture_id}/holdings", responses=documented(404))
 def get_holdings(service: ServiceOf, caller: Reader, capture_id: str) -> HoldingsOut:
     """Returns what a removal of the capture would delete, and what would stay."""
-    return HoldingsOut.model_validate(service.captures.holdings(capture_id))
+    return service.captures.holdings(capture_id)
 
 
 @router.delete("/captures/{capture_id}", status_code=204, responses=documented(404, 409))
@@ -250,7 +250,7 @@ async def reconstruct_upload(
     if job.capture_id != record.id:  # an earlier call with this key made the job, so this upload is removed
         service.store.remove_capture(record.id, later=True)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
-    return JobOut.model_validate(job)
+    return job
 
 
 def _settings_of(text: str | None) -> dict[str, object] | None:

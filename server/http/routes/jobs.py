@@ -16,13 +16,11 @@ from rig.errors import InputError
 from rig.messages.message import compose
 from server.http.auth import ServiceOf, require
 from server.http.schemas import (
-    BulkOut,
     Cursor,
     Idempotency,
     JobBatch,
     JobBulk,
     JobList,
-    JobOut,
     Key,
     Limit,
     NewDelivery,
@@ -32,12 +30,12 @@ from server.http.schemas import (
     Restart,
     ResultList,
     Sought,
-    State,
 )
-from server.services.bulk import each
+from server.services.answer import State
+from server.services.bulk import BulkOut, each
 from server.services.job_rows import FINISHED, STATUSES
 from server.services.keys import Caller
-from server.services.records import Job
+from server.services.records import JobOut
 from server.services.work import ReconstructionRequest
 from server.storage.job_index import JobOrder, JobQuery
 from server.storage.records import JobWebhook
@@ -78,7 +76,7 @@ def submit_session(service: ServiceOf, caller: Submitter, session_id: str, wante
     """Queues a reconstruction of every capture of a session that shows a head."""
     work = ReconstructionRequest(wanted.model, wanted.settings)
     jobs = service.jobs.submit_session(session_id, work, key=caller.key, priority=wanted.priority)
-    return JobBatch(jobs=[JobOut.model_validate(job) for job in jobs])
+    return JobBatch(jobs=jobs)
 
 
 @router.get("/jobs", responses=documented(400))
@@ -102,7 +100,7 @@ def list_jobs(
         raise InputError("offset", [compose("cursor-in-place-of-offset")])
     query = JobQuery(q, None if state is None else STATUSES[state], capture, session, batch, sort)
     found = service.jobs.page(query, limit, cursor)
-    return JobList(jobs=[JobOut.model_validate(job) for job in found.items], next=found.next, total=found.total)
+    return JobList(jobs=list(found.items), next=found.next, total=found.total)
 
 
 @router.post("/jobs/bulk", responses=documented(400, 413, 415, 507))
@@ -113,13 +111,13 @@ def change_jobs(service: ServiceOf, caller: Submitter, wanted: JobBulk) -> BulkO
         "restart": lambda job: service.jobs.restart(job, ReconstructionRequest(), key=caller.key),
         "remove": service.jobs.delete,
     }
-    return BulkOut.model_validate(each(wanted.ids, actions[wanted.action]))
+    return each(wanted.ids, actions[wanted.action])
 
 
 @router.get("/jobs/{job_id}", responses=documented(404))
 def get_job(service: ServiceOf, caller: Reader, job_id: str) -> JobOut:
     """Returns a job: its state, stage, progress, remaining seconds, and once it has succeeded its files."""
-    return JobOut.model_validate(service.jobs.get(job_id))
+    return service.jobs.get(job_id)
 
 
 def known_job(service: ServiceOf, caller: Reader, job_id: str) -> str:
@@ -150,7 +148,7 @@ async def job_events(
                 yield ServerSentEvent(event="progress", id=str(seq), data=event.document)
             if state in FINISHED:
                 ended = await service.threads.disk(service.jobs.get, job)
-                yield ServerSentEvent(event="end", id=str(seq), data=JobOut.model_validate(ended))
+                yield ServerSentEvent(event="end", id=str(seq), data=ended)
                 return
             await anyio.sleep(service.settings.poll_s * max(1.0, streams[caller.key] / LOOKS_MOST))
     finally:
@@ -160,7 +158,7 @@ async def job_events(
 @router.post("/jobs/{job_id}/cancel", responses=documented(404))
 def cancel_job(service: ServiceOf, caller: Submitter, job_id: str) -> JobOut:
     """Cancels a job, in any stage; its worker stops within a second. A finished job does not change."""
-    return JobOut.model_validate(service.cancel(job_id))
+    return service.cancel(job_id)
 
 
 @router.post("/jobs/{job_id}/restart", status_code=202, responses=documented(400, 404, 413, 415, 507))
@@ -177,7 +175,7 @@ def restart_job(
 def deliver_job(service: ServiceOf, caller: Submitter, job_id: str, wanted: NewDelivery | None = None) -> JobOut:
     """Delivers the result of a job to an object store: for the first time, again after a failure, or elsewhere. 409
     while it is being delivered."""
-    return JobOut.model_validate(service.deliver(job_id, None if wanted is None else wanted.to))
+    return service.deliver(job_id, None if wanted is None else wanted.to)
 
 
 @router.post("/jobs/{job_id}/exports", responses=EXPORT, response_class=Response)
@@ -250,6 +248,6 @@ def get_result(
     return send_file(request, service.jobs.result_file(job_id, name))
 
 
-def _accepted(job: Job, response: Response) -> JobOut:
+def _accepted(job: JobOut, response: Response) -> JobOut:
     response.headers["Location"] = f"/v1/jobs/{job.id}"
-    return JobOut.model_validate(job)
+    return job

@@ -11,11 +11,14 @@ from pydantic import ConfigDict, Field
 
 from rig.messages.message import compose
 from server.http.auth import ServiceOf, require
-from server.http.schemas import Answer, JobSettings, MessageOut, Received, TextOf
+from server.http.schemas import Received
 from server.metrics import MEDIA_TYPE
-from server.services.health import about, exposition, readiness
+from server.services.answer import Answer
+from server.services.health import InfoOut, about, exposition, readiness
 from server.services.keys import Caller
-from server.services.templates import templates_at_hand
+from server.services.records import NewWebhookOut, WebhookOut
+from server.services.service import CheckOut
+from server.services.templates import TemplateOut, templates_at_hand
 from server.services.texts import PLAIN
 from server.wire.problems import Problem, documented
 
@@ -59,19 +62,6 @@ class ModelList(Answer):
     models: list[ModelOut]
 
 
-class WebhookOut(Answer):
-    """Describes a webhook without its secret."""
-
-    id: str
-    url: str
-
-
-class NewWebhookOut(WebhookOut):
-    """Describes a webhook that was just added, with its secret."""
-
-    secret: str = Field(description="shown this once; signs the messages (standardwebhooks.com)")
-
-
 class WebhookList(Answer):
     """Holds all webhooks, oldest first."""
 
@@ -106,63 +96,11 @@ class Health(Answer):
     version: str
 
 
-class InfoOut(Answer):
-    """Describes the service: version, load, limits, and the default settings of a job."""
-
-    version: str
-    cores: int = Field(description="that this service may use; its workers may run elsewhere")
-    queued: int = Field(description="jobs")
-    running: int = Field(description="jobs")
-    cameras_least: int = Field(description="of a capture")
-    cameras_most: int = Field(description="of a capture")
-    body_bytes_most: int = Field(description="of an upload")
-    image_pixels_most: int = Field(description="of one image")
-    jobs_per_key_most: int = Field(description="queued and running")
-    settings: JobSettings = Field(description="what a job has where it gives none; its schema says what it may give")
-
-
-class CheckOut(Answer):
-    """Holds one check of the service: whether it passed and, if not, what to do. ``starting``: it will pass soon by
-    itself."""
-
-    ok: bool
-    detail: TextOf
-    starting: bool
-    detail_message: MessageOut = Field(validation_alias="detail")
-
-
 class Ready(Answer):
     """States whether the service can take work: every check, and whether all passed."""
 
     ready: bool
     checks: dict[str, CheckOut]
-
-
-class RegistrationOut(Answer):
-    """Describes how well a template was fitted to its model. Distances are in mm: the median, and the value that 95 %
-    of vertices stay below (``p95``)."""
-
-    skin_share: float = Field(ge=0, le=1, description="of its vertices, on the model's skin; the others follow it")
-    face_covered_share: float = Field(ge=0, le=1, description="of the model's face, that it shows")
-    unlike_median_mm: float = Field(description="between the mesh as it came and the nearest head of the model")
-    unlike_p95_mm: float
-    off_median_mm: float = Field(description="between the mesh drawn onto that head and the head")
-    off_p95_mm: float
-
-
-class TemplateOut(Answer):
-    """Describes a template: a mesh in whose vertex order a job writes its head if ``settings.outputs.template`` names
-    it."""
-
-    id: str = Field(description="what a job calls it")
-    name: str
-    source: str | None = Field(description="file of the mesh")
-    sha256: str | None = Field(description="of that file")
-    model: str | None = Field(description="that it was registered to; a job with another one is refused")
-    models: list[str] = Field(description="names of that model at /v1/models; none where it is not at hand")
-    vertices: int | None
-    registration: RegistrationOut | None
-    fault: str | None = Field(description="why it cannot be used, and nothing else is known of it; null: it can")
 
 
 class TemplateList(Answer):
@@ -191,7 +129,7 @@ def readyz(service: ServiceOf, response: Response) -> Ready:
     checks = readiness(service)
     ready = all(check.ok for check in checks.values())
     response.status_code = 200 if ready else 503
-    return Ready(ready=ready, checks={name: CheckOut.model_validate(check) for name, check in checks.items()})
+    return Ready(ready=ready, checks=checks)
 
 
 @router.get(
@@ -208,7 +146,7 @@ def metrics(service: ServiceOf, caller: Reader) -> Response:
 @router.get("/v1/info", tags=["operations"], responses=documented())
 def info(service: ServiceOf, caller: Reader) -> InfoOut:
     """Returns version, limits, the number of waiting jobs, and the default settings of a job."""
-    return InfoOut.model_validate(about(service))
+    return about(service)
 
 
 @router.get("/v1/models", tags=["models"], responses=documented())
@@ -227,8 +165,7 @@ def list_models_at_hand(service: ServiceOf, caller: Reader) -> ModelList:
 @router.get("/v1/templates", tags=["models"], responses=documented())
 def list_templates(service: ServiceOf, caller: Reader) -> TemplateList:
     """Lists the meshes in whose vertex order a job may write its head (``settings.outputs.template``)."""
-    templates = [TemplateOut.model_validate(template) for template in templates_at_hand()]
-    return TemplateList(templates=templates)
+    return TemplateList(templates=templates_at_hand())
 
 
 @router.post("/v1/keys", status_code=201, tags=["access"], responses=documented(400, 413, 415, 507))
@@ -257,13 +194,13 @@ def remove_key(service: ServiceOf, caller: Admin, key_id: str) -> None:
 @router.post("/v1/webhooks", status_code=201, tags=["webhooks"], responses=documented(400, 413, 415, 507))
 def add_webhook(service: ServiceOf, caller: Admin, wanted: NewWebhook) -> NewWebhookOut:
     """Registers an address that gets a signed message whenever a job or a batch ends (standardwebhooks.com)."""
-    return NewWebhookOut.model_validate(service.webhooks.add(wanted.url))
+    return service.webhooks.add(wanted.url)
 
 
 @router.get("/v1/webhooks", tags=["webhooks"], responses=documented())
 def list_webhooks(service: ServiceOf, caller: Admin) -> WebhookList:
     """Lists the addresses that get a message whenever a job or a batch ends, oldest first."""
-    return WebhookList(webhooks=[WebhookOut.model_validate(hook) for hook in service.webhooks.all()])
+    return WebhookList(webhooks=service.webhooks.all())
 
 
 @router.delete("/v1/webhooks/{webhook_id}", status_code=204, tags=["webhooks"], responses=documented(404))

@@ -12,17 +12,9 @@ from fastapi.responses import StreamingResponse
 from server.errors import Unavailable
 from server.http.auth import ServiceOf, require
 from server.http.calibration_schemas import UseCalibration
-from server.http.rig_schemas import (
-    BackgroundOut,
-    CameraSettingsEdit,
-    CameraSettingsOut,
-    Lights,
-    PlatesList,
-    PlatesOut,
-    RigOut,
-    UsePlates,
-)
+from server.http.rig_schemas import BackgroundOut, CameraSettingsEdit, Lights, PlatesList, PlatesOut, UsePlates
 from server.services.keys import Caller
+from server.services.records import CameraSettingsOut, RigOut
 from server.services.service import Service
 from server.wire.problems import documented
 
@@ -37,7 +29,7 @@ UNKEPT = {"Cache-Control": "no-store"}
 @router.get("", responses=documented())
 def rig_state(service: ServiceOf, caller: Reader) -> RigOut:
     """Returns the cameras, drivers and faults of the rig, and whether it is calibrated."""
-    return RigOut.model_validate(service.rig.describe())
+    return service.rig.describe()
 
 
 @router.get(
@@ -81,15 +73,14 @@ async def _pictures(service: Service, name: str, picture: bytes, seconds: float)
 @router.get("/cameras/{name}/settings", responses=documented(404))
 def camera_settings(service: ServiceOf, caller: Reader, name: str) -> CameraSettingsOut:
     """Returns exposure, gain and white balance as requested of a camera, and which of them it did not accept."""
-    return CameraSettingsOut.model_validate(service.rig.camera_settings(name))
+    return service.rig.camera_settings(name)
 
 
 @router.patch("/cameras/{name}/settings", responses=documented(400, 404, 409, 413, 415, 507))
 def set_camera(service: ServiceOf, caller: Taker, name: str, wanted: CameraSettingsEdit) -> CameraSettingsOut:
     """Changes settings of a camera, also for later starts. New clean plates are needed afterwards. 409 in the simulated
     studio."""
-    changed = service.rig.set_camera(name, wanted.model_dump(exclude_unset=True))
-    return CameraSettingsOut.model_validate(changed)
+    return service.rig.set_camera(name, wanted.model_dump(exclude_unset=True))
 
 
 @router.get("/lights", responses=documented())
@@ -133,4 +124,4 @@ def use_plates(service: ServiceOf, caller: Taker, wanted: UsePlates) -> PlatesLi
 def use_calibration(service: ServiceOf, caller: Taker, wanted: UseCalibration) -> RigOut:
     """Selects the calibration of every later capture. Answers 409, with the reasons, for a calibration whose verdict is
     poor, unless ``poor`` is set."""
-    return RigOut.model_validate(service.use_calibration(wanted.calibration_id, poor=wanted.poor))
+    return service.use_calibration(wanted.calibration_id, poor=wanted.poor)

@@ -5,19 +5,9 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Response
 
 from server.http.auth import ServiceOf, require
-from server.http.schemas import (
-    Cursor,
-    Limit,
-    NewSession,
-    PersonOut,
-    SessionEdit,
-    SessionList,
-    SessionOut,
-    Sought,
-    SubjectList,
-    WithTag,
-)
+from server.http.schemas import Cursor, Limit, NewSession, SessionEdit, SessionList, Sought, SubjectList, WithTag
 from server.services.keys import Caller
+from server.services.records import SessionOut
 from server.storage.library import SubjectOrder
 from server.wire.problems import documented
 
@@ -32,7 +22,7 @@ def make_session(service: ServiceOf, caller: Taker, wanted: NewSession, response
     """Begins a session, which holds captures of one subject."""
     made = service.sessions.add(wanted.label, wanted.consent)
     response.headers["Location"] = f"/v1/sessions/{made.id}"
-    return SessionOut.model_validate(made)
+    return made
 
 
 @router.get("/sessions", responses=documented(400))
@@ -41,8 +31,7 @@ def list_sessions(
 ) -> SessionList:
     """Lists sessions in pages, newest first; ``q`` searches label and consent."""
     found = service.sessions.page(q, limit, cursor)
-    sessions = [SessionOut.model_validate(session) for session in found.items]
-    return SessionList(sessions=sessions, next=found.next, total=found.total)
+    return SessionList(sessions=list(found.items), next=found.next, total=found.total)
 
 
 @router.get("/subjects", responses=documented(400))
@@ -59,21 +48,19 @@ def list_subjects(
     """Lists people in pages, each with the newest head. Sessions with the same name are one person's. ``q`` searches
     label and consent."""
     found = service.sessions.subjects(q, sort, limit, cursor, tag=tag)
-    subjects = [PersonOut.model_validate(subject) for subject in found.items]
-    return SubjectList(subjects=subjects, next=found.next, total=found.total)
+    return SubjectList(subjects=list(found.items), next=found.next, total=found.total)
 
 
 @router.get("/sessions/{session_id}", responses=documented(404))
 def get_session(service: ServiceOf, caller: Reader, session_id: str) -> SessionOut:
     """Returns a session with the ids of its captures."""
-    return SessionOut.model_validate(service.sessions.get(session_id))
+    return service.sessions.get(session_id)
 
 
 @router.patch("/sessions/{session_id}", responses=documented(400, 404, 413, 415, 507))
 def edit_session(service: ServiceOf, caller: Taker, session_id: str, wanted: SessionEdit) -> SessionOut:
     """Changes the label or the consent note of a session. Keys that are left out keep their values."""
-    changed = service.sessions.edit(session_id, label=wanted.label, consent=wanted.consent)
-    return SessionOut.model_validate(changed)
+    return service.sessions.edit(session_id, label=wanted.label, consent=wanted.consent)
 
 
 @router.delete("/sessions/{session_id}", status_code=204, responses=documented(404))

@@ -1,47 +1,19 @@
 """Declares the routes that show what the data folder holds and what retention removes from it, and their documents."""
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from fastapi import APIRouter, Depends
 from pydantic import Field
 
 from server.http.auth import ServiceOf, require
-from server.http.schemas import Answer, Moment
+from server.services.answer import Answer
 from server.services.keys import Caller
-from server.services.retention import upcoming
+from server.services.retention import UpcomingOut, upcoming
+from server.services.storage_use import StorageOut
 from server.wire.problems import documented
 
 router = APIRouter(prefix="/v1", tags=["operations"])
 Reader = Annotated[Caller, Depends(require("read"))]
-
-
-class KindOut(Answer):
-    """Describes how much disk space one kind of data takes."""
-
-    kind: str
-    bytes: int
-    things: int = Field(description="captures, jobs, ...: what lies directly in the kind's folders")
-
-
-class StorageOut(Answer):
-    """Describes how the disk of the data folder is used."""
-
-    free: int = Field(description="bytes of the disk")
-    total: int = Field(description="bytes of the disk")
-    spare: int = Field(description="bytes that uploads and jobs leave free")
-    failed: int = Field(description="jobs that failed or were cancelled")
-    kinds: list[KindOut] | None = Field(description="null while the data folder is looked through for the first time")
-    at: float | None = Field(description="when it was looked through, seconds since 1970")
-
-
-class UpcomingOut(Answer):
-    """Describes a capture or finished job that retention will remove."""
-
-    kind: Literal["job", "capture"]
-    id: str
-    label: str
-    goes: Moment | None = Field(description="null where that hangs on the disk or on what comes")
-    why: str = Field(description="the setting that takes it")
 
 
 class RetentionOut(Answer):
@@ -61,7 +33,7 @@ class RetentionOut(Answer):
 def get_storage(service: ServiceOf, caller: Reader) -> StorageOut:
     """Returns the bytes of each kind of data, as they were last measured. If that is older than five minutes, a new
     measurement starts, but the answer does not wait for it."""
-    return StorageOut.model_validate(service.storage.use())
+    return service.storage.use()
 
 
 @router.get("/retention", responses=documented())
@@ -69,4 +41,4 @@ def get_retention(service: ServiceOf, caller: Reader) -> RetentionOut:
     """Returns how long captures and finished jobs are kept (set by the variables ``EIGENHEAD_KEEP_...``), and what is
     removed next."""
     settings = {name: getattr(service.settings, name) for name in RetentionOut.model_fields if name != "upcoming"}
-    return RetentionOut(**settings, upcoming=[UpcomingOut.model_validate(one) for one in upcoming(service)])
+    return RetentionOut(**settings, upcoming=upcoming(service))

@@ -9,7 +9,7 @@ does not answer is killed and begun again with the next look. ``IDLE_S`` after t
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig
 from server.errors import Refused
-from server.services.live.seen import LiveShown, Seen, Word
+from server.services.live.seen import LiveOut, Seen, Word, word_out
 from server.services.live.words import Speaker, lamps_of
 from server.services.rigs.backend import RigBackend
 from server.tasks.child import Child, WorkerContext
@@ -34,10 +34,10 @@ AGAIN_S = 1.0  # after a fault
 LOOK_S, FIRST_LOOK_S = 4.0, 40.0  # that the child may take; the first one reads model and networks
 OFFERED_S = 1.0  # pictures that are offered so lately are waited for: the cameras are looked at once
 FRESH_S = 3.0  # a look so old says nothing about now
-WAIT_S = 0.02
+PAUSE_S = 0.02  # between two looks at least
 WIDTH_PX = 480  # of pictures that the child gets, at least
 NICENESS = 2  # a job's processes have 5: half a core of 0.15 s a look must not wait for their two
-HEAD_SHOWN = ("vertices", "triangles", "left_deg", "up_deg", "eyes_open")
+HEAD_SHOWN = {"vertices", "triangles", "left_deg", "up_deg", "eyes_open"}
 
 log = structlog.get_logger()
 
@@ -62,18 +62,19 @@ class Live:
         self._thread: threading.Thread | None = None
         self._asked_s = self._offered_s = self._polled_s = 0.0
         self._moment: Moment | None = None
+        self._taken = threading.Event()  # set by each moment
         self._begun, self._child_s = threading.Event(), 0.0  # whether the child looks at the newest; how long it took
-        self._shown: tuple[float, LiveShown] | None = None
+        self._shown: tuple[float, LiveOut] | None = None
         self._number = 0
         self._closing = False
 
-    def newest(self) -> LiveShown:
+    def newest(self) -> LiveOut:
         """Returns the newest look, and asks for the next ones. While the first is under way, and when the cameras are
         lost, the answer has no cameras and says why. Does not block."""
         self._polled_s = time.monotonic()
         return self._newest()
 
-    def _newest(self) -> LiveShown:
+    def _newest(self) -> LiveOut:
         self._asked_s = now_s = time.monotonic()
         with self._lock:
             if self._thread is None and not self._closing:
@@ -82,15 +83,17 @@ class Live:
         shown = self._shown
         return shown[1] if shown is not None and now_s - shown[0] < FRESH_S else nothing(compose("live-starting"))
 
-    def offer(self, pictures: Mapping[str, bytes], taken_s: float) -> LiveShown:
+    def offer(self, pictures: Mapping[str, bytes], taken_s: float) -> LiveOut:
         """Takes the pictures that the live view has just got, so that the cameras need not be asked twice, and returns
         the newest look."""
-        self._moment, self._offered_s = Moment(taken_s, pictures), time.monotonic()
+        self._offered_s = time.monotonic()
+        self._hand_on(Moment(taken_s, pictures))
         return self._newest()
 
     def close(self) -> None:
         """Ends the threads and the child process."""
         self._closing, thread = True, self._thread
+        self._taken.set()
         if thread is not None:
             thread.join(LOOK_S)
 
@@ -100,9 +103,10 @@ class Live:
         threading.Thread(target=self._watch_cameras, args=(ended,), daemon=True, name="live pictures").start()
         try:
             while not self._is_idle():
+                self._taken.wait(EVERY_S)
+                self._taken.clear()
                 moment = self._moment
                 if moment is None or moment.taken_s <= last_s:
-                    time.sleep(WAIT_S)
                     continue
                 last_s = moment.taken_s
                 self._begun.set()
@@ -120,18 +124,23 @@ class Live:
         while not ended.is_set():
             begun_s = time.monotonic()
             if begun_s - self._offered_s < OFFERED_S or begun_s - self._polled_s > IDLE_S:
-                ended.wait(WAIT_S)
+                ended.wait(EVERY_S)
                 continue
             self._begun.clear()
             try:
-                self._moment = Moment(begun_s, {name: halved(image) for name, image in self._rig.look().items()})
+                pictures = {name: halved(image) for name, image in self._rig.look().items()}
+                self._hand_on(Moment(begun_s, pictures))
             except Exception as error:  # the cameras may come back
                 fault = error.detail if isinstance(error, Refused) else compose("live-no-pictures")
-                self._moment = Moment(begun_s, {}, fault)
+                self._hand_on(Moment(begun_s, {}, fault))
                 ended.wait(AGAIN_S)
             took_s = time.monotonic() - begun_s
             self._begun.wait(LOOK_S)
-            ended.wait(max(WAIT_S, self._child_s - took_s, begun_s + EVERY_S - time.monotonic()))
+            ended.wait(max(PAUSE_S, self._child_s - took_s, begun_s + EVERY_S - time.monotonic()))
+
+    def _hand_on(self, moment: Moment) -> None:
+        self._moment = moment
+        self._taken.set()
 
     def _is_idle(self) -> bool:
         with self._lock:
@@ -156,14 +165,14 @@ class Live:
         self._child_s, self._number = now_s - begun_s, self._number + 1
         words, steady = speaker.words(seen, moment.taken_s), speaker.steady(seen.head, moment.taken_s)
         opened = seen.head is not None and seen.head.eyes_open is True
-        shown = LiveShown(
+        shown = LiveOut(
             time=datetime.fromtimestamp(time.time() + moment.taken_s - now_s, UTC).isoformat(timespec="milliseconds"),
             age_s=round(now_s - moment.taken_s, 3),
             number=self._number,
             cameras=lamps_of(seen),
             head=seen.head,
             steady=steady,
-            words=words,
+            words=[word_out(word) for word in words],
             ready=steady and opened and not words,
         )
         self._shown = (now_s, shown)
@@ -173,9 +182,11 @@ class Live:
         return None if in_use is None or self._config is None else (str(self._config.plates_folder), in_use.id)
 
 
-def nothing(why: Message) -> LiveShown:
+def nothing(why: Message) -> LiveOut:
     """Returns a look that found nothing."""
-    return LiveShown("", 0.0, 0, {}, None, False, (Word(why),), False)
+    return LiveOut(
+        time="", age_s=0.0, number=0, cameras={}, head=None, steady=False, words=[word_out(Word(why))], ready=False
+    )
 
 
 def halved(image: ImageRgb) -> ImageRgb:
@@ -200,11 +211,8 @@ def look(
     return looking.look(context, pictures, rig, front, plates)
 
 
-def document_of(shown: LiveShown) -> dict[str, object]:
+def document_of(shown: LiveOut) -> dict[str, object]:
     """Returns a look as JSON types, for a page."""
-    return {
-        **{name: getattr(shown, name) for name in ("time", "age_s", "number", "steady", "ready")},
-        "cameras": {name: asdict(lamps) for name, lamps in shown.cameras.items()},
-        "head": None if shown.head is None else {name: getattr(shown.head, name) for name in HEAD_SHOWN},
-        "words": [{**word.message.document(), "camera": word.camera} for word in shown.words],
-    }
+    head = None if shown.head is None else shown.head.model_dump(include=HEAD_SHOWN)
+    words = [{**word.message.model_dump(), "camera": word.camera} for word in shown.words]
+    return shown.model_dump(exclude={"head", "words"}) | {"head": head, "words": words}

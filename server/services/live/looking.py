@@ -27,7 +27,7 @@ from rig.camera import Camera
 from rig.capture import ImageRgb
 from rig.errors import InputError
 from rig.rig import Rig
-from server.services.live.seen import CameraSeen, HeadSeen, Numbers, Seen
+from server.services.live.seen import CameraSeen, HeadOut, Numbers, Seen
 from server.tasks.child import WorkerContext
 
 SMALL_PX = 320
@@ -234,7 +234,7 @@ def _search_stranger(
             seen[name] = replace(seen[name], stranger=True)
 
 
-def _head(head: LiveHead, rig: Rig, scaled: Rig, front: str | None) -> HeadSeen:
+def _head(head: LiveHead, rig: Rig, scaled: Rig, front: str | None) -> HeadOut:
     pose, name = head.motion.world_from_head, front if front in rig.names else rig.front_camera()
     camera, centre = rig[name], rig.centre_world()
     face, _ = place_face(head.landmarks_world)
@@ -244,21 +244,21 @@ def _head(head: LiveHead, rig: Rig, scaled: Rig, front: str | None) -> HeadSeen:
     off = view @ (middle - centre)
     distance = float(np.linalg.norm(camera.centre_world - centre))
     vertices, openings = (head.vertices_world - pose.translation) @ view.T, head.sighting.openings
-    return HeadSeen(
-        _rounded(pose.rotation.ravel(), 5),
-        _rounded(pose.translation, 2),
-        round(head.who.scale, 4),
-        round(left_deg or 0.0, 1),
-        round(up_deg or 0.0, 1),
-        round(float(off[0]), 1),
-        round(float(off[1]), 1),
-        round(float(off[2]), 1),
-        round(ROOM * camera.intrinsics.height / camera.intrinsics.fy * distance, 1),
-        round(DEPTH * distance, 1),
-        {side: round(opening, 3) for side, opening in openings.items()},
-        not closed_by_openings(openings) if openings else None,
-        tuple(_rounded(vertex, 1) for vertex in vertices),
-        tuple(tuple(face) for face in mesh_faces(head.who.person.model).tolist()),
+    return HeadOut(
+        rotation=_rounded(pose.rotation.ravel(), 5),
+        translation=_rounded(pose.translation, 2),
+        scale=round(head.who.scale, 4),
+        left_deg=round(left_deg or 0.0, 1),
+        up_deg=round(up_deg or 0.0, 1),
+        right_mm=round(float(off[0]), 1),
+        down_mm=round(float(off[1]), 1),
+        away_mm=round(float(off[2]), 1),
+        room_mm=round(ROOM * camera.intrinsics.height / camera.intrinsics.fy * distance, 1),
+        depth_mm=round(DEPTH * distance, 1),
+        openings={side: round(opening, 3) for side, opening in openings.items()},
+        eyes_open=not closed_by_openings(openings) if openings else None,
+        vertices=tuple(_rounded(vertex, 1) for vertex in vertices),
+        triangles=tuple(tuple(face) for face in mesh_faces(head.who.person.model).tolist()),
     )
 
 

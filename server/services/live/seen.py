@@ -1,9 +1,12 @@
-"""Holds what one look at the cameras finds. These values travel from the child process to the service."""
+"""Holds what one look at the cameras finds, in the child process and in the service, and what is answered of it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from pydantic import Field
+
 from rig.messages.message import Message
+from server.services.answer import Answer, MessageOut
 
 Numbers = tuple[float, ...]
 
@@ -34,21 +37,11 @@ class CameraSeen:
     points: tuple[Numbers, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class HeadSeen:
-    """Holds the head at one moment.
-
-    Attributes:
-        rotation: of world_from_head, row by row; ``translation``: mm; ``scale``: of the model's mean size.
-        left_deg: how far the face looks to the subject's left, seen from the front camera; ``up_deg``: the same
-            upwards.
-        right_mm: how far the head is to the front picture's right of the place where the cameras look; ``down_mm`` and
-            ``away_mm`` the same downwards, and away from the front camera; ``room_mm`` how far it may be to a side,
-            ``depth_mm`` along the view.
-        openings: of the lids, by side (``pipeline.faces.eyes``); ``eyes_open``: both are; None where they are not seen.
-        vertices: of the small mesh about the head's middle, as the front camera sees it: right, down, away (mm).
-        triangles: of these vertices.
-    """
+class HeadOut(Answer):
+    """Describes the head. ``rotation`` (row by row) and ``translation`` (mm): of world_from_head; ``scale``: by the
+    model's mean size; ``left_deg``, ``up_deg``: where the face looks, seen from the front camera; ``right_mm``,
+    ``down_mm``, ``away_mm``: how far the head is, in the front camera's picture, from where all cameras look;
+    ``vertices`` (mm, in the same directions) and ``triangles``: a small mesh."""
 
     rotation: Numbers
     translation: Numbers
@@ -58,12 +51,12 @@ class HeadSeen:
     right_mm: float
     down_mm: float
     away_mm: float
-    room_mm: float
-    depth_mm: float
-    openings: Mapping[str, float]
-    eyes_open: bool | None
-    vertices: tuple[Numbers, ...] = ()
-    triangles: tuple[tuple[int, ...], ...] = ()
+    room_mm: float = Field(exclude=True)  # that it may be to a side,
+    depth_mm: float = Field(exclude=True)  # and along the view
+    openings: dict[str, float]  # of the lids, by side (``pipeline.faces.eyes``)
+    eyes_open: bool | None  # None where they are not seen
+    vertices: tuple[Numbers, ...]
+    triangles: tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,22 +65,21 @@ class Seen:
     ``calibrated``: whether the cameras' places are known; ``missing``: cameras that deliver no picture."""
 
     cameras: Mapping[str, CameraSeen]
-    head: HeadSeen | None
+    head: HeadOut | None
     faces: bool
     calibrated: bool
     missing: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Lamps:
-    """Holds whether a camera shows the face, is sharp, well exposed and centred, and is looked at by the face; None
-    where that is not known or does not matter."""
+class LampsOut(Answer):
+    """Tells of one camera whether it shows the face, is sharp, well exposed and has the head in its middle, and whether
+    the face looks at it. null: not known, or it need not be."""
 
-    face: bool | None = None
-    sharp: bool | None = None
-    exposed: bool | None = None
-    centred: bool | None = None
-    looking: bool | None = None
+    face: bool | None
+    sharp: bool | None
+    exposed: bool | None
+    centred: bool | None
+    looking: bool | None
     points: tuple[Numbers, ...] = ()
 
 
@@ -99,19 +91,31 @@ class Word:
     camera: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class LiveShown:
-    """Holds the newest look: when its pictures were taken (UTC, ISO 8601), how old they were when the head was ready,
-    lamps by camera, the head, and what to do.
+class WordOut(Answer):
+    """Says one thing to do. ``camera``: that it is about, null for the subject."""
 
-    ``ready``: the head is steady, its eyes are open and nothing is to do.
-    """
+    code: str
+    text: str
+    camera: str | None
+    message: MessageOut
+
+
+class LiveOut(Answer):
+    """Describes the newest look. ``time``: when its pictures were taken, empty before the first; ``age_s``: how old
+    they were when the head was ready; ``points`` of ``cameras``: landmarks of the face, as shares of width and height;
+    ``ready``: the head is steady, its eyes are open, and nothing is to do."""
 
     time: str
     age_s: float
     number: int
-    cameras: Mapping[str, Lamps]
-    head: HeadSeen | None
+    cameras: dict[str, LampsOut]
+    head: HeadOut | None
     steady: bool
-    words: tuple[Word, ...]
+    words: list[WordOut]
     ready: bool
+
+
+def word_out(word: Word) -> WordOut:
+    """Returns a word as it is answered."""
+    message = MessageOut.model_validate(word.message)
+    return WordOut(code=message.code, text=word.message.text, camera=word.camera, message=message)

@@ -13,7 +13,7 @@ import numpy as np
 from rig.acquisition.face_sighting import TURNED_DEG
 from rig.geometry import vector_from_rotation
 from rig.messages.message import compose
-from server.services.live.seen import CameraSeen, HeadSeen, Lamps, Seen, Word
+from server.services.live.seen import CameraSeen, HeadOut, LampsOut, Seen, Word
 
 HOLD_S = 0.4  # longer than a blink
 AT_ONCE = frozenset({"live-black", "live-darker", "live-brighter", "live-soft"})  # no subject does that in passing
@@ -45,7 +45,7 @@ class Speaker:
         triples = zip(reasons, keys, held_s, strict=True)
         return tuple(word for word, key, least_s in triples if time_s - self._since[key] >= least_s)
 
-    def steady(self, head: HeadSeen | None, time_s: float) -> bool:
+    def steady(self, head: HeadOut | None, time_s: float) -> bool:
         """Tells whether the head has kept its pose for ``STEADY_S``."""
         if head is None:
             self._poses.clear()
@@ -60,11 +60,11 @@ class Speaker:
         return time_s - self._poses[0][0] >= STEADY_S and max(turns) < STEADY_DEG and max(shifts) < STEADY_MM
 
 
-def lamps_of(seen: Seen) -> dict[str, Lamps]:
+def lamps_of(seen: Seen) -> dict[str, LampsOut]:
     """Returns the lamps of every camera."""
     light = dict(_light(seen))
     return {
-        name: Lamps(
+        name: LampsOut(
             face=camera.face,
             sharp=None if camera.blur_px is None else camera.blur_px <= SOFT_PX,
             exposed=name not in light and camera.clipped <= CLIPPED,
@@ -95,7 +95,7 @@ def reasons_of(seen: Seen) -> Iterator[Word]:
             yield from _of_camera(name, camera)
 
 
-def _of_head(head: HeadSeen) -> Iterator[Word]:
+def _of_head(head: HeadOut) -> Iterator[Word]:
     if abs(head.left_deg) > TURNED_DEG:
         yield Word(
             compose("live-turn-right" if head.left_deg > 0.0 else "live-turn-left", angle_deg=abs(head.left_deg))

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 from server.errors import Conflict
-from server.services.records import CameraSettings, CleanPlates, RigCamera, RigState
+from server.services.records import CameraOut, CameraSettingsOut, CleanPlates, RigOut
 from server.tasks.simulate import SimulatedCertificate
 
 SHOT_BYTES = 64 << 20  # that a shot may take on the disk
@@ -24,7 +24,7 @@ PREVIEW_QUALITY = 80  # of JPEG, 0 to 100
 class RigBackend(Protocol):
     """Declares what the service needs of a rig, simulated or real. Methods block, so call them from a thread."""
 
-    def describe(self) -> RigState:
+    def describe(self) -> RigOut:
         """Returns the state of the rig without opening its cameras."""
         ...
 
@@ -51,11 +51,11 @@ class RigBackend(Protocol):
         NotFound for an unknown camera, and Unavailable if the rig cannot be opened or the camera delivers none."""
         ...
 
-    def camera_settings(self, camera: str) -> CameraSettings:
+    def camera_settings(self, camera: str) -> CameraSettingsOut:
         """Returns the exposure, gain and white balance requested of a camera. Raises NotFound for an unknown camera."""
         ...
 
-    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
+    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettingsOut:
         """Changes settings of a camera and keeps them across restarts; an open rig is closed and opened again. Raises
         NotFound for an unknown camera, InputError for wrong values, and Conflict for the simulated studio."""
         ...
@@ -103,11 +103,15 @@ def check_names(rig: Rig, names: tuple[str, ...]) -> None:
 
 
 def rig_state(
-    identity: str, kind: str, cameras: list[RigCamera], faults: list[Message], calibration: str | None
-) -> RigState:
+    identity: str,
+    kind: Literal["simulated", "real"],
+    cameras: list[CameraOut],
+    faults: list[Message],
+    calibration: str | None,
+) -> RigOut:
     """Returns the state of a rig, which is ready if it has no fault and no camera is missing."""
     ready = not faults and all(camera.state != "missing" for camera in cameras)
-    return RigState(identity, kind, ready, tuple(cameras), tuple(faults), calibration)
+    return RigOut(id=identity, kind=kind, ready=ready, cameras=cameras, faults=tuple(faults), calibration=calibration)
 
 
 def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:

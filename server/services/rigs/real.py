@@ -23,7 +23,7 @@ from rig.image import ImageRgb
 from rig.messages.message import compose, message_of
 from rig.rig import Rig
 from server.errors import Conflict, NotFound, Unavailable
-from server.services.records import CameraSettings, CleanPlates, RigCamera, RigState
+from server.services.records import CameraOut, CameraSettingsOut, CleanPlates, RigOut
 from server.services.rigs.backend import check_names, jpeg, rig_state
 from server.storage.records import RIG_ADJUSTMENT, RigAdjustment
 
@@ -43,7 +43,7 @@ class RealRig:
         self._session: RigSession | None = None
         self._lock = threading.RLock()
 
-    def describe(self) -> RigState:
+    def describe(self) -> RigOut:
         """Returns the state of the rig. Cameras that were not used yet are "closed", which is no fault; a missing
         calibration is one."""
         with self._lock:
@@ -53,7 +53,7 @@ class RealRig:
         for camera in self._config.cameras:
             state = states.get(camera.name)
             known = "closed" if state is None else "open" if state.opened else "missing"
-            cameras.append(RigCamera(camera.name, camera.driver, known))
+            cameras.append(CameraOut(name=camera.name, driver=camera.driver, state=known))
             if state is not None and state.error:
                 faults.append(compose("located", where=camera.name, fault=state.error))
         rig = self.calibrated()
@@ -113,7 +113,7 @@ class RealRig:
             raise Unavailable("camera-missing", compose("camera-without-picture", camera=camera), [camera])
         return jpeg(image)
 
-    def camera_settings(self, camera: str) -> CameraSettings:
+    def camera_settings(self, camera: str) -> CameraSettingsOut:
         """Returns the settings requested of a camera, by rig.toml or by the operator, and those that the driver did not
         take. Raises NotFound for an unknown camera."""
         wanted = next((found for found in self._config.cameras if found.name == camera), None)
@@ -122,9 +122,11 @@ class RealRig:
         with self._lock:
             state = None if self._session is None else self._session.states().get(camera)
         unmet = () if state is None else tuple(message_of(line) for line in state.unmet)
-        return CameraSettings(wanted.exposure_ms, wanted.gain_db, wanted.white_balance_k, unmet)
+        return CameraSettingsOut(
+            exposure_ms=wanted.exposure_ms, gain_db=wanted.gain_db, white_balance_k=wanted.white_balance_k, unmet=unmet
+        )
 
-    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
+    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettingsOut:
         """Changes settings of a camera and stores them in adjusted.json. An open rig is closed and opened again, since
         drivers take settings when they open. Raises NotFound and InputError."""
         self.camera_settings(camera)

@@ -10,7 +10,7 @@ from rig.image import ImageRgb
 from rig.messages.message import compose
 from rig.rig import Rig
 from server.errors import Conflict, NotFound, Unavailable
-from server.services.records import CameraSettings, CleanPlates, RigCamera, RigState
+from server.services.records import CameraOut, CameraSettingsOut, CleanPlates, RigOut
 from server.services.rigs.backend import check_names, jpeg, rig_state
 from server.tasks.child import Child, WorkFailed
 from server.tasks.simulate import SimulatedCertificate, look, simulated
@@ -25,9 +25,9 @@ class SimulatedRig:
         self._child = Child(niceness=3)
         self._one_at_a_time = threading.Lock()
 
-    def describe(self) -> RigState:
+    def describe(self) -> RigOut:
         """Returns the state of the studio, whose cameras are always ready."""
-        cameras = [RigCamera(name, "simulated", "ready") for name in self._rig().names]
+        cameras = [CameraOut(name=name, driver="simulated", state="ready") for name in self._rig().names]
         return rig_state("simulated", "simulated", cameras, [], "own" if self._calibration.is_file() else "studio")
 
     def calibrated(self) -> Rig:
@@ -58,13 +58,13 @@ class SimulatedRig:
         with self._one_at_a_time:
             return jpeg(self._child.remote(look)(cameras=[camera])[camera])
 
-    def camera_settings(self, camera: str) -> CameraSettings:
+    def camera_settings(self, camera: str) -> CameraSettingsOut:
         """Returns settings without values, since simulated cameras have none. Raises NotFound for an unknown camera."""
         if camera not in self._rig():
             raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
-        return CameraSettings(None, None, None, ())
+        return CameraSettingsOut(exposure_ms=None, gain_db=None, white_balance_k=None, unmet=())
 
-    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
+    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettingsOut:
         """Raises Conflict, since simulated cameras cannot be set; NotFound for an unknown camera."""
         self.camera_settings(camera)
         raise _fixed_studio()

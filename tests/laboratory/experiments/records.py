@@ -60,17 +60,20 @@ class Outcome(TypedDict):
 class Records:
     """Holds rows by key in one JSON file; without a folder, in memory alone."""
 
-    def __init__(self, folder: Path | None, name: str, key: str) -> None:
+    def __init__(self, folder: Path | None, name: str, key: str, report: Progress = discard_progress) -> None:
         """``key`` names all that the rows depend on (model, settings, code version): another key starts anew."""
         self._path = None if folder is None else folder / f"{name}.json"
-        self._key = key
+        self._key, self._report = key, report
         self._rows: dict[str, Row] = {}
         if self._path is not None and self._path.is_file():
             kept = json.loads(self._path.read_text())
             self._rows = kept["rows"] if kept.get("key") == key else {}
 
-    def row(self, name: str, compute: Callable[[], Row]) -> Row:
-        """Returns the row of this name; if there is none it is computed and kept."""
+    def row(self, name: str, compute: Callable[[], Row], begun: float | None = None) -> Row:
+        """Returns the row of this name; if there is none it is computed and kept. ``begun``: the share of the
+        experiment before this row, which is reported."""
+        if begun is not None:
+            self._report(name, begun)
         if name not in self._rows:
             self._rows[name] = compute()
             if self._path is not None:
@@ -95,7 +98,7 @@ class Bench:
 
     def records(self, name: str, key: str) -> Records:
         """Returns the kept rows of this name, see ``Records``."""
-        return Records(self.folder, name, key)
+        return Records(self.folder, name, key, self.report)
 
 
 def means_by(rows: Sequence[Row], group: str) -> dict[str, float]:

@@ -1,10 +1,12 @@
 """The parts of the operator's pages that need no browser: identity, removal with undo, numbers by vertex, guides."""
 
+import asyncio
 import json
 import struct
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
 from rig.messages.message import compose, verbatim
 from rig.rig import Rig
-from server.console import comparison, coverage, guides
+from server.console import comparison, coverage, guides, live
 from server.console.identity import cookie_secret, is_foreign, is_rebound
 from server.console.live import look_bytes
 from server.console.live_frame import LiveFrame
@@ -27,11 +29,15 @@ from server.console.mount import path_below
 from server.console.pages.jobs import SettingsForm, chosen_settings, log_lines
 from server.console.removal import Removals
 from server.console.work_form import chosen_work, settings_of
-from server.errors import Conflict, Forbidden, NotFound, Unauthenticated
+from server.errors import Conflict, Forbidden, NotFound, Unauthenticated, Unavailable
 from server.services.keys import Keys
+from server.services.live.live import nothing
+from server.services.records import RigOut
 from server.services.work import ReconstructionRequest
 from server.settings import ServiceSettings
 from server.storage.events import JobEvent
+
+SHOWN = nothing(compose("live-starting"))
 
 
 def scope(host: str, origin: str | None = None) -> Scope:
@@ -169,9 +175,9 @@ def test_quality_and_distance_come_in_the_order_of_the_vertices(tmp_path: Path) 
     mesh = grid()
     quality = np.linspace(0.1, 3.0, len(mesh.vertices))
     mine = write_head(tmp_path / "mine", mesh, quality)
-    np.testing.assert_array_equal(comparison.ply_property(mine / "head.ply", "quality"), quality.astype(np.float32))
+    np.testing.assert_array_equal(comparison.vertex_numbers(mine / "head.ply", "quality"), quality.astype(np.float32))
     with pytest.raises(NotFound):
-        comparison.ply_property(mine / "head.ply", "curvature")
+        comparison.vertex_numbers(mine / "head.ply", "curvature")
     lifted = Mesh(mesh.vertices + [0, 0, 2.5], mesh.faces)
     theirs = write_head(tmp_path / "theirs", lifted, quality)
     np.testing.assert_allclose(comparison.to_surface(mine, theirs / "head.ply"), 2.5, atol=1e-5)
@@ -290,9 +296,29 @@ def test_a_look_on_the_wire_holds_every_picture() -> None:
     assert body == 3
 
 
-def test_a_session_is_worth_what_its_key_is(tmp_path: Path) -> None:
-    from types import SimpleNamespace
+def test_the_live_view_names_an_error_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever it comes from: here not from the cameras."""
+    monkeypatch.setattr(live, "AGAIN_S", 0.0)
+    monkeypatch.setattr(live, "KEEP_S", 0.5)
+    errors = iter([Unavailable("rig-unavailable", compose("live-no-pictures"))])
 
+    def describe() -> RigOut:
+        for error in errors:
+            raise error
+        return RigOut(id="", kind="real", ready=True, cameras=[], faults=(), calibration=None)
+
+    rig = SimpleNamespace(describe=describe, look=dict)
+    view = live.LiveView(SimpleNamespace(rig=rig, live=SimpleNamespace(offer=lambda *_: SHOWN)))  # type: ignore[arg-type]
+
+    async def faults() -> list[str | None]:
+        stream = view.stream()
+        headers = [json.loads((await anext(stream))[8:]) for _ in range(2)]
+        return [header["fault"] and header["fault"]["code"] for header in headers]
+
+    assert asyncio.run(faults()) == ["live-no-pictures", None]
+
+
+def test_a_session_is_worth_what_its_key_is(tmp_path: Path) -> None:
     from server.console.identity import caller_of, permit
     from server.settings import ServiceSettings
     from server.storage.database import open_database

@@ -18,11 +18,11 @@ def test_templates_name_their_models_and_damaged_ones_their_fault(
     header_file(tmp_path, "lost", model_name="gone", model_sha256="ee" * 32)
     header_file(tmp_path, "wrong").write_bytes(b"PK")
     flame, lost, wrong = templates_at_hand()
-    assert (flame.id, flame.model, flame.models) == ("flame", "makehuman-138", ("default", "makehuman-138"))
+    assert (flame.id, flame.model, flame.models) == ("flame", "makehuman-138", ["default", "makehuman-138"])
     assert (flame.vertices, flame.fault) == (5023, None)
     assert flame.registration is not None
-    assert flame.registration["off_median_mm"] == 0.012
-    assert (lost.model, lost.models, lost.fault) == ("gone", (), None)
-    assert (wrong.model, wrong.models, wrong.registration) == (None, (), None)
+    assert flame.registration.off_median_mm == 0.012
+    assert (lost.model, lost.models, lost.fault) == ("gone", [], None)
+    assert (wrong.model, wrong.models, wrong.registration) == (None, [], None)
     assert wrong.fault is not None
     assert str(tmp_path) not in wrong.fault

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from rig.digest import sha256_of
 from server.services.unclaimed import OWNER, collect
 from server.settings import ServiceSettings
 from server.storage.database import database_identity, open_database
-from server.storage.objects import FolderObjects, sha256_of
+from server.storage.objects import FolderObjects
 from server.storage.store import new_id
 from tests.support.at_once import run_at_once
 

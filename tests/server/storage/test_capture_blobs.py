@@ -8,12 +8,13 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
+from rig.digest import sha256_of
 from server.errors import Conflict
 from server.services.unclaimed import collect
 from server.settings import ServiceSettings
 from server.storage.capture_blobs import NAME, SMALL_BYTES, CaptureBlobs, open_capture_blobs
 from server.storage.database import capture_index, open_database
-from server.storage.objects import FolderObjects, StoreUnavailable, sha256_of
+from server.storage.objects import FolderObjects, StoreUnavailable
 from server.storage.store import new_id
 from tests.server.storage.test_records import in_parallel
 

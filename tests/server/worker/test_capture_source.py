@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from rig.digest import sha256_of
 from rig.errors import Cancelled
 from server.services.failures import JobFailed
 from server.services.stored_captures import bound_captures, forget_erased
@@ -16,7 +17,6 @@ from server.settings import ServiceSettings
 from server.storage.capture_blobs import open_capture_blobs
 from server.storage.database import open_database
 from server.storage.library import Library
-from server.storage.objects import sha256_of
 from server.storage.records import CaptureRecord
 from server.storage.store import Store, new_id
 from server.worker.capture_source import CaptureSource

@@ -200,7 +200,7 @@ def test_a_report_that_cannot_be_read_has_no_warnings(tmp_path: Path, text: str 
         (OSError(28, "No space left on device"), "disk-full"),
         (OSError(30, "Read-only file system"), "data-unwritable"),
         (InputError("cameras.json", ["cameras.json: no camera"]), "invalid-cameras"),
-        (WorkFailed("NoHull", "No hull was found."), "no-hull"),
+        (WorkFailed("NoSubject", "No subject was found."), "no-subject"),
         (WorkFailed("NobodyKnowsThis", "?"), "eigenhead-error"),
     ],
 )

@@ -44,9 +44,8 @@ def drift(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int =
     records = bench.records("drift", key_of(model.sha256, camera_drift, tangency, TURN_DEG, LOOSE_PX))
     span, rows = with_modes(model, 60), []
     for i, subject in enumerate(random_subjects(subjects, seed=17)):
-        bench.report(subject.name, i / subjects)
         rng = np.random.default_rng([17, i])
-        rows.append(records.row(subject.name, lambda s=subject, r=rng: {"name": s.name} | draw(span, s, renderer, r)))
+        rows.append(records.row(subject.name, lambda s=subject, r=rng: draw(span, s, renderer, r), i / subjects))
     found = figures(rows)
     return {"figures": found, "rows": rows, "markdown": as_markdown(found)}
 
@@ -76,7 +75,7 @@ def draw(model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.
         "close_up_loose": (near_wide, near_rig),
     }
     said = {condition: said_of(masks, cameras) for condition, (masks, cameras) in cases.items()}
-    return {"turned_camera": turned, "close_up_camera": near, "said": said}
+    return {"name": subject.name, "turned_camera": turned, "close_up_camera": near, "said": said}
 
 
 def said_of(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:

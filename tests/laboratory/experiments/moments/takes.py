@@ -78,9 +78,8 @@ def moments(
     cases = [*product(range(subjects), models.items(), cameras)]
     for done, (number, (label, model), count) in enumerate(cases):
         name = f"{label}-{number:02} {count} cameras {moments} moments"
-        bench.report(name, done / len(cases))
         records = bench.records(f"moments-{label}", key_of(model.sha256, settings, *code))
-        row = records.row(name, partial(take_row, model, number, count, moments, settings, renderer))
+        row = records.row(name, partial(take_row, model, number, count, moments, settings, renderer), done / len(cases))
         skin = [not LIDS.match(each) for each in model.expressions.names]
         rows.append({"name": name, "model": label, "cameras": count, "skin": skin} | row)
     return {"figures": figures(rows), "rows": rows, "markdown": table(rows), "lines": table(rows).splitlines()}

@@ -33,8 +33,7 @@ def alignment(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: i
     records = bench.records("alignment", key_of(model.sha256, Settings(), *CONTOUR, silhouette_search))
     span, rows = with_modes(model, 60), []
     for seed in range(subjects):
-        bench.report(f"draw {seed}", seed / subjects)
-        rows.append({"draw": seed} | records.row(str(seed), lambda s=seed: draw(span, s, renderer)))
+        rows.append({"draw": seed} | records.row(str(seed), lambda s=seed: draw(span, s, renderer), seed / subjects))
     right = [row for row in rows if row["right"]]
     figures = {
         "draws": len(rows),

@@ -32,8 +32,7 @@ def convergence(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects:
         jobs += [(kind, subject) for subject in random_subjects(count, seed=500, most=most)]
     rows = []
     for i, (kind, subject) in enumerate(jobs):
-        bench.report(f"{kind} {subject.name}", i / len(jobs))
-        row = records.row(f"{kind} {subject.name}", lambda s=subject: _row(span, s, rig, renderer))
+        row = records.row(f"{kind} {subject.name}", lambda s=subject: _row(span, s, rig, renderer), i / len(jobs))
         rows.append({"kind": kind, "name": subject.name} | row)
     figures, table = {}, []
     for kind in KINDS:

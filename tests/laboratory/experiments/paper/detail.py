@@ -1,4 +1,4 @@
-"""Compares levels of detail: eigenheads alone, with kernel modes, and with photographs, together with a visual hull.
+"""Compares levels of detail: eigenheads alone, with kernel modes, and with photographs. ``surfaces`` has the hull.
 
 Every figure is of a whole reconstruction from photographs: own masks, own alignment, calibration as given. Distances
 are from the true face region, weighted by area, to the delivered surface, without realignment. Subjects:
@@ -32,7 +32,6 @@ from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import vertex_areas
-from pipeline.multiview.visual_hull import visual_hull
 from pipeline.reconstruct import fit_shape
 from pipeline.segmentation.segment import segment
 from pipeline.settings import Settings, document_from_settings
@@ -122,7 +121,6 @@ def run(
     for name, path in captures.items():
         for other, with_model in models.items():
             jobs.append((f"{name}_{other}", partial(known_row, partial(read_known, path), with_model, renderer)))
-        jobs.append((f"{name}_hull", partial(hull_row, partial(read_known, path))))
     if others is not None:
         drawn = partial(photographed, others, len(others.modes), 1.0, renderer=renderer)
         jobs += [(f"draw-{i:02}_{label}", partial(known_row, partial(drawn, i), model, renderer)) for i in range(draws)]
@@ -139,8 +137,7 @@ def run(
             jobs.append((f"heldout-{name}-{camera}_{label}", compute))
     rows = []
     for done, (name, compute) in enumerate(jobs):
-        bench.report(name, done / len(jobs))
-        rows.append({"name": name, **records.row(name, compute)})
+        rows.append({"name": name, **records.row(name, compute, done / len(jobs))})
     return {"figures": figures(rows), "rows": rows}
 
 
@@ -208,13 +205,6 @@ def every_level(
         _, head = fit_shape(Recorder(at_level), views, alignment)
         fitted[level] = Fitted(head.fit, head.model, head.detail.level, time.perf_counter() - began)
     return fitted
-
-
-def hull_row(known: Callable[[], Known]) -> Row:
-    """Computes the visual hull of a capture, and returns its distances (mm) from the true face."""
-    subject = known()
-    silhouettes = segment(subject.capture, subject.rig, report=discard_progress)
-    return {"hull": surface_error(subject, visual_hull(silhouettes, subject.rig))}
 
 
 def surface_error(known: Known, found: Mesh) -> dict[str, float]:

@@ -48,12 +48,9 @@ def posterior_check(model: HeadModel, *, renderer: Renderer, bench: Bench, subje
     span, rig = with_modes(model, 60), exact(default_layout())
     rows = []
     for i, subject in enumerate(random_subjects(subjects, seed=22)):
-        bench.report(subject.name, i / subjects)
-        rows.append(records.row(subject.name, lambda s=subject, n=i: _row(span, s, rig, renderer, n)))
-    figures: dict[str, float] = {"subjects": len(rows)}
-    for quantity in rows[0]:
-        figures[quantity] = float(np.mean([row[quantity] for row in rows]))
-    return {"figures": figures, "rows": rows}
+        rows.append(records.row(subject.name, lambda s=subject, n=i: _row(span, s, rig, renderer, n), i / subjects))
+    figures = {quantity: float(np.mean([row[quantity] for row in rows])) for quantity in rows[0]}
+    return {"figures": {"subjects": len(rows), **figures}, "rows": rows}
 
 
 def _row(model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, number: int) -> Row:

@@ -69,10 +69,9 @@ def robustness(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: 
     for i, subject in enumerate(planted):
         row: Row = {"name": subject.name}
         for j, (name, condition) in enumerate(CONDITIONS.items()):
-            bench.report(f"{subject.name} {name}", (i + j / len(CONDITIONS)) / subjects)
             rng = np.random.default_rng([66, i, j])
             compute = partial(condition, span, subject, renderer, rng)
-            row[name] = records.row(f"{subject.name} {name}", compute)
+            row[name] = records.row(f"{subject.name} {name}", compute, (i + j / len(CONDITIONS)) / subjects)
         rows.append(row)
     found = figures(rows)
     return {"figures": found, "rows": rows, "markdown": as_markdown(found)}

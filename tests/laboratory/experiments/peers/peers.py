@@ -39,7 +39,6 @@ from pipeline.contour_fit.fit import Fit
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.visual_hull import visual_hull
 from pipeline.settings import FittingSettings
 from pipeline.simplex import xor_objective as objective
 from pipeline.simplex.hierarchy import HIERARCHY, LIMIT, MU, TOLERANCE
@@ -51,6 +50,7 @@ from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.peers import soft_rasteriser
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.visual_hull import visual_hull
 from tests.support.subjects import (
     Planted,
     binary_silhouettes,

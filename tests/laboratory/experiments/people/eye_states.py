@@ -50,8 +50,7 @@ def eyes(
     cases = [*product(range(heads), models.items(), STATES)]
     for done, (number, (label, model), state) in enumerate(cases):
         name = f"{label}-{number:02} {state}"
-        bench.report(name, done / len(cases))
-        row = records.row(name, partial(eye_row, model, number, state, job, renderer))
+        row = records.row(name, partial(eye_row, model, number, state, job, renderer), done / len(cases))
         rows.append({"name": name, "state": state, **row})
     return {"figures": figures(rows), "rows": rows, "markdown": table(rows), "lines": table(rows).splitlines()}
 

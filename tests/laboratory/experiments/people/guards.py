@@ -104,8 +104,7 @@ def guards(
     jobs |= {f"studio {n} {KINDS[n % len(KINDS)].what}": partial(studio, n) for n in range(subjects)}
     judged: list[Row] = []
     for number, (name, job) in enumerate(jobs.items()):
-        bench.report(name, number / len(jobs))
-        judged += records.row(name, lambda job=job: {"judged": list(job())})["judged"]
+        judged += records.row(name, lambda job=job: {"judged": list(job())}, number / len(jobs))["judged"]
     rows = [row for guard in GUARDS for row in rows_of(guard, judged)]
     refusing = {code for guard in GUARDS if guard.kind != "warns" for code in guard.codes}
     figures = {}

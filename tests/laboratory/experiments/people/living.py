@@ -79,8 +79,7 @@ def living(
         subject = Subject(folder, capture, rig, run(capture, rig), segment(capture, rig, report=bench.report))
         shots = [one for one in shots_of(subject) if all(word in one.name for word in only)]
         for number, shot in enumerate(shots):
-            bench.report(shot.name, number / len(shots))
-            rows.append(records.row(shot.name, partial(judge, shot, subject, run)))
+            rows.append(records.row(shot.name, partial(judge, shot, subject, run), number / len(shots)))
         if not only:
             rows.append(records.row(f"{folder.name} halves", partial(judge_halves, subject, run)))
     header = ("name", "median", "mean", "p95", "dB", "seconds", "told")

@@ -76,10 +76,9 @@ def people(
     records = bench.records(f"people-{detail or 'default'}", key)
     rows: list[Row] = []
     for done, case in enumerate(cases):
-        bench.report(case.name, done / len(cases))
         rows.append(
             {"name": case.name, "subject": case.subject, "kind": case.kind, "evidence": case.evidence}
-            | records.row(case.name, partial(judge_case, case, model, settings, renderer))
+            | records.row(case.name, partial(judge_case, case, model, settings, renderer), done / len(cases))
         )
     text = table(rows)
     return {"figures": figures(rows), "rows": rows, "markdown": text, "lines": text.splitlines()}

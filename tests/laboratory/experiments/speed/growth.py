@@ -79,10 +79,9 @@ def growth(
     records = bench.records("growth", key_of(model.sha256, SEED))
     rows: list[Row] = []
     for done, size in enumerate(chosen):
-        bench.report(size.name, done / len(chosen))
         rows.append(
             {"name": size.name, "kind": size.kind, "views": size.views, "megapixels": size.megapixels}
-            | records.row(size.name, lambda size=size: _measured(size, model, command, renderer))
+            | records.row(size.name, lambda size=size: _measured(size, model, command, renderer), done / len(chosen))
         )
     figures: dict[str, float] = {}
     for kind, quantity in (("views", "views"), ("pixels", "megapixels")):

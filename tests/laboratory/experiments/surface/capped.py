@@ -88,9 +88,8 @@ def capped(
     for done, (group, number) in enumerate(jobs):
         worn = CAPS[number % len(CAPS)]
         name = f"{group}-{number:02}-{worn.stated}"
-        bench.report(name, done / len(jobs))
         made = partial(_row, model, *populations[group], number, worn, renderer=renderer)
-        rows.append({"name": name, "group": group, **records.row(name, made)})
+        rows.append({"name": name, "group": group, **records.row(name, made, done / len(jobs))})
     found = figures(rows)
     return {"figures": found, "rows": rows, "markdown": as_markdown(rows)}
 
@@ -149,10 +148,9 @@ def skulls(
     if others is not None:
         populations.append((others, len(others.modes), 1.0))
     for style, number in product(STYLES, range(subjects)):
-        bench.report(style, number / subjects)
         drawn, name = populations[number % len(populations)], f"{style}-{number:02}"
         made = partial(_skull, model, *drawn, number, style, renderer=renderer)
-        rows.append({"name": name, "style": style, **records.row(name, made)})
+        rows.append({"name": name, "style": style, **records.row(name, made, number / subjects)})
     return {"figures": means_by(rows, "style"), "rows": rows}
 
 
@@ -210,13 +208,9 @@ def girth_mm(
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:
     """Returns means over the heads of each group, of the girth's absolute error."""
-    values: dict[str, list[float]] = {}
-    for row in rows:
-        for way in ("without", "with"):
-            for key, value in row[way].items():
-                if isinstance(value, float):
-                    values.setdefault(f"{row['group']}_{way}_{key}", []).append(abs(value))
-    return {key: float(np.mean(found)) for key, found in values.items()}
+    ways = [(row["group"], way, row[way]) for row in rows for way in ("without", "with")]
+    errors = [of | {"way": f"{group}_{way}", "girth_error_mm": abs(of["girth_error_mm"])} for group, way, of in ways]
+    return means_by(errors, "way")
 
 
 def as_markdown(rows: Sequence[Row]) -> str:

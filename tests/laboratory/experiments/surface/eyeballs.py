@@ -36,8 +36,7 @@ def eyeballs(facekit: HeadModel, *, bench: Bench) -> Outcome:
     shapes and weights), ``crossing_turned`` (after, over all directions too, and at rest), and ``lift_worst_mm``."""
     records, rows = bench.records("eyeballs", key_of(facekit.sha256, tested, placing)), []
     for number in range(HEADS):
-        bench.report(f"head {number}", number / HEADS)
-        rows.append({"head": number} | records.row(f"head-{number}", lambda number=number: _row(facekit, number)))
+        rows.append({"head": number} | records.row(f"head-{number}", lambda n=number: _row(facekit, n), number / HEADS))
     figures = {name: float(sum(float(row[name]) for row in rows)) for name in CROSSING}
     figures["lift_worst_mm"] = max(float(row["lift_mm"]) for row in rows)
     return {"figures": figures, "rows": rows}

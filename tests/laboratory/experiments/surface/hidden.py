@@ -49,7 +49,7 @@ from rig.studio.sensor.realism import made_real
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
 from tests.laboratory.experiments.paper.span import weighted_quantile
-from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of, means_by
 
 Level = Literal["span", "kernel", "photo", "fine"]
 HEAVY_HAIR = replace(PRESET, hairstyle=("fringe",))  # over the ears and 30 mm down the forehead
@@ -224,14 +224,9 @@ def reached_from_outside(mesh: Mesh) -> Bool[np.ndarray, " v"]:
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:
     """Returns means over the subjects of each group, and over those of all populations together."""
-    values: dict[str, list[float]] = {}
-    for row in rows:
-        groups = (row["group"], POOLED[row["group"]]) if row["group"] in POOLED else (row["group"],)
-        for level in LEVELS:
-            for key, value in row.get(level, {}).items():
-                for group in groups if isinstance(value, float) else ():
-                    values.setdefault(f"{group}_{level}_{key}", []).append(value)
-    return {key: float(np.mean(found)) for key, found in values.items()}
+    pooled: list[Row] = [row | {"group": POOLED[row["group"]]} for row in rows if row["group"] in POOLED]
+    every = [row.get(level, {}) | {"of": f"{row['group']}_{level}"} for row in (*rows, *pooled) for level in LEVELS]
+    return means_by(every, "of")
 
 
 def as_markdown(found: Mapping[str, float]) -> str:

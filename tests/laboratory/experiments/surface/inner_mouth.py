@@ -34,8 +34,7 @@ def inner_mouths(facekit: HeadModel, *, bench: Bench) -> Outcome:
     and weights), and ``lift_worst_mm``."""
     records, rows = bench.records("inner-mouth", key_of(facekit.sha256, tested)), []
     for number in range(HEADS):
-        bench.report(f"head {number}", number / HEADS)
-        rows.append({"head": number} | records.row(f"head-{number}", lambda number=number: _row(facekit, number)))
+        rows.append({"head": number} | records.row(f"head-{number}", lambda n=number: _row(facekit, n), number / HEADS))
     names = ("meeting_rest", "meeting_before", "meeting_after")
     figures = {name: float(sum(float(row[name]) for row in rows)) for name in names}
     figures["lift_worst_mm"] = max(float(row["lift_mm"]) for row in rows)

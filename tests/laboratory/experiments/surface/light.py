@@ -78,10 +78,9 @@ def light(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int =
     rows = []
     for number in range(subjects):
         name = f"{number:02}"
-        bench.report(name, number / subjects)
         picture = None if bench.folder is None else bench.folder / f"light-{name}.png"
         compute = partial(row_of, model, 400 + number, renderer, settings, picture)
-        rows.append({"name": name, **records.row(name, compute)})
+        rows.append({"name": name, **records.row(name, compute, number / subjects)})
     keys = [key for key, value in rows[0].items() if isinstance(value, float)]
     return {"figures": {key: float(np.mean([row[key] for row in rows])) for key in keys}, "rows": rows}
 

@@ -38,7 +38,7 @@ from rig.image import ImageRgb
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of, means_by
 from tests.laboratory.experiments.surface.pores_scene import CloseUp, photograph_close_up
 from tests.laboratory.experiments.surface.texture import drawn_texture, face_pixels, noise_power
 
@@ -66,13 +66,7 @@ def pores(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int =
             {"name": f"{skin}-{seed}", "skin": skin}
             | records.row(f"{skin}-{seed}", partial(row_of, model, skin, seed, renderer, settings, picture=picture))
         )
-    keys = [key for key, value in rows[0].items() if isinstance(value, float)]
-    figures = {
-        f"{skin}_{key}": float(np.mean([row[key] for row in rows if row["skin"] == skin]))
-        for skin in SKINS
-        for key in keys
-    }
-    return {"figures": figures, "rows": rows}
+    return {"figures": means_by(rows, "skin"), "rows": rows}
 
 
 def row_of(

@@ -27,7 +27,7 @@ import numpy as np
 
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.visual_hull import hull_extent, visual_hull
+from pipeline.multiview.visual_hull import hull_extent
 from pipeline.reconstruct import reconstruct
 from pipeline.segmentation.segment import segment
 from pipeline.settings import Settings
@@ -42,8 +42,9 @@ from rig.render.renderer import Renderer
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.paper.detail import Known, every_level, read_known, surface_error
 from tests.laboratory.experiments.peers.openmvs import PeerFailed, programs_in, surface_by_openmvs
-from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of, means_by
 from tests.laboratory.experiments.surface.visible_surface import score_visible
+from tests.laboratory.experiments.visual_hull import visual_hull
 
 POISSON_DEPTH = 9  # of its octree: cells of 1 to 1.5 mm about a bust
 SURE_MM = 1.0  # points with a larger deviation stay out
@@ -177,12 +178,7 @@ def by_openmvs(shown: Shown, *, programs: Mapping[str, Path]) -> tuple[Mesh, flo
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:
     """Returns the numbers of all rows by name: capture, surface and column joined."""
-    return {
-        f"{row['name']}_{row['peer']}_{key}": value
-        for row in rows
-        for key, value in row.items()
-        if isinstance(value, float)
-    }
+    return means_by([row | {"surface": f"{row['name']}_{row['peer']}"} for row in rows], "surface")
 
 
 def as_markdown(rows: Sequence[Row]) -> str:

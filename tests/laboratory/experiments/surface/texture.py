@@ -71,10 +71,9 @@ def texture(
     jobs += [(name, name, 1, partial(read_known, path)) for name, path in captures.items()]
     rows = []
     for done, (group, name, number, read) in enumerate(jobs):
-        bench.report(name, done / len(jobs))
         picture = None if bench.folder is None else bench.folder / f"texture-{name}.png"
         compute = partial(row_of, read, model, renderer, settings, number, picture)
-        rows.append({"name": name, "group": group, **records.row(name, compute)})
+        rows.append({"name": name, "group": group, **records.row(name, compute, done / len(jobs))})
     return {"figures": means_by(rows, "group"), "rows": rows}
 
 

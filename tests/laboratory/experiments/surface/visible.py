@@ -96,10 +96,9 @@ def visible(
     jobs += [(name, name, partial(read_known, path)) for name, path in captures.items()]
     rows = []
     for done, (group, name, read) in enumerate(jobs):
-        bench.report(name, done / len(jobs))
         picture = None if bench.folder is None else bench.folder / f"visible-{name}.png"
         compute = partial(known_row, read, model, renderer, picture)
-        rows.append({"name": name, "group": group, **records.row(name, compute)})
+        rows.append({"name": name, "group": group, **records.row(name, compute, done / len(jobs))})
     return {"figures": means_by(rows, "group"), "rows": rows}
 
 

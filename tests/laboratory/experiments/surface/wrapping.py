@@ -44,8 +44,7 @@ def wrapping(facekit: HeadModel, truths: Mapping[str, Path], *, bench: Bench) ->
         return {**wrapped.figures(), "landmarks_mm": apart, "unit_found": float(wrapped.placed.unit == "mm")}
 
     for number, (name, path) in enumerate(truths.items()):
-        bench.report(name, number / len(truths))
-        rows.append({"scan": name} | records.row(name, lambda n=name, p=path: one(n, p)))
+        rows.append({"scan": name} | records.row(name, lambda n=name, p=path: one(n, p), number / len(truths)))
     figures = {f"{row['scan']}_{name}": value for row in rows for name, value in row.items() if name != "scan"}
     return {"figures": figures, "rows": rows, "markdown": _table(rows), "pictures": pictures}
 

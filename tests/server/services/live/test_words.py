@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from rig.geometry import rotation_from_vector
-from server.services.live.seen import CameraSeen, HeadSeen, Seen
+from server.services.live.seen import CameraSeen, HeadOut, Seen
 from server.services.live.words import HOLD_S, STEADY_S, Speaker, lamps_of, reasons_of
 
 CAMERA = CameraSeen(130.0, 1.0, 0.0, 0.3, facing=0.8, face=True, centred=True)
-HEAD = HeadSeen(
+HEAD = HeadOut(
     rotation=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
     translation=(0.0, 0.0, 0.0),
     scale=1.0,
@@ -23,6 +23,8 @@ HEAD = HeadSeen(
     depth_mm=85.0,
     openings={"left": 0.2, "right": 0.22},
     eyes_open=True,
+    vertices=(),
+    triangles=(),
 )
 CAMERAS = {f"cam{k}": CAMERA for k in range(4)}
 GOOD = Seen(CAMERAS, HEAD, True, True)
@@ -58,7 +60,7 @@ def test_nothing_is_said_of_a_good_subject() -> None:
     ],
 )
 def test_the_subject_is_told_what_to_do(changes: dict[str, object], code: str, text: str) -> None:
-    (word,) = reasons_of(replace(GOOD, head=replace(HEAD, **changes)))
+    (word,) = reasons_of(replace(GOOD, head=HEAD.model_copy(update=changes)))
     assert (word.message.code, word.message.text, word.camera) == (code, text, None)
 
 
@@ -102,7 +104,7 @@ def test_it_is_said_when_there_is_no_head() -> None:
 
 
 def test_a_blink_is_not_told() -> None:
-    speaker, shut = Speaker(), replace(GOOD, head=replace(HEAD, eyes_open=False))
+    speaker, shut = Speaker(), replace(GOOD, head=HEAD.model_copy(update={"eyes_open": False}))
     assert speaker.words(shut, 0.0) == ()
     assert speaker.words(GOOD, 0.25) == ()
     assert speaker.words(shut, 0.5) == ()
@@ -119,8 +121,8 @@ def test_a_head_is_steady_when_it_has_kept_its_pose_for_a_while() -> None:
     assert [speaker.steady(HEAD, time_s) for time_s in times.tolist()] == [time_s >= STEADY_S for time_s in times]
     turned = tuple(rotation_from_vector(np.radians([0.0, 4.0, 0.0])).ravel().tolist())
     last_s = float(times[-1])
-    assert not speaker.steady(replace(HEAD, rotation=turned), last_s + 0.2)
-    assert not speaker.steady(replace(HEAD, rotation=turned), last_s + 0.4)
-    assert speaker.steady(replace(HEAD, rotation=turned), last_s + 0.5 + STEADY_S)
+    assert not speaker.steady(HEAD.model_copy(update={"rotation": turned}), last_s + 0.2)
+    assert not speaker.steady(HEAD.model_copy(update={"rotation": turned}), last_s + 0.4)
+    assert speaker.steady(HEAD.model_copy(update={"rotation": turned}), last_s + 0.5 + STEADY_S)
     assert not speaker.steady(None, last_s + 3.0)
     assert not speaker.steady(HEAD, last_s + 3.2)

@@ -1,0 +1,66 @@
+"""Declares what the documents of the service have in common. The services return them, HTTP answers them as JSON, and
+pages show them."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetPydanticSchema,
+    PlainSerializer,
+    WithJsonSchema,
+    computed_field,
+    model_validator,
+)
+from pydantic_core import core_schema
+
+from rig.messages.message import Message
+from server.storage.records import JsonObject
+
+SETTINGS = {"type": "object", "title": "Settings"}  # placeholder of settings, until the description of HTTP replaces it
+JobSettings = Annotated[JsonObject, WithJsonSchema(SETTINGS)]
+Moment = Annotated[str, Field(json_schema_extra={"format": "date-time"})]
+State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+Said = Annotated[
+    Message,
+    GetPydanticSchema(lambda _source, _handler: core_schema.is_instance_schema(Message)),
+    PlainSerializer(str),
+    WithJsonSchema({"type": "string"}),
+]  # in JSON its English text
+
+
+class MessageOut(BaseModel):
+    """Holds a message of the service as data. A program can show it in another language by its ``code`` and
+    ``parameters``."""
+
+    code: str = Field(description="stable; decides what parameters there are")
+    message: str = Field(description="in English")
+    parameters: JsonObject = Field(default_factory=dict, description="what stands in the message, by name")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_message(cls, value: Any) -> Any:
+        return value.document() if isinstance(value, Message) else value
+
+
+class Answer(BaseModel):
+    """Declares what all documents of the service share: they also read their fields from a record that has the same."""
+
+    model_config = ConfigDict(frozen=True, from_attributes=True)
+
+
+def as_data(field: str, form: Any = MessageOut) -> Any:
+    """Returns a field of an ``Answer`` that holds as data what ``field`` says as text. ``form``: ``MessageOut``, with
+    ``| None`` where there may be none, or a list of it."""
+
+    def read(self: Answer) -> Any:
+        said = getattr(self, field)
+        if said is None or isinstance(said, Message):
+            return said and MessageOut.model_validate(said)
+        return [MessageOut.model_validate(one) for one in said]
+
+    def drop_read_only(schema: JsonObject) -> None:
+        del schema["readOnly"]
+
+    return computed_field(return_type=form, json_schema_extra=drop_read_only)(property(read))
