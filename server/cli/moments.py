@@ -148,7 +148,7 @@ def clock(
     All cameras see one screen with the page. Take 40 shots or more, a second apart, or films. The error of the mean is
     2 ms where cameras and screen run at their own rates, 5 ms where they are in step."""
     from calibration.board.picture_files import list_pictures
-    from rig.acquisition.screen_clock import clock_page, measure_shots
+    from pipeline.applications.moments.screen_clock import clock_page, measure_shots
     from rig.atomic_write import write_atomically
 
     if (shots is None) == (page is None):

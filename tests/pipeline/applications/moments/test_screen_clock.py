@@ -2,6 +2,9 @@
 
 import json
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -9,9 +12,50 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from rig.acquisition.screen_clock import PERIOD, clock_page, draw_row, measure_skews, read_refresh
+from pipeline.applications.moments.screen_clock import PERIOD, clock_page, draw_row, measure_skews, read_refresh
 from server.cli.main import app
-from tests.support.clock_films import SCREEN_HZ, FreeCamera, photograph_clock, true_middles_s
+from tests.support.browser import chromium
+
+SIZE = (480, 640)  # height and width
+CELL_PX = 12  # of the screen
+SCREEN_HZ = 60.0
+
+
+@dataclass(frozen=True)
+class FreeCamera:
+    """Exposes ``exposure_s`` long, ``rate_hz`` times a second, first at ``first_s``."""
+
+    rate_hz: float
+    first_s: float
+    exposure_s: float
+
+    def next_begin_s(self, time_s: float) -> float:
+        """When the first exposure after a moment begins."""
+        return np.ceil((time_s - self.first_s) * self.rate_hz) / self.rate_hz + self.first_s
+
+
+def photograph_clock(begin_s: float, exposure_s: float, rng: np.random.Generator) -> np.ndarray:
+    """The screen from a little aside: refreshes within the exposure are blended, with blur and noise."""
+    begin, end = SCREEN_HZ * begin_s, SCREEN_HZ * (begin_s + exposure_s)
+    edges = np.unique([begin, *np.arange(np.ceil(begin), end), end])
+    shown = sum((b - a) * draw_row(int((a + b) / 2) % PERIOD).astype(float) for a, b in pairwise(edges))
+    screen = cv2.resize(shown / (end - begin), None, fx=CELL_PX, fy=CELL_PX, interpolation=cv2.INTER_NEAREST)
+    height, width = screen.shape
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    seen = np.array([[110, 190], [530, 205], [525, 265], [115, 260]]) + rng.normal(0.0, 10.0, (4, 2))
+    warp = cv2.getPerspectiveTransform(corners, seen.astype(np.float32))
+    picture = cv2.warpPerspective(screen, warp, SIZE[::-1], flags=cv2.INTER_AREA, borderValue=120.0)
+    noisy = 0.8 * cv2.GaussianBlur(picture, (0, 0), 0.8) + 20.0 + rng.normal(0.0, 4.0, SIZE)
+    return np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+def true_middles_s(cameras: Mapping[str, FreeCamera], asked_s: np.ndarray) -> dict[str, np.ndarray]:
+    """When the middle of each exposure was, of the first pictures after the moments ``asked_s``."""
+    return {
+        name: np.array([camera.next_begin_s(moment) for moment in asked_s]) + camera.exposure_s / 2
+        for name, camera in cameras.items()
+    }
+
 
 # rates as webcams have them, not quite what their boxes say
 FREE = {
@@ -93,3 +137,18 @@ def test_the_page_holds_every_code(tmp_path: Path) -> None:
     assert len(set(codes)) == PERIOD
     again = CliRunner().invoke(app, ["clock", "--page", str(tmp_path / "clock.html")])
     assert again.exit_code == 1
+
+
+@pytest.mark.slow
+def test_the_page_shows_the_refresh_that_it_counts(tmp_path: Path) -> None:
+    (tmp_path / "clock.html").write_text(clock_page(), encoding="utf-8")
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.goto(f"file://{tmp_path / 'clock.html'}")
+        for _ in range(5):
+            before = page.evaluate("refresh")
+            shown = read_refresh(cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_GRAYSCALE))
+            after = page.evaluate("refresh")
+            assert shown is not None
+            assert (shown - before + 2) % PERIOD < after - before + 4
+        page.wait_for_function("parseFloat(document.querySelector('span').textContent) > 10")
