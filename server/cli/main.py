@@ -17,7 +17,7 @@ ROOMS = {  # page below docs/commands: its title, and its commands in the order 
     "heads": ("Heads", ("reconstruct", "take", "sequence", "batch", "check", "export")),
     "clinic": ("Clinic", ("compare", "register", "measure")),
     "trials": ("Trials", ("simulate", "demo", "verify")),
-    "cameras": ("Cameras", ("board", "calibrate", "refine", "convert")),
+    "cameras": ("Cameras", ("board", "calibrate", "refine", "clock", "convert")),
     "rig": ("The rig", ("rig",)),
     "service": ("The service", ("serve", "worker", "keys", "doctor", "prepare")),
     "models": ("Models and templates", ("model", "template", "wrap")),

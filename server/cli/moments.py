@@ -130,10 +130,7 @@ def film_sequence(out: Path, frames: int, seed: int, preset: "Preset", json_out:
     answer({"sequence": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
 
 
-@app.command(
-    epilog="Example: eigenhead clock --page clock.html   then, with pictures of that page: eigenhead clock shots --out "
-    "clock.json"
-)
+@app.command(epilog="Example: eigenhead clock --page clock.html   eigenhead clock shots --out clock.json")
 def clock(
     shots: Annotated[Path | None, typer.Argument(help="SHOTS/CAMERA/SHOT.png.", exists=True, file_okay=False)] = None,
     *,
@@ -143,10 +140,10 @@ def clock(
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Measure how much later each free camera exposes than the others.
+    """Measure how much later each free camera exposes.
 
-    All cameras see one screen with the page. Take 40 shots or more, a second apart, or films. The error of the mean is
-    2 ms where cameras and screen run at their own rates, 5 ms where they are in step."""
+    All see one screen with the page. Take 40 shots, a second apart: the mean is then known to 2 ms, or to 5 ms where
+    cameras run in step with the screen."""
     from calibration.board.picture_files import list_pictures
     from pipeline.applications.moments.screen_clock import clock_page, measure_shots
     from rig.atomic_write import write_atomically

@@ -145,11 +145,6 @@ def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) ->
     return Located(landmark.position_world, projected, off, _together(remarks))
 
 
-def helps(rig: Rig, points: Pixels, landmarks: Landmarks) -> Helps:
-    """Computes the aids for picking feature points, for all points in all views, without results of an earlier call."""
-    return Guides(rig).helps(points, landmarks, list(points))
-
-
 def predicted(
     rig: Rig, located: Mapping[str, Float[np.ndarray, " 3"]], landmarks: Mapping[str, Float[np.ndarray, " 3"]]
 ) -> dict[str, dict[str, list[float]]]:

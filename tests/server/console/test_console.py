@@ -226,7 +226,7 @@ def test_three_picked_points_place_the_models_landmarks() -> None:
     place = RigidTransform(rotation_from_vector(np.array([0.1, -0.2, 0.05])), np.array([8.0, -5.0, 12.0]))
     world = {name: place.apply(point[None])[0] for name, point in head.items()}
     picked = {n: {c.name: c.project(world[n][None])[0] for c in RIG if c.name != "right"} for n in "abd"}
-    result = guides.helps(RIG, picked, head)
+    result = guides.Guides(RIG).helps(picked, head, list(picked))
     for name in "abcdefg":
         for c in RIG:
             np.testing.assert_allclose(result["predicted"][name][c.name], c.project(world[name][None])[0], atol=0.02)
@@ -235,7 +235,7 @@ def test_three_picked_points_place_the_models_landmarks() -> None:
             result["reprojected"][name]["right"], RIG["right"].project(world[name][None])[0], atol=0.02
         )
         assert max(result["off_px"][name].values()) < 0.01
-    assert guides.helps(RIG, {"a": picked["a"]}, head)["predicted"] == {}
+    assert guides.Guides(RIG).helps({"a": picked["a"]}, head, [])["predicted"] == {}
     assert guides.nearest_views(RIG, "front", 2) == ["front", "right"]
 
 

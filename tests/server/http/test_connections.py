@@ -69,16 +69,11 @@ def test_a_header_of_the_permitted_length_passes_and_a_longer_one_is_told(servic
     assert json.loads(body)["detail_message"]["parameters"] == {"bytes": connections.HEADER_BYTES}
 
 
-def test_silent_connections_leave_room_for_others(service: RunningService, calm: Witness) -> None:
-    with Witness(service).watching() as witness, silent_connections(service, 300) as opened:
+@pytest.mark.parametrize("begin", [b"", half_body("/v1/jobs")], ids=["silent", "half"])
+def test_connections_that_wait_leave_room_for_others(service: RunningService, calm: Witness, begin: bytes) -> None:
+    with Witness(service).watching() as witness, silent_connections(service, 300, begin) as opened:
         time.sleep(1.0)
         assert len(opened) == 300
-    check(witness, calm)
-
-
-def test_half_bodies_leave_room_for_others(service: RunningService, calm: Witness) -> None:
-    with Witness(service).watching() as witness, silent_connections(service, 300, half_body("/v1/jobs")):
-        time.sleep(1.0)
     check(witness, calm)
 
 

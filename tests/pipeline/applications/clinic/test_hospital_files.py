@@ -34,9 +34,7 @@ def test_the_object_holds_a_closed_head_in_the_patient_s_axes_and_no_name(tmp_pa
     nose = frame.patient_from_world.apply(HERE.measured.landmarks["pronasale"])
     assert nose[1] < surface.vertices[:, 1].mean() - 50.0  # L, P, S: the nose is in front
     assert np.linalg.norm(surface.vertices - nose, axis=1).min() < 1e-3
-    assert dicom_bytes(HERE, frame, "P017") == data
-    other = pydicom.dcmread(io.BytesIO(dicom_bytes(HERE, frame, "P018")))
-    assert other.StudyInstanceUID != held.StudyInstanceUID
+    assert dicom_bytes(HERE, frame, "P017") == data != dicom_bytes(HERE, frame, "P018")
 
 
 def test_the_mask_lies_where_the_head_is(tmp_path: Path) -> None:
@@ -59,10 +57,8 @@ def test_the_mask_lies_where_the_head_is(tmp_path: Path) -> None:
     assert found[1] < 0.03
 
 
-@pytest.mark.parametrize("shape", ["ball", "box"])
-def test_voxels_fill_the_volume_of_a_closed_mesh(shape: str) -> None:
-    made = trimesh.creation.icosphere(4, 20.0) if shape == "ball" else trimesh.creation.box((20.0, 14.0, 30.0))
+def test_voxels_fill_the_volume_of_a_closed_mesh() -> None:
+    made = trimesh.creation.icosphere(4, 20.0)
     mask, affine = fill_voxels(Mesh(np.asarray(made.vertices), np.asarray(made.faces, np.int32)))
-    assert int(mask.sum()) == pytest.approx(made.volume, rel=0.08 if shape == "box" else 0.003)
-    centre = np.argwhere(mask).mean(axis=0) @ affine[:3, :3] + affine[:3, 3]
-    np.testing.assert_allclose(centre, 0.0, atol=0.51)
+    assert int(mask.sum()) == pytest.approx(made.volume, rel=0.003)
+    np.testing.assert_allclose(np.argwhere(mask).mean(axis=0) @ affine[:3, :3] + affine[:3, 3], 0.0, atol=0.51)
