@@ -22,7 +22,7 @@ Grey = UInt8[np.ndarray, "h w"]
 SLOTS, TURNS = 6, 40
 PERIOD = SLOTS * TURNS  # refreshes after which the row repeats: 4 s at 60 Hz
 CELLS, GAP = 6, 2  # of a marker with its black border, and of white beside it
-LEAST_READ = 3  # markers of a row: fewer may be chance
+MIN_READ = 3  # markers of a row: fewer may be chance
 MAX_BLENDED = 3  # markers that change during an exposure: 50 ms at 60 Hz
 UNIFORM_STD = 12**-0.5  # of a value that may lie anywhere within one refresh
 DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
@@ -97,7 +97,7 @@ def read_refresh(image: Grey) -> float | None:
     """Returns the middle of a picture's exposure in refreshes of the screen, 0 to ``PERIOD``; None if the row cannot be
     read."""
     _, found, _ = cv2.aruco.ArucoDetector(DICTIONARY).detectMarkers(image)
-    if found is None or len(found) < LEAST_READ:
+    if found is None or len(found) < MIN_READ:
         return None
     changed = {int(code) % TURNS * SLOTS + int(code) // TURNS for code in found.ravel() if code < PERIOD}
     for newest in changed:

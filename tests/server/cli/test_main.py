@@ -62,7 +62,7 @@ def test_commands_are_listed_in_rooms_and_choices_are_those_of_the_settings() ->
         values = [value for option in (types, *get_args(types)) for value in get_args(option) if isinstance(value, str)]
         assert f"--{name} <{'|'.join(dict.fromkeys(values))}>" in shown
     assert get_args(CameraFormat) == FORMATS
-    assert get_args(ExportFormat) == (*settings.FORMATS, "slicer", *DATASET_FORMATS)
+    assert get_args(ExportFormat) == (*settings.FORMATS, "slicer", "dicom", "nifti", *DATASET_FORMATS)
     assert "\n  One share of eight: eigenhead batch study.csv" in run("batch", "--help").stdout
 
 
