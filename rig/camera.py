@@ -53,10 +53,6 @@ class Distortion:
         """Distorts normalised coordinates ``X / Z, Y / Z``."""
         return np.ascontiguousarray(_distorted(normalised.T, self.opencv()).T)
 
-    def jacobian(self, normalised: Pixels) -> Float[np.ndarray, "n 2 2"]:
-        """Computes the derivative of the distorted coordinates by the normalised ones."""
-        return _symmetric(_distortion_slopes(normalised.T, self.opencv()))
-
     def remove(self, distorted: Pixels) -> Pixels:
         """Inverts ``apply`` by Newton's method. Returns NaN where no point inside the valid radius maps to the given
         one."""
@@ -180,7 +176,8 @@ def lens_image(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Pixels:
 def lens_slopes(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Float[np.ndarray, "n 2 3"]:
     """Returns the derivatives of ``lens_image`` by the point (px / mm)."""
     normalised, z = points[:, :2] / points[:, 2:], points[:, 2, None]
-    slopes = lens[..., :2, None] * _symmetric(_distortion_slopes(normalised.T, lens[..., 4:]))
+    slopes = np.ascontiguousarray(_distortion_slopes(normalised.T, lens[..., 4:])[[0, 1, 1, 2]].T).reshape(-1, 2, 2)
+    slopes = lens[..., :2, None] * slopes
     by_depth = (slopes * (-normalised / z)[:, None]).sum(axis=2)
     return np.concatenate([slopes * (1.0 / z)[:, None], by_depth[:, :, None]], axis=2)
 
@@ -222,7 +219,3 @@ def _distortion_slopes(
     xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
     yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
     return np.array([xx, cross, yy])
-
-
-def _symmetric(entries: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "n 2 2"]:
-    return np.ascontiguousarray(entries[[0, 1, 1, 2]].T).reshape(-1, 2, 2)

@@ -24,8 +24,7 @@ def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreei
     tolerance_mm, deviations = np.float32(limits[0]), np.float32(limits[1])
     far_mm, zero, half, one = tolerance_mm * FAR_TOLERANCES, np.float32(0.0), np.float32(0.5), np.float32(1.0)
     height, width = agreeing.shape
-    live, count = np.empty(width, np.int32), np.empty((2, width), np.int32)
-    total = np.empty(width, np.float32)
+    live, count, total = np.empty(width, np.int32), np.empty((2, width), np.int32), np.empty(width, np.float32)
     for row in range(height):
         first, lives = np.uint64(start + row * width), 0
         for column in range(width):
