@@ -64,7 +64,8 @@ def _choose_processor() -> None:
 
 
 _choose_processor()
-cpu_target.options.noalias = TargetOptions.Mapping("noalias")  # a flag of Numba's that no option sets
+_target_options: Any = cpu_target.options
+_target_options.noalias = TargetOptions.Mapping("noalias")  # a flag of Numba's that no option sets
 
 
 def njit(
