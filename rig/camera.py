@@ -51,11 +51,7 @@ class Distortion:
 
     def apply(self, normalised: Pixels) -> Pixels:
         """Distorts normalised coordinates ``X / Z, Y / Z``."""
-        return _distorted(normalised, self.opencv())
-
-    def jacobian(self, normalised: Pixels) -> Float[np.ndarray, "n 2 2"]:
-        """Computes the derivative of the distorted coordinates by the normalised ones."""
-        return _distortion_slopes(normalised, self.opencv())
+        return np.ascontiguousarray(_distorted(normalised.T, self.opencv()).T)
 
     def remove(self, distorted: Pixels) -> Pixels:
         """Inverts ``apply`` by Newton's method. Returns NaN where no point inside the valid radius maps to the given
@@ -63,19 +59,18 @@ class Distortion:
         if self.is_zero:
             return distorted.copy()
         limit = self.max_valid_radius()
-        guess = distorted.copy()
+        guess, wanted, lens = distorted.T, distorted.T, self.opencv()
+        miss = _distorted(guess, lens) - wanted
         for _ in range(20):
-            miss = self.apply(guess) - distorted
-            if not len(miss) or np.abs(miss).max() < 1e-13:
+            if not miss.size or np.abs(miss).max() < 1e-13:
                 break
-            step = np.linalg.solve(self.jacobian(guess), miss[:, :, None])[:, :, 0]
+            xx, cross, yy = _distortion_slopes(guess, lens)
+            step = np.array([yy * miss[0] - cross * miss[1], xx * miss[1] - cross * miss[0]]) / (xx * yy - cross**2)
             guess = guess - step
-            radius = np.linalg.norm(guess, axis=1)
-            far = radius > 0.999 * limit  # step back inside, where the map is one to one
-            guess[far] *= (0.999 * limit / radius[far])[:, None]
-        lost = np.abs(self.apply(guess) - distorted).max(axis=1) > 1e-9
-        guess[lost] = np.nan
-        return guess
+            radius = np.maximum(np.hypot(guess[0], guess[1]), 1e-9)
+            guess *= np.minimum(0.999 * limit / radius, 1.0)  # step back inside, where the map is one to one
+            miss = _distorted(guess, lens) - wanted
+        return np.ascontiguousarray(np.where(np.abs(miss).max(axis=0) > 1e-9, np.nan, guess).T)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,13 +169,15 @@ def lens_image(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Pixels:
 
     ``lens`` is fx fy cx cy (px) k1 k2 p1 p2 k3, one for all points or one for each. The caller must make sure that the
     points lie in front of the camera and inside the distortion's valid radius."""
-    return _distorted(points[:, :2] / points[:, 2:], lens[..., 4:]) * lens[..., :2] + lens[..., 2:4]
+    distorted = np.ascontiguousarray(_distorted(points[:, :2].T / points[:, 2], lens[..., 4:]).T)
+    return distorted * lens[..., :2] + lens[..., 2:4]
 
 
 def lens_slopes(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Float[np.ndarray, "n 2 3"]:
     """Returns the derivatives of ``lens_image`` by the point (px / mm)."""
     normalised, z = points[:, :2] / points[:, 2:], points[:, 2, None]
-    slopes = lens[..., :2, None] * _distortion_slopes(normalised, lens[..., 4:])
+    slopes = np.ascontiguousarray(_distortion_slopes(normalised.T, lens[..., 4:])[[0, 1, 1, 2]].T).reshape(-1, 2, 2)
+    slopes = lens[..., :2, None] * slopes
     by_depth = (slopes * (-normalised / z)[:, None]).sum(axis=2)
     return np.concatenate([slopes * (1.0 / z)[:, None], by_depth[:, :, None]], axis=2)
 
@@ -193,7 +190,7 @@ def lens_jacobians(
     x, y = normalised.T
     r2 = x * x + y * y
     by_lens = np.zeros((len(points), 2, 9))
-    by_lens[:, [0, 1], [0, 1]] = _distorted(normalised, lens[..., 4:])
+    by_lens[:, [0, 1], [0, 1]] = _distorted(normalised.T, lens[..., 4:]).T
     by_lens[:, [0, 1], [2, 3]] = 1.0
     by_lens[:, 0, 4:] = np.stack([x * r2, x * r2**2, 2.0 * x * y, r2 + 2.0 * x * x, x * r2**3], axis=1)
     by_lens[:, 1, 4:] = np.stack([y * r2, y * r2**2, r2 + 2.0 * y * y, 2.0 * x * y, y * r2**3], axis=1)
@@ -201,25 +198,24 @@ def lens_jacobians(
     return lens_slopes(points, lens), by_lens
 
 
-def _distorted(normalised: Pixels, lens: Float[np.ndarray, "*n 5"]) -> Pixels:
+def _distorted(normalised: Float[np.ndarray, "2 n"], lens: Float[np.ndarray, "*n 5"]) -> Float[np.ndarray, "2 n"]:
     """Distorts normalised coordinates by the module's equation."""
-    (x, y), (k1, k2, p1, p2, k3) = normalised.T, lens.T
+    (x, y), (k1, k2, p1, p2, k3) = normalised, lens.T
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    across, down = (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
-    return np.stack([across, down], axis=1)
+    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    return np.array([across, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])
 
 
-def _distortion_slopes(normalised: Pixels, lens: Float[np.ndarray, "*n 5"]) -> Float[np.ndarray, "n 2 2"]:
-    """Returns the derivative of ``_distorted`` by the normalised coordinates, a symmetric matrix."""
-    (x, y), (k1, k2, p1, p2, k3) = normalised.T, lens.T
+def _distortion_slopes(
+    normalised: Float[np.ndarray, "2 n"], lens: Float[np.ndarray, "*n 5"]
+) -> Float[np.ndarray, "3 n"]:
+    """Returns the derivative of ``_distorted`` by the normalised coordinates, a symmetric matrix: xx, xy and yy."""
+    (x, y), (k1, k2, p1, p2, k3) = normalised, lens.T
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d(radial) / d(r^2) * 2
     cross = slope * x * y + 2 * p1 * x + 2 * p2 * y
     xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
     yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    return np.stack([np.stack([xx, cross], 1), np.stack([cross, yy], 1)], axis=1)
+    return np.array([xx, cross, yy])

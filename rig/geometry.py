@@ -67,7 +67,7 @@ class Similarity:
 def cross_matrix(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
     """Returns the matrix ``[v]x``, so that ``cross_matrix(v) @ w == cross(v, w)``."""
     matrix = np.zeros((*vector.shape[:-1], 3, 3))
-    x, y, z = np.moveaxis(vector, -1, 0)
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     matrix[..., 0, 1], matrix[..., 0, 2] = -z, y
     matrix[..., 1, 0], matrix[..., 1, 2] = z, -x
     matrix[..., 2, 0], matrix[..., 2, 1] = -y, x

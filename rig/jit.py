@@ -13,7 +13,7 @@ with AVX-512 a job took as many processor seconds.
 
 Numba has no public interface for that. What is used of its inside: ``Dispatcher._cache`` (an object with
 ``load_overload`` and ``save_overload``), ``CompileResult._reduce`` and ``_rebuild``, ``serialize.dumps``, the option
-``_nrt``.
+``_nrt``, the flag ``noalias``.
 """
 
 import hashlib
@@ -33,6 +33,7 @@ import numpy as np
 from numba.core import config, serialize
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
+from numba.core.options import TargetOptions
 from numba.core.registry import cpu_target
 from numba.core.runtime.nrt import rtsys
 
@@ -63,9 +64,13 @@ def _choose_processor() -> None:
 
 
 _choose_processor()
+_target_options: Any = cpu_target.options
+_target_options.noalias = TargetOptions.Mapping("noalias")  # a flag of Numba's that no option sets
 
 
-def njit(*, cache: bool = True, allocates: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+def njit(
+    *, cache: bool = True, allocates: bool = True, overlaps: bool = True, **options: Any
+) -> Callable[[Callable[..., Any]], Any]:
     """Compiles a function as ``numba.njit`` does, and keeps the machine code in ``cache_folder()`` for later processes.
 
     Args:
@@ -73,6 +78,8 @@ def njit(*, cache: bool = True, allocates: bool = True, **options: Any) -> Calla
         allocates: whether the function, or one that it calls, creates arrays. If False, Numba's reference counting is
             left out. With it every new name of an array, a row or a field costs an atomic instruction, for which cores
             wait on each other: most of the time of the dense stage's sweep.
+        overlaps: whether arguments may share memory. If False, LLVM vectorises also a loop that writes to one array
+            what it reads from another at computed places.
         options: passed on to ``numba.njit``.
     """
 
@@ -80,6 +87,8 @@ def njit(*, cache: bool = True, allocates: bool = True, **options: Any) -> Calla
         chosen: dict[str, Any] = {"no_cfunc_wrapper": True, **options}  # nothing in C calls them: 8 % of compiling
         if not allocates:
             chosen["_nrt"] = False
+        if not overlaps:
+            chosen["noalias"] = True
         dispatcher = numba.njit(**chosen)(function)
         if cache and isinstance(dispatcher, Dispatcher):  # with NUMBA_DISABLE_JIT it is the function itself
             dispatcher._cache = KeptFunction(dispatcher)  # type: ignore[assignment]

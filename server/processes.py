@@ -5,6 +5,7 @@ They must run the code of this installation and no other, even if a folder named
 working directory or on PYTHONPATH.
 """
 
+import gc
 import os
 import platform
 import secrets
@@ -15,7 +16,7 @@ from pathlib import Path
 
 from rig.progress import Progress
 
-M_ARENA_MAX = -8  # of malloc.h
+M_ARENA_MAX, M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -8, -1, -3  # of malloc.h
 PR_SET_PDEATHSIG = 1  # of sys/prctl.h
 SERVER = __package__ or "server"  # "eigenhead.server" in the wheel
 
@@ -43,10 +44,11 @@ def share_one_heap() -> None:
     threads.
 
     By default each thread has a heap and gives nothing it has freed to the others. A default job then uses 150 MB more
-    and is no faster.
+    and is no faster. And Python then looks for garbage so often that it takes 1.5 of 31 CPU s.
     """
     import ctypes
 
+    gc.set_threshold(100_000, 10, 10)
     with suppress(AttributeError):
         ctypes.CDLL(None).mallopt(M_ARENA_MAX, 1)
 

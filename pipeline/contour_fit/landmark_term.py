@@ -71,7 +71,7 @@ class LandmarkTerm:
         turned = pose.scale * (observed.basis[: stage.modes] @ pose.rotation.T)
         rows[:, :, : stage.modes] = turned.transpose(1, 2, 0)
         arm = points - pose.translation
-        by_pose = [np.stack([-cross_matrix(x) for x in arm]), np.tile(np.eye(3), (len(arm), 1, 1)), arm[:, :, None]]
+        by_pose = [-cross_matrix(arm), np.tile(np.eye(3), (len(arm), 1, 1)), arm[:, :, None]]
         rows[:, :, stage.modes : stage.modes + POSE] = np.concatenate(by_pose, axis=2)
         return observed.whiten @ rows.reshape(3 * len(points), -1)
 

@@ -148,7 +148,7 @@ def _points(model: HeadModel, fit: Fit, vertices: np.ndarray) -> tuple[Points, F
     points = place.apply(mean + np.einsum("m,mni->ni", fit.coefficients, basis))
     by_shape = np.einsum("ij,mnj->nim", place.scale * place.rotation, basis)
     arms = points - place.translation
-    by_rotation = np.array([-cross_matrix(arm) for arm in arms]).reshape(-1, 3, 3)
+    by_rotation = -cross_matrix(arms)
     by_translation = np.broadcast_to(np.eye(3), (len(points), 3, 3))
     return points, np.concatenate([by_shape, by_rotation, by_translation, arms[:, :, None]], axis=2)
 

@@ -18,30 +18,25 @@ def rasterise(
     depth = np.full((height, width), np.inf, np.float32)
     seen = np.full((height, width), -1, np.int32)
     for f in range(faces.shape[0]):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        a, b, c = np.uint32(faces[f, 0]), np.uint32(faces[f, 1]), np.uint32(faces[f, 2])
         za, zb, zc = depths[a], depths[b], depths[c]
-        if not (za > 0.0 and zb > 0.0 and zc > 0.0):
-            continue
         ax, ay, bx, by, cx, cy = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1]
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if not abs(area) > 1e-12:  # NaN ends here too
-            continue
         x_low, x_high = max(np.ceil(min(ax, bx, cx)), 0.0), min(np.floor(max(ax, bx, cx)), width - 1.0)
         y_low, y_high = max(np.ceil(min(ay, by, cy)), 0.0), min(np.floor(max(ay, by, cy)), height - 1.0)
-        if x_low > x_high or y_low > y_high:
+        drawn = (za > 0.0) & (zb > 0.0) & (zc > 0.0) & (abs(area) > 1e-12)  # NaN ends here too
+        if not (drawn & (x_low <= x_high) & (y_low <= y_high)):
             continue
         ia, ib, ic, share = 1.0 / za, 1.0 / zb, 1.0 / zc, 1.0 / area
         for y in range(int(y_low), int(y_high) + 1):
-            for x in range(int(x_low), int(x_high) + 1):
-                wa = ((bx - x) * (cy - y) - (by - y) * (cx - x)) * share
-                wb = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) * share
+            a_y, b_y, c_y = (ay - y) * share, (by - y) * share, (cy - y) * share
+            for x in range(int(x_low), int(x_high) + 1):  # without branches: half of the pixels lie outside
+                wa, wb = (bx - x) * c_y - (cx - x) * b_y, (cx - x) * a_y - (ax - x) * c_y
                 wc = 1.0 - wa - wb
-                if wa < 0.0 or wb < 0.0 or wc < 0.0:
-                    continue
-                z = np.float32(1.0 / (wa * ia + wb * ib + wc * ic))
-                if z < depth[y, x]:
-                    depth[y, x] = z
-                    seen[y, x] = f
+                z, before = np.float32(1.0 / (wa * ia + wb * ib + wc * ic)), depth[y, x]
+                nearer = (min(wa, wb, wc) >= 0.0) & (z < before)
+                depth[y, x] = z if nearer else before
+                seen[y, x] = f if nearer else seen[y, x]
     return depth, seen
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from pipeline.imaging.silhouette import Silhouette
 from rig.camera import Camera
+from rig.geometry import cross_matrix
 from rig.rig import Rig
 
 Vector = Float[np.ndarray, " 3"]
@@ -133,7 +134,7 @@ def epipolar_plane_axes(one: Camera, two: Camera, towards: Vector) -> tuple[Vect
     axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
     u = towards - axis * (towards @ axis)
     u = u / max(float(np.linalg.norm(u)), 1e-9)
-    return u, np.cross(axis, u)
+    return u, cross_matrix(axis) @ u
 
 
 def rays_about(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 4 3"]:

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from pipeline.geometry.projection_kernels import NEAREST_MM, placed
+from pipeline.geometry.projection_kernels import NEAREST_MM
 from pipeline.stereo.matching_kernels import HEIGHT, START, WIDTH
 from rig.jit import njit
 
-FAR_TOLERANCES = 20.0  # along a ray: at the steepest slope the planes are then six tolerances apart
+FAR_TOLERANCES = np.float32(20.0)  # along a ray: at the steepest slope the planes are then six tolerances apart
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, overlaps=False)
 def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreeing, before, apart):
     """Fills, for every pixel (h, w) of one view: how many other views have the surface at the same point
     (``agreeing``), how many see through it (``before``: the point lies in front of their surface), and the mean squared
@@ -21,47 +21,50 @@ def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreei
     views one after the other, this view from ``start`` on; ``ways`` are rows of ``Stack.homographies``, ``lenses`` fx
     and fy of the others.
     """
-    tolerance_mm, deviations = limits
-    far_mm = FAR_TOLERANCES * tolerance_mm
+    tolerance_mm, deviations = np.float32(limits[0]), np.float32(limits[1])
+    far_mm, zero, half, one = tolerance_mm * FAR_TOLERANCES, np.float32(0.0), np.float32(0.5), np.float32(1.0)
     height, width = agreeing.shape
+    live, count, total = np.empty(width, np.int32), np.empty((2, width), np.int32), np.empty(width, np.float32)
     for row in range(height):
+        first, lives = np.uint64(start + row * width), 0
         for column in range(width):
-            p = row * width + column
-            agreeing[row, column] = 0
-            before[row, column] = 0
-            apart[row, column] = 0.0
-            z = depth[start + p]
-            if z <= 0.0:
-                continue
-            total = 0.0
-            for k in range(len(ways)):
-                way = ways[k]
-                x, y, there = placed(way, z * column, z * row, z)
-                if there < NEAREST_MM:
-                    continue
-                x, y = x / there, y / there
-                if x < 0.0 or y < 0.0 or x > way[WIDTH] - 1.0 or y > way[HEIGHT] - 1.0:
-                    continue
-                i, j = int(x + 0.5), int(y + 0.5)
-                q = int(way[START]) + j * int(way[WIDTH]) + i
-                if depth[q] <= 0.0:
-                    continue
-                if there > depth[q] + far_mm:
-                    continue
-                if there < depth[q] - far_mm:
-                    before[row, column] += 1
-                    continue
-                z_x, z_y = slopes[q, 0], slopes[q, 1]
-                off = there - (depth[q] + (x - i) * z_x + (y - j) * z_y)
-                u, v = z_x * lenses[k, 0] / depth[q], z_y * lenses[k, 1] / depth[q]
-                upright = 1.0 / np.sqrt(1.0 + u * u + v * v)  # cosine between the other's ray and its plane's normal
-                distance = off * upright
-                mine, theirs = deviation[start + p], deviation[q] * upright
-                limit = min(max(deviations * np.sqrt(mine * mine + theirs * theirs), 0.5 * tolerance_mm), tolerance_mm)
-                if abs(distance) < limit:
-                    agreeing[row, column] += 1
-                    total += distance * distance
-                elif distance < 0.0:
-                    before[row, column] += 1
-            if agreeing[row, column] > 0:
-                apart[row, column] = total / agreeing[row, column]
+            agreeing[row, column], before[row, column], apart[row, column] = 0, 0, zero
+            if depth[first + np.uint64(column)] > zero:
+                live[lives] = column
+                count[0, lives], count[1, lives], total[lives] = 0, 0, zero
+                lives += 1
+        for k in range(len(ways)):
+            way = ways[k]
+            r0, r1, r2 = way[1] * row + way[2], way[4] * row + way[5], way[7] * row + way[8]
+            there_first, stride = np.uint64(np.int64(way[START])), np.int32(way[WIDTH])
+            fx, fy = np.float32(lenses[k, 0]), np.float32(lenses[k, 1])
+            for m in range(lives):  # without branches, so that it is vectorised
+                column = live[m]
+                p = first + np.uint64(np.uint32(column))
+                z, mine = depth[p], deviation[p]
+                there = z * (way[6] * column + r2) + way[11]
+                per = 1.0 / max(there, NEAREST_MM)
+                x, y = (z * (way[0] * column + r0) + way[9]) * per, (z * (way[3] * column + r1) + way[10]) * per
+                inside = (there >= NEAREST_MM) & (x >= 0.0) & (y >= 0.0)
+                inside = inside & (x <= way[WIDTH] - 1.0) & (y <= way[HEIGHT] - 1.0)
+                u, v = np.float32(x if inside else 0.0), np.float32(y if inside else 0.0)
+                i, j = np.int32(u + half), np.int32(v + half)
+                q = there_first + np.uint64(np.uint32(j * stride + i))
+                shown, z_x, z_y = depth[q], slopes[q, 0], slopes[q, 1]
+                behind = np.float32(there) - shown
+                off = behind - (u - np.float32(i)) * z_x - (v - np.float32(j)) * z_y
+                by = one / max(shown, one)
+                a, b = z_x * fx * by, z_y * fy * by
+                upright = one / np.sqrt(one + a * a + b * b)  # cosine between the other's ray and its plane's normal
+                distance, theirs = off * upright, deviation[q] * upright
+                limit = min(max(deviations * np.sqrt(mine * mine + theirs * theirs), half * tolerance_mm), tolerance_mm)
+                known = inside & (shown > zero) & (behind <= far_mm)
+                same = known & (abs(distance) < limit) & (behind >= -far_mm)
+                past = known & (not same) & ((distance < zero) | (behind < -far_mm))
+                count[0, m] += same
+                count[1, m] += past
+                total[m] += distance * distance if same else zero
+        for m in range(lives):
+            column = live[m]
+            agreeing[row, column], before[row, column] = count[0, m], count[1, m]
+            apart[row, column] = total[m] / max(np.float32(count[0, m]), one)

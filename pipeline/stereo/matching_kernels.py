@@ -73,7 +73,7 @@ def farthest(pattern):
     return reach
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False, overlaps=False)
 def load_window(sight, width, height, column, row, window):
     """Fills ``window`` (2, s) with the grey values (zero mean) and weights of the samples around a pixel. Returns the
     sum of the weights, and the weighted sum of squares.
@@ -82,14 +82,15 @@ def load_window(sight, width, height, column, row, window):
     ``contrast``), so that a window at an outline or a crease holds one surface. ``width`` and ``height`` are those of
     the view's image.
     """
-    pairs, pattern, start = sight.pairs, sight.pattern, sight.start
-    centre = np.float32(np.int32(pairs[start + row * width + column] & LOW))
+    pairs, pattern, start = sight.pairs, sight.pattern, np.uint64(sight.start)
+    x0, y0, right, lowest = np.float32(column), np.float32(row), np.float32(width - 1), np.float32(height - 1)
+    zero, stride = np.float32(0.0), np.int32(width)
+    centre = np.float32(np.int32(pairs[start + np.uint64(row * width + column)] & LOW))
     falloff = np.float32(1.0 / (sight.contrast * sight.contrast))
     total, mean = np.float32(0.0), np.float32(0.0)
     for i in range(pattern.shape[1]):
-        x = min(max(column + int(pattern[0, i]), 0), width - 1)
-        y = min(max(row + int(pattern[1, i]), 0), height - 1)
-        at = start + y * width + x
+        x, y = min(max(x0 + pattern[0, i], zero), right), min(max(y0 + pattern[1, i], zero), lowest)
+        at = start + np.uint64(np.uint32(np.int32(y) * stride + np.int32(x)))
         value = np.float32(np.int32(pairs[at] & LOW))
         w = np.float32(0.0)
         if sight.distance_px[at] < WINDOW_PX:
@@ -183,7 +184,7 @@ def match(way, sight, loaded, z, z_x, z_y, reach, place):
     return correlate(way, place, sight, loaded)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def correlate_and_slide(way, place, sight, loaded, found):
     """Fills ``found`` (3) with the correlation of the loaded window, and with what a move along the ray would change:
     the gradient (1 / mm) and the information (1 / mm^2) of the depth.
@@ -218,12 +219,15 @@ def correlate_and_slide(way, place, sight, loaded, found):
         s_jj += wj * slope
         s_kr += wk * window[0, i]
         s_jr += wj * window[0, i]
-    theirs = total * way[NOISE] * way[NOISE]
-    kk = max(s_kk - s_k * s_k / total, zero) + theirs
-    kj = s_kj - s_k * s_j / total
-    jj = max(s_jj - s_j * s_j / total, zero)
-    gain = s_kr / kk
-    variance = (max(energy - gain * s_kr, zero) + total * noise * noise + gain * gain * theirs) / total
-    found[0] = s_kr / np.sqrt((energy + total * noise * noise) * kk)
-    found[1] = gain * (s_jr - gain * kj) / variance
-    found[2] = gain * gain * max(jj - kj * kj / kk, zero) / variance
+    # In single precision, and with three divisions: in double they took a quarter of the time.
+    per, theirs = np.float32(1.0) / total, total * np.float32(way[NOISE] * way[NOISE])
+    ours = total * np.float32(noise * noise)
+    kk = max(s_kk - s_k * s_k * per, zero) + theirs
+    kj = s_kj - s_k * s_j * per
+    jj = max(s_jj - s_j * s_j * per, zero)
+    by_kk = np.float32(1.0) / kk
+    gain = s_kr * by_kk
+    precise = gain * total / (max(energy - gain * s_kr, zero) + ours + gain * gain * theirs)
+    found[0] = s_kr / np.sqrt((energy + ours) * kk)
+    found[1] = precise * (s_jr - gain * kj)
+    found[2] = precise * gain * max(jj - kj * kj * by_kk, zero)

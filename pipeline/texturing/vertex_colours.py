@@ -210,7 +210,7 @@ def texture(
     unit = np.ones((len(views), 3)), np.zeros((len(views), 3))
     gains, offsets = balance(weights, colours) if settings.balance else unit
     weights *= (1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2))[:, None]  # of noise, or in shadow
-    balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
+    balanced = colours * gains[:, None].astype(np.float32) + offsets[:, None].astype(np.float32)
     unlike = [] if shown is None else shown.find_unlike(weights, balanced, mesh_world, normals, views)
     agreed, seen = blend_views(weights, balanced, outlier)
     if not seen.any():

@@ -201,8 +201,10 @@ def with_picture_faults(
     with a turned picture are not usable."""
     found = dict(silhouettes)
     blurred = blurred_views(capture.images, silhouettes) if suspects else {}
+    misfits = own_misfit({camera: s for camera, s in silhouettes.items() if s.quality.usable}, rig) if suspects else {}
     for name in suspects:
-        fault = turned_against_plate(capture, name) or turned_against_others(silhouettes, name, rig)
+        fits = misfits.get(name, np.inf) <= FITTING_MISFIT
+        fault = turned_against_plate(capture, name) or (None if fits else turned_against_others(silhouettes, name, rig))
         usable = silhouettes[name].quality.usable and fault is None
         fault = fault or blurred.get(name)
         if fault is not None:

@@ -59,7 +59,8 @@ def generalised_procrustes(
         turned = scale * source @ rotation.T
         residual = (target - turned - translation).ravel()
         # columns: left turn about the head's origin, shift, log scale
-        jacobian = np.concatenate([np.concatenate([-cross_matrix(x), np.eye(3), x[:, None]], axis=1) for x in turned])
+        shift = np.tile(np.eye(3), (len(turned), 1, 1))
+        jacobian = np.concatenate([-cross_matrix(turned), shift, turned[:, :, None]], axis=2).reshape(-1, 7)
         rows = np.concatenate([whiten @ jacobian, np.eye(7)[6:] / scale_spread])
         step = np.linalg.lstsq(rows, np.append(whiten @ residual, -np.log(scale) / scale_spread), rcond=None)[0]
         rotation = rotation_from_vector(step[:3]) @ rotation
