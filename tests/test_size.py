@@ -10,7 +10,6 @@ SOLVER_LOOPS = {
     "pipeline.faces.irises.fitted": "its edges are searched anew at each reach: no two steps have a cost in common",
     "pipeline.multiview.triangulation.triangulate_many": "takes the steps of thousands of points at once",
     "pipeline.texturing.light.fit_light": "its bounds are inequalities over a sphere, which each step states anew",
-    "rig.camera.remove": "inverts the lens for all pixels at once; rig knows no estimator",
     "rig.studio.scene.subject.scattered": "solves once for each colour, and no least squares",
 }  # why the rooms of least squares do not serve
 

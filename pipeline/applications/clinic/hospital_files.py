@@ -131,7 +131,6 @@ def nifti_bytes(visit: Visit, frame: AnatomicalFrame) -> bytes:
     mask, affine = fill_voxels(close_head(visit, frame))
     image = nibabel.Nifti1Image(mask, affine)
     image.header.set_xyzt_units("mm")
-    image.header["descrip"] = b"head, 1 inside; eigenhead"
     return gzip.compress(image.to_bytes(), mtime=0)
 
 

@@ -116,7 +116,7 @@ def bound(source: Session) -> np.ndarray:
     nothing = LensPrior(state.intrinsics, prior.information * 1e-6)
     problem = bundle_problem(state, CornerTerm(seen, np.full(len(source.rig), 0.2)), nothing, Free())
     here = problem.at(state)
-    evidence = Evidence("converged", 1, 0, here.cost, 0.0)
+    evidence = Evidence("converged", 1, 0, here.cost)
     assert problem.free is not None
     full = BundleSolution(state, problem.equations(here).matrix, problem.free, evidence).covariance()
     count = len(source.rig)

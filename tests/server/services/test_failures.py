@@ -21,9 +21,9 @@ def row(error: Exception | None, status: str = "ERROR") -> WorkflowStatus:
 
 
 def test_a_failure_keeps_code_and_parameters_through_the_engine() -> None:
-    text, kind = serialize_exception(JobFailed("no-hull", compose("worker-died"), FAULTS), None, SERIALIZER)
+    text, kind = serialize_exception(JobFailed("no-subject", compose("worker-died"), FAULTS), None, SERIALIZER)
     found = failure(row(deserialize_exception(text, kind, SERIALIZER)))
-    assert (kind, found.type) == ("portable_json", "urn:eigenhead:problem:no-hull")
+    assert (kind, found.type) == ("portable_json", "urn:eigenhead:problem:no-subject")
     assert found.detail == compose("worker-died")
     assert found.errors == (FAULTS[0], verbatim("said by a library"))
 

@@ -84,7 +84,7 @@ def test_a_job_ends_once_however_many_write_it(engine: sa.Engine) -> None:
     log.append("job", {"state": "running", "stage": "fit"})
 
     def write() -> list[bool]:
-        return [log.end("job", {"state": "failed"}, failure="no-hull") for _ in range(5)]
+        return [log.end("job", {"state": "failed"}, failure="no-subject") for _ in range(5)]
 
     assert sorted(chain(*run_at_once(write, 4))) == [False] * 19 + [True]
     assert log.append("job", {"state": "running", "stage": "late"}) == 2, "of a worker that was thought dead"
@@ -93,7 +93,7 @@ def test_a_job_ends_once_however_many_write_it(engine: sa.Engine) -> None:
         (END, "failed"),
     ]
     assert log.latest(["job"])["job"].document == {"state": "failed"}
-    assert failure_counts(engine) == {"no-hull": 1}
+    assert failure_counts(engine) == {"no-subject": 1}
     log.replace_end("job", {"state": "cancelled"})
     assert [event.document.get("state") for event in log.since("job", 2)] == ["cancelled"]
 

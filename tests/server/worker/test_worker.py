@@ -181,10 +181,10 @@ def test_an_end_waits_for_the_database_and_is_written_once(worker: Worker) -> No
             raise OperationalError("INSERT", None, ConnectionRefusedError("away"))
 
     for _ in range(2):  # the worker is killed before the engine knows of the end; the next one repeats it
-        worker.outcomes.publish(JOB, "failed", failure="no-hull")
+        worker.outcomes.publish(JOB, "failed", failure="no-subject")
     assert len(refused) == 2
     assert events_of(worker) == [{"state": "failed"}]
-    assert failure_counts(worker.engine) == {"no-hull": 1}
+    assert failure_counts(worker.engine) == {"no-subject": 1}
 
 
 @pytest.mark.parametrize("text", [None, "", "[]", "{}", '{"warnings": 3'])

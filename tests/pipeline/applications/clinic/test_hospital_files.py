@@ -4,11 +4,12 @@ import io
 import json
 from pathlib import Path
 
-import nibabel
 import numpy as np
 import pydicom
 import pytest
 import trimesh
+from nibabel.nifti1 import Nifti1Image
+from nibabel.orientations import aff2axcodes
 from scipy.ndimage import map_coordinates
 
 from pipeline.applications.clinic.anatomical_frame import frankfurt_axes
@@ -42,16 +43,16 @@ def test_the_mask_lies_where_the_head_is(tmp_path: Path) -> None:
     frame = frankfurt_axes(later.measured, "RAS")
     document = write_hospital_files(tmp_path, later, frame, "nifti", "P017")
     assert document == json.loads((tmp_path / "frame.json").read_text())
-    image = nibabel.loadsave.load(tmp_path / "sub-P017_desc-head_mask.nii.gz")
-    assert isinstance(image, nibabel.nifti1.Nifti1Image)
-    assert nibabel.orientations.aff2axcodes(image.affine) == ("R", "A", "S")
+    image = Nifti1Image.from_filename(tmp_path / "sub-P017_desc-head_mask.nii.gz")
+    affine = np.asarray(image.affine)
+    assert aff2axcodes(affine) == ("R", "A", "S")
     mask = np.asarray(image.dataobj)
     mesh = later.measured.mesh_world
     normals = mesh.normals() @ frame.patient_from_world.rotation.T
     skin = frame.patient_from_world.apply(mesh.vertices)
     found = []
     for depth_mm in (-2.0, 2.0):  # below the skin and above it
-        voxels = np.linalg.solve(image.affine[:3, :3], (skin + depth_mm * normals - image.affine[:3, 3]).T)
+        voxels = np.linalg.solve(affine[:3, :3], (skin + depth_mm * normals - affine[:3, 3]).T)
         found.append(map_coordinates(mask, voxels, order=0).mean())
     assert found[0] > 0.97  # lips, lids and ears are thinner
     assert found[1] < 0.03

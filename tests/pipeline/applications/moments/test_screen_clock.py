@@ -38,7 +38,7 @@ def photograph_clock(begin_s: float, exposure_s: float, rng: np.random.Generator
     """The screen from a little aside: refreshes within the exposure are blended, with blur and noise."""
     begin, end = SCREEN_HZ * begin_s, SCREEN_HZ * (begin_s + exposure_s)
     edges = np.unique([begin, *np.arange(np.ceil(begin), end), end])
-    shown = sum((b - a) * draw_row(int((a + b) / 2) % PERIOD).astype(float) for a, b in pairwise(edges))
+    shown = np.sum([(b - a) * draw_row(int((a + b) / 2) % PERIOD) for a, b in pairwise(edges)], axis=0)
     screen = cv2.resize(shown / (end - begin), None, fx=CELL_PX, fy=CELL_PX, interpolation=cv2.INTER_NEAREST)
     height, width = screen.shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
@@ -147,7 +147,8 @@ def test_the_page_shows_the_refresh_that_it_counts(tmp_path: Path) -> None:
         page.goto(f"file://{tmp_path / 'clock.html'}")
         for _ in range(5):
             before = page.evaluate("refresh")
-            shown = read_refresh(cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_GRAYSCALE))
+            picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_GRAYSCALE)
+            shown = read_refresh(np.asarray(picture, np.uint8))
             after = page.evaluate("refresh")
             assert shown is not None
             assert (shown - before + 2) % PERIOD < after - before + 4
