@@ -89,12 +89,13 @@ def sequence(
     ],
     out: Annotated[Path, typer.Option(help="The result folder; a killed run goes on there.", file_okay=False)],
     *,
+    usd: Annotated[bool, typer.Option("--usd", help="Write sequence.usdc too, a point cache.")] = False,
     model: Model = None,
     data: Data = None,
     json_out: Json = False,
 ) -> None:
     """Track one head through pictures or videos."""
-    from pipeline.applications.moments.sequence_files import FILES, make_sequence
+    from pipeline.applications.moments.sequence_files import CACHE, FILES, make_sequence
     from pipeline.settings import settings_from_document
     from server.cli.heads import head_alone
     from server.cli.reconstruct_local import check_apart
@@ -106,10 +107,10 @@ def sequence(
     prepare_folder(out)
     with progress_bar() as report, terminated_like_interrupted():
         prepare_kernels(report, chosen)
-        document = make_sequence(folder, out, model=model or "default", settings=chosen, report=report)
+        document = make_sequence(folder, out, model=model or "default", settings=chosen, report=report, usd=usd)
     for warning in document["warnings"]:
         warn(f"{warning['code']}: {warning['message']}")
-    answer(document, json_out, [str(out / name) for name in FILES])
+    answer(document, json_out, [str(out / name) for name in (*FILES, *[CACHE][:usd])])
 
 
 def film_sequence(out: Path, frames: int, seed: int, preset: "Preset", json_out: bool) -> None:

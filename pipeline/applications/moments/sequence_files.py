@@ -7,6 +7,7 @@ sequence.npz    frames (t), times_s, expressions (e), weights and weight_deviati
 person.npz      names (e), neutral (v 3, head frame, mm), shapes (e v 3, mm at weight 1), the corrected cameras; the
                 head of a frame is rotation (neutral + sum of weights times shapes) + translation
 sequence.glb    the head, animated: its expressions as morph targets, its pose relative to the first frame
+sequence.usdc   the same as a point cache of OpenUSD, where it is asked for
 preview.mp4     the front camera's pictures beside the head in clay
 report.json     what was found, written last
 .chunks/        what a run that was killed goes on from
@@ -24,6 +25,7 @@ from jaxtyping import Float, UInt8
 
 from pipeline.applications.moments.animated_glb import animated
 from pipeline.applications.moments.footage import Footage, open_footage
+from pipeline.applications.moments.point_cache import write_point_cache
 from pipeline.applications.moments.sequence import Course, smoothed, track_sequence, write_arrays
 from pipeline.applications.moments.sequence_person import Motion, SequencePerson
 from pipeline.applications.moments.track_frame import POSE
@@ -36,6 +38,7 @@ from rig.camera import Camera
 from rig.errors import EigenheadError
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.scene import Part, Scene
+from rig.formats.meshes.usdz import check_usd
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh, vertex_normals
 from rig.messages.message import compose, documents_of
@@ -44,15 +47,20 @@ from rig.render.renderer import Renderer
 
 FORMAT = "eigenhead-sequence/1"
 FILES = ("sequence.npz", "person.npz", "sequence.glb", "preview.mp4", "report.json")
-CHUNKS = ".chunks"
+CHUNKS, CACHE = ".chunks", "sequence.usdc"
 SKEWED_MM, SKEWED_SHARE = 1.0, 0.05  # motion between exposures that warns, in more than this share of the frames
 USED = 0.02  # largest weight of an expression that is left out of sequence.glb
 CLAY, LIGHT = np.array([198.0, 176.0, 158.0]), np.array([-0.35, 0.45, 0.82])  # colour; direction to it, camera's axes
 
 
-def make_sequence(folder: Path, out: Path, *, model: str, settings: Settings, report: Progress) -> dict[str, Any]:
-    """Tracks the head of a sequence and writes the ``FILES`` into ``out``. Returns the content of report.json. Raises
-    InputError for a wrong folder, what the identity's single jobs raise, UnknownModel or BadModel, and OSError."""
+def make_sequence(
+    folder: Path, out: Path, *, model: str, settings: Settings, report: Progress, usd: bool = False
+) -> dict[str, Any]:
+    """Tracks the head of a sequence and writes the ``FILES`` into ``out``, with ``usd`` sequence.usdc, too. Returns the
+    content of report.json. Raises InputError for a wrong folder, what the identity's single jobs raise, UnknownModel or
+    BadModel, NoUsd, and OSError."""
+    if usd:
+        check_usd()
     footage, head_model = open_footage(folder), load_model(model)
     with Renderer.create() as renderer:
         person, course = track_sequence(footage, head_model, settings, out / CHUNKS, renderer=renderer, report=report)
@@ -75,6 +83,13 @@ def make_sequence(folder: Path, out: Path, *, model: str, settings: Settings, re
     )
     shutil.copyfile(out / CHUNKS / "person.npz", out / "person.npz")
     write_atomically(out / "sequence.glb", animation_of(person, footage, found))
+    if usd:
+        faces = person.model.levels["full"].faces
+        heads = [
+            pose.apply(person.head(weights))
+            for pose, weights in zip(poses_from_first(found), found.weights, strict=True)
+        ]
+        write_point_cache(out / CACHE, heads, faces, footage.times_s)
     write_preview(out / "preview.mp4", person, footage, found, report)
     document = document_of(person, footage, found)
     write_atomically(out / "report.json", json.dumps(document, indent=1, allow_nan=False).encode())
@@ -125,9 +140,13 @@ def animation_of(person: SequencePerson, footage: Footage, course: Course) -> by
     shapes = {plain_name(person.names[row]): person.shapes[row].astype(float) for row in used}
     extras = {"unit": "m", "frame": "head", "model": {"name": person.model.name, "sha256": person.model.sha256}}
     still = scene_glb_bytes(Scene([Part("head", Mesh(person.neutral, faces), None, None, shapes)]), extras)
+    return animated(still, footage.times_s - footage.times_s[0], course.weights[:, used], poses_from_first(course))
+
+
+def poses_from_first(course: Course) -> list[RigidTransform]:
+    """Returns the head's pose in every frame, relative to the first one."""
     first = RigidTransform(course.rotations[0], course.translations[0]).inverse()
-    poses = [first @ RigidTransform(*pose) for pose in zip(course.rotations, course.translations, strict=True)]
-    return animated(still, footage.times_s - footage.times_s[0], course.weights[:, used], poses)
+    return [first @ RigidTransform(*pose) for pose in zip(course.rotations, course.translations, strict=True)]
 
 
 def write_preview(path: Path, person: SequencePerson, footage: Footage, course: Course, report: Progress) -> None:

@@ -46,7 +46,7 @@ def scene_usdz_bytes(scene: Scene) -> bytes:
     images = {f"{part.name}{SUFFIXES[part.skin.mime]}": part.skin.image for part in scene.parts if part.skin}
     with tempfile.TemporaryDirectory() as scratch:
         layer = Path(scratch) / "head.usdc"
-        _write_layer(layer, scene)
+        write_layer(layer, scene)
         return package({"head.usdc": layer.read_bytes()} | images)
 
 
@@ -55,7 +55,8 @@ def openusd_module(name: str) -> Any:
     return importlib.import_module(f"pxr.{name}")
 
 
-def _write_layer(path: Path, scene: Scene) -> None:
+def write_layer(path: Path, scene: Scene) -> None:
+    """Writes the parts to ``path`` (.usdc), where their textures are to lie, too."""
     Gf, Usd, UsdGeom = map(openusd_module, ("Gf", "Usd", "UsdGeom"))
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -67,7 +68,7 @@ def _write_layer(path: Path, scene: Scene) -> None:
         if part.skin is None:
             colours = np.full(vertices.shape, 200, np.uint8) if part.mesh.colours is None else part.mesh.colours
             shown = shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-            shown.Set(_vectors("Vec3fArray", linear_from_srgb(colours / 255.0)))
+            shown.Set(vectors("Vec3fArray", linear_from_srgb(colours / 255.0)))
         else:
             _write_skin(stage, shape, part, part.skin)
         if scene.pivots_mm:
@@ -77,7 +78,8 @@ def _write_layer(path: Path, scene: Scene) -> None:
     stage.GetRootLayer().Save()
 
 
-def _vectors(kind: str, values: np.ndarray) -> Any:
+def vectors(kind: str, values: np.ndarray) -> Any:
+    """Returns an array of OpenUSD of a kind: Vec3fArray, Vec2fArray or IntArray."""
     dtype = np.int32 if kind == "IntArray" else np.float32
     return getattr(openusd_module("Vt"), kind).FromNumpy(np.ascontiguousarray(values, dtype))
 
@@ -85,12 +87,12 @@ def _vectors(kind: str, values: np.ndarray) -> Any:
 def _write_mesh(stage: Any, part: Part, vertices: Float[np.ndarray, "v 3"]) -> Any:
     UsdGeom, points, faces = openusd_module("UsdGeom"), vertices / 1000.0, part.mesh.faces
     shape = UsdGeom.Mesh.Define(stage, f"{ROOT}/{part.name}")
-    shape.CreatePointsAttr(_vectors("Vec3fArray", points))
-    shape.CreateFaceVertexCountsAttr(_vectors("IntArray", np.full(len(faces), 3)))
-    shape.CreateFaceVertexIndicesAttr(_vectors("IntArray", faces.ravel()))
-    shape.CreateExtentAttr(_vectors("Vec3fArray", np.stack([points.min(axis=0), points.max(axis=0)])))
+    shape.CreatePointsAttr(vectors("Vec3fArray", points))
+    shape.CreateFaceVertexCountsAttr(vectors("IntArray", np.full(len(faces), 3)))
+    shape.CreateFaceVertexIndicesAttr(vectors("IntArray", faces.ravel()))
+    shape.CreateExtentAttr(vectors("Vec3fArray", np.stack([points.min(axis=0), points.max(axis=0)])))
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    shape.CreateNormalsAttr(_vectors("Vec3fArray", part.unit_normals()))
+    shape.CreateNormalsAttr(vectors("Vec3fArray", part.unit_normals()))
     shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     return shape
 
@@ -99,8 +101,8 @@ def _write_skin(stage: Any, shape: Any, part: Part, skin: Skin) -> None:
     Gf, Sdf, UsdGeom, UsdShade = map(openusd_module, ("Gf", "Sdf", "UsdGeom", "UsdShade"))
     kinds, path = Sdf.ValueTypeNames, f"{ROOT}/{part.name}_skin"
     coordinates = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("st", kinds.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
-    coordinates.Set(_vectors("Vec2fArray", skin.uv * (1, -1) + (0, 1)))  # USD's v is upwards
-    coordinates.SetIndices(_vectors("IntArray", (part.mesh.faces if skin.faces is None else skin.faces).ravel()))
+    coordinates.Set(vectors("Vec2fArray", skin.uv * (1, -1) + (0, 1)))  # USD's v is upwards
+    coordinates.SetIndices(vectors("IntArray", (part.mesh.faces if skin.faces is None else skin.faces).ravel()))
     material = UsdShade.Material.Define(stage, path)
     surface, reader, picture = (
         UsdShade.Shader.Define(stage, f"{path}/{name}") for name in ("surface", "coordinates", "texture")

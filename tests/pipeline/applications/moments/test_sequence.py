@@ -14,9 +14,10 @@ from typer.testing import CliRunner
 
 from pipeline.applications.moments import sequence, sequence_person
 from pipeline.applications.moments.footage import open_footage
-from pipeline.applications.moments.sequence_files import CHUNKS, FILES
+from pipeline.applications.moments.sequence_files import CACHE, CHUNKS, FILES
 from pipeline.head_model.model import HeadModel
 from rig.errors import InputError
+from rig.formats.meshes.usdz import ROOT, openusd_module
 from rig.formats.pictures.images import read_image
 from rig.formats.pictures.work_size import work_rig
 from rig.geometry import vector_from_rotation
@@ -46,7 +47,7 @@ def film(model: HeadModel, renderer: Renderer, tmp_path_factory: pytest.TempPath
 
 
 def run(film: Path, out: Path) -> dict[str, Any]:
-    result = CliRunner().invoke(app, ["sequence", str(film), "--out", str(out), "--json"])
+    result = CliRunner().invoke(app, ["sequence", str(film), "--out", str(out), "--usd", "--json"])
     assert result.exit_code == 0, result.output
     return json.loads(result.stdout)
 
@@ -107,6 +108,24 @@ def test_the_head_is_animated(done: tuple[Path, dict[str, Any]]) -> None:
     reel.release()
 
 
+def test_the_point_cache_moves_as_the_weights_and_poses_do(done: tuple[Path, dict[str, Any]]) -> None:
+    UsdGeom = openusd_module("UsdGeom")
+    stage = openusd_module("Usd").Stage.Open(str(done[0] / CACHE))
+    head = UsdGeom.Mesh(stage.GetPrimAtPath(f"{ROOT}/head"))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, FRAMES - 1.0)
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(FPS)
+    with np.load(done[0] / "sequence.npz") as course, np.load(done[0] / "person.npz") as person:
+        for k in (0, FRAMES - 1):
+            still = person["neutral"] + np.einsum("e,evx->vx", course["weights"][k], person["shapes"])
+            world_mm = still @ course["rotations"][k].T + course["translations"][k]
+            expected = (world_mm - course["translations"][0]) @ course["rotations"][0] / 1000.0
+            found = np.array(head.GetPointsAttr().Get(float(k)))
+            np.testing.assert_allclose(found, expected, atol=1e-6)
+            normals = np.array(head.GetNormalsAttr().Get(float(k)))
+            assert (normals * (found - found.mean(axis=0))).sum(axis=1).mean() > 0.02  # outwards, m
+            np.testing.assert_allclose(head.GetExtentAttr().Get(float(k)), [found.min(axis=0), found.max(axis=0)])
+
+
 def test_a_run_that_was_cut_short_goes_on_to_the_same_bytes(
     done: tuple[Path, dict[str, Any]], film: Path, tmp_path: Path
 ) -> None:
@@ -119,7 +138,7 @@ def test_a_run_that_was_cut_short_goes_on_to_the_same_bytes(
     assert len(kept) == 2
     run(film, out)
     assert {name: (out / CHUNKS / name).stat().st_mtime_ns for name in kept} == kept  # they were not made anew
-    for name in FILES:
+    for name in (*FILES, CACHE):
         assert (out / name).read_bytes() == (done[0] / name).read_bytes(), name
 
 
