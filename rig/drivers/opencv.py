@@ -59,10 +59,10 @@ class MjpegStream:
         self._buffer = bytearray()
         self._part: tuple[float, int | None] | None = None  # arrival and length of the part being read
         self._received_s = 0.0  # when the kernel had what came last
-        self._socket = _connect(url, timeout_s)
+        self._socket = connect(url, timeout_s)
         try:
-            head = self._take_until(b"\r\n\r\n", deadline_s, HEAD_MOST)
-            self._boundary = _boundary(head)
+            self.head = self._take_until(b"\r\n\r\n", deadline_s, HEAD_MOST)
+            self._boundary = _boundary(self.head)
         except BaseException:
             self.close()
             raise
@@ -79,7 +79,9 @@ class MjpegStream:
             self._take_until(self._boundary, deadline_s, HEAD_MOST)
             head = self._take_until(b"\r\n\r\n", deadline_s, HEAD_MOST, keep_on_timeout=self._boundary)
             length = re.search(rb"(?im)^content-length:\s*(\d+)", head)
-            self._part = (self._received_s, int(length.group(1)) if length else None)
+            age = re.search(rb"(?im)^x-age-ms:\s*(\d{1,5}\.?\d*)", head)  # that a node says of its picture
+            arrival_s = self._received_s - (float(age.group(1)) / 1000.0 if age else 0.0)
+            self._part = (arrival_s, int(length.group(1)) if length else None)
         arrival_s, length = self._part
         if length is None:
             body = self._take_until(b"\r\n" + self._boundary, deadline_s, PART_MOST)
@@ -144,7 +146,8 @@ def _stamp_s(notes: list[tuple[int, int, bytes]]) -> float:
     return now_s
 
 
-def _connect(url: str, timeout_s: float) -> socket.socket:
+def connect(url: str, timeout_s: float, method: str = "GET") -> socket.socket:
+    """Sends a request without a body, and returns the connection. Raises OSError."""
     parts = urlsplit(url)
     port = parts.port or (443 if parts.scheme == "https" else 80)
     host = parts.hostname or ""
@@ -157,7 +160,7 @@ def _connect(url: str, timeout_s: float) -> socket.socket:
             connection = ssl.create_default_context().wrap_socket(connection, server_hostname=host)
         path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
         # HTTP/1.0: the answer then comes without chunked coding
-        request = f"GET {path} HTTP/1.0\r\nHost: {host}:{port}\r\nAccept: multipart/x-mixed-replace\r\n"
+        request = f"{method} {path} HTTP/1.0\r\nHost: {host}:{port}\r\nAccept: multipart/x-mixed-replace\r\n"
         if parts.username:
             secret = f"{unquote(parts.username)}:{unquote(parts.password or '')}".encode()
             request += f"Authorization: Basic {base64.b64encode(secret).decode('ascii')}\r\n"
@@ -202,9 +205,18 @@ class MjpegDriver:
         """Connects to the camera's address. Raises CameraNotFound."""
         self.close()
         try:
-            self._stream = MjpegStream(self._camera.identity, timeout_s)
+            self._stream = MjpegStream(self.address(), timeout_s)
         except (OSError, StreamBroken, StreamTimeout, ValueError) as error:
             raise CameraNotFound(self._camera, _reason(error, compose("no-answer"))) from error
+
+    def address(self) -> str:
+        """Returns the stream's address."""
+        return self._camera.identity
+
+    def header(self, name: str) -> str:
+        """Returns a header of the open stream's answer, or an empty text."""
+        found = re.search(rf"(?im)^{name}:(.*)$", self._stream.head.decode("latin-1") if self._stream else "")
+        return found.group(1).strip() if found else ""
 
     def configure(self) -> tuple[Message, ...]:
         """Returns one message for each setting in rig.toml of exposure, gain or white balance: none of them can be set

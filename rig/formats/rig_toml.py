@@ -20,7 +20,7 @@ from rig.text import suggest
 from rig.typed_tables import read_fields
 
 FORMAT = "eigenhead-rig/1"
-DriverName = Literal["opencv", "gphoto", "genicam", "replay", "simulated"]
+DriverName = Literal["opencv", "gphoto", "genicam", "node", "replay", "simulated"]
 TriggerMode = Literal["external", "software", "free"]
 
 # The kernel numbers devices in the order of discovery, so numbers change with a reboot or another port.

@@ -1,9 +1,12 @@
 """Cameras that every test of a driver may open."""
 
+import os
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -12,6 +15,27 @@ import pytest
 from rig.acquisition.trigger import TriggerBox
 from rig.studio.devices.serve import StudioDevices
 from tests.support.textured_studio import NAMES, FlatStudio
+
+ROOT = Path(__file__).resolve().parents[3]
+STAND_IN = ROOT / "tests" / "support" / "raspberry_pi"
+
+
+@contextmanager
+def run_node(*options: str) -> Iterator[str]:
+    """Runs the program of a Raspberry Pi on this machine; its address."""
+    command = [sys.executable, str(ROOT / "deploy" / "raspberry_pi" / "node.py"), "--host", "127.0.0.1", "--port", "0"]
+    environment = os.environ | {"PYTHONPATH": str(STAND_IN)}
+    with subprocess.Popen([*command, *options], env=environment, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        port = process.stdout.readline().split()[-1]
+        yield f"http://127.0.0.1:{port}"
+        process.terminate()
+
+
+@pytest.fixture(scope="module")
+def node() -> Iterator[str]:
+    with run_node() as address:
+        yield address
 
 
 @pytest.fixture(scope="module")

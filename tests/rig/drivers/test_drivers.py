@@ -41,6 +41,9 @@ def make(request: pytest.FixtureRequest) -> Make:
     if kind == "replay":
         camera, folder = config("replay", "."), request.getfixturevalue("recorded")
         return lambda: driver_for(camera, folder)
+    if kind == "node":
+        camera = config("node", request.getfixturevalue("node"), width=160, height=120)
+        return lambda: driver_for(camera, Path())
     if kind == "genicam":
         camera = config("genicam", request.getfixturevalue("gige"), width=256, height=256, fps=20.0)
         return lambda: driver_for(camera, Path())
@@ -48,7 +51,7 @@ def make(request: pytest.FixtureRequest) -> Make:
 
 
 KINDS = pytest.mark.parametrize(
-    "make", ["opencv-http", "opencv-capture", "replay", "genicam", "simulated"], indirect=True
+    "make", ["opencv-http", "opencv-capture", "node", "replay", "genicam", "simulated"], indirect=True
 )
 
 
