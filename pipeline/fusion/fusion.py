@@ -18,7 +18,7 @@ from pipeline.fusion.hair import (
     grown_to_outlines,
     parts_over_head,
     shell_deviation_mm,
-    smooth_hair,
+    smooth_unresolved,
 )
 from pipeline.fusion.net_kernels import component_of, compose_well
 from pipeline.fusion.prior import below_head
@@ -167,7 +167,8 @@ def finished(
         mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured), seen_vertices)
         if seen.any() and np.median(measured.views[seen]) <= MIN_VIEWS:  # the relief of a neck is noise
             neck[seen] = skin[seen] * below_head(head.mesh_world, mesh.vertices[seen])
-    mesh = smooth_hair(mesh, np.maximum(strands, neck), seen_vertices, surface.capped)
+    clothes, noise_mm = shares[:, Part.CLOTHES.channel], seen_deviation_mm(measured)
+    mesh = smooth_unresolved(mesh, np.maximum(strands, neck), clothes, noise_mm, seen_vertices, surface.capped)
     if surface.shell_deviation_mm is None:
         mesh, moved_mm = grown_to_outlines(mesh, strands, silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))

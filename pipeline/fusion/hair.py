@@ -45,6 +45,7 @@ Places = Float[np.ndarray, "n 3"]
 STUBBLE_MM = (1.0, 3.0)
 CELLS = 64  # about a cell, whose mean height counts: 12 mm about it
 RESOLVED_MM = 4.0  # standard deviation of the mean that a vertex of hair takes: gravel is 2 to 5 mm wide
+CLOTHES_DEVIATIONS = 2.0  # of depth, by which that mean may move clothes: shirts lose half of their gravel, a rim stays
 STEP_SHARE = 0.46  # variance of one step of a mean, by the area of a vertex
 OFF_HEAD_MM = 8.0  # from the head there is no skin: strands that hang before it have skin's colours in shade
 FRAME_PX = 3  # from the border of a photograph, where the outline is the photograph's
@@ -252,22 +253,31 @@ def _cells_about(votes: PartVotes) -> Int[np.ndarray, "g c"]:
 
 
 @traced
-def smooth_hair(
-    mesh_world: Mesh, hair: Float[np.ndarray, " v"], seen: SeenVertices, held: Bool[np.ndarray, " v"]
+def smooth_unresolved(
+    mesh_world: Mesh,
+    hair: Float[np.ndarray, " v"],
+    clothes: Float[np.ndarray, " v"],
+    noise_mm: Float[np.ndarray, " v"],
+    seen: SeenVertices,
+    held: Bool[np.ndarray, " v"],
 ) -> Mesh:
-    """Returns the mesh with the vertices of hair, and those far from all that is seen, moved to the mean of their
-    surroundings.
+    """Returns the mesh with the vertices of hair, of clothes, and those far from all that is seen, moved to the mean of
+    their surroundings: relief that is narrower is noise. Clothes have edges: they move by little more than their noise.
 
-    ``mesh_world``: closed, mm. ``hair``: probability that a vertex shows hair. ``seen``: by a view; the others are what
-    is seen next to them. ``held``: vertices that stay.
+    ``mesh_world``: closed, mm. ``hair``, ``clothes``: probability that a vertex shows them. ``noise_mm``: standard
+    deviation of depth. ``seen``: by a view; the others are what is seen next to them. ``held``: vertices that stay.
     """
     beside = neighbours(mesh_world.faces, len(hair))
-    share = skin_share(beside, 1.0 - hair, seen)
+    share = skin_share(beside, 1.0 - np.maximum(hair, clothes), seen)
     share *= EDGE_MM / np.maximum(seen.guess_deviation_mm(), EDGE_MM)
     share = np.where(held, 1.0, share)[:, None]
     area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / len(hair)
     mean = blurred_over_mesh(mesh_world.vertices, *beside, round(RESOLVED_MM**2 / (STEP_SHARE * area_mm2)))
-    return Mesh(share * mesh_world.vertices + (1.0 - share) * mean, mesh_world.faces)
+    way = (1.0 - share) * (mean - mesh_world.vertices)
+    most_mm = CLOTHES_DEVIATIONS * mean_around(beside, noise_mm, seen.themselves.astype(float))
+    bounded = seen.themselves & (clothes > hair)
+    way[bounded] *= np.minimum(1.0, most_mm / np.maximum(np.linalg.norm(way, axis=1), 1e-9))[bounded, None]
+    return Mesh(mesh_world.vertices + way, mesh_world.faces)
 
 
 @traced

@@ -14,7 +14,7 @@ from pipeline.fusion.hair import (
     grown_to_outlines,
     loosened,
     parts_over_head,
-    smooth_hair,
+    smooth_unresolved,
 )
 from pipeline.fusion.refinement import SeenVertices
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
@@ -121,12 +121,27 @@ def test_scatter_of_strands_is_smoothed_and_skin_stays() -> None:
     noisy = Mesh(mesh.vertices * (1.0 + rng.normal(0.0, 1.0 / OUTLINE_MM, (len(mesh.vertices), 1))), mesh.faces)
     side = mesh.vertices[:, 0]
     held = mesh.vertices[:, 2] > 40.0
-    smooth = smooth_hair(noisy, (side <= 0.0).astype(float), SeenVertices.of(noisy.vertices, side < np.inf), held)
+    hair, none, seen = (side <= 0.0).astype(float), np.zeros(len(side)), SeenVertices.of(noisy.vertices, side < np.inf)
+    smooth = smooth_unresolved(noisy, hair, none, none, seen, held)
     assert np.array_equal(smooth.vertices[held], noisy.vertices[held])
     off = radii(smooth)[(side < -20.0) & ~held] - OUTLINE_MM
     assert off.std() < 0.25  # of 1 mm: the 45 vertices about one leave a seventh, and near ones count more
     assert np.median(off) == pytest.approx(0.0, abs=0.5)
     assert smooth.vertices[side > 20.0] == pytest.approx(noisy.vertices[side > 20.0], abs=0.05)
+
+
+def test_clothes_lose_their_gravel_and_keep_their_rims() -> None:
+    rng, mesh = np.random.default_rng(0), ball(OUTLINE_MM)
+    rim = np.abs(mesh.vertices[:, 1]) < 4.0  # a belt that stands off by 10 mm
+    true = mesh.vertices * (1.0 + rim[:, None] / 6.0)
+    noisy = Mesh(true * (1.0 + rng.normal(0.0, 1.0 / OUTLINE_MM, (len(true), 1))), mesh.faces)
+    none, every = np.zeros(len(true)), np.ones(len(true))
+    seen = SeenVertices.of(noisy.vertices, every > 0.0)
+    smooth = smooth_unresolved(noisy, none, every, every, seen, every < 0.0)
+    flat = np.abs(mesh.vertices[:, 1]) > 20.0
+    assert (radii(smooth) - OUTLINE_MM)[flat].std() < 0.3  # of 1 mm
+    assert (radii(smooth) - OUTLINE_MM)[rim].mean() > 7.0  # the mean alone leaves less than half of it
+    assert np.linalg.norm(smooth.vertices - noisy.vertices, axis=1).max() < 2.1
 
 
 def test_scattered_depth_makes_handles_and_loosened_depth_of_hair_none(outlines: Scene) -> None:
