@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.compute.trace import traced
 from pipeline.fusion.crossings import without_coincidences
+from pipeline.fusion.grid_kernels import component_of, compose_well
 from pipeline.fusion.hair import (
     STRAND_SHARE,
     Places,
@@ -20,7 +21,6 @@ from pipeline.fusion.hair import (
     shell_deviation_mm,
     smooth_hair,
 )
-from pipeline.fusion.net_kernels import component_of, compose_well
 from pipeline.fusion.prior import below_head
 from pipeline.fusion.refinement import (
     MAX_MM,

@@ -20,8 +20,15 @@ from jaxtyping import Float, Int
 
 from pipeline.compute.threads import in_threads
 from pipeline.geometry.projection import packed_camera
-from pipeline.photometric_fit.camera_term_kernels import add_by_camera, add_cameras, write_grams, write_image_motion
-from pipeline.photometric_fit.correlation_kernels import Members, Pictures, Samples
+from pipeline.photometric_fit.patch_kernels import (
+    Members,
+    Pictures,
+    Samples,
+    add_by_camera,
+    add_cameras,
+    write_grams,
+    write_image_motion,
+)
 from pipeline.photometric_fit.patches import Patches
 from rig.camera import Camera
 

@@ -17,14 +17,14 @@ from jaxtyping import Bool, Float, Float32, Int
 from pipeline.compute.threads import in_threads, map_in_threads
 from pipeline.contour_fit.problem import ContourProblem, State, SurfaceObservations, moved_views
 from pipeline.contour_fit.rim import Views
-from pipeline.geometry.normals import facing_cosine
 from pipeline.geometry.projection import project_points
 from pipeline.geometry.raster import camera_depths
 from pipeline.geometry.raster_kernels import rasterise
+from pipeline.geometry.surface_index import facing_cosine
 from pipeline.multiview.parallax import depth_factor, parallax
 from pipeline.photometric_fit.camera_term import camera_sensitivity, gram_matrices
-from pipeline.photometric_fit.correlation_kernels import Members, Pictures, Samples, correlate_views, sweep_pictures
 from pipeline.photometric_fit.images import MIN_BLUR_PX, Photographs, blurred, distance_of
+from pipeline.photometric_fit.patch_kernels import Members, Pictures, Samples, correlate_views, sweep_pictures
 from pipeline.photometric_fit.patches import Patches
 from rig.camera import Camera
 from rig.geometry import RigidTransform

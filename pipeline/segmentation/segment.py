@@ -33,8 +33,8 @@ from pipeline.imaging.masks import dilated, eroded
 from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from_mask
 from pipeline.multiview.visual_hull import depth_of, hull_extent, mask_extent
 from pipeline.segmentation.background import Background
-from pipeline.segmentation.cross_view_kernels import MIN_WITNESSES, least_dissent
 from pipeline.segmentation.foreground import Decision, decide, doubtful, reconsider
+from pipeline.segmentation.mask_kernels import MIN_WITNESSES, least_dissent
 from pipeline.segmentation.matting import ALPHA_BLUR_PX, WEAK_CONTRAST, Matte, solve_matte
 from pipeline.segmentation.without_plates.head_seed import HeadSeed, above_chin, find_head_seed
 from rig.camera import Camera

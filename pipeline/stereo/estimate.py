@@ -20,10 +20,9 @@ from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.visual_hull import hull_extent
-from pipeline.stereo.agreement_kernels import count_agreeing
 from pipeline.stereo.crops import Crop, make_crops
 from pipeline.stereo.depth_map import DepthMap, Field, placing
-from pipeline.stereo.depth_map_kernels import normals_of_known
+from pipeline.stereo.depth_map_kernels import count_agreeing, normals_of_known
 from pipeline.stereo.depth_range import find_depth_ranges
 from pipeline.stereo.matcher import matching_on
 from pipeline.stereo.refinement import Pass, doubled, refined

@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
 
 from pipeline.stereo.depth_range import DepthRange
-from pipeline.stereo.matching_kernels import Sight, farthest, make_scratch
-from pipeline.stereo.refine_kernels import propagate, slide
+from pipeline.stereo.matching_kernels import Sight, farthest, make_scratch, propagate, slide
 from pipeline.stereo.stack import SHADES, Stack
 from pipeline.stereo.sweep_kernels import sweep_view
 from rig.render.compute import ComputeDevice, DeviceArray

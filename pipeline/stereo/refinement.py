@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float32
 from pipeline.compute.threads import map_in_threads
 from pipeline.stereo.crops import MAX_UNSEEN_PX
 from pipeline.stereo.depth_map import Field
-from pipeline.stereo.field_kernels import double, fit_planes
+from pipeline.stereo.field_kernels import double, fill_specks, fit_planes, mark_specks
 from pipeline.stereo.matcher import Matching, Planes
-from pipeline.stereo.speck_kernels import fill_specks, mark_specks
 from pipeline.stereo.stack import Stack
 
 MATCH_FACTOR = 1.6  # of a match's own standard deviation: samples of a window are not independent

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.compute.threads import in_threads
 from pipeline.geometry.cells import sorted_into_cells
-from pipeline.stereo.window_bias_kernels import windowed_heights
+from pipeline.stereo.depth_map_kernels import windowed_heights
 from rig.mesh import Mesh
 
 WINDOW_MM, REACH_MM = 2.5, 6.25  # standard deviation of the window, and where it ends

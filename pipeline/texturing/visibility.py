@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from pipeline.geometry.normals import facing_cosine
 from pipeline.geometry.projection import project_points
 from pipeline.geometry.raster import camera_depths
+from pipeline.geometry.surface_index import facing_cosine
 from pipeline.imaging.masks import box_around
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.texturing.visibility_kernels import POOR, sample_colours, visibility_weights
+from pipeline.texturing.view_selection_kernels import POOR, sample_colours, visibility_weights
 from rig.camera import Camera
 from rig.colour_space import linear_from_srgb
 

@@ -21,8 +21,6 @@ from server.cli.answers import (
 )
 
 app = typer.Typer(rich_markup_mode=None)
-
-
 CameraFormat = Literal[
     "eigenhead", "colmap", "colmap-text", "caliscope", "aniposelib", "metashape", "realitycapture",
     "realitycapture-csv", "nerfstudio", "opencv-yaml", "blender",

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.compute.trace import traced
-from pipeline.fusion.net_kernels import component_of
+from pipeline.fusion.grid_kernels import component_of
 from pipeline.geometry.raster_kernels import rasterise
 from pipeline.texturing.layout.uv_unwrap import Layout
 from rig.mesh import Mesh, face_normals

@@ -22,9 +22,8 @@ from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout
 from pipeline.texturing.neighbourhood import fill_unknown, level_views
 from pipeline.texturing.paint import paint_texture
 from pipeline.texturing.sets.specular import Specular, specular_light
-from pipeline.texturing.view_selection_kernels import OUTLIER, blend_views
+from pipeline.texturing.view_selection_kernels import OUTLIER, blend_views, sample_colours
 from pipeline.texturing.visibility import FOOTPRINT_PX, LINEAR, sharpened
-from pipeline.texturing.visibility_kernels import sample_colours
 from pipeline.warnings import ReportWarning
 from rig.colour_space import srgb_from_linear
 from rig.image import ImageRgb

@@ -42,8 +42,6 @@ REFUSED_MODELS = {
     **{7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION"},
     **{16: "EUCM", 17: "EQUIRECTANGULAR"},
 }
-
-
 COLMAP_NAMES = {number: name for name, (number, _) in COLMAP_MODELS.items()}
 
 

@@ -29,8 +29,6 @@ from rig.messages.message import Message, compose
 
 # Pillow's names. JPEG covers the MPO that many phones write into a .jpg, PPM all of Netpbm's maps.
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM")
-
-
 PictureKind = Literal["colour", "grey", "mask"]
 JPEG = b"\xff\xd8\xff"
 NO_MEMORY = -4  # cv::Error::StsNoMem
@@ -62,8 +60,6 @@ COLOUR_FLAGS = (  # the reducing ones give BGR; OpenCV has no RGB variant of the
 )
 PAGED_SUFFIXES = (".tif", ".tiff", ".webp")  # of files that hold several pictures
 PIXELS_MOST = 100_000_000  # 100 Mpx, the largest studio backs; more is a decompression bomb
-
-
 # Sensor noise does not repeat, so a search for repeats is useless: this halves the time and saves a sixth of space.
 PNG_OPTIONS = [
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
