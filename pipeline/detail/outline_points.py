@@ -18,7 +18,7 @@ from pipeline.contour_fit.rim_term import OUTSIDE_SCALE
 from pipeline.detail.solve import Observed
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.head_model.model import HeadModel
-from pipeline.photometric_fit.hair_mask import HairProbability
+from pipeline.photometric_fit.patches import HairProbability
 from rig.camera import Camera
 from rig.geometry import RigidTransform, rotation_from_vector
 

@@ -19,9 +19,8 @@ from pipeline.contour_fit.rim import Views, pack_views
 from pipeline.detail.outline_points import corrected
 from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit.depth_search import DEPTH_LEVEL, Round, find_places, pixels_per_mm, visibility_of
-from pipeline.photometric_fit.hair_mask import HairProbability, under_hair
 from pipeline.photometric_fit.images import Photographs, load_photographs
-from pipeline.photometric_fit.patches import Patches, arrays_of, make_patches
+from pipeline.photometric_fit.patches import HairProbability, Patches, arrays_of, make_patches, under_hair
 from pipeline.photometric_fit.refine import RADIUS_WINDOWS
 from rig.camera import Camera
 from rig.mesh import Mesh, vertex_normals

@@ -35,8 +35,7 @@ from pipeline.faces.triangulated_face import TriangulatedFace, point_noise_px, u
 from rig.camera import Camera
 from rig.capture import ImageRgb
 from rig.geometry import RigidTransform, Similarity, rotation_from_vector
-from rig.rig import Rig
-from rig.spread_views import spread_views
+from rig.rig import Rig, spread_views
 
 ROUNDS = 3  # of the pose, and the bias that follows from it
 DISTANCE_SHARE = 0.1  # standard deviation of the distance, by itself: measured, and by how heads differ

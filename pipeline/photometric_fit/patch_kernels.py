@@ -1,5 +1,5 @@
 """Compiled loops of photo-consistency: the grey values that views show along the normals, their correlation, and the
-rows of ``camera_term``, which has the equations. Threads share out the samples or patches.
+rows of the camera term (``depth_search`` has the equations). Threads share out the samples or patches.
 
 Shapes in the camera term: n patches, v views of each, a = 2 v image axes.
 """

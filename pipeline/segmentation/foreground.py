@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from pipeline.imaging.chart_plates import empty_plates
+from pipeline.imaging.colour_chart import empty_plates
 from pipeline.imaging.masks import dilated, eroded, spread
 from pipeline.segmentation.background import (
     ANY_COLOUR_ODDS,

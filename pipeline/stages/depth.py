@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.detail.cap_points import skin_under_cap
-from pipeline.detail.dense_points import dense_points
+from pipeline.detail.dense_points import dense_points, skin_under_cap
 from pipeline.detail.depth_bias import OnFace, measure_bias, points_on_face
 from pipeline.detail.surface_points import SurfacePoints
 from pipeline.imaging.highlights import without_highlights

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.geometry.cell_kernels import COLUMNS, columns_about
+from pipeline.geometry.nearest_kernels import COLUMNS, columns_about
 from pipeline.geometry.projection_kernels import NEAREST_MM, NOWHERE, distorted, placed
 from pipeline.stereo.matching_kernels import HEIGHT, START, UNSEEN_PX, WIDTH
 from rig.jit import njit

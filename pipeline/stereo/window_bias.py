@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.compute.threads import in_threads
-from pipeline.geometry.cells import sorted_into_cells
+from pipeline.geometry.nearest import sorted_into_cells
 from pipeline.stereo.depth_map_kernels import windowed_heights
 from rig.mesh import Mesh
 

@@ -11,7 +11,7 @@ import typer
 from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, file_in, prepare_folder, warn
 
 if TYPE_CHECKING:
-    from pipeline.applications.clinic.comparison import Comparison
+    from pipeline.applications.clinic.comparison_files import Comparison
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -38,7 +38,7 @@ def compare(
     tables, and a PDF; what is below two combined standard deviations is grey."""
     if (out / "compare.json").exists() and not overwrite:
         raise Overwrites(out / "compare.json")
-    from pipeline.applications.clinic.comparison import compare as compare_visits
+    from pipeline.applications.clinic.comparison_files import compare as compare_visits
     from pipeline.applications.clinic.comparison_files import write_comparison
     from pipeline.applications.clinic.visit import read_visit
 

@@ -24,7 +24,7 @@ from pipeline.applications.clinic.trimmed_fit import Patch, TrimmedFit, trimmed_
 from pipeline.applications.clinic.visit import Visit
 from pipeline.applications.model_building.correspondence.scans import read_landmarks, welded
 from pipeline.applications.verification.reference import Reference
-from pipeline.geometry.registration.search import ROUNDS, draw_rows, draw_surface_points, search_motions
+from pipeline.geometry.registration.rigid import ROUNDS, draw_rows, draw_surface_points, search_motions
 from pipeline.head_model.landmarks import stacked
 from rig.errors import InputError
 from rig.formats.meshes.markups import AXES, Axes

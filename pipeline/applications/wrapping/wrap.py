@@ -49,8 +49,7 @@ from rig.image import ImageRgb
 from rig.mesh import Mesh, face_normals, vertex_normals
 from rig.messages.message import compose
 from rig.progress import Progress
-from rig.render.colour import HEADLIGHT, UNLIT, Light
-from rig.render.renderer import Renderer
+from rig.render.renderer import HEADLIGHT, UNLIT, Light, Renderer
 from rig.rig import Rig
 
 # Deviation of a found point, an axis: the network errs by 1 to 2 mm, but all points of a region together. With 2 mm the

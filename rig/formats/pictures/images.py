@@ -19,12 +19,11 @@ from PIL import Image, UnidentifiedImageError
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError, how_to_install
-from rig.formats.pictures.mask_values import Plane, mask_plane
+from rig.formats.pictures.mask_values import Plane, mask_plane, subject_convention
 from rig.formats.pictures.picture_names import HEIC_SUFFIXES, IMAGE_SUFFIXES, RAW_SUFFIXES
 from rig.formats.pictures.picture_samples import TIFF, WHOLE_BITS
 from rig.formats.pictures.work_size import at_share, halvings
 from rig.image import ImageRgb
-from rig.mask_polarity import subject_convention
 from rig.messages.message import Message, compose
 
 # Pillow's names. JPEG covers the MPO that many phones write into a .jpg, PPM all of Netpbm's maps.

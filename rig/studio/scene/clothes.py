@@ -5,8 +5,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rig.mesh import Mesh, boundary_edges, face_normals
-from rig.studio.scene.anatomy import Anatomy
-from rig.studio.scene.grids import grid_faces
+from rig.studio.scene.anatomy import Anatomy, grid_faces
 from rig.studio.sensor.noise import around
 
 COLUMNS = 120

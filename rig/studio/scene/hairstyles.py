@@ -8,8 +8,8 @@ from types import MappingProxyType
 from rig.errors import InputError
 from rig.messages.message import compose
 from rig.studio.scene.hair import HairStyle
+from rig.studio.scene.headwear import TightCap
 from rig.studio.scene.subject import Colour, Look
-from rig.studio.scene.tight_cap import TightCap
 
 CAP_TONE: Colour = (0.035, 0.06, 0.14)  # navy
 

@@ -22,8 +22,8 @@ from pipeline.fusion.untangling import (
     untangled,
     untangled_head,
 )
+from pipeline.head_model.gaussian_process import model_basis
 from pipeline.head_model.model import HeadModel, load_model
-from pipeline.head_model.model_basis import model_basis
 from pipeline.settings import Settings
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import face_normals, vertex_normals

@@ -25,8 +25,7 @@ from pipeline.part_labels.labelling import (
 from rig.mesh import Mesh
 from rig.rig import Rig
 from rig.studio.scene.anatomy import anatomy
-from rig.studio.scene.beard import grow_beard
-from rig.studio.scene.hair import HairStyle, grow
+from rig.studio.scene.hair import HairStyle, grow, grow_beard
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import Subject
 from tests.rig.studio.test_images import egg_head

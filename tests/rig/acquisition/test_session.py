@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rig.acquisition.commands import COLUMNS, NoCalibration, board_shots, capture, check, preview, take_plates
-from rig.acquisition.plate_checks import PlatesRefused
+from rig.acquisition.judgement import PlatesRefused
 from rig.acquisition.plates import plates_versions, read_plates, write_plates
 from rig.acquisition.session import RigSession
 from rig.acquisition.shot import FAULTS, WARNINGS, ShotFailed, Timing, certify

@@ -12,7 +12,7 @@ from typing import get_args
 
 from nicegui.translations import translations
 
-from calibration.quality import verdict as calibration_verdict
+from calibration.quality import checks as calibration_checks
 from pipeline.evidence.measurements import DISTANCES
 from rig.acquisition import shot, verdict
 from server.console.theme import PAGES
@@ -57,7 +57,7 @@ def vocabulary() -> Iterator[str]:
     """Words that reach the pages as values."""
     yield from ("queued", "running", *FINISHED)
     yield from (*get_args(BatchState), *(f"{state} (captures)" for state in ITEM_STATES))
-    yield from (*get_args(verdict.Verdict), *get_args(calibration_verdict.Word), *get_args(shot.Status))
+    yield from (*get_args(verdict.Verdict), *get_args(calibration_checks.Word), *get_args(shot.Status))
     yield from (title for _, _, title in PAGES)
     yield from (name.replace("_", " ") for name in DISTANCES)
     yield from KINDS

@@ -35,8 +35,7 @@ from rig.formats.captures.capture_folder import capture_root
 from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.render.renderer import Renderer
-from rig.rig import Rig
-from rig.spread_views import spread_views
+from rig.rig import Rig, spread_views
 from server.tasks.photographs import read_or_calibrate
 from server.tasks.prepare import prepare_kernels
 from tests.laboratory.experiments.records import Bench, Outcome, Row

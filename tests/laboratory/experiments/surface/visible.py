@@ -33,8 +33,7 @@ from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.studio.scene.visible import PARTS, VisiblePoints
-from rig.studio.sensor.preset import PRESET
-from rig.studio.sensor.realism import made_real
+from rig.studio.sensor.preset import PRESET, made_real
 from tests.laboratory.experiments.paper.detail import (
     IN_SPAN_MODES,
     IN_SPAN_SPREAD,
@@ -81,7 +80,7 @@ def visible(
 
     ``model``: fitted; heads are drawn from it, too. ``captures``: folders with a truth beside them, by name.
     ``renderer``: for the studio. ``subjects``: heads in the studio, with the hair styles of ``STYLES`` in turn.
-    ``realism``: names of ``rig.studio.sensor.realism``, with which each head is photographed once more.
+    ``realism``: names of ``rig.studio.sensor.preset``, with which each head is photographed once more.
     """
     records = bench.records("visible", key_of(model.sha256, Settings()))
     jobs: list[tuple[str, str, Callable[[], Known]]] = []

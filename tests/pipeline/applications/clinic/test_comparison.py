@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.applications.clinic.comparison import compare
-from pipeline.applications.clinic.comparison_files import FILES, write_comparison
+from pipeline.applications.clinic.comparison_files import FILES, compare, write_comparison
 from pipeline.applications.verification.pictures import UNTOLD
 from pipeline.evidence.measurements import Measurement
 from rig.errors import InputError
