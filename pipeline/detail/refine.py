@@ -98,7 +98,6 @@ class DeformedSurface:
     observed: Bool[np.ndarray, " v"]  # at a triangle that a point of skin showed
     closed_eyes: frozenset[str] = frozenset()  # of ``right`` and ``left``
     lids: Mapping[str, float] = field(default_factory=dict)  # how far each eye is closed, where the model blinks
-    outlined: PerVertex | None = None  # how far silhouettes hold each vertex, 0 to 1; None: not compared
 
 
 @traced
@@ -157,8 +156,7 @@ def refine_to_surface(
     )
     clean, clean_deviation_mm = untangled_head(model, head.vertices, head.deviation_mm)
     observed = head.observed & (clean_deviation_mm < 2.0 * head.deviation_mm)  # what was moved farther is not as seen
-    outlined = None if outlines is None else outlines.support(clean.vertices)
-    return DeformedSurface(clean.vertices, clean_deviation_mm, observed, closed | unexplained, lids, outlined)
+    return DeformedSurface(clean.vertices, clean_deviation_mm, observed, closed | unexplained, lids)
 
 
 def deform_to_points(

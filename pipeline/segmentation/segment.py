@@ -188,11 +188,6 @@ def _operators(mask: Bool[np.ndarray, "h w"], share: UInt8[np.ndarray, "h w"] | 
     return Silhouette(mask, distance_to_level(smooth), _mask_quality(mask))
 
 
-def segment_view(image: ImageRgb, plates: tuple[ImageRgb, ...]) -> Silhouette:
-    """Returns the silhouette of one image from its clean plates alone, without other cameras."""
-    return _refined(image, _decided(image, plates))
-
-
 def _decided(image: ImageRgb, plates: tuple[ImageRgb, ...]) -> Decision:
     return decide(image, plates_for(image, plates))
 

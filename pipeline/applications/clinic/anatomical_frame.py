@@ -24,7 +24,6 @@ from rig.messages.message import compose
 Vector = Float[np.ndarray, " 3"]
 
 Plane = Literal["head", "frankfurt"]
-PLANES: tuple[Plane, ...] = ("head", "frankfurt")
 POINTS = ("porion_right", "porion_left", "orbitale_right", "orbitale_left")
 # An adult's bony orbit is 34 to 36 mm high, and the eye stands a little above its middle (Gray's Anatomy). The rim of
 # one person may lie 3 mm off, which tilts the plane by 2 degrees: mark orbitale where that matters.

@@ -95,11 +95,6 @@ def codes_of(heights_mm: Float32[np.ndarray, "r s"]) -> UInt16[np.ndarray, "r s"
     return np.clip(np.rint(heights_mm / np.float32(MM_PER_CODE)) + MID_CODE, 0, 65535).astype(np.uint16)
 
 
-def heights_of(codes: UInt16[np.ndarray, "r s"]) -> Float32[np.ndarray, "r s"]:
-    """Returns the heights (mm) of a displacement map."""
-    return (codes.astype(np.float32) - MID_CODE) * np.float32(MM_PER_CODE)
-
-
 def normal_codes(
     heights_mm: Float32[np.ndarray, "s s"], rows: slice, frames: TexelFrames
 ) -> UInt8[np.ndarray, "r s 3"]:

@@ -62,7 +62,7 @@ def vocabulary() -> Iterator[str]:
     yield from (name.replace("_", " ") for name in DISTANCES)
     yield from KINDS
     yield from (*CHECKS, *PARTS)
-    yield from shot.FAULTS.keys() - named_faults().keys()
+    yield from shot.REMEDIES.keys() - named_faults().keys()
     yield from ("left", "right", "top", "bottom", "width", "height", "first", "second", "simulated", "real")
     yield from ("capture", "captures", "job", "jobs")  # what a message counts, or what it found faults in
     yield from translations["en-US"].values()
@@ -79,7 +79,7 @@ def named_faults() -> dict[str, str]:
 
 
 def test_every_code_of_a_fault_is_named() -> None:
-    assert {named_faults().get(code, code) for code in shot.FAULTS} - german().keys() == set()
+    assert {named_faults().get(code, code) for code in shot.REMEDIES} - german().keys() == set()
 
 
 def test_no_entry_of_the_table_is_unused() -> None:

@@ -23,7 +23,7 @@ from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.head_model.subdivision import vertex_areas
-from pipeline.part_labels.votes import SKIN
+from pipeline.part_labels.codes import Part
 from pipeline.reconstruct import reconstruct
 from pipeline.results.clay import clay
 from pipeline.settings import Settings
@@ -167,7 +167,7 @@ def seen_of(bust: BustSurface) -> Mesh:
 
 def head_to_bust(head_world: Mesh, bust: BustSurface) -> Float[np.ndarray, " n"]:
     """Returns the distances (mm) of the bust's visible skin to the head, where the head is within 5 mm."""
-    skin = bust.mesh_world.vertices[bust.part == SKIN]
+    skin = bust.mesh_world.vertices[bust.part == Part.SKIN]
     far = SurfaceIndex(head_world.vertices, head_world.faces, 1.0).closest(skin).distances
     return far[far < 5.0]
 
