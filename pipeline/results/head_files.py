@@ -202,7 +202,7 @@ def write_set_textures(folder: Path, sets: SetTextures) -> None:
         _write_png(folder / "diffuse.png", sets.diffuse.image)
         write_exr(folder / "diffuse.exr", LINEAR[sets.diffuse.image])
         light = sets.specular.light.astype(np.float32)
-        _write_png(folder / "specular.png", _encode_light(light))
+        _write_png(folder / "specular.png", ENCODED[(CODES * np.clip(light, 0.0, 1.0) + 0.5).astype(np.int32)])
         write_exr(folder / "specular.exr", light)
 
 
@@ -216,10 +216,6 @@ def strength_png(specular: Specular) -> bytes:
     """Returns glTF's specular strength as a PNG whose alpha it is; the colours of the pixels are white."""
     alpha = specular.strength()
     return cv2.imencode(".png", cv2.merge([np.full_like(alpha, 255)] * 3 + [alpha]), PNG_SPEED)[1].tobytes()
-
-
-def _encode_light(light: Float[np.ndarray, "s s 3"]) -> UInt8[np.ndarray, "s s 3"]:
-    return ENCODED[(CODES * np.clip(light, 0.0, 1.0) + 0.5).astype(np.int32)]
 
 
 def _write_png(path: Path, image: UInt8[np.ndarray, "s s 3"] | UInt16[np.ndarray, "s s"]) -> None:
