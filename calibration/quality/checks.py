@@ -18,9 +18,8 @@ from calibration.adjustment.gauge import align_world, image_distance
 from calibration.adjustment.lens_prior import LensPrior, fixed_prior
 from calibration.adjustment.state import BundleState, Observations, residuals
 from calibration.board.board import Board
-from rig.geometry import rigid_fit
+from rig.geometry import rigid_fit, second_difference, vertex_offset
 from rig.messages.message import Message, compose
-from rig.parabola import second_difference, vertex_offset
 from rig.plausibility import FRAME_LEAST_MM, frame_mm
 from rig.rig import Rig
 

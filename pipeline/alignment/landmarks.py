@@ -35,8 +35,7 @@ from pipeline.multiview.triangulation import CLICK_NOISE_PX, TriangulatedPoint
 from rig.capture import Features
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
-from rig.messages.fault_groups import some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, some_of
 from rig.rig import Rig
 
 Points = Float[np.ndarray, "n 3"]

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.trace import traced
 from pipeline.detail.association import associate, interpolated
-from pipeline.detail.surface_points import SurfacePoints
+from pipeline.detail.dense_points import SurfacePoints
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.robust import Cauchy
 from pipeline.estimation.terms import Linear, Problem

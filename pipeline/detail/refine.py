@@ -21,15 +21,22 @@ from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
 from pipeline.detail.association import Associated, associate, interpolated
 from pipeline.detail.blink import blink_shift, estimate_eyelid_closure, plain_shape
-from pipeline.detail.dense_points import CELL_MM
+from pipeline.detail.dense_points import CELL_MM, SurfacePoints, thinned
 from pipeline.detail.ears import with_ears_in_place
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids, with_plain_lids
-from pipeline.detail.nodes import NodeMesh, Nodes, solving_nodes
 from pipeline.detail.outline_points import Outlines, OutlineSearch
 from pipeline.detail.patch_points import PatchPlaces, PatchSearch
 from pipeline.detail.smooth_field import SmoothField, smooth_field
-from pipeline.detail.solve import Observed, Posterior, free_directions, normal_directions, solve_field
-from pipeline.detail.surface_points import SurfacePoints, thinned
+from pipeline.detail.solve import (
+    NodeMesh,
+    Nodes,
+    Observed,
+    Posterior,
+    free_directions,
+    normal_directions,
+    solve_field,
+    solving_nodes,
+)
 from pipeline.fusion.untangling import untangled_head
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.head_model.model import HeadModel

@@ -20,8 +20,7 @@ from pipeline.faces.subject import SubjectFaces
 from pipeline.warnings import ReportWarning
 from rig.geometry import Similarity
 from rig.mesh import Mesh
-from rig.messages.fault_groups import some_of
-from rig.messages.message import compose
+from rig.messages.message import compose, some_of
 from rig.rig import Rig
 
 PUPIL_DISTANCE = "pupil_distance"

@@ -48,9 +48,8 @@ from pipeline.photometric_fit.patch_kernels import (
 )
 from pipeline.photometric_fit.patches import Patches
 from rig.camera import Camera
-from rig.geometry import RigidTransform
+from rig.geometry import RigidTransform, second_difference, vertex_offset
 from rig.mesh import Mesh
-from rig.parabola import second_difference, vertex_offset
 
 MIN_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
 

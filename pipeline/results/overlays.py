@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.geometry.raster import picture
-from pipeline.imaging.contour_distance import chamfer
-from pipeline.imaging.masks import box_around
+from pipeline.imaging.masks import box_around, chamfer
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.image import ImageRgb

@@ -28,8 +28,7 @@ from jaxtyping import Bool, Float, Float32, Int8, UInt8
 from pipeline.compute.threads import map_in_threads, task_pool
 from pipeline.compute.trace import traced
 from pipeline.geometry.projection import packed_camera
-from pipeline.imaging.contour_distance import distance_to_level
-from pipeline.imaging.masks import dilated, eroded
+from pipeline.imaging.masks import dilated, distance_to_level, eroded
 from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from_mask
 from pipeline.multiview.visual_hull import depth_of, hull_extent, mask_extent
 from pipeline.segmentation.background import Background

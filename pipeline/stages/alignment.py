@@ -19,8 +19,7 @@ from pipeline.stages.recorder import Staged
 from pipeline.stages.views import Views
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
-from rig.messages.fault_groups import say_once
-from rig.messages.message import compose
+from rig.messages.message import compose, say_once
 from rig.progress import Progress
 from rig.rig import Rig
 

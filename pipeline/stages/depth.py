@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.detail.dense_points import dense_points, skin_under_cap
+from pipeline.detail.dense_points import SurfacePoints, dense_points, skin_under_cap
 from pipeline.detail.depth_bias import OnFace, measure_bias, points_on_face
-from pipeline.detail.surface_points import SurfacePoints
 from pipeline.imaging.highlights import without_highlights
 from pipeline.part_labels.votes import PartVotes, vote_parts
 from pipeline.settings import FINE_LEVELS, Settings

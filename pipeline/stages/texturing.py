@@ -20,8 +20,7 @@ from pipeline.texturing.chart_colours import ChartColours, chart_colours, with_t
 from pipeline.texturing.layout.normal_map import ReducedLayout, reduced_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.paint import find_layout, paint_head
-from pipeline.texturing.pores.close_views import CloseViews, read_close_views
-from pipeline.texturing.pores.skin_maps import SkinMaps, skin_maps, skin_share
+from pipeline.texturing.pores.skin_maps import CloseViews, SkinMaps, read_close_views, skin_maps, skin_share
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
 from pipeline.texturing.vertex_colours import Shown, Texture, texture
 from pipeline.warnings import ReportWarning

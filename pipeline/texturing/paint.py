@@ -18,8 +18,15 @@ from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings
 from pipeline.texturing.decision import Decision
-from pipeline.texturing.layout.charts import lay_out_charts
-from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, ModelLayout, NoLayout, model_layout, spread_texels
+from pipeline.texturing.layout.uv_unwrap import (
+    Atlas,
+    Layout,
+    ModelLayout,
+    NoLayout,
+    lay_out_charts,
+    model_layout,
+    spread_texels,
+)
 from pipeline.texturing.paint_kernels import paint_rows
 from pipeline.texturing.vertex_colours import Texture
 from pipeline.warnings import ReportWarning

@@ -54,8 +54,7 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
 from rig.mesh import Mesh, face_normals
-from rig.messages.fault_groups import some_of
-from rig.messages.message import compose
+from rig.messages.message import compose, some_of
 from rig.rig import Rig
 
 MIN_LIKENESS = 0.62  # of the others' to each other: 0.73 and more in 33 clean captures, below 0.63 with an open jaw

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from rig.geometry import second_difference, vertex_offset
 from rig.image import ImageRgb
-from rig.parabola import second_difference, vertex_offset
 
 Edge = Literal["top", "left", "right"]
 

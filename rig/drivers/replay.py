@@ -7,8 +7,7 @@ With ``plates = "FOLDER/background"`` in rig.toml, a recorded shot can be taken 
 import time
 from pathlib import Path
 
-from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout
-from rig.drivers.frame_clock import Pace
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout, Pace
 from rig.errors import InputError
 from rig.formats.pictures.images import IMAGE_SUFFIXES, read_image
 from rig.formats.rig_toml import CameraConfig

@@ -8,8 +8,7 @@ trigger box, serve the studio (``rig.studio.devices.serve``).
 import time
 from pathlib import Path
 
-from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout
-from rig.drivers.frame_clock import Pace
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout, Pace
 from rig.errors import InputError
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb

@@ -39,8 +39,7 @@ from rig.formats.captures.shot_files import find_files, picture_folder
 from rig.formats.pictures.images import is_picture, picture_size, write_image
 from rig.formats.pictures.picture_names import entry
 from rig.formats.pictures.work_size import WORK_PIXELS, work_rig
-from rig.messages.fault_groups import say_once
-from rig.messages.message import Message, compose, documents_of, read_message
+from rig.messages.message import Message, compose, documents_of, read_message, say_once
 from rig.plausibility import rig_faults
 from rig.progress import Progress
 from rig.rig import Rig, spread_views

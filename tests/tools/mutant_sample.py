@@ -29,8 +29,7 @@ IMAGING, TEXTURE = "tests/pipeline/imaging", "tests/pipeline/texturing"
 # The loops of geometry, silhouette cost and texture weights, and the tests that speak of them.
 LOOPS = {
     "pipeline/geometry/projection_kernels.py": [f"{IMAGING}/test_projection.py"],
-    "pipeline/imaging/sampling_kernels.py": [f"{IMAGING}/test_sampling.py"],
-    "pipeline/imaging/contour_distance_kernels.py": [f"{IMAGING}/test_contour_distance.py"],
+    "pipeline/imaging/sampling_kernels.py": [f"{IMAGING}/test_sampling.py", f"{IMAGING}/test_contour_distance.py"],
     "pipeline/geometry/raster_kernels.py": [f"{IMAGING}/test_cpu_raster.py"],
     "pipeline/contour_fit/rim_kernels.py": [
         "tests/pipeline/contour_fit/test_rim.py",

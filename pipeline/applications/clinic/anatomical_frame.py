@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.applications.verification.measured import Measured
-from pipeline.results.slicer_landmarks import LPS_FROM_HEAD
+from pipeline.results.head_files import LPS_FROM_HEAD
 from rig.errors import InputError
 from rig.formats.meshes.markups import Axes, axes_turn
 from rig.geometry import RigidTransform

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.applications.clinic.patient_files import matrix_document, write_json
-from pipeline.applications.clinic.trimmed_fit import Patch, TrimmedFit, trimmed_fit
+from pipeline.applications.clinic.registration import Patch, TrimmedFit, trimmed_fit
 from pipeline.applications.clinic.visit import Visit
 from pipeline.applications.verification.judgement import weighted_quantiles
 from pipeline.applications.verification.pictures import HEAT_DARKEST, heat_colours, legend, scale_end

@@ -5,7 +5,7 @@ Templates lie in the folder ``templates`` of the data folder, each with its pict
 
 from pathlib import Path
 
-from pipeline.head_model.data_folder import data_folder
+from pipeline.head_model.model_names import data_folder
 from pipeline.settings import TEMPLATE_NAME
 from rig.errors import EigenheadError
 from rig.messages.message import compose

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.applications.verification.judgement import FORM_SHARE, Judgement
-from pipeline.applications.verification.limits import Check
+from pipeline.applications.verification.judgement import FORM_SHARE, Check, Judgement
 from pipeline.applications.verification.measured import Measured
 from pipeline.applications.verification.pictures import AZIMUTHS_DEG, Pictures, draw, legend
 from pipeline.applications.verification.reference import Reference

@@ -9,8 +9,14 @@ import cv2
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from pipeline.applications.templates.write.mesh import template_materials, tile_suffix
-from pipeline.applications.templates.write.texture import MAX_TILES, Tile, corner_tiles, filled
+from pipeline.applications.templates.write.mesh import (
+    MAX_TILES,
+    Tile,
+    corner_tiles,
+    filled,
+    template_materials,
+    tile_suffix,
+)
 from pipeline.applications.wrapping.wrap import Wrapped, residual_colours, surface_in_head
 from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.results.clay import clay

@@ -45,8 +45,7 @@ from rig.formats.cameras.reading import CamerasRead
 from rig.formats.cameras.realitycapture import looks_like_csv, read_csv, read_xmp, write_csv, write_xmp
 from rig.formats.cameras.transforms_json import read_nersemble, read_splatting, read_transforms, write_transforms
 from rig.formats.pictures.picture_names import entry, is_junk
-from rig.messages.fault_groups import some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, some_of
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig, spread_views
 

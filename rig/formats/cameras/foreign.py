@@ -19,8 +19,7 @@ from jaxtyping import Float
 from rig.errors import InputError
 from rig.formats.pictures.picture_names import IMAGE_SUFFIXES, entry, picture_stem, safe_name
 from rig.geometry import rotation_from_vector
-from rig.messages.fault_groups import some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, some_of
 from rig.recorded_lens import COEFFICIENTS, LensModel
 from rig.text import as_utf8
 

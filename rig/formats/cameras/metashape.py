@@ -28,8 +28,7 @@ from rig.formats.cameras.foreign import (
 )
 from rig.formats.cameras.foreign_keys import METASHAPE
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
-from rig.messages.fault_groups import some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, some_of
 from rig.rig import Rig
 
 KEYS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")

@@ -39,8 +39,7 @@ from rig.formats.cameras.foreign_keys import ANIPOSELIB, CALISCOPE, OPENCV_YAML
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
 from rig.formats.pictures.picture_names import entry
 from rig.geometry import vector_from_rotation
-from rig.messages.fault_groups import some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, some_of
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
 

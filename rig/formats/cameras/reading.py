@@ -7,8 +7,7 @@ from types import MappingProxyType
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import FORMAT, rig_from_document
 from rig.formats.cameras.foreign_keys import ForeignKey, Table, says_nothing
-from rig.messages.fault_groups import say_once, some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, say_once, some_of
 from rig.rig import Rig
 
 VALUE_MOST = 40  # characters of a value in a message

@@ -44,12 +44,10 @@ from rig.formats.captures.shot_files import (
 )
 from rig.formats.pictures.images import cut_out_alpha, decode_image_file, page_count, picture_size, write_image
 from rig.formats.pictures.picture_names import entry, is_junk
-from rig.formats.pictures.picture_rims import fill_rims
-from rig.formats.pictures.picture_samples import WHOLE_BITS, measure_samples
+from rig.formats.pictures.picture_samples import WHOLE_BITS, fill_rims, measure_samples
 from rig.formats.pictures.work_size import work_features, work_rig, work_share
 from rig.image import ImageRgb, is_grey
-from rig.messages.fault_groups import say_once, some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, say_once, some_of
 from rig.plausibility import rig_faults
 from rig.rig import Rig
 from rig.text import suggest

@@ -21,8 +21,7 @@ from rig.formats.pictures.picture_names import (
     match_names,
     picture_stem,
 )
-from rig.messages.fault_groups import some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, some_of
 from rig.rig import Rig
 
 PLATES_MOST = 32  # clean plates read per camera

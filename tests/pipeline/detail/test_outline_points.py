@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.contour_fit.rim import make_topology, pack_views
+from pipeline.detail.dense_points import SurfacePoints
 from pipeline.detail.outline_points import OutlineSearch
 from pipeline.detail.refine import deform_to_points
-from pipeline.detail.surface_points import SurfacePoints
 from pipeline.part_labels.codes import Part
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import look_at

@@ -8,8 +8,8 @@ import pytest
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
-from pipeline.detail.nodes import solving_nodes
 from pipeline.detail.smooth_field import smooth_field
+from pipeline.detail.solve import solving_nodes
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.fusion.untangling import (
     MeshFaults,

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from pipeline.contour_fit.fit import Fit
+from pipeline.detail.dense_points import SurfacePoints
 from pipeline.detail.depth_bias import points_on_face
-from pipeline.detail.surface_points import SurfacePoints
 from pipeline.head_model.model import load_model
 from pipeline.part_labels.codes import Part
 from pipeline.results.reconstruction import Reconstruction

@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.applications.templates.animated import AnimatedMesh, animated_head, animated_mesh
 from pipeline.applications.templates.eyeballs import AHEAD, LIMBUS_MM, Eyeball, turn_to
-from pipeline.applications.templates.flame_fit import FlameFit, fit_flame
+from pipeline.applications.templates.flame_model import FlameFit, fit_flame
 from pipeline.applications.templates.inner_mouth import TONGUE_OUT, WITH_JAW
 from pipeline.applications.templates.template_file import Template, load_template
 from pipeline.applications.templates.write.mesh import template_colours, write_template, write_template_hair
@@ -42,7 +42,7 @@ from pipeline.texturing.layout.uv_unwrap import Atlas
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.flame_param import FILE, encode_flame_param, flame_param
 from rig.formats.meshes.glb import scene_glb_bytes
-from rig.formats.meshes.obj import scene_obj_bytes
+from rig.formats.meshes.polygon_obj import scene_obj_bytes
 from rig.formats.meshes.scene import NECK, Part, Scene, Skin
 from rig.formats.meshes.usdz import scene_usdz_bytes
 from rig.geometry import RigidTransform

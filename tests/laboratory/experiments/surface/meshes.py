@@ -15,8 +15,8 @@ import scipy.sparse as sparse
 from jaxtyping import Float
 from scipy.sparse.linalg import SuperLU, splu
 
-from pipeline.detail.nodes import solving_nodes
 from pipeline.detail.smooth_field import SmoothField, smooth_field
+from pipeline.detail.solve import solving_nodes
 from pipeline.fusion import crossing_kernels, crossings, untangling
 from pipeline.fusion.untangling import MeshFaults, Topology, clean_mean_head, head_topology, mesh_faults, topology_of
 from pipeline.head_model.gaussian_process import model_basis

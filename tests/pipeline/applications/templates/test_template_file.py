@@ -12,9 +12,8 @@ from pipeline.applications.templates.header import BadTemplate, OtherModel, chec
 from pipeline.applications.templates.names import UnknownTemplate, WrongName, list_templates, new_path, remove_template
 from pipeline.applications.templates.template_file import Template, load_template, read_template, save_template
 from pipeline.applications.templates.write.mesh import write_template
-from pipeline.head_model.data_folder import DATA
 from pipeline.head_model.model import HeadModel
-from pipeline.head_model.model_names import UnknownModel, model_path
+from pipeline.head_model.model_names import DATA, UnknownModel, model_path
 from pipeline.settings import Settings, settings_from_document
 from pipeline.texturing.layout.uv_unwrap import Atlas, model_layout
 from rig.errors import InputError

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.applications.verification.judgement import judge
-from pipeline.applications.verification.limits import Limits
+from pipeline.applications.verification.judgement import Limits, judge
 from pipeline.applications.verification.measured import ResultIdentity
 from pipeline.applications.verification.pictures import draw, heat_colours, scale_end
 from pipeline.applications.verification.reference import Reference

@@ -3,8 +3,8 @@
 import numpy as np
 
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
+from pipeline.texturing.pores.relief import COARSE, TexelFrames
 from pipeline.texturing.pores.skin_maps import MID_CODE, MM_PER_CODE, codes_of, normal_codes, sharpened_atlas
-from pipeline.texturing.pores.texel_frames import COARSE, TexelFrames
 from rig.colour_space import linear_from_srgb
 
 SIZE, IMAGE_MM = 64, 32.0
