@@ -1,5 +1,5 @@
-"""Bilinear interpolation for compiled loops, and those of the distance to a contour. The helpers are inlined, so that their arithmetic is the calling loop's,
-fast or strict.
+"""Bilinear interpolation for compiled loops, and the distance to a contour. The helpers are inlined, so that their
+arithmetic is the calling loop's, fast or strict.
 
 Four neighbouring pixels are named ``a b`` above ``c d``; ``right`` and ``down`` (0 to 1) say how far a point is from
 ``a``.

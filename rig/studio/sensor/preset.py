@@ -22,7 +22,7 @@ class Preset:
     )
     defocus_px: float = 0.7  # standard deviation of the blur
     hair: bool = True
-    hairstyle: tuple[str, ...] = ()  # names of ``scene.hairstyles``, in place of the hair that the seed draws
+    hairstyle: tuple[str, ...] = ()  # names of ``scene.subject.HAIRSTYLES``, in place of the hair that the seed draws
     clothes: bool = True
     texture: bool = True  # brows, lips, pores, freckles; False paints the skin in one colour
     backdrop_unevenness: float = 1.0  # 0: one flat colour; 1: folds, panels, a gradient
