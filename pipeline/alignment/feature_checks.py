@@ -19,7 +19,7 @@ from pipeline.alignment.feature_points import features_as_wholes, locate_feature
 from pipeline.alignment.landmarks import MIN_POINTS, MIN_TRIANGLE_MM, flatness
 from pipeline.faces.landmark_map import LandmarkMap
 from pipeline.faces.matching import MatchedFaces
-from pipeline.geometry.raster import camera_depths, depth_map
+from pipeline.geometry.projection import camera_depths, depth_map
 from pipeline.geometry.registration.procrustes import procrustes
 from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS

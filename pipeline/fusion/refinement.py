@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Int, Int32, Int64, UInt8
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion.grid_kernels import component_of
-from pipeline.fusion.refinement_kernels import measure, smooth_offsets
 from pipeline.fusion.view_stack import ViewStack
+from pipeline.fusion.vote_kernels import measure, smooth_offsets
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.surface_index import corners_at_vertices
 from rig.mesh import Mesh, face_normals, vertex_normals

@@ -29,9 +29,8 @@ from jaxtyping import Bool, Float, Float32, Int
 from pipeline.compute.threads import in_threads, map_in_threads
 from pipeline.contour_fit.problem import ContourProblem, State, SurfaceObservations, moved_views
 from pipeline.contour_fit.rim import Views
-from pipeline.geometry.projection import packed_camera, project_points
-from pipeline.geometry.raster import camera_depths
-from pipeline.geometry.raster_kernels import rasterise
+from pipeline.geometry.projection import camera_depths, packed_camera, project_points
+from pipeline.geometry.projection_kernels import rasterise
 from pipeline.geometry.surface_index import facing_cosine
 from pipeline.multiview.triangulation import depth_factor, parallax
 from pipeline.photometric_fit.images import MIN_BLUR_PX, Photographs, blurred, distance_of

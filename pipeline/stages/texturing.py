@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.projection import depth_maps
 from pipeline.head_model.regions import halves_of_face, pinnae, scalp
 from pipeline.part_labels.codes import Part
 from pipeline.stages.context import ReconstructionContext

@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
 
 from pipeline.stereo.depth_range import DepthRange
-from pipeline.stereo.matching_kernels import Sight, farthest, make_scratch
+from pipeline.stereo.matching_kernels import Sight, farthest, make_scratch, propagate, slide, sweep_view
 from pipeline.stereo.stack import SHADES, Stack
-from pipeline.stereo.sweep_kernels import propagate, slide, sweep_view
 from rig.render.compute import ComputeDevice, DeviceArray
 
 Plane = Float32[np.ndarray, "h w"]

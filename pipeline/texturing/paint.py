@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion.refinement import neighbours
-from pipeline.fusion.refinement_kernels import blurred_over_mesh
-from pipeline.geometry.raster import camera_depths
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.fusion.vote_kernels import blurred_over_mesh
+from pipeline.geometry.projection import camera_depths
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings
 from pipeline.texturing.decision import Decision

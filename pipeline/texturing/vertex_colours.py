@@ -30,7 +30,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion.grid_kernels import component_of
-from pipeline.geometry.raster import camera_depths
+from pipeline.geometry.projection import camera_depths
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part

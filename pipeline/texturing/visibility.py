@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from pipeline.geometry.projection import project_points
-from pipeline.geometry.raster import camera_depths
+from pipeline.geometry.projection import camera_depths, project_points
 from pipeline.geometry.surface_index import facing_cosine
 from pipeline.imaging.masks import box_around
 from pipeline.imaging.silhouette import Silhouette

@@ -140,8 +140,14 @@ def measure(
 
     Prints each measure with its standard deviation and ISO name, and of every table of sizes how likely each size
     fits."""
-    from pipeline.applications.clinic.fitting import ISO_NAMES, MEASURES, Fitted, fitting_measures
-    from pipeline.applications.clinic.sizes import choose_size, read_size_tables
+    from pipeline.applications.clinic.fitting import (
+        ISO_NAMES,
+        MEASURES,
+        Fitted,
+        choose_size,
+        fitting_measures,
+        read_size_tables,
+    )
     from pipeline.applications.clinic.visit import read_visit
     from rig.messages.message import compose, documents_of
 

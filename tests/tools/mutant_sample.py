@@ -28,9 +28,8 @@ LEAST_S = 60.0  # a busy machine is no reason to call a mutant noticed
 IMAGING, TEXTURE = "tests/pipeline/imaging", "tests/pipeline/texturing"
 # The loops of geometry, silhouette cost and texture weights, and the tests that speak of them.
 LOOPS = {
-    "pipeline/geometry/projection_kernels.py": [f"{IMAGING}/test_projection.py"],
+    "pipeline/geometry/projection_kernels.py": [f"{IMAGING}/test_projection.py", f"{IMAGING}/test_cpu_raster.py"],
     "pipeline/imaging/sampling_kernels.py": [f"{IMAGING}/test_sampling.py", f"{IMAGING}/test_contour_distance.py"],
-    "pipeline/geometry/raster_kernels.py": [f"{IMAGING}/test_cpu_raster.py"],
     "pipeline/contour_fit/rim_kernels.py": [
         "tests/pipeline/contour_fit/test_rim.py",
         "tests/pipeline/estimation/test_jacobians.py",

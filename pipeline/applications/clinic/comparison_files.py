@@ -27,12 +27,11 @@ from pipeline.applications.clinic.patient_files import matrix_document, write_js
 from pipeline.applications.clinic.registration import Patch, TrimmedFit, trimmed_fit
 from pipeline.applications.clinic.visit import Visit
 from pipeline.applications.verification.judgement import weighted_quantiles
-from pipeline.applications.verification.pictures import HEAT_DARKEST, heat_colours, legend, scale_end
 from pipeline.applications.verification.reference import Reference
+from pipeline.applications.verification.write import HEAT_DARKEST, heat_colours, legend, scale_end
 from pipeline.evidence.measurements import Measurement
 from pipeline.head_model.landmarks import stacked
-from pipeline.results.clay import clay
-from pipeline.results.overlays import Resized, contact_sheet
+from pipeline.results.overlays import Resized, clay, contact_sheet
 from pipeline.results.pdf_page import BAD, FAINT, LINE_MM, MARGIN_MM, PdfPage
 from rig.atomic_write import write_atomically
 from rig.errors import InputError

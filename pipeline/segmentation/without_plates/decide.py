@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.compute.threads import task_pool
 from pipeline.imaging.masks import dilated, eroded, spread, without_holes
-from pipeline.multiview.scene_points import ScenePoints, find_scene_points
+from pipeline.multiview.scene_tracks import ScenePoints, find_scene_points
 from pipeline.segmentation.background import COARSE_COLUMNS, Background, coarse_size, plate_tolerance
 from pipeline.segmentation.foreground import CONCLUSIVE, Decision, colours_apart, find_mixtures, whole_subject
 from pipeline.segmentation.mask_kernels import MAX_ODDS

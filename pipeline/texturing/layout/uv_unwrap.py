@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from pipeline.compute.array_cache import cached_arrays
 from pipeline.compute.trace import traced
 from pipeline.fusion.grid_kernels import component_of
-from pipeline.geometry.raster_kernels import rasterise
+from pipeline.geometry.projection_kernels import rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from rig.errors import EigenheadError

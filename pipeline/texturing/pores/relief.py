@@ -21,7 +21,7 @@ import scipy.fft
 from jaxtyping import Bool, Complex, Float, Float16, Float32, Int, UInt8
 
 from pipeline.compute.threads import in_threads
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.texturing.layout.uv_unwrap import Layout, spread_texels
 from pipeline.texturing.light import BAND_FACTORS, harmonics
 from pipeline.texturing.paint_kernels import Choice, Pictures, paint_rows

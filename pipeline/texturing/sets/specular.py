@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Float16, Float32, UInt8
 
 from pipeline.compute.threads import in_threads, map_in_threads
 from pipeline.compute.trace import traced
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.imaging.masks import box_around
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.texturing.decision import Decision

@@ -1,4 +1,4 @@
-"""Holds the compiled loops of ``cylinder``. The axis of the cylinder is y; an angle is counted about it from z towards
+"""Holds the compiled loops that cast rays from the axis of a cylinder. The axis of the cylinder is y; an angle is counted about it from z towards
 x."""
 
 import numpy as np

@@ -12,13 +12,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.applications.model_building.correspondence.correspondence import (
+    CylinderIndex,
     Matching,
     common_frame,
     on_reference,
+    points_at,
     prepared,
     warp_and_resample,
 )
-from pipeline.applications.model_building.correspondence.cylinder import CylinderIndex, points_at
 from pipeline.applications.model_building.correspondence.scans import Scan
 from pipeline.applications.model_building.training.training import (
     USED_MODES,
@@ -27,7 +28,7 @@ from pipeline.applications.model_building.training.training import (
     generalisation,
     specificity,
 )
-from pipeline.geometry.raster import picture
+from pipeline.geometry.projection import picture
 from pipeline.head_model.landmarks import NAMES
 from pipeline.head_model.model import HeadModel
 from rig.camera import Camera, Intrinsics

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.applications.templates.carrying import SurfaceBinding
 from pipeline.applications.templates.template_file import Template
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.results.head_files import ENCODINGS, encoded
 from pipeline.results.reconstruction import Reconstruction, ply_comments
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout

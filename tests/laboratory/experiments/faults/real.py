@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.geometry.raster import depth_map, picture
+from pipeline.geometry.projection import depth_map, picture
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.masks import eroded
 from pipeline.imaging.silhouette import Silhouette, signed_distance
-from pipeline.multiview.scene_points import find_scene_points
+from pipeline.multiview.scene_tracks import find_scene_points
 from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.segmentation.segment import segment

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.projection import depth_maps
 from pipeline.head_model.expressions import closed_lids, plain_name
 from pipeline.head_model.landmarks import SEVEN_POINTS
 from pipeline.head_model.model import HeadModel, Level

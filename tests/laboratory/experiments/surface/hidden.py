@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 from pipeline.contour_fit import contour, posterior
 from pipeline.evidence import measurements
 from pipeline.evidence.measurements import DISTANCES, Landmark, Measurement
-from pipeline.geometry.raster import camera_depths, depth_map
+from pipeline.geometry.projection import camera_depths, depth_map
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions

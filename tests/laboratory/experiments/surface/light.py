@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.geometry.raster import depth_map
+from pipeline.geometry.projection import depth_map
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging import colour_chart
 from pipeline.imaging.masks import box_around

@@ -25,7 +25,7 @@ from pipeline.head_model.regions import head_regions
 from pipeline.head_model.subdivision import vertex_areas
 from pipeline.part_labels.codes import Part
 from pipeline.reconstruct import reconstruct
-from pipeline.results.clay import clay
+from pipeline.results.overlays import clay
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
 from rig.errors import EigenheadError

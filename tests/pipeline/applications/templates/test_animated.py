@@ -18,7 +18,7 @@ from pipeline.applications.templates.write.writers import (
     eyeball_uv,
     paint_eyeball,
 )
-from pipeline.geometry.raster import depth_map
+from pipeline.geometry.projection import depth_map
 from pipeline.head_model.expressions import VISEMES, mixed
 from pipeline.head_model.model import HeadModel, load_model
 from pipeline.head_model.subdivision import opened_faces

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from pipeline.geometry.projection import project_points
-from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.projection import depth_maps, project_points
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision
