@@ -2,8 +2,8 @@
 are nearly known.
 
 Two views cannot show an error along the epipolar line; three can. SIFT keypoints are compared near that line only, so
-that many more can be accepted than by their likeness alone (``find_scene_points``, whose points lie in two neighbouring views
-each and say what is near and what is far where colours do not).
+that many more can be accepted than by their likeness alone (``find_scene_points``, whose points lie in two
+neighbouring views each and say what is near and what is far where colours do not).
 
 Enters: photographs, silhouettes and the rig. Leaves: pixels by point and view, and by how much their rays miss.
 """

@@ -1,5 +1,5 @@
-"""Compiled loops over the pixels of depth maps, each ray of a crop and each vertex of a surface; over fields of depth and
-slopes: doubling their size, planes fitted around each pixel, and specks.
+"""Compiled loops over the pixels of depth maps, each ray of a crop and each vertex of a surface; over fields of depth
+and slopes: doubling their size, planes fitted around each pixel, and specks.
 
 Specks are pieces of surface too small to be more than chance matches. Where skin has no texture, any depth along a ray
 is as good as another, and overlapping windows make the same error. They form pieces of a few windows' size, before or
