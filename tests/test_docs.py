@@ -14,7 +14,7 @@ import jsonschema_rs
 import numpy as np
 import pytest
 
-from pipeline.applications.templates.names import templates_folder
+from pipeline.applications.templates.header import templates_folder
 from pipeline.head_model.model_names import models_folder
 from rig.camera import Camera, Intrinsics
 from rig.errors import InputError

@@ -20,8 +20,8 @@ from pipeline.alignment.landmarks import MIN_POINTS, MIN_TRIANGLE_MM, flatness
 from pipeline.faces.landmark_map import LandmarkMap
 from pipeline.faces.matching import MatchedFaces
 from pipeline.geometry.projection import camera_depths, depth_map
-from pipeline.geometry.registration.procrustes import procrustes
-from pipeline.geometry.warp import landmark_warp
+from pipeline.geometry.registration.nonrigid import landmark_warp
+from pipeline.geometry.registration.rigid import procrustes
 from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS
 from pipeline.head_model.model import HeadModel
 from pipeline.multiview.tangency import pixel_mm

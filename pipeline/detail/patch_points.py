@@ -1,6 +1,6 @@
 """Measures the deformed head once more with patches of its own surface, where the windows of dense matching flatten it.
 
-Dense windows are planes; they make curved skin too flat and too deep (``pipeline.stereo.window_bias``). A patch of the
+Dense windows are planes; they make curved skin too flat and too deep (``pipeline.stereo.depth_map``). A patch of the
 deformed head (``pipeline.photometric_fit.patches``) has its shape already, so that it is warped rightly into all its
 views, with the cameras' corrections that the fit found. Patches narrower than those of the fit determine the last
 tenths of a millimetre where they match. Elsewhere the dense points are used.

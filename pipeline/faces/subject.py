@@ -17,15 +17,16 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.faces.crops import Pyramid, make_pyramid
 from pipeline.faces.detection import (
     CERTAIN_SCORE,
     MIN_SCORE,
     FaceDetection,
+    Pyramid,
     crop_around,
     find_face_at,
     find_large_faces,
     find_small_faces,
+    make_pyramid,
 )
 from pipeline.faces.eyes import find_eyes
 from pipeline.faces.matching import EYE_DISTANCE_MM, MatchedFaces, complete_match, find_subject_face

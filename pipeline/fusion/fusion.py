@@ -40,8 +40,7 @@ from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.votes import PartVotes, part_codes, part_shares
-from pipeline.stereo.depth_map import DepthMap
-from pipeline.stereo.window_bias import WindowBias, without_bias
+from pipeline.stereo.depth_map import DepthMap, WindowBias, without_bias
 from pipeline.warnings import ReportWarning
 from rig.mesh import Mesh, face_normals
 from rig.messages.message import compose

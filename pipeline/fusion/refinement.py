@@ -31,7 +31,7 @@ ISLAND_MM2 = 100.0
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
     """Holds what the views measure at every vertex: its offset (mm) along the normal, ``information`` (1/mm2) and
-    ``scatter`` (mm2) as in ``refinement_kernels.measure``, and how many ``views`` see it."""
+    ``scatter`` (mm2) as in ``vote_kernels.measure``, and how many ``views`` see it."""
 
     offset_mm: Float[np.ndarray, " v"]
     information: Float[np.ndarray, " v"]

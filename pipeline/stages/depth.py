@@ -16,9 +16,8 @@ from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged
 from pipeline.stages.views import Views
-from pipeline.stereo.depth_map import DepthMap
+from pipeline.stereo.depth_map import DepthMap, WindowBias
 from pipeline.stereo.estimate import estimate_depth
-from pipeline.stereo.window_bias import WindowBias
 
 
 @dataclass(frozen=True, slots=True, eq=False)

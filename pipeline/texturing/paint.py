@@ -17,7 +17,6 @@ from pipeline.geometry.projection import camera_depths
 from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings
-from pipeline.texturing.decision import Decision
 from pipeline.texturing.layout.uv_unwrap import (
     Atlas,
     Layout,
@@ -29,6 +28,7 @@ from pipeline.texturing.layout.uv_unwrap import (
 )
 from pipeline.texturing.paint_kernels import paint_rows
 from pipeline.texturing.vertex_colours import Texture
+from pipeline.texturing.visibility import Decision
 from pipeline.warnings import ReportWarning
 from rig.mesh import Mesh
 from rig.messages.message import compose

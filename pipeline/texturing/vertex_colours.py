@@ -35,7 +35,6 @@ from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
 from pipeline.settings import TextureSettings
-from pipeline.texturing.decision import Decision, pack_pictures
 from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown, level_views
 from pipeline.texturing.paint_kernels import Pictures
 from pipeline.texturing.view_selection_kernels import (
@@ -48,7 +47,7 @@ from pipeline.texturing.view_selection_kernels import (
     propagate,
     ring_quality,
 )
-from pipeline.texturing.visibility import Sight, see_points, see_weights, sharpened
+from pipeline.texturing.visibility import Decision, Sight, pack_pictures, see_points, see_weights, sharpened
 from pipeline.warnings import ReportWarning
 from rig.camera import Camera
 from rig.capture import Capture

@@ -48,7 +48,7 @@ class LimitsMissed(EigenheadError):
 
 
 def _templates() -> tuple[str, ...]:
-    from pipeline.applications.templates.names import list_templates
+    from pipeline.applications.templates.header import list_templates
 
     return tuple(list_templates())
 

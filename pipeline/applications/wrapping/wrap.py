@@ -38,7 +38,7 @@ from pipeline.faces.points import RIGHT_EYE_OUTLINE, point_table
 from pipeline.faces.subject import find_subject
 from pipeline.fusion.untangling import topology_of, untangled
 from pipeline.geometry.registration.nonrigid import draw_to_matches
-from pipeline.geometry.registration.procrustes import procrustes
+from pipeline.geometry.registration.rigid import procrustes
 from pipeline.geometry.surface_index import Hits, SurfaceIndex
 from pipeline.head_model.model import HeadModel, with_expressions
 from pipeline.multiview.triangulation import NoPoint, triangulate_many

@@ -15,12 +15,12 @@ from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.geometry.projection import project_points
 from pipeline.texturing.chart_colours import CODES, ENCODED, LINEAR, ChartColours, in_true_colours
-from pipeline.texturing.decision import Decision, pack_pictures
 from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout
 from pipeline.texturing.light import fit_light, transfer
 from pipeline.texturing.paint_kernels import Choice, Pictures
 from pipeline.texturing.pores.relief import MIN_SKIN, HalfPictures, Strips, TexelFrames, estimate_detail, texel_frames
 from pipeline.texturing.vertex_colours import Texture
+from pipeline.texturing.visibility import Decision, pack_pictures
 from rig.camera import Camera
 from rig.capture import ReadImage
 from rig.colour_space import linear_from_srgb

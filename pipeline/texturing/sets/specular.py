@@ -22,10 +22,9 @@ from pipeline.compute.trace import traced
 from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.imaging.masks import box_around
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.texturing.decision import Decision
 from pipeline.texturing.layout.uv_unwrap import Layout, spread_texels
 from pipeline.texturing.paint_kernels import TAPS
-from pipeline.texturing.visibility import LINEAR
+from pipeline.texturing.visibility import LINEAR, Decision
 from rig.image import ImageRgb
 
 NORMAL_SHARE = 0.04  # of light at right angles that glTF's material mirrors (index of refraction 1.5)

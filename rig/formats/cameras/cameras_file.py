@@ -31,7 +31,7 @@ from rig.formats.cameras.cameras_json import (
     write_rig,
 )
 from rig.formats.cameras.colmap import read_colmap, write_colmap
-from rig.formats.cameras.foreign import head_of, program_of, unread_programs
+from rig.formats.cameras.foreign import CamerasRead, head_of, program_of, unread_programs
 from rig.formats.cameras.metashape import read_metashape, write_metashape
 from rig.formats.cameras.opencv_yaml import (
     looks_like_aniposelib,
@@ -41,7 +41,6 @@ from rig.formats.cameras.opencv_yaml import (
     write_caliscope,
     write_yaml,
 )
-from rig.formats.cameras.reading import CamerasRead
 from rig.formats.cameras.realitycapture import looks_like_csv, read_csv, read_xmp, write_csv, write_xmp
 from rig.formats.cameras.transforms_json import read_nersemble, read_splatting, read_transforms, write_transforms
 from rig.formats.pictures.picture_names import entry, is_junk

@@ -17,8 +17,16 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.formats.cameras.cameras_json import CAMERAS_READ_MOST
-from rig.formats.cameras.foreign import Malformed, camera_entry, camera_names, lens_entry, parsed
-from rig.formats.cameras.reading import CamerasRead, Reading, shown
+from rig.formats.cameras.foreign import (
+    CamerasRead,
+    Malformed,
+    Reading,
+    camera_entry,
+    camera_names,
+    lens_entry,
+    parsed,
+    shown,
+)
 from rig.formats.pictures.picture_names import entry
 from rig.messages.message import Message, compose
 from rig.rig import Rig

@@ -17,17 +17,19 @@ from rig.camera import Camera
 from rig.errors import InputError
 from rig.formats.cameras.foreign import (
     LENS_LOSS_PX,
+    CamerasRead,
+    Reading,
     brown_conrady,
     camera_entry,
     camera_names,
     corner_radius,
     lens_entry,
     parsed,
+    shown,
     word_numbers,
     xml_root,
 )
 from rig.formats.cameras.foreign_keys import METASHAPE
-from rig.formats.cameras.reading import CamerasRead, Reading, shown
 from rig.messages.message import Message, compose, some_of
 from rig.rig import Rig
 

@@ -24,7 +24,9 @@ from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
 from rig.formats.cameras.foreign import (
+    CamerasRead,
     Malformed,
+    Reading,
     camera_entry,
     lens_entry,
     matrix_intrinsics,
@@ -33,10 +35,10 @@ from rig.formats.cameras.foreign import (
     number_array,
     parsed,
     pose_rotation,
+    shown,
     sized,
 )
 from rig.formats.cameras.foreign_keys import ANIPOSELIB, CALISCOPE, OPENCV_YAML
-from rig.formats.cameras.reading import CamerasRead, Reading, shown
 from rig.formats.pictures.picture_names import entry
 from rig.geometry import vector_from_rotation
 from rig.messages.message import Message, compose, some_of

@@ -30,8 +30,7 @@ from rig.digest import sha256_of
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import find_rig_file, no_rig_fault, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras.cameras_json import CAMERAS_LEAST, write_rig
-from rig.formats.cameras.foreign import program_of, unread_programs
-from rig.formats.cameras.reading import CamerasRead
+from rig.formats.cameras.foreign import CamerasRead, program_of, unread_programs
 from rig.formats.captures.capture_masks import MaskSubjects, mask_subjects
 from rig.formats.captures.features_json import document_from_features, features_from_bytes
 from rig.formats.captures.shot_files import (

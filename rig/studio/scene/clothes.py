@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 
 from rig.mesh import Mesh, boundary_edges, face_normals
 from rig.studio.scene.anatomy import Anatomy, grid_faces
-from rig.studio.sensor.noise import around
+from rig.studio.sensor.sensor import around
 
 COLUMNS = 120
 # Rings from the collar down: drop below the collar, half width, half depth (mm); the first two follow the neck.

@@ -16,7 +16,7 @@ from rig.mesh import Mesh, vertex_normals
 from rig.messages.message import compose
 from rig.studio.scene.anatomy import Anatomy, Landmarks, finer_grid, grid_faces
 from rig.studio.scene.skin_texture import smoothstep
-from rig.studio.sensor.noise import around, waves
+from rig.studio.sensor.sensor import around, waves
 
 Points = Float[np.ndarray, "n 3"]
 

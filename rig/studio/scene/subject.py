@@ -22,7 +22,7 @@ from rig.studio.scene.hair import STRAND_POINTS, Hair, HairStyle, grow, grow_bea
 from rig.studio.scene.headwear import TightCap, cap, glasses, joined, lay_cap
 from rig.studio.scene.lights import LAMPS, Lamp, irradiance, lamp_directions
 from rig.studio.scene.skin_texture import SkinRelief, oily_zones, relieved, skin_paint
-from rig.studio.sensor.noise import volume
+from rig.studio.sensor.sensor import volume
 
 Vertices = Float[np.ndarray, "v 3"]
 

@@ -22,7 +22,7 @@ from pipeline.stages.depth import Depth
 from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
-from pipeline.stereo.window_bias import WindowBias
+from pipeline.stereo.depth_map import WindowBias
 from pipeline.warnings import Detail
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear

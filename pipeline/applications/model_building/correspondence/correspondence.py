@@ -35,9 +35,16 @@ from scipy.spatial.distance import cdist
 
 from pipeline.applications.model_building.correspondence.cylinder_kernels import CELL_MM, bin_triangles, cast_rays
 from pipeline.applications.model_building.correspondence.scans import Scan
-from pipeline.geometry.registration.nonrigid import Search, Target, dots, draw_to_target, match_points, oriented_tree
+from pipeline.geometry.registration.nonrigid import (
+    Search,
+    Target,
+    dots,
+    draw_to_target,
+    landmark_warp,
+    match_points,
+    oriented_tree,
+)
 from pipeline.geometry.registration.rigid import motion_columns, solve_with_prior
-from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.landmarks import NAMES, stacked
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.pca import align

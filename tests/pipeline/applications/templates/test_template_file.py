@@ -8,8 +8,17 @@ import numpy as np
 import pytest
 
 from pipeline.applications.templates.carrying import bind_vertices, surface_binding
-from pipeline.applications.templates.header import BadTemplate, OtherModel, check_template, read_header
-from pipeline.applications.templates.names import UnknownTemplate, WrongName, list_templates, new_path, remove_template
+from pipeline.applications.templates.header import (
+    BadTemplate,
+    OtherModel,
+    UnknownTemplate,
+    WrongName,
+    check_template,
+    list_templates,
+    new_path,
+    read_header,
+    remove_template,
+)
 from pipeline.applications.templates.template_file import Template, load_template, read_template, save_template
 from pipeline.applications.templates.write.mesh import write_template
 from pipeline.head_model.model import HeadModel
