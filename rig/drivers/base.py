@@ -149,3 +149,23 @@ class Pace:
         time.sleep(max(0.0, wait_s))
         self.beat = due
         return True
+
+
+class PacedDriver:
+    """Delivers frames at the camera's rate without a device."""
+
+    def __init__(self, camera: CameraConfig) -> None:
+        self._camera = camera
+        self._pace: Pace | None = None
+
+    def grab(self, timeout_s: float) -> Arrival:
+        """Waits for the next frame at the camera's rate. Raises GrabTimeout, CameraLost."""
+        if self._pace is None:
+            raise CameraLost(self._camera, compose("camera-not-open"))
+        if not self._pace.wait(timeout_s):
+            raise GrabTimeout(self._camera, timeout_s)
+        return Arrival(time.monotonic(), self._pace.beat)
+
+    def trigger(self) -> None:
+        """Does nothing: frames come at their own rate."""
+        return
