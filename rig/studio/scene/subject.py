@@ -16,12 +16,11 @@ from rig.messages.message import compose
 from rig.render.photograph import NOISE_CELLS, Gallery, Grain, Part
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import Anatomy, Landmarks, anatomy
-from rig.studio.scene.clothes import shirt
 from rig.studio.scene.eyes import IRIS_TONES, Eye, EyeSurface, eye_centres, look_at_point, opened, surface
 from rig.studio.scene.hair import STRAND_POINTS, Hair, HairStyle, grow, grow_beard, hang, knot
-from rig.studio.scene.headwear import TightCap, cap, glasses, joined, lay_cap
 from rig.studio.scene.lights import LAMPS, Lamp, irradiance, lamp_directions
 from rig.studio.scene.skin_texture import SkinRelief, oily_zones, relieved, skin_paint
+from rig.studio.scene.worn import TightCap, cap, glasses, joined, lay_cap, shirt
 from rig.studio.sensor.sensor import volume
 
 Vertices = Float[np.ndarray, "v 3"]

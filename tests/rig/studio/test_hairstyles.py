@@ -10,10 +10,10 @@ from rig.mesh import Mesh, face_normals, vertex_normals
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import Anatomy, anatomy, finer_grid, grid_faces
 from rig.studio.scene.hair import HairStyle, beard_share, curled, grow, hang, knot
-from rig.studio.scene.headwear import cap, glasses
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.subject import HAIRSTYLES, Look, Subject, dress, restyled
+from rig.studio.scene.worn import cap, glasses
 from rig.studio.sensor.preset import CLEAN
 from tests.rig.studio.test_images import egg_head
 

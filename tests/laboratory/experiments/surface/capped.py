@@ -34,10 +34,10 @@ from rig.mesh import Mesh
 from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import anatomy
-from rig.studio.scene.headwear import TightCap, above_edge_mm
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.subject import Look, Subject, random_look, restyled
+from rig.studio.scene.worn import TightCap, above_edge_mm
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD
