@@ -35,7 +35,7 @@ from pipeline.segmentation.background import Background
 from pipeline.segmentation.foreground import Decision, decide, doubtful, reconsider
 from pipeline.segmentation.mask_kernels import MIN_WITNESSES, least_dissent
 from pipeline.segmentation.matting import ALPHA_BLUR_PX, WEAK_CONTRAST, Matte, solve_matte
-from pipeline.segmentation.without_plates.mask_search import HeadSeed, above_chin, find_head_seed
+from pipeline.segmentation.without_plates.head_seed import HeadSeed, above_chin, find_head_seed
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError

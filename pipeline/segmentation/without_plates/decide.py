@@ -22,7 +22,8 @@ from pipeline.multiview.scene_tracks import ScenePoints, find_scene_points
 from pipeline.segmentation.background import COARSE_COLUMNS, Background, coarse_size, plate_tolerance
 from pipeline.segmentation.foreground import CONCLUSIVE, Decision, colours_apart, find_mixtures, whole_subject
 from pipeline.segmentation.mask_kernels import MAX_ODDS
-from pipeline.segmentation.without_plates.mask_search import CoarseMask, HeadSeed, head_core, search_masks
+from pipeline.segmentation.without_plates.head_seed import HeadSeed
+from pipeline.segmentation.without_plates.mask_search import CoarseMask, head_core, search_masks
 from pipeline.segmentation.without_plates.viewing_volume import (
     ViewingVolume,
     ask_other_views,

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.segmentation.segment import segment
 from pipeline.segmentation.without_plates.decide import solid_around
-from pipeline.segmentation.without_plates.mask_search import HeadSeed, above_chin, beside_head, head_core
+from pipeline.segmentation.without_plates.head_seed import HeadSeed, above_chin, beside_head, head_core
 from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture
 from tests.pipeline.segmentation.test_segment import true_mask
