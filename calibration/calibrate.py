@@ -39,7 +39,7 @@ from calibration.quality.checks import (
 )
 from calibration.quality.outliers import CORNER_SIGMAS, Dropped, bad_views, drop_blurred, drop_misread, explain_shot
 from calibration.result import Calibration, CalibrationRefused
-from rig.formats.captures.serials import with_serials
+from rig.formats.captures.shot_files import with_serials
 from rig.geometry import RigidTransform
 from rig.messages.message import Message, compose
 from rig.progress import Progress

@@ -13,9 +13,8 @@ from calibration.adjustment.intrinsics import Lens
 from calibration.adjustment.state import INTRINSICS, rms
 from calibration.adjustment.timing import TimeOffsets
 from calibration.board.board import Board
-from calibration.quality.checks import Check
+from calibration.quality.checks import CameraEvidence, Check, Verdict, Word, judge
 from calibration.quality.outliers import Dropped
-from calibration.quality.verdict import CameraEvidence, Verdict, Word, judge
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import EigenheadError

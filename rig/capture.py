@@ -15,8 +15,6 @@ from rig.messages.message import Message
 Content = TypeVar("Content")
 
 TEXTURE_SETS = "texture_sets"  # a capture's folder of them
-
-
 ReadImage = Callable[[str], ImageRgb]
 """Reads once more, at the size of its file, the picture that is filed under a camera's name. Raises InputError."""
 

@@ -1,9 +1,12 @@
 """Defines rigid motions and similarities between frames, named ``b_from_a``, and functions on rotations."""
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
+
+Values = TypeVar("Values", float, np.ndarray)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,3 +169,19 @@ def look_at(
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     return RigidTransform(rotation, -rotation @ centre)
+
+
+def second_difference(before: Values, middle: Values, after: Values) -> Values:
+    """Returns the second derivative of the parabola, per step squared; it is negative at a peak."""
+    return before - 2.0 * middle + after
+
+
+def vertex_offset(before: Values, after: Values, curvature: Values) -> Values:
+    """Returns the distance of the parabola's vertex from the middle value, in steps towards ``after``.
+
+    Args:
+        before: the value one step before the middle one.
+        after: the value one step behind the middle one.
+        curvature: ``second_difference`` of the three. It must not be 0; callers bound it by the noise of their values.
+    """
+    return 0.5 * (before - after) / curvature

@@ -73,7 +73,7 @@ def _value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:
             return ... if any(item is ... for item in items) else items
         if option in (int, bool) and type(value) is option:
             return value
-        if option is str and _is_text(value):
+        if option is str and isinstance(value, str) and is_encodable(value):
             return value
     faults.append(compose("setting-wrong", setting=where, value=_shown(value), wanted=_wanted(options)))
     return ...
@@ -88,10 +88,6 @@ def _number(value: Any) -> float | None:
     except OverflowError:
         return None
     return number if math.isfinite(number) else None
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and is_encodable(value)
 
 
 def _item(where: str, value: Any, index: int) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict, SettingsError
 
-from pipeline.head_model.data_folder import data_folder
+from pipeline.head_model.model_names import data_folder
 from server.address import is_loopback
 
 PREFIX = "EIGENHEAD_"

@@ -109,9 +109,9 @@ def test_the_map_names_what_is_there() -> None:
 
 LINES_MOST, FUNCTION_MOST, PARAMETERS_MOST = 600, 60, 10
 LONG_FOR_A_REASON = {
-    "pipeline.segmentation.matting_kernels.solve_alpha": "one compiled loop: calls between would pass a dozen arrays",
+    "pipeline.segmentation.mask_kernels.solve_alpha": "one compiled loop: calls between would pass a dozen arrays",
     "pipeline.fusion.vote_kernels.vote": "one compiled loop over cells and views",
-    "pipeline.stereo.field_kernels.fit_planes": "one compiled loop with ten sums in registers",
+    "pipeline.stereo.depth_map_kernels.fit_planes": "one compiled loop with ten sums in registers",
 }
 
 MANY_FOR_A_REASON = {

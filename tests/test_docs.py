@@ -14,8 +14,8 @@ import jsonschema_rs
 import numpy as np
 import pytest
 
-from pipeline.applications.templates.names import templates_folder
-from pipeline.head_model.data_folder import models_folder
+from pipeline.applications.templates.header import templates_folder
+from pipeline.head_model.model_names import models_folder
 from rig.camera import Camera, Intrinsics
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import document_from_rig, rig_from_document

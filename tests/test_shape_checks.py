@@ -100,5 +100,5 @@ def test_only_compiled_loops_are_left_out() -> None:
 def test_loops_are_compiled_in_modules_of_their_own() -> None:
     """There, in ``*_kernels.py``, annotations are not checked; beside other functions they would be wrapped."""
     compiled = [path for path in product_files() if re.search(r"^\s*@njit\b", path.read_text("utf-8"), re.MULTILINE)]
-    assert len(compiled) > 30
+    assert len(compiled) > 15
     assert [path for path in compiled if not path.stem.endswith("_kernels")] == []

@@ -70,7 +70,7 @@ REPLACED = {
 }
 PUBLIC = {
     ("calibration/scene/result.py", "told"),  # scale.told of a calibration's document
-    ("rig/formats/cameras/reading.py", "told"),  # a parameter of the message key-not-used
+    ("rig/formats/cameras/foreign.py", "told"),  # a parameter of the message key-not-used
     ("server/storage/records.py", "own"),  # of deliveries that wait in the job engine's queue
 }
 

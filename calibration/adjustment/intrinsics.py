@@ -127,19 +127,14 @@ def _start(views: Sequence[View], size: tuple[int, int], board: Board) -> Bundle
             best = (score, intrinsics, [pose for pose, _ in fits])
     assert best is not None
     _, intrinsics, poses = best
-    return single_state(intrinsics, poses)
-
-
-def single_state(intrinsics: Intrinsics, camera_from_boards: Sequence[RigidTransform]) -> BundleState:
-    """Returns the state of a single camera at the world's origin, with the given board poses."""
     return BundleState(
         intrinsics.values()[None],
         np.eye(3)[None],
         np.zeros((1, 3)),
-        np.stack([pose.rotation for pose in camera_from_boards]),
-        np.stack([pose.translation for pose in camera_from_boards]),
+        np.stack([pose.rotation for pose in poses]),
+        np.stack([pose.translation for pose in poses]),
         np.zeros(1),
-        np.zeros((len(camera_from_boards), 6)),
+        np.zeros((len(poses), 6)),
     )
 
 

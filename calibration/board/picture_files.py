@@ -16,8 +16,7 @@ from jaxtyping import UInt8
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import name_fault
 from rig.formats.pictures.picture_names import PLAIN_SUFFIXES, WORD
-from rig.messages.fault_groups import say_once
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, say_once
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *PLAIN_SUFFIXES)
 CAMERA_WORDS = ("cam", "camera", "kamera", "left", "right")  # with which names of cameras begin

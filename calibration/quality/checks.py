@@ -1,7 +1,13 @@
-"""Checks what a low reprojection error does not imply. A calibration that fails a check is refused, with what to do."""
+"""Checks what a low reprojection error does not imply. A calibration that fails a check is refused, with what to do.
+Shots may pass every check and still determine too little: the verdict says what a calibration lacks.
 
-from collections.abc import Callable, Sequence
+The verdict's limits were chosen on simulated sessions of 4 to 30 shots (``tests.support.board_sessions``); no command
+prints them.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -12,12 +18,17 @@ from calibration.adjustment.gauge import align_world, image_distance
 from calibration.adjustment.lens_prior import LensPrior, fixed_prior
 from calibration.adjustment.state import BundleState, Observations, residuals
 from calibration.board.board import Board
-from rig.geometry import rigid_fit
+from rig.geometry import rigid_fit, second_difference, vertex_offset
 from rig.messages.message import Message, compose
-from rig.parabola import second_difference, vertex_offset
 from rig.plausibility import FRAME_LEAST_MM, frame_mm
 from rig.rig import Rig
 
+Word = Literal["good", "usable", "poor"]
+
+VIEWS_LEAST, VIEWS_GOOD = 3, 6  # Zhang's method needs three; from six on its lenses hardly gain
+FOCAL_POOR, FOCAL_GOOD = 0.03, 0.01  # standard deviation of the focal length, as a share of it
+POSE_POOR_PX, POSE_GOOD_PX = 1.0, 0.5  # of a pose, seen at the subject
+COVERED_GOOD = 0.25  # share of the picture's twelfths that hold a corner: lenses are guessed beyond
 HELD_OUT_EVERY = 5  # every fifth shot is held out once
 HELD_OUT_RATIO, HELD_OUT_LEAST_PX = 1.5, 0.3
 SCALE_SHARE = 0.005  # a ruler on a printed board is read to 0.5 mm in 200
@@ -220,3 +231,50 @@ def measure_aspect(
 def failed(checks: Sequence[Check]) -> list[Check]:
     """Returns the checks that failed, without those that could not be judged."""
     return [check for check in checks if check.passed is False]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraEvidence:
+    """Holds how well one camera is calibrated. ``focal_share`` is the relative standard deviation of its focal length;
+    ``covered`` is the share of twelve equal parts of the picture in which corners were seen."""
+
+    views: int
+    focal_share: float
+    pose_sigma_px: float
+    covered: float
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Holds the verdict on a calibration: good, usable or poor. ``missing`` lists what would improve it, the most
+    urgent first; empty if it is good."""
+
+    word: Word
+    missing: tuple[Message, ...]
+
+
+def judge(cameras: Mapping[str, CameraEvidence], checks: Sequence[Check]) -> Verdict:
+    """Judges a calibration by its weakest camera, and by whether held-out shots could be checked."""
+    severe, mild = [], []
+
+    def of(test: str, least: float, most: float) -> list[str]:
+        return [name for name, camera in cameras.items() if least < getattr(camera, test) <= most]
+
+    infinite = float("inf")
+    if blind := [name for name, camera in cameras.items() if camera.views < VIEWS_LEAST]:
+        severe.append(compose("views-too-few", cameras=blind, views=VIEWS_LEAST))
+    if vague := of("focal_share", FOCAL_POOR, infinite):
+        severe.append(compose("focal-poor", cameras=vague, percent=100 * FOCAL_POOR))
+    if loose := of("pose_sigma_px", POSE_POOR_PX, infinite):
+        severe.append(compose("pose-loose", cameras=loose, px=POSE_POOR_PX))
+    if few := [name for name, camera in cameras.items() if VIEWS_LEAST <= camera.views < VIEWS_GOOD]:
+        mild.append(compose("views-too-few", cameras=few, views=VIEWS_GOOD))
+    if vague := of("focal_share", FOCAL_GOOD, FOCAL_POOR):
+        mild.append(compose("focal-poor", cameras=vague, percent=100 * FOCAL_GOOD))
+    if loose := of("pose_sigma_px", POSE_GOOD_PX, POSE_POOR_PX):
+        mild.append(compose("pose-loose", cameras=loose, px=POSE_GOOD_PX))
+    if bare := [name for name, camera in cameras.items() if camera.covered < COVERED_GOOD]:
+        mild.append(compose("rim-uncovered", cameras=bare))
+    if any(check.name == "held-out shots" and check.passed is None for check in checks):
+        mild.append(compose("held-out-missing"))
+    return Verdict("poor" if severe else "usable" if mild else "good", (*severe, *mild))

@@ -18,8 +18,7 @@ from rig.formats.captures.capture_masks import mask_subjects
 from rig.formats.captures.shot_files import ASIDE, find_files, listed_pictures, picture_folder
 from rig.formats.pictures.images import decode_image_file
 from rig.formats.pictures.picture_names import entry, safe_name
-from rig.messages.fault_groups import say_once
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, say_once
 from rig.rig import Rig
 
 ONE_SHOT = "shot"  # the name of the only one, where every camera has one picture

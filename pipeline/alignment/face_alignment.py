@@ -16,7 +16,7 @@ from pipeline.contour_fit.problem import LandmarkObservations, blended_basis
 from pipeline.faces.landmark_map import LandmarkMap
 from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.points import point_table
-from pipeline.geometry.registration.procrustes import block_diagonal, generalised_procrustes, procrustes
+from pipeline.geometry.registration.rigid import block_diagonal, generalised_procrustes, procrustes
 from pipeline.head_model.model import HeadModel
 from rig.geometry import Similarity
 from rig.rig import Rig

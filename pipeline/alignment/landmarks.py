@@ -12,7 +12,7 @@ Eq. (3) trusts all points alike and takes the subject for the mean head. Step 2 
 covariance of the triangulated point and with the model's covariance of its landmarks: a wide jaw is expected together
 with wide cheeks, and must not turn the head.
 
-The paper's alignment is ``pipeline.geometry.registration.procrustes``.
+The paper's alignment is ``pipeline.geometry.registration.rigid``.
 """
 
 from collections.abc import Mapping
@@ -23,20 +23,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.alignment.feature_points import features_as_wholes, locate_features
-from pipeline.geometry.registration.procrustes import (
-    block_diagonal,
-    generalised_procrustes,
-    procrustes,
-    rigid_procrustes,
-)
+from pipeline.geometry.registration.rigid import block_diagonal, generalised_procrustes, procrustes, rigid_procrustes
 from pipeline.head_model.landmarks import LANDMARK_NOISE_MM, NAMES, SEVEN_POINTS, mirrored
 from pipeline.head_model.model import HeadModel
 from pipeline.multiview.triangulation import CLICK_NOISE_PX, TriangulatedPoint
 from rig.capture import Features
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
-from rig.messages.fault_groups import some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, some_of
 from rig.rig import Rig
 
 Points = Float[np.ndarray, "n 3"]

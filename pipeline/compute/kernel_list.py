@@ -17,7 +17,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from numba import types
 from numba.core.dispatcher import Dispatcher
@@ -131,23 +130,6 @@ def _members(text: str) -> Iterator[str]:
             yield text[start:at]
             start = at + 1
     yield text[start:]
-
-
-def text_from_type(kind: Any) -> str:
-    """Returns the list's notation of a Numba type. Raises ValueError if it has none."""
-    if isinstance(kind, types.Array):
-        text = f"{kind.dtype}[{kind.ndim}{kind.layout}]" + "r" * (not kind.mutable)
-    elif isinstance(kind, types.NamedTuple | types.NamedUniTuple):
-        module = kind.instance_class.__module__.removeprefix(PACKAGE + ".")
-        inside = ";".join(text_from_type(each) for each in kind.types)
-        text = f"{module}:{kind.instance_class.__name__}{{{inside}}}"
-    elif isinstance(kind, types.UniTuple):
-        text = f"{kind.count}*{kind.dtype}"
-    else:
-        text = str(kind)
-    if type_from_text(text) != kind:
-        raise ValueError(f"the list of kernels has no notation for {kind!r}")
-    return text
 
 
 def _scalar(name: str) -> types.Type:

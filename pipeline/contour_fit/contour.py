@@ -15,6 +15,7 @@ from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.head_problem import started_problem
 from pipeline.contour_fit.noise_model import is_hairless, with_clutter_of_start, with_misfit
+from pipeline.contour_fit.posterior import cage_variance, with_estimated_prior
 from pipeline.contour_fit.problem import (
     FIRST_CORRELATION_PX,
     POSE,
@@ -26,6 +27,7 @@ from pipeline.contour_fit.problem import (
     first_evidence,
     make_problem,
     start_state,
+    widened,
 )
 from pipeline.contour_fit.rim_term import observed_rim
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
@@ -35,9 +37,11 @@ from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity
+from rig.mesh import vertex_normals
 from rig.progress import Progress
 from rig.rig import Rig
 
+LEVEL, STEPS = "p95", 4  # as the contour solver's own stage with more modes
 FIRST_MODES = 15  # of the coarse stage; 10 to 20 measured alike
 TOLERANCE = 0.05  # predicted fall of the cost at which the solver stops: a step of 0.2 sigma
 TRIES = 3  # of a step, each with a hundred times the damping
@@ -202,3 +206,37 @@ def finish(solved: ContourSolution) -> Fit:
         used={name: bool((rim.view == k).any()) for k, name in enumerate(names)},
         camera_shift=dict(zip(names, state.camera_shift, strict=True)),
     )
+
+
+def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_mm: float) -> Fit:
+    """Returns the fit of a solution with its misfit set to what the eigenheads cannot represent.
+
+    The head of most people is not in their span, and the fit's own covariance does not include that. The fit agrees
+    with the outlines, where it was made to; between them its error is several times larger. So the same outlines are
+    fitted once more in a wider basis that can leave the span (``gaussian_process``). The distance between both heads,
+    and the wider fit's own uncertainty, are the misfit of the narrower one.
+
+    Args:
+        solved: solution with the eigenheads alone.
+        wider_model: the same mesh and eigenheads, followed by the kernel's modes.
+        relief_mm: as of ``with_estimated_prior``.
+    """
+    fit, eigenheads = finish(solved), len(solved.state.coefficients)
+    problem = widened(solved.problem, wider_model, (LEVEL,))
+    last = solved.problem.settings.robust_px
+    stage = Stage(LEVEL, len(wider_model.modes), True, (2.0 * last, last), solved.stage.whole_head, True, STEPS)
+    state, evaluations, reason = run_stage(problem, solved.evidence, solved.state, stage, lambda fraction: None)
+    wider = finish(ContourSolution(problem, solved.evidence, state, stage, evaluations, reason))
+    wider = with_estimated_prior(wider_model, wider, eigenheads, relief_mm=relief_mm)
+    return judged_by(wider_model, wider, solved.problem.model, fit)
+
+
+def judged_by(wider_model: HeadModel, wider: Fit, model: HeadModel, fit: Fit) -> Fit:
+    """Returns ``fit`` with its misfit (mm, along the normals) set by comparison with ``wider``, a fit of more modes to
+    the same outlines. The misfit's square is their squared distance plus the variance that only the wider fit has. Both
+    fits must have a covariance."""
+    cage = fit.world_from_head.apply(model.cage(fit.coefficients))
+    normals = vertex_normals(cage, model.levels["cage"].faces)
+    apart = ((wider.world_from_head.apply(wider_model.cage(wider.coefficients)) - cage) * normals).sum(axis=1)
+    square = apart**2 + cage_variance(wider_model, wider) - cage_variance(model, fit)
+    return replace(fit, misfit_mm=np.sqrt(np.maximum(square, 0.0)), sliding_mm=wider.sliding_mm)

@@ -9,7 +9,7 @@ https://doi.org/10.1162/neco.1992.4.3.415).
 Two more uncertainties follow, which no coefficient describes. The kernel moves the surface along its normals only; a
 head that deviates from the eigenheads deviates along the surface as well, so that a landmark's position there is as
 uncertain as the kernel allows (``Fit.sliding_mm``). Relief finer than the modes exists even where no photograph shows
-it. A fit to the eigenheads alone contains neither (see ``span_misfit``).
+it. A fit to the eigenheads alone contains neither (see ``with_span_misfit``).
 """
 
 import math

@@ -24,7 +24,7 @@ from pipeline.compute.threads import in_threads
 from pipeline.contour_fit.clutter import downweight_outside_contour, with_bare_crown, without_clutter
 from pipeline.contour_fit.problem import PER_CAMERA, POSE, ContourProblem, Stage, StageEvidence, State, moved_views
 from pipeline.contour_fit.rim import Rim, find_rim
-from pipeline.contour_fit.rim_jacobian_kernels import Level, RimSamples, fill_rows
+from pipeline.contour_fit.rim_kernels import Level, RimSamples, fill_rows
 from pipeline.estimation.robust import GemanMcClure
 from pipeline.estimation.terms import NormalEquations
 

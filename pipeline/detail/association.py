@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.compute.threads import in_threads
-from pipeline.geometry.closest_point_kernels import FannedMesh, closest_at_vertices
-from pipeline.geometry.fans import corners_at_vertices
 from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.surface_index import corners_at_vertices
+from pipeline.geometry.surface_kernels import FannedMesh, closest_at_vertices
 
 Faces = Int[np.ndarray, "f 3"]
 

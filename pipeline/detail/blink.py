@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 
 from pipeline.contour_fit.fit import Fit
 from pipeline.detail.association import associate
+from pipeline.detail.dense_points import SurfacePoints
 from pipeline.detail.eyelids import EyeEvidence, Fissure, eye_fissure
-from pipeline.detail.surface_points import SurfacePoints
 from pipeline.head_model.expressions import BLINKS, plain_name
 from pipeline.head_model.model import HeadModel
 from pipeline.part_labels.codes import Part

@@ -2,22 +2,27 @@
 shows."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
-from pipeline.detail.surface_points import SurfacePoints, thinned
+from pipeline.detail.surface_points_kernels import cell_numbers, mean_points
 from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE
 from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.part_labels.cap import Cap
 from pipeline.part_labels.codes import Part, codes_from_channels
-from pipeline.part_labels.votes import PartVotes, part_shares
+from pipeline.part_labels.labelling import PartMap
+from pipeline.part_labels.votes import PartVotes, part_shares, vote_parts
 from pipeline.stereo.depth_map import DepthMap, points_world
 from rig.camera import Camera
 from rig.mesh import Mesh, vertex_normals
+from rig.rig import Rig
 
+MOSTLY = 0.7  # of the views that show a place, from which on it is the cap's
+FOLDS_MM = 0.3  # how far a cap lies off the skin beyond its thickness, standard deviation
 CELL_MM = 0.8  # points nearer than that become one: three quarters of a pixel of the usual rig
 MAX_VIEWS_NEEDED = 4  # views that agree on a point, at most: with fewer, points beside hair lie 1 mm too deep
 HAIR_OFF_MM = 0.5  # how far beside the skin a point lies that is hair after all
@@ -25,6 +30,50 @@ MIN_FACING = 0.35  # cosine between a point's normal and its view: flatter windo
 INSIDE_MM = 4.0  # farther behind the fitted head a point shows something that neither pulls nor bounds it
 EVERY = 4  # vertices of the head stand for the others
 TOGETHER_DEG = 65.0  # between views that may see one place: the dense stage compares no others
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfacePoints:
+    """Holds n points of the visible surface in the world frame, each with its normal, its standard deviation, and the
+    part of the subject that it shows."""
+
+    points: Float[np.ndarray, "n 3"]  # mm
+    normals: Float[np.ndarray, "n 3"]  # unit, outwards
+    deviation_mm: Float[np.ndarray, " n"]  # along the normal
+    part: UInt8[np.ndarray, " n"]  # codes of ``Part``
+
+    def chosen(self, rows: Bool[np.ndarray, " n"] | Int[np.ndarray, " m"]) -> "SurfacePoints":
+        """Returns the points of the chosen rows."""
+        return SurfacePoints(self.points[rows], self.normals[rows], self.deviation_mm[rows], self.part[rows])
+
+
+def with_scaled_deviation(surface: SurfacePoints, factor: float | Float[np.ndarray, " n"]) -> SurfacePoints:
+    """Returns the points with ``factor`` times their deviation."""
+    return replace(surface, deviation_mm=factor * surface.deviation_mm)
+
+
+def thinned(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:
+    """Thins out points: returns the mean, weighted by information, of the points in each cell of a grid, for each part
+    of the subject and main direction of the normal.
+
+    The deviation remains that of a single point: neighbouring points have nearly the same error, since their windows
+    overlap.
+
+    Args:
+        surface: points, mm.
+        cell_mm: edge of a cell.
+
+    Returns:
+        The means, in the order of the cells.
+    """
+    if not len(surface.points):
+        return surface
+    points, normals, deviation = (
+        np.ascontiguousarray(each, float) for each in (surface.points, surface.normals, surface.deviation_mm)
+    )
+    part = np.ascontiguousarray(surface.part)
+    numbers, group = np.unique(cell_numbers(points, normals, part, cell_mm), return_inverse=True)
+    return SurfacePoints(*mean_points(group, len(numbers), points, normals, deviation, part))
 
 
 @traced
@@ -90,3 +139,27 @@ def _cloud(
     deviation = depth_map.deviation_mm[known][kept] * facing[kept]  # along the ray, to along the normal
     deviation *= np.where(views[kept] < VIEWS_SURE, ALONE_FACTOR, 1.0)
     return points[kept], normals[kept], deviation
+
+
+def skin_under_cap(points: SurfacePoints, depth_maps: Sequence[DepthMap], cap: Cap, rig: Rig) -> SurfacePoints:
+    """Moves the points that show the cap inwards by its thickness, and counts them as skin.
+
+    ``points``: of the visible surface, world, mm, with outward normals. ``depth_maps``: of which they come. ``cap``:
+    the pixels that show it. ``rig``: the cameras as calibrated.
+    """
+    worn = {
+        name: PartMap(name, np.zeros((*shown.shape, 3), np.uint8)).with_clothes(shown)
+        for name, shown in cap.masks.items()
+    }
+    votes = vote_parts(depth_maps, worn, rig)
+    if votes is None or not len(points.points):
+        return points
+    share = part_shares(votes, points.points)[:, Part.CLOTHES.channel]
+    on_cap = (points.part == Part.CLOTHES) & (share > MOSTLY)
+    moved = points.points - np.where(on_cap, cap.thickness_mm, 0.0)[:, None] * points.normals
+    return replace(
+        points,
+        points=moved,
+        deviation_mm=np.where(on_cap, np.hypot(points.deviation_mm, FOLDS_MM), points.deviation_mm),
+        part=np.where(on_cap, np.uint8(Part.SKIN), points.part),
+    )

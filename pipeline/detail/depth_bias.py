@@ -1,4 +1,4 @@
-"""Measures the bias of depth that comes from matching windows (``pipeline.stereo.window_bias``), on the fitted face of
+"""Measures the bias of depth that comes from matching windows (``pipeline.stereo.depth_map``), on the fitted face of
 each capture. The face can serve as the reference: its cameras and shape were solved together, by patches that follow
 the surface.
 
@@ -13,12 +13,12 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.trace import traced
 from pipeline.detail.association import associate, interpolated
-from pipeline.detail.surface_points import SurfacePoints
+from pipeline.detail.dense_points import SurfacePoints
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.robust import Cauchy
 from pipeline.estimation.terms import Linear, Problem
 from pipeline.part_labels.codes import Part
-from pipeline.stereo.window_bias import WindowBias, windowed_height
+from pipeline.stereo.depth_map import WindowBias, windowed_height
 from rig.mesh import Mesh
 
 REACH_MM, AGREEMENT, MIN_POINTS = 2.0, 0.8, 300

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.detail.association import Target, interpolated
-from pipeline.detail.surface_points import SurfacePoints
+from pipeline.detail.dense_points import SurfacePoints
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.registration.rigid import motion_columns, solve_with_prior
 from pipeline.head_model.model import HeadModel

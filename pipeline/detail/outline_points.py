@@ -16,9 +16,8 @@ from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.rim import Rim, Topology, Views, find_rim, make_topology
 from pipeline.contour_fit.rim_term import OUTSIDE_SCALE
 from pipeline.detail.solve import Observed
-from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.head_model.model import HeadModel
-from pipeline.photometric_fit.hair_mask import HairProbability
+from pipeline.photometric_fit.patches import HairProbability
 from rig.camera import Camera
 from rig.geometry import RigidTransform, rotation_from_vector
 
@@ -26,7 +25,6 @@ from rig.geometry import RigidTransform, rotation_from_vector
 # percentile of scan-a are 0.001 and 0.014 mm worse, with 0.5 and 2 the median of scan-a-skin 0.007.
 UNIT_PX3 = 8.0
 MIN_ROBUST_MM = 1.0  # robust scale, however small that of the points is
-AGREED_MM, HELD_MM = 0.5, 4.0  # of a rim from the outline, and how far beside it that still speaks
 INSIDE_PX = 3.0  # so far inside the rim the pixel is read that says whether it is hair's
 
 Outlines = Callable[[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"], float], Observed]
@@ -58,17 +56,6 @@ class OutlineSearch:
             (moved * normal).sum(axis=1) + off,
             robust * rim.length * px_per_mm**2 / UNIT_PX3,
         )
-
-    def support(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
-        """Returns how far silhouettes hold each vertex of the head (world frame, mm): 1 on a rim that lies within
-        ``AGREED_MM`` of the outline, less with the distance from it."""
-        rim = find_rim(self.topology, vertices, self.views, averaged=True)
-        off_mm = np.abs(rim.residual) / np.linalg.norm(rim.gradient, axis=1)
-        agreed = (off_mm < AGREED_MM) & (self._hair_at(rim) < 0.5)
-        if not agreed.any():
-            return np.zeros(len(vertices))
-        distance = nearest(PointTree.of(rim.point[agreed]), vertices, within=4.0 * HELD_MM)[0]
-        return np.exp(-0.5 * (np.minimum(distance, 1e3) / HELD_MM) ** 2)
 
     def _hair_at(self, rim: Rim) -> Float[np.ndarray, " s"]:
         share, pixel = np.zeros(len(rim.view)), rim.pixel - INSIDE_PX * rim.normal

@@ -1,6 +1,6 @@
 """Measures the deformed head once more with patches of its own surface, where the windows of dense matching flatten it.
 
-Dense windows are planes; they make curved skin too flat and too deep (``pipeline.stereo.window_bias``). A patch of the
+Dense windows are planes; they make curved skin too flat and too deep (``pipeline.stereo.depth_map``). A patch of the
 deformed head (``pipeline.photometric_fit.patches``) has its shape already, so that it is warped rightly into all its
 views, with the cameras' corrections that the fit found. Patches narrower than those of the fit determine the last
 tenths of a millimetre where they match. Elsewhere the dense points are used.
@@ -19,9 +19,8 @@ from pipeline.contour_fit.rim import Views, pack_views
 from pipeline.detail.outline_points import corrected
 from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit.depth_search import DEPTH_LEVEL, Round, find_places, pixels_per_mm, visibility_of
-from pipeline.photometric_fit.hair_mask import HairProbability, under_hair
 from pipeline.photometric_fit.images import Photographs, load_photographs
-from pipeline.photometric_fit.patches import Patches, arrays_of, make_patches
+from pipeline.photometric_fit.patches import HairProbability, Patches, arrays_of, make_patches, under_hair
 from pipeline.photometric_fit.refine import RADIUS_WINDOWS
 from rig.camera import Camera
 from rig.mesh import Mesh, vertex_normals

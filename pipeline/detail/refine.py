@@ -14,30 +14,41 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
 from pipeline.detail.association import Associated, associate, interpolated
 from pipeline.detail.blink import blink_shift, estimate_eyelid_closure, plain_shape
-from pipeline.detail.dense_points import CELL_MM
+from pipeline.detail.dense_points import CELL_MM, SurfacePoints, thinned
 from pipeline.detail.ears import with_ears_in_place
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids, with_plain_lids
-from pipeline.detail.folds import unfolded
-from pipeline.detail.nodes import NodeMesh, Nodes, solving_nodes
 from pipeline.detail.outline_points import Outlines, OutlineSearch
 from pipeline.detail.patch_points import PatchPlaces, PatchSearch
 from pipeline.detail.smooth_field import SmoothField, smooth_field
-from pipeline.detail.solve import Observed, Posterior, free_directions, normal_directions, solve_field
-from pipeline.detail.surface_points import SurfacePoints, thinned
+from pipeline.detail.solve import (
+    NodeMesh,
+    Nodes,
+    Observed,
+    Posterior,
+    free_directions,
+    normal_directions,
+    solve_field,
+    solving_nodes,
+)
 from pipeline.fusion.untangling import untangled_head
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
-from rig.mesh import vertex_normals
+from rig.mesh import face_normals, vertex_normals
 from rig.progress import Progress
 
+MAX_TURN = 0.0  # cosine between a triangle before and after; a right angle is a fold
+MIN_AREA = 0.02  # of the triangle's own, before
+SWEEPS, RINGS = 60, 6  # of smoothing, and how far about a fold it may reach
+GIVING_WAY = 0.8  # what a sweep leaves of a displacement, in the second half of them
 Vertices = Float[np.ndarray, "v 3"]
 PerVertex = Float[np.ndarray, " v"]
 Faces = Int[np.ndarray, "f 3"]
@@ -94,7 +105,6 @@ class DeformedSurface:
     observed: Bool[np.ndarray, " v"]  # at a triangle that a point of skin showed
     closed_eyes: frozenset[str] = frozenset()  # of ``right`` and ``left``
     lids: Mapping[str, float] = field(default_factory=dict)  # how far each eye is closed, where the model blinks
-    outlined: PerVertex | None = None  # how far silhouettes hold each vertex, 0 to 1; None: not compared
 
 
 @traced
@@ -153,8 +163,7 @@ def refine_to_surface(
     )
     clean, clean_deviation_mm = untangled_head(model, head.vertices, head.deviation_mm)
     observed = head.observed & (clean_deviation_mm < 2.0 * head.deviation_mm)  # what was moved farther is not as seen
-    outlined = None if outlines is None else outlines.support(clean.vertices)
-    return DeformedSurface(clean.vertices, clean_deviation_mm, observed, closed | unexplained, lids, outlined)
+    return DeformedSurface(clean.vertices, clean_deviation_mm, observed, closed | unexplained, lids)
 
 
 def deform_to_points(
@@ -365,3 +374,51 @@ def field_deviation(
     distance, _ = nearest(PointTree.of(base[observed]), base, within=6.0 * LENGTH_MM)
     near = np.exp(-0.5 * (np.where(np.isfinite(distance), distance, np.inf) / LENGTH_MM) ** 2)
     return np.sqrt(near * square + (1.0 - near) * np.maximum(square, deviation_mm**2))
+
+
+def folded(before: Vertices, after: Vertices, faces: Faces) -> Bool[np.ndarray, " f"]:
+    """Tells which triangles a displacement turns over, or squeezes to almost no area."""
+    old, new = face_normals(before, faces), face_normals(after, faces)
+    size, length = np.linalg.norm(old, axis=1), np.linalg.norm(new, axis=1)
+    return ((old * new).sum(axis=1) <= MAX_TURN * size * length) | (length < MIN_AREA * size)
+
+
+def unfolded(before: Vertices, after: Vertices, faces: Faces) -> Vertices:
+    """Returns the displaced vertices ``after`` without folds. Around each fold the displacement from ``before`` is
+    smoothed until no triangle is turned over. In the second half of the sweeps it also shrinks there, so that the
+    vertices return towards ``before``."""
+    bad = faces[folded(before, after, faces)]
+    if not len(bad):
+        return after
+    local = _around(bad, faces, len(before), RINGS)
+    rows = np.unique(local)  # everything below happens among these
+    place = np.zeros(len(before), int)
+    place[rows] = np.arange(len(rows))
+    bad, local, old = place[bad], place[local], before[rows]
+    moved, mean = after[rows] - old, _neighbour_mean(local, len(rows))
+    for sweep in range(SWEEPS):
+        give = np.unique(_around(bad, local, len(rows), 1))
+        moved[give] = (1.0 if sweep < SWEEPS // 2 else GIVING_WAY) * (mean[give] @ moved)
+        bad = local[folded(old, old + moved, local)]
+        if not len(bad):
+            break
+    out = after.copy()
+    out[rows] = old + moved
+    return out
+
+
+def _around(chosen: Int[np.ndarray, "b 3"], faces: Faces, count: int, rings: int) -> Int[np.ndarray, "g 3"]:
+    """Returns the faces within the given number of rings about the chosen faces."""
+    about = np.zeros(count, bool)
+    about[chosen] = True
+    for _ in range(rings - 1):
+        about[faces[about[faces].any(axis=1)]] = True
+    return faces[about[faces].any(axis=1)]
+
+
+def _neighbour_mean(faces: Faces, count: int) -> sparse.csr_array:
+    """Returns the matrix that takes, for each vertex, the mean over the corners of the faces at it; the vertex itself
+    is among those corners."""
+    rows, columns = np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, 3).ravel()
+    share = 1.0 / np.maximum(np.bincount(rows, minlength=count), 1)
+    return sparse.csr_array((share[rows], (rows, columns)), shape=(count, count))

@@ -1,4 +1,4 @@
-"""Compiled loops of ``pipeline.detail.surface_points``."""
+"""Compiled loops of ``pipeline.detail.dense_points``."""
 
 import numpy as np
 

@@ -11,7 +11,7 @@ from pipeline.compute.threads import map_in_threads
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.problem import level_topology
 from pipeline.contour_fit.rim import find_rim, pack_views
-from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.projection import depth_maps
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.masks import box_around
 from pipeline.imaging.silhouette import Silhouette, boundary_weighted_xor, boundary_weights

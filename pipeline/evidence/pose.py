@@ -2,7 +2,7 @@
 
 Enters: the delivered head, the faces found in the photographs, and how the pose was found. Leaves: ``PoseEvidence`` and
 warnings. A face that lies elsewhere in most of the views that show one always gives a warning. If no face was found,
-the pose rests on outlines alone, and a warning says so.
+the pose rests on outlines alone, and a warning says so. Of irises that were found, also where the eyes look.
 """
 
 from collections.abc import Mapping
@@ -12,16 +12,18 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.alignment.silhouette_search import fan_strength
+from pipeline.evidence.measurements import Measurement
 from pipeline.faces.detection import CERTAIN_SCORE, FaceDetection
+from pipeline.faces.irises import Iris, UnseenEye
 from pipeline.faces.landmark_map import LandmarkMap
 from pipeline.faces.subject import SubjectFaces
 from pipeline.warnings import ReportWarning
 from rig.geometry import Similarity
 from rig.mesh import Mesh
-from rig.messages.fault_groups import some_of
-from rig.messages.message import compose
+from rig.messages.message import compose, some_of
 from rig.rig import Rig
 
+PUPIL_DISTANCE = "pupil_distance"
 ELSEWHERE = 0.12  # of the face's size in the picture, RMS over its points; of a right head 0.01 to 0.04
 MIN_FACING = 0.5  # cosine: a camera that sees the head so far from the front must see the face, too
 MIN_VIEWS = 2
@@ -135,3 +137,33 @@ def _offset(pixels: Float[np.ndarray, "n 2"], found: Float[np.ndarray, "n 2"], s
 def _elsewhere(names: list[str], off: Mapping[str, float]) -> ReportWarning:
     worst = max(min(off[name], 10.0) for name in names)
     return compose("face-elsewhere", cameras=some_of(names), sizes=worst)
+
+
+def pupils(eyes: Mapping[str, Iris | UnseenEye]) -> dict[str, Measurement]:
+    """Returns the far pupil distance by its name among the measurements; nothing where there is none."""
+    found = pupil_distance(eyes)
+    return {} if found is None else {PUPIL_DISTANCE: found}
+
+
+def pupil_distance(eyes: Mapping[str, Iris | UnseenEye]) -> Measurement | None:
+    """Returns the far pupil distance (mm), None unless both irises were found.
+
+    It is the distance when both eyes look straight ahead at a point infinitely far away (ISO 13666). Both pupils then
+    lie the same way in front of the points about which the eyes turn: it is the distance between the centres of the
+    eyeballs, whatever the eyes looked at when they were photographed."""
+    right, left = eyes.get("right"), eyes.get("left")
+    if not isinstance(right, Iris) or not isinstance(left, Iris):
+        return None
+    apart = left.eyeball - right.eyeball
+    value = float(np.linalg.norm(apart))
+    variance = sum(
+        along @ iris.covariance @ along for iris in (right, left) for along in [apart / value @ iris.eyeball_jacobian]
+    )
+    return Measurement(value, float(np.sqrt(variance)))
+
+
+def angles_deg(direction: Float[np.ndarray, " 3"]) -> tuple[float, float]:
+    """Returns azimuth (from z towards x) and elevation (from there towards y) of a unit vector, degrees. In the head
+    frame these are to the subject's left, and up."""
+    x, y, z = direction
+    return float(np.degrees(np.arctan2(x, z))), float(np.degrees(np.arcsin(np.clip(y, -1.0, 1.0))))

@@ -1,22 +1,24 @@
 """Finds faces in one picture, with 468 points on each.
 
-Enters: a picture as it was taken, in whatever orientation. Leaves: ``FaceDetection``. The detector proposes faces in
-the picture turned by each quarter (it tolerates 45 degrees either way). A proposal counts as a face if the landmark
-network confirms it, in a crop that follows the points. The network is given the face and its mirror image; the points
-are the means of both.
-"""
+Enters: a picture as it was taken, in whatever orientation. Leaves: ``FaceDetection``. The detector proposes faces
+in the picture turned by each quarter (it tolerates 45 degrees either way). A proposal counts as a face if the
+landmark network confirms it, in a crop that follows the points. The network is given the face and its mirror image;
+the points are the means of both. Crops are squares, turned so that the face is upright in them; a picture is kept
+at full size and repeatedly halved, so that a small sample of a large face averages over its pixels."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
-from pipeline.faces.crops import Crop, Pyramid, in_picture, make_pyramid
 from pipeline.faces.networks import FINDER_SIZE, LANDMARK_SIZE, FaceNetworks
 from pipeline.faces.points import CHIN, FOREHEAD, LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS, point_table
 from rig.capture import ImageRgb
 
+SMALLEST_PX = 192  # of the longer side: no network wants a smaller picture
+AREA_FROM = 1.7  # pixels of the picture to one of the crop from which the next half is read: bilinear reads two
 CROP_OF_FACE = 1.5  # side of a crop by the larger side of the points in it
 MIN_ROUNDS, MAX_ROUNDS = 2, 8  # of a crop that follows its points: five where the first is turned by 40 degrees
 SETTLED, SETTLED_DEG = 0.02, 2.0  # a step of a crop, by its side, and of its roll: the last that counts
@@ -28,6 +30,68 @@ SAME_FACE = 0.5  # of the size of a face: as near as the centres of two boxes of
 SAME_WAY_UP_DEG = 60.0
 MAX_CELLS = 200  # a face lights some thirty
 RIGHT_EYE, LEFT_EYE = 2, 3  # rows of the finder's faces
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Crop:
+    """Holds a square part of a picture: its centre and side (px of the picture), and the angle (degrees, clockwise) by
+    which the square is turned in the picture. A ``mirrored`` crop is read from right to left."""
+
+    centre_px: Float[np.ndarray, " 2"]
+    side_px: float
+    roll_deg: float
+    mirrored: bool = False
+
+    def picture_from_crop(self, size: int) -> Float[np.ndarray, "2 3"]:
+        """Returns the affine map (2 x 3) from pixels of this crop, sampled at ``size`` x ``size``, to pixels of the
+        picture."""
+        turn = np.deg2rad(self.roll_deg)
+        scale = self.side_px / size
+        linear = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        if self.mirrored:
+            linear[:, 0] *= -1.0
+        middle = np.full(2, (size - 1) / 2)
+        return np.column_stack([linear, self.centre_px - linear @ middle])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pyramid:
+    """Holds a picture at full size, half, quarter and so on, the full size first."""
+
+    levels: tuple[ImageRgb, ...]
+
+    @property
+    def size_px(self) -> Float[np.ndarray, " 2"]:
+        """Returns the width and height of the full-size picture in pixels."""
+        return np.array(self.levels[0].shape[1::-1], float)
+
+    def sample(self, crop: Crop, size: int) -> UInt8[np.ndarray, "size size 3"]:
+        """Returns the pixels of a crop, resampled to ``size`` x ``size``; black where the crop leaves the picture."""
+        picture_from_crop = crop.picture_from_crop(size)
+        halvings = int(np.ceil(np.log2(max(crop.side_px / size / AREA_FROM, 1.0))))
+        level = self.levels[min(halvings, len(self.levels) - 1)]
+        ratio = np.array(level.shape[1::-1]) / self.size_px
+        level_from_crop = ratio[:, None] * picture_from_crop
+        level_from_crop[:, 2] += 0.5 * ratio - 0.5  # pixel centres: u' = (u + 1/2) ratio - 1/2
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return cv2.warpAffine(level, level_from_crop, (size, size), flags=flags, borderMode=cv2.BORDER_CONSTANT)
+
+
+def make_pyramid(image: ImageRgb) -> Pyramid:
+    """Halves a picture again and again, until its longer side is below twice ``SMALLEST_PX``, and returns all sizes."""
+    levels = [np.ascontiguousarray(image)]
+    while max(levels[-1].shape[:2]) >= 2 * SMALLEST_PX:
+        height, width = levels[-1].shape[:2]
+        half = ((width + 1) // 2, (height + 1) // 2)
+        levels.append(cv2.resize(levels[-1], half, interpolation=cv2.INTER_AREA))
+    return Pyramid(tuple(levels))
+
+
+def in_picture(
+    points_crop: Float[np.ndarray, "n 2"], picture_from_crop: Float[np.ndarray, "2 3"]
+) -> Float[np.ndarray, "n 2"]:
+    """Returns the pixels of the picture at which points of a crop lie."""
+    return points_crop @ picture_from_crop[:, :2].T + picture_from_crop[:, 2]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

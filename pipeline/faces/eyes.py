@@ -11,8 +11,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.faces.crops import Crop, Pyramid, in_picture
-from pipeline.faces.detection import FaceDetection
+from pipeline.faces.detection import Crop, FaceDetection, Pyramid, in_picture
 from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.networks import EYE_SIZE, FaceNetworks
 from pipeline.faces.points import LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS, direction_from_face

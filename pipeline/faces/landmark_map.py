@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.array_cache import cached_arrays
+from pipeline.geometry.registration.nonrigid import landmark_warp
 from pipeline.geometry.surface_index import SurfaceIndex
-from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.model import HeadModel, load_model
 from rig.errors import EigenheadError
 

@@ -72,29 +72,12 @@ class MatchedFaces:
         return self.world_from_face.rotation[:, 2]
 
 
-def match_faces(
-    candidates: Mapping[str, Sequence[FaceDetection]],
-    rig: Rig,
-    *,
-    eye_distance_mm: tuple[float, float] | None = EYE_DISTANCE_MM,
-) -> MatchedFaces | None:
-    """Finds the subject's face among all faces in the views, and triangulates its 468 points. Returns None if no two
-    views show one face.
-
-    Args:
-        candidates: the faces found in each view, the best first.
-        rig: the views' cameras.
-        eye_distance_mm: limits of a face's size; None if the rig's scale is not known.
-    """
-    best = find_subject_face(candidates, rig, eye_distance_mm)
-    return best and complete_match(best, candidates, rig)
-
-
 def find_subject_face(
     candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
 ) -> TriangulatedFace | None:
-    """Finds the subject's face, as ``match_faces`` does, and triangulates only every thirteenth of its points, which is
-    faster."""
+    """Finds the subject's face among all faces in the views (the best of each first), and triangulates only every
+    thirteenth of its points. Returns None if no two views show one face. ``eye_distance_mm``: limits of a face's size;
+    None if the rig's scale is not known."""
     faces = _consistent(candidates, rig, eye_distance_mm)
     return max(faces, key=lambda face: _prominence(face, rig), default=None)
 

@@ -17,15 +17,16 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.faces.crops import Pyramid, make_pyramid
 from pipeline.faces.detection import (
     CERTAIN_SCORE,
     MIN_SCORE,
     FaceDetection,
+    Pyramid,
     crop_around,
     find_face_at,
     find_large_faces,
     find_small_faces,
+    make_pyramid,
 )
 from pipeline.faces.eyes import find_eyes
 from pipeline.faces.matching import EYE_DISTANCE_MM, MatchedFaces, complete_match, find_subject_face
@@ -35,8 +36,7 @@ from pipeline.faces.triangulated_face import TriangulatedFace, point_noise_px, u
 from rig.camera import Camera
 from rig.capture import ImageRgb
 from rig.geometry import RigidTransform, Similarity, rotation_from_vector
-from rig.rig import Rig
-from rig.spread_views import spread_views
+from rig.rig import Rig, spread_views
 
 ROUNDS = 3  # of the pose, and the bias that follows from it
 DISTANCE_SHARE = 0.1  # standard deviation of the distance, by itself: measured, and by how heads differ

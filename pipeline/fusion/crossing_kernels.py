@@ -7,7 +7,7 @@ touching does not count.
 
 import numpy as np
 
-from pipeline.geometry.cell_kernels import COLUMNS, columns_about
+from pipeline.geometry.nearest_kernels import COLUMNS, columns_about
 from rig.jit import njit
 
 

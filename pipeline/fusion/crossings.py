@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, Int
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion.crossing_kernels import beside_active, crossing_triangles, triangle_boxes
-from pipeline.geometry.cells import sorted_into_cells
+from pipeline.geometry.nearest import sorted_into_cells
 from rig.mesh import Mesh
 
 APART_SHARE = 0.05  # of the way to the middle of a vertex's neighbours: some 0.03 mm

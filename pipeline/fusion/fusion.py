@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.compute.trace import traced
 from pipeline.fusion.crossings import without_coincidences
+from pipeline.fusion.grid_kernels import component_of, compose_well
 from pipeline.fusion.hair import (
     STRAND_SHARE,
     Places,
@@ -20,7 +21,6 @@ from pipeline.fusion.hair import (
     shell_deviation_mm,
     smooth_unresolved,
 )
-from pipeline.fusion.net_kernels import component_of, compose_well
 from pipeline.fusion.prior import below_head
 from pipeline.fusion.refinement import (
     MAX_MM,
@@ -40,8 +40,7 @@ from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.votes import PartVotes, part_codes, part_shares
-from pipeline.stereo.depth_map import DepthMap
-from pipeline.stereo.window_bias import WindowBias, without_bias
+from pipeline.stereo.depth_map import DepthMap, WindowBias, without_bias
 from pipeline.warnings import ReportWarning
 from rig.mesh import Mesh, face_normals
 from rig.messages.message import compose

@@ -23,13 +23,11 @@ from pipeline.compute.trace import traced
 from pipeline.fusion.grid import Grid
 from pipeline.fusion.prior import near_rim
 from pipeline.fusion.refinement import EDGE_MM, SeenVertices, neighbours
-from pipeline.fusion.refinement_kernels import blurred_over_mesh
 from pipeline.fusion.skin import mean_around, skin_share
 from pipeline.fusion.view_stack import ViewStack
-from pipeline.fusion.vote_kernels import CENTRE
+from pipeline.fusion.vote_kernels import CENTRE, blurred_over_mesh
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.projection import project_points
-from pipeline.geometry.raster import camera_depths
+from pipeline.geometry.projection import camera_depths, project_points
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap

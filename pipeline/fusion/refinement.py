@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float, Int, Int32, Int64, UInt8
 
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
-from pipeline.fusion.net_kernels import component_of
-from pipeline.fusion.refinement_kernels import measure, smooth_offsets
+from pipeline.fusion.grid_kernels import component_of
 from pipeline.fusion.view_stack import ViewStack
-from pipeline.geometry.fans import corners_at_vertices
+from pipeline.fusion.vote_kernels import measure, smooth_offsets
 from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.surface_index import corners_at_vertices
 from rig.mesh import Mesh, face_normals, vertex_normals
 
 GATE_STEPS = 1.5  # a view that is farther off shows another surface
@@ -31,7 +31,7 @@ ISLAND_MM2 = 100.0
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
     """Holds what the views measure at every vertex: its offset (mm) along the normal, ``information`` (1/mm2) and
-    ``scatter`` (mm2) as in ``refinement_kernels.measure``, and how many ``views`` see it."""
+    ``scatter`` (mm2) as in ``vote_kernels.measure``, and how many ``views`` see it."""
 
     offset_mm: Float[np.ndarray, " v"]
     information: Float[np.ndarray, " v"]

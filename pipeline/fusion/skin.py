@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int32, Int64
 from pipeline.compute.trace import traced
 from pipeline.fusion.prior import near_rim
 from pipeline.fusion.refinement import SeenVertices, neighbours
-from pipeline.fusion.refinement_kernels import blurred_over_mesh, smooth_offsets
+from pipeline.fusion.vote_kernels import blurred_over_mesh, smooth_offsets
 from pipeline.geometry.surface_index import SurfaceIndex
 from rig.mesh import Mesh, face_normals
 

@@ -18,8 +18,8 @@ from pipeline.compute.array_cache import cached_arrays
 from pipeline.estimation.positive_definite import factorised
 from pipeline.fusion.crossing_kernels import any_corner, turned_and_folded
 from pipeline.fusion.crossings import crossing_faces
-from pipeline.fusion.net_kernels import component_of
-from pipeline.geometry.registration.procrustes import procrustes
+from pipeline.fusion.grid_kernels import component_of
+from pipeline.geometry.registration.rigid import procrustes
 from pipeline.head_model.model import HeadModel
 from rig.mesh import Mesh
 

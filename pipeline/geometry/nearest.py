@@ -1,12 +1,14 @@
 """Finds the nearest of many points, with the threads that compiled loops share.
 
-SciPy's tree takes 2 microseconds for a place among 53,000 points; this one, of boxes, takes 0.5.
+SciPy's tree takes 2 microseconds for a place among 53,000 points; this one, of boxes, takes 0.5. Points sorted into
+cubic cells let compiled loops find all neighbours.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Int64
 
 from pipeline.compute.threads import in_threads
 from pipeline.geometry.nearest_kernels import LEAF, Tree, find_nearest, sort_into_tree
@@ -52,3 +54,22 @@ def _in_space(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 3"]:
     placed = np.zeros((len(points), 3))
     placed[:, : points.shape[1]] = points
     return placed
+
+
+class Cells(NamedTuple):
+    """Holds points sorted by the cell of a grid that they lie in. ``order`` sorts the points; ``keys`` are their cells'
+    numbers, sorted; ``spans`` is the number of cells along each axis. Outermost cells are empty, so the neighbours of a
+    cell are at fixed differences in number."""
+
+    order: Int64[np.ndarray, " n"]
+    keys: Int64[np.ndarray, " n"]
+    spans: Int64[np.ndarray, " 3"]
+
+
+def sorted_into_cells(points: Float[np.ndarray, "n 3"], wide: float) -> Cells:
+    """Sorts points into cubic cells with edge ``wide``, in the unit of the points."""
+    cell = np.floor((points - points.min(axis=0)) / wide).astype(np.int64) + 1
+    spans = cell.max(axis=0) + 2
+    keys = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
+    order = np.argsort(keys, kind="stable")
+    return Cells(order, keys[order], spans)

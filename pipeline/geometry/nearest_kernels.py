@@ -1,4 +1,5 @@
-"""Compiled loops of ``pipeline.geometry.nearest``: a balanced tree of points and the search in it."""
+"""Compiled loops of ``pipeline.geometry.nearest``: a balanced tree of points and the search in it,
+and what lies near a point among points sorted into cubic cells."""
 
 from typing import NamedTuple
 
@@ -6,6 +7,7 @@ import numpy as np
 
 from rig.jit import njit
 
+COLUMNS = 9  # of three cells each: those about a cell, and it
 LEAF = 12  # points of a leaf, at most; with 4 to 24 it is as fast
 DEEPEST = 64  # nodes that wait at once, more than any tree is deep
 
@@ -130,3 +132,14 @@ def find_nearest(
                 squares[k], rows[k] = np.inf, total
             else:
                 squares[k] = np.sqrt(squares[k])
+
+
+@njit(cache=True, nogil=True)
+def columns_about(cell: int, keys: np.ndarray, spans: np.ndarray, ranges: np.ndarray) -> None:
+    """Fills ``ranges`` (9, 2): where the points of the 27 cells around ``cell`` begin and end in the sorted ``keys``.
+    Three cells that are adjacent in z have consecutive keys, so that nine ranges suffice. ``keys`` and ``spans`` are
+    those of ``cells.Cells``."""
+    for column in range(COLUMNS):
+        low = cell + ((column // 3 - 1) * spans[1] + column % 3 - 1) * spans[2] - 1
+        ranges[column, 0] = np.searchsorted(keys, low)
+        ranges[column, 1] = np.searchsorted(keys, low + 3)

@@ -1,11 +1,22 @@
 """Packs cameras into rows of numbers for compiled loops, which ``projection_kernels`` reads. ``rig.camera`` is the
-reference."""
+reference. And draws depth on the processor: which triangle a pixel sees, and how far away.
 
+The z-buffer serves visibility for the texture (section 4.5), and a result's figures and small pictures, where reading
+images back from OpenGL takes longer than drawing them here. ``rig.render`` is the reference; tests compare the two.
+Vertices are projected exactly, lens distortion included. Triangles between them are drawn with straight edges, which on
+a head of 48,000 vertices (edges of 2 to 5 px) is wrong by less than 0.001 px.
+"""
+
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32, Int, Int32, UInt8
 
-from pipeline.geometry.projection_kernels import project_all
+from pipeline.compute.threads import map_in_threads
+from pipeline.compute.trace import traced
+from pipeline.geometry.projection_kernels import interpolate, project_all, rasterise
 from rig.camera import Camera
+from rig.mesh import Mesh
+from rig.rig import Rig
 
 MAX_RADIUS = 1e6  # instead of an endless turning radius, which compiled loops with fast arithmetic may not meet
 
@@ -25,3 +36,43 @@ def packed_camera(camera: Camera) -> Float[np.ndarray, " 22"]:
 def project_points(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """Projects world points (mm) to pixels as ``Camera.project`` does, compiled, in a tenth of the time."""
     return project_all(packed_camera(camera), np.ascontiguousarray(points_world, float))
+
+
+def camera_depths(camera: Camera, points_world: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
+    """Returns the camera z of world points, mm."""
+    return points_world @ camera.camera_from_world.rotation[2] + camera.camera_from_world.translation[2]
+
+
+def depth_map(
+    camera: Camera, vertices_world: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float32[np.ndarray, "h w"], Int32[np.ndarray, "h w"]]:
+    """Returns the camera z (mm) and the visible face at each pixel, for a mesh in the world frame, as ``rasterise``
+    does."""
+    k = camera.intrinsics
+    return rasterise(
+        project_points(camera, vertices_world), camera_depths(camera, vertices_world), faces, k.height, k.width
+    )
+
+
+@traced
+def depth_maps(rig: Rig, mesh_world: Mesh) -> dict[str, Float32[np.ndarray, "_ _"]]:
+    """Returns the depth image of a mesh in every camera of a rig: camera z (mm) at each pixel, inf beside the mesh."""
+    vertices, faces = mesh_world.vertices, mesh_world.faces
+    found = map_in_threads(lambda k: depth_map(rig.cameras[k], vertices, faces)[0], len(rig))
+    return dict(zip(rig.names, found, strict=True))
+
+
+def picture(
+    camera: Camera,
+    vertices_world: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    colours: UInt8[np.ndarray, "v 3"],
+    background: tuple[int, int, int] = (255, 255, 255),
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Draws the mesh with its vertex colours, unlit, as the camera sees it."""
+    pixels, depths = camera.project(vertices_world), camera_depths(camera, vertices_world)
+    _, seen = rasterise(pixels, depths, faces, camera.intrinsics.height, camera.intrinsics.width)
+    image = interpolate(seen, pixels, depths, faces, colours.astype(np.float32))
+    canvas = np.full(image.shape, background, np.uint8)
+    cv2.copyTo(cv2.convertScaleAbs(image), (seen >= 0).view(np.uint8), canvas)  # it rounds
+    return canvas

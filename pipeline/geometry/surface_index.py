@@ -1,15 +1,16 @@
-"""Finds closest points on triangle surfaces, exactly among the triangles around the nearest samples of the surface.
+"""Finds closest points on triangle surfaces, exactly among the triangles around the nearest samples of the surface; and
+the faces at each vertex.
 
 Lengths are in mm, in any common frame."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Int64
 
 from pipeline.compute.threads import in_threads
-from pipeline.geometry.closest_point_kernels import closest_of_candidates
 from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.surface_kernels import closest_of_candidates, cosines_towards, sort_corners
 
 
 def closest_candidates(
@@ -104,3 +105,20 @@ def _samples(
         points.append(np.einsum("gk,fkx->fgx", weights, corners[faces]).reshape(-1, 3))
         owner.append(np.repeat(faces, len(weights)))
     return np.concatenate(points), np.concatenate(owner)
+
+
+def corners_at_vertices(
+    faces: Int[np.ndarray, "f 3"], count: int
+) -> tuple[Int64[np.ndarray, " v1"], Int64[np.ndarray, " e"]]:
+    """Returns the corners of faces at each of ``count`` vertices as compressed rows, ``start`` and ``corner``: those of
+    vertex i are ``corner[start[i]:start[i + 1]]``. Corner 3 f + k is the k-th of face f."""
+    return sort_corners(np.array(faces, np.int32, order="C"), count)
+
+
+def facing_cosine(
+    place: Float[np.ndarray, " 3"], points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " n"]:
+    """Returns the cosine between the unit normal of each point and the direction from there to a place."""
+    return cosines_towards(
+        np.ascontiguousarray(place, float), np.ascontiguousarray(points, float), np.ascontiguousarray(normals, float)
+    )

@@ -4,7 +4,7 @@ Gibson, *Constrained elastic surface nets*, 1998, the naive kind: a vertex in ev
 the mean of the points where the cell's edges cross zero; and a quadrilateral over every edge with both signs. Enters: a
 field, negative inside, at the nodes of a sparse grid, positive on the outermost ones. Leaves:
 vertices in grid steps, triangles facing outwards. The mesh is closed; it is a manifold if the signs are well composed
-(``pipeline.fusion.net_kernels``).
+(``pipeline.fusion.grid_kernels``).
 """
 
 from dataclasses import dataclass

@@ -1,12 +1,18 @@
-"""Lists the available head models and their files. Loads no model: the command line calls it."""
+"""Lists the available head models and their files. Loads no model: the command line calls it.
 
+The data folder is ``--data``, which sets EIGENHEAD_DATA, else EIGENHEAD_DATA, else ``$XDG_DATA_HOME/eigenhead``, else
+~/.local/share/eigenhead. Models lie in its folder ``models``, unless EIGENHEAD_MODELS names another one: one rule for
+the command line, the service and its workers.
+"""
+
+import os
 from functools import lru_cache
 from pathlib import Path
 
-from pipeline.head_model.data_folder import models_folder
 from rig.digest import sha256_of
 from rig.errors import EigenheadError
 
+DATA, MODELS = "EIGENHEAD_DATA", "EIGENHEAD_MODELS"
 PACKS = Path(__file__).parent / "packs"
 DEFAULT = "makehuman-138"
 _PACK_FILES = {"default": "makehuman.npz", DEFAULT: "makehuman.npz", "makehuman": "makehuman.npz"}
@@ -72,3 +78,17 @@ def remove_model(name: str) -> Path:
         raise ShippedModel(name) if name in _PACK_FILES else UnknownModel(name)
     path.unlink()
     return path
+
+
+def data_folder() -> Path:
+    """Returns the folder in which captures, results, keys, jobs and models are kept. The folder need not exist."""
+    configured = os.environ.get(DATA)
+    if configured:
+        return Path(configured)
+    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "eigenhead"
+
+
+def models_folder() -> Path:
+    """Returns the folder of the user's head models. The folder need not exist."""
+    configured = os.environ.get(MODELS)
+    return Path(configured) if configured else data_folder() / "models"

@@ -20,10 +20,9 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
-from pipeline.geometry.normals import facing_cosine
-from pipeline.geometry.projection import project_points
-from pipeline.geometry.raster import camera_depths
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection import camera_depths, project_points
+from pipeline.geometry.projection_kernels import interpolate, rasterise
+from pipeline.geometry.surface_index import facing_cosine
 from pipeline.imaging.silhouette import Silhouette
 from rig.camera import Camera
 from rig.mesh import Mesh

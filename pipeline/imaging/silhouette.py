@@ -79,11 +79,6 @@ def _distance_transform(mask: Mask) -> Float32[np.ndarray, "h w"]:
     return np.sqrt(np.rint(squares, out=squares), out=squares).astype(np.float32)
 
 
-def xor_cost(observed: Mask, model: Mask) -> float:
-    """Computes the paper's eq. (4): the number of pixels in which two masks differ."""
-    return float(np.count_nonzero(observed ^ model))
-
-
 def boundary_weights(observed: Mask) -> Float32[np.ndarray, "h w"]:
     """Returns the weights ``1 / d(i, j)^2`` of eq. (5), where ``d = D(S) + D(~S)`` is the distance (px) from the
     observed contour."""

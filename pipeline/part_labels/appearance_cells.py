@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.raster import camera_depths
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection import camera_depths
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.imaging.colour_balance import balance
 from rig.camera import Camera
 from rig.colour_space import linear_from_srgb

@@ -19,7 +19,6 @@ from pipeline.stereo.depth_map import DepthMap, points_world
 from rig.camera import Camera
 from rig.rig import Rig
 
-SKIN = Part.SKIN  # as the laboratory calls it
 PART_NAMES = tuple(part.name.lower() for part in Part)  # by code, in the report
 CELL_MM = 4.0  # edge of a cell
 

@@ -4,8 +4,8 @@ Enters: a solved contour problem and the photographs. Leaves: the same problem, 
 observations of the surface. There are three rounds, from coarse to fine. Each patch of the current surface
 (``patches``) is moved along its normal through the images of the cameras that see it. The surface is observed where its
 views look most alike (``depth_search``), and the shifts that remain between the views correct the cameras
-(``camera_term``). A patch whose best match is weak or at the end of the search (hidden, glossy, without texture) is
-left out, and so is hair (``hair_mask``). The observations enter the normal equations beside rims, features and priors
+(``depth_search``). A patch whose best match is weak or at the end of the search (hidden, glossy, without texture) is
+left out, and so is hair (``under_hair``). The observations enter the normal equations beside rims, features and priors
 (``surface_term``), robustly; where there are none, the kernels continue the surface smoothly.
 """
 
@@ -35,9 +35,8 @@ from pipeline.photometric_fit.depth_search import (
     pixels_per_mm,
     sample_visibility,
 )
-from pipeline.photometric_fit.hair_mask import HairProbability, under_hair
 from pipeline.photometric_fit.images import fine_texture, load_photographs
-from pipeline.photometric_fit.patches import Patches, arrays_of, make_patches
+from pipeline.photometric_fit.patches import HairProbability, Patches, arrays_of, make_patches, under_hair
 from pipeline.warnings import Detail
 from rig.mesh import vertex_normals
 from rig.messages.message import compose

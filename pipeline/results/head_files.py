@@ -7,8 +7,10 @@ vertices of head.glb are those of head.ply in the same order; the vertices on th
 a normal map it has only some of them (``rows_of_ply``).
 """
 
+import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,8 +27,9 @@ from pipeline.texturing.sets.texture_sets import SetTextures
 from pipeline.texturing.visibility import LINEAR
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.glb import scene_glb_bytes
-from rig.formats.meshes.obj import mtl_bytes, scene_obj_bytes
+from rig.formats.meshes.markups import MarkupPoint, markups_document
 from rig.formats.meshes.ply import write_ply
+from rig.formats.meshes.polygon_obj import mtl_bytes, scene_obj_bytes
 from rig.formats.meshes.printing import stl_bytes, threemf_bytes
 from rig.formats.meshes.scene import Part, Scene, Skin
 from rig.formats.meshes.usdz import scene_usdz_bytes
@@ -34,6 +37,7 @@ from rig.formats.pictures.exr import write_exr
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 
+LPS_FROM_HEAD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 JPEG_OPTIONS = (
     cv2.IMWRITE_JPEG_QUALITY, 92, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
 )  # fmt: skip
@@ -202,7 +206,7 @@ def write_set_textures(folder: Path, sets: SetTextures) -> None:
         _write_png(folder / "diffuse.png", sets.diffuse.image)
         write_exr(folder / "diffuse.exr", LINEAR[sets.diffuse.image])
         light = sets.specular.light.astype(np.float32)
-        _write_png(folder / "specular.png", _encode_light(light))
+        _write_png(folder / "specular.png", ENCODED[(CODES * np.clip(light, 0.0, 1.0) + 0.5).astype(np.int32)])
         write_exr(folder / "specular.exr", light)
 
 
@@ -218,10 +222,29 @@ def strength_png(specular: Specular) -> bytes:
     return cv2.imencode(".png", cv2.merge([np.full_like(alpha, 255)] * 3 + [alpha]), PNG_SPEED)[1].tobytes()
 
 
-def _encode_light(light: Float[np.ndarray, "s s 3"]) -> UInt8[np.ndarray, "s s 3"]:
-    return ENCODED[(CODES * np.clip(light, 0.0, 1.0) + 0.5).astype(np.int32)]
-
-
 def _write_png(path: Path, image: UInt8[np.ndarray, "s s 3"] | UInt16[np.ndarray, "s s"]) -> None:
     stored = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
     write_atomically(path, cv2.imencode(".png", stored, PNG_SPEED)[1].tobytes())
+
+
+def landmarks_document(result: Reconstruction) -> dict[str, Any]:
+    """Returns ``landmarks.mrk.json``, a point list of 3D Slicer, as JSON types, with one control point for each
+    landmark: in the patient's axes LPS (to the left, posterior, superior; mm) with the head frame's origin and true
+    size. A point (x, y, z) of the head frame is (x, -z, y)."""
+    place = result.head.fit.world_from_head
+    head_from_world = RigidTransform(place.rotation, place.translation).inverse()  # keeps the size, as head.glb does
+    lps_from_world = RigidTransform(LPS_FROM_HEAD, np.zeros(3)) @ head_from_world
+    points = {
+        name: MarkupPoint(lps_from_world.apply(landmark.position_mm), uncertainty(landmark.std_mm))
+        for name, landmark in result.evidence.landmarks.items()
+    }
+    return markups_document(points, "LPS")
+
+
+def uncertainty(std_mm: Float[np.ndarray, " 3"] | None) -> str:
+    """Returns the standard deviation as text: that of the distance, which no rotation changes, and those of the three
+    world coordinates, as in report.json."""
+    if std_mm is None:
+        return "standard deviation unknown"
+    x, y, z = (float(value) for value in std_mm)
+    return f"standard deviation {math.hypot(x, y, z):.3f} mm; of world x {x:.3f}, y {y:.3f}, z {z:.3f} mm"

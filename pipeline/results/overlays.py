@@ -1,4 +1,5 @@
-"""Draws the pictures of a result: input and fitted contour over each image, the contact sheet, the turntable strip.
+"""Draws the pictures of a result: input and fitted contour over each image, the contact sheet, the turntable strip;
+and a head in clay or in colours, lit from its right front.
 
 A contour is painted from its signed distance d, with opacity ``half width + 1/2 - |d|``, so that it is antialiased and
 lies where the sub-pixel contour lies. Vermilion and sky blue can be told apart with every kind of colour vision (Okabe
@@ -12,14 +13,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.compute.threads import map_in_threads
-from pipeline.geometry.raster import picture
-from pipeline.imaging.contour_distance import chamfer
-from pipeline.imaging.masks import box_around
+from pipeline.geometry.projection import picture
+from pipeline.imaging.masks import box_around, chamfer
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.image import ImageRgb
 from rig.mesh import Mesh
 
+SKIN = np.array([214.0, 188.0, 168.0])
+LAMP = np.array([-0.35, 0.45, 0.82])  # head frame
+AZIMUTH_DEG, CLAY_PANEL = 30.0, (360, 480)
+DARKEST = 0.25  # of the colour, where no light comes
 INPUT_COLOUR = (70, 215, 255)  # sky blue, a little lighter
 FITTED_COLOUR = (255, 110, 20)  # vermilion, a little lighter
 PART_COLOURS = {"skin": (240, 228, 66), "hair": (0, 158, 115), "clothes": (204, 121, 167)}  # Okabe and Ito's, too
@@ -185,3 +189,34 @@ def _paint(
     pixels = canvas.reshape(-1, 3)
     alpha = strength * np.clip(width / 2 + 0.5 - distance, 0.0, 1.0)[:, None]
     pixels[index] = np.round(pixels[index] + alpha * (np.array(colour, np.float32) - pixels[index]))
+
+
+def clay(
+    mesh: Mesh,
+    *,
+    colours: UInt8[np.ndarray, "v 3"] | None = None,
+    azimuth_deg: float = AZIMUTH_DEG,
+    panel: tuple[int, int] = CLAY_PANEL,
+    box: Box | None = None,
+    paper: tuple[int, int, int] = PAPER,
+    darkest: float = DARKEST,
+) -> Resized:
+    """Draws a mesh (head frame, mm), supersampled twice.
+
+    ``mesh``: the head. ``colours``: sRGB of its vertices; None draws clay. ``azimuth_deg``: direction from which it is
+    seen, 0 = from the front, positive from its left. ``panel``: width and height of the picture, px. ``box``: two
+    opposite corners (mm) of what fills the picture, so that several meshes can share a scale; None fits the mesh.
+    ``paper``: sRGB of the background. ``darkest``: brightness of surfaces in full shadow.
+    """
+    fitting = (mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) if box is None else box
+    shaded = lit(mesh, colours, darkest)
+    return portrait(mesh, shaded, fitting, azimuth_deg, panel, paper=paper, lift=0.05, share=0.85)
+
+
+def lit(
+    mesh: Mesh, colours: UInt8[np.ndarray, "v 3"] | None = None, darkest: float = DARKEST
+) -> UInt8[np.ndarray, "v 3"]:
+    """Returns the colours of the vertices (clay if None) shaded by the lamp."""
+    cosine: Float[np.ndarray, " v"] = np.clip(mesh.normals() @ (LAMP / np.linalg.norm(LAMP)), 0.0, 1.0)
+    base = SKIN if colours is None else colours.astype(float)
+    return np.clip(base * (darkest + (1.0 - darkest) * cosine[:, None]), 0, 255).astype(np.uint8)

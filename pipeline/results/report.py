@@ -10,8 +10,7 @@ from jaxtyping import Float
 
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.expression import BlendshapeRig
-from pipeline.evidence.gaze import angles_deg
-from pipeline.evidence.pose import PoseEvidence
+from pipeline.evidence.pose import PoseEvidence, angles_deg
 from pipeline.faces.detection import FaceDetection
 from pipeline.faces.irises import Iris, UnseenEye
 from pipeline.faces.subject import SubjectFaces

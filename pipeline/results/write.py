@@ -24,12 +24,19 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.compute.threads import task_pool
-from pipeline.results.head_files import head_from_world, head_mesh, head_skin, plain_skin, write_formats, write_head_ply
+from pipeline.results.head_files import (
+    head_from_world,
+    head_mesh,
+    head_skin,
+    landmarks_document,
+    plain_skin,
+    write_formats,
+    write_head_ply,
+)
 from pipeline.results.overlays import contact_sheet, difference, overlay, turntable
 from pipeline.results.reconstruction import QUALITY, Reconstruction, asset_extras, ply_comments
 from pipeline.results.report import report_document
 from pipeline.results.report_types import AddedReport
-from pipeline.results.slicer_landmarks import landmarks_document
 from pipeline.stages.bust import Bust, HairyHead
 from rig.atomic_write import write_atomically
 from rig.capture import Capture, reassign_images

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from pipeline.imaging.chart_plates import empty_plates
+from pipeline.imaging.colour_chart import empty_plates
 from pipeline.imaging.masks import dilated, eroded, spread
 from pipeline.segmentation.background import (
     ANY_COLOUR_ODDS,
@@ -28,7 +28,7 @@ from pipeline.segmentation.background import (
     estimate_background,
     plate_tolerance,
 )
-from pipeline.segmentation.mean_field_kernels import MAX_ODDS, mean_field_sweeps
+from pipeline.segmentation.mask_kernels import MAX_ODDS, mean_field_sweeps
 
 DARKEST_SHADOW = 0.55  # share of the sRGB code that a soft shadow leaves (a quarter of the light)
 SHADOW_CHROMA = 0.05  # how far a shadow's colour may be from the plate's, by the light it takes
@@ -45,8 +45,6 @@ MAX_HOLE_SHARE = 0.02  # of the subject: smaller holes that are not quite the pl
 CLOSING = 2  # coarse pixels
 CONCLUSIVE = 10.0  # standard deviations between plate and subject's colour at which a look of the plate is proof
 SHADES = 0.35, 1.15  # by which the subject's colour may be darker (in codes; a tenth of the light) or brighter nearby
-
-
 PAINT_ODDS = 4.4  # log odds that the free choice of the shade costs: 1 % of brightness, the noise, out of 80 %
 ALLOWED, DENIED = 4.0, 3.0  # log odds for a pixel that no other camera denies, and against one that three deny
 PALETTE = 16  # bins a channel of the subject's colours

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32, UInt8
 from pipeline.imaging.masks import box_around, dilated, eroded, spread
 from pipeline.segmentation.background import Background
 from pipeline.segmentation.foreground import Decision
-from pipeline.segmentation.matting_kernels import MAX_ALPHA_INFORMATION, solve_alpha
+from pipeline.segmentation.mask_kernels import MAX_ALPHA_INFORMATION, solve_alpha
 from rig.colour_space import linear_from_srgb
 
 Plane = Float32[np.ndarray, "h w"]
@@ -36,12 +36,8 @@ WINDOW_PX = 3.0  # sigma of the window it is averaged in
 DEPTH = 6  # bands inside the outline up to which a gap before the plate is looked for: 48 px
 COARSE_ALPHA_SIGMA = 1.0  # standard deviation of alpha at which the coarse mask counts as much as the pixel
 LINEAR = (255 * linear_from_srgb(np.arange(257) / 255.0)).astype(np.float32)  # by code, one more to interpolate to
-
-
 SHADE = 0.08  # standard deviation of the subject's brightness at the rim, of full alpha: surfaces darken as they turn
 # away
-
-
 WIDE_PX = 2.5  # sigma of that window
 MARGIN_PX = 12  # around the band: beyond every window here and in what follows
 

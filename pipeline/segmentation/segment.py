@@ -28,13 +28,12 @@ from jaxtyping import Bool, Float, Float32, Int8, UInt8
 from pipeline.compute.threads import map_in_threads, task_pool
 from pipeline.compute.trace import traced
 from pipeline.geometry.projection import packed_camera
-from pipeline.imaging.contour_distance import distance_to_level
-from pipeline.imaging.masks import dilated, eroded
+from pipeline.imaging.masks import dilated, distance_to_level, eroded
 from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from_mask
 from pipeline.multiview.visual_hull import depth_of, hull_extent, mask_extent
 from pipeline.segmentation.background import Background
-from pipeline.segmentation.cross_view_kernels import MIN_WITNESSES, least_dissent
 from pipeline.segmentation.foreground import Decision, decide, doubtful, reconsider
+from pipeline.segmentation.mask_kernels import MIN_WITNESSES, least_dissent
 from pipeline.segmentation.matting import ALPHA_BLUR_PX, WEAK_CONTRAST, Matte, solve_matte
 from pipeline.segmentation.without_plates.head_seed import HeadSeed, above_chin, find_head_seed
 from rig.camera import Camera
@@ -186,11 +185,6 @@ def _operators(mask: Bool[np.ndarray, "h w"], share: UInt8[np.ndarray, "h w"] | 
         return replace(silhouette_from_mask(mask), quality=_mask_quality(mask))
     smooth = cv2.GaussianBlur(share * np.float32(1 / 255), (0, 0), ALPHA_BLUR_PX)
     return Silhouette(mask, distance_to_level(smooth), _mask_quality(mask))
-
-
-def segment_view(image: ImageRgb, plates: tuple[ImageRgb, ...]) -> Silhouette:
-    """Returns the silhouette of one image from its clean plates alone, without other cameras."""
-    return _refined(image, _decided(image, plates))
 
 
 def _decided(image: ImageRgb, plates: tuple[ImageRgb, ...]) -> Decision:

@@ -9,8 +9,8 @@ from pipeline.alignment.landmarks import TooFewFeatures, WrongFeatures, feature_
 from pipeline.alignment.silhouette_search import NoSubject, moved_to_hull, search_alignment, upright_axes
 from pipeline.contour_fit.problem import LandmarkObservations
 from pipeline.faces.landmark_map import landmark_map
+from pipeline.head_model.gaussian_process import model_basis
 from pipeline.head_model.model import HeadModel
-from pipeline.head_model.model_basis import model_basis
 from pipeline.multiview.upright import guessed_up
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
@@ -19,8 +19,7 @@ from pipeline.stages.recorder import Staged
 from pipeline.stages.views import Views
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
-from rig.messages.fault_groups import say_once
-from rig.messages.message import compose
+from rig.messages.message import compose, say_once
 from rig.progress import Progress
 from rig.rig import Rig
 

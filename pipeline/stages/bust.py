@@ -12,7 +12,7 @@ from pipeline.fusion.hair import find_silent_hair, parts_over_head, without_spec
 from pipeline.fusion.signed_distance import NoSurface
 from pipeline.fusion.skin import HeadSkin
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.projection import depth_maps
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import scalp
 from pipeline.part_labels.codes import Part

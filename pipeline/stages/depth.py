@@ -6,10 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.detail.cap_points import skin_under_cap
-from pipeline.detail.dense_points import dense_points
+from pipeline.detail.dense_points import SurfacePoints, dense_points, skin_under_cap
 from pipeline.detail.depth_bias import OnFace, measure_bias, points_on_face
-from pipeline.detail.surface_points import SurfacePoints
 from pipeline.imaging.highlights import without_highlights
 from pipeline.part_labels.votes import PartVotes, vote_parts
 from pipeline.settings import FINE_LEVELS, Settings
@@ -18,9 +16,8 @@ from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged
 from pipeline.stages.views import Views
-from pipeline.stereo.depth_map import DepthMap
+from pipeline.stereo.depth_map import DepthMap, WindowBias
 from pipeline.stereo.estimate import estimate_depth
-from pipeline.stereo.window_bias import WindowBias
 
 
 @dataclass(frozen=True, slots=True, eq=False)

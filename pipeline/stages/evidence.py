@@ -21,10 +21,9 @@ from pipeline.evidence.expression import (
     found_expressions,
     shut_eyes,
 )
-from pipeline.evidence.gaze import pupils
 from pipeline.evidence.measurements import Landmark, Measurement, landmarks, measurements
 from pipeline.evidence.plausibility import UnexplainedOutlines, plausibility_warnings, unexplained_outlines, unseen_face
-from pipeline.evidence.pose import PoseEvidence, judge_pose
+from pipeline.evidence.pose import PoseEvidence, judge_pose, pupils
 from pipeline.faces.eyes import MAX_CLOSED_OPENING, closed_by_openings, eye_warnings
 from pipeline.faces.landmark_map import landmark_map
 from pipeline.head_model.expressions import words

@@ -7,18 +7,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from pipeline.contour_fit.bare_outline import with_bare_outline, with_counted_crown
-from pipeline.contour_fit.cap_outline import CapOutline, cells_of_views, without_cap
-from pipeline.contour_fit.contour import ContourSolution, finish, last_problem, solve_contour
+from pipeline.contour_fit.bare_outline import (
+    CapOutline,
+    cells_of_views,
+    with_bare_outline,
+    with_counted_crown,
+    without_cap,
+)
+from pipeline.contour_fit.contour import ContourSolution, finish, last_problem, solve_contour, with_span_misfit
 from pipeline.contour_fit.expression_evidence import doubtful_weights, with_expression_evidence
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, with_estimated_prior
-from pipeline.contour_fit.span_misfit import with_span_misfit
+from pipeline.head_model.gaussian_process import basis_of, model_basis
 from pipeline.head_model.model import HeadModel
-from pipeline.head_model.model_basis import basis_of, model_basis
 from pipeline.imaging.highlights import without_highlights
 from pipeline.part_labels.cap import Cap
-from pipeline.photometric_fit.hair_mask import HairProbability
+from pipeline.photometric_fit.patches import HairProbability
 from pipeline.photometric_fit.refine import FINE_AMPLITUDE_MM, refine_with_photographs
 from pipeline.settings import PHOTO_LEVELS
 from pipeline.simplex.hierarchy import fit_simplex

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
+from pipeline.head_model.gaussian_process import model_basis
 from pipeline.head_model.model import HeadModel
-from pipeline.head_model.model_basis import model_basis
 from pipeline.part_labels.cap import Cap, find_cap
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap, classify_parts

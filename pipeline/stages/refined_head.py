@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.contour_fit.posterior import vertex_deviation_mm
+from pipeline.detail.dense_points import with_scaled_deviation
 from pipeline.detail.depth_bias import without_window_bias
 from pipeline.detail.eyelids import measure_eye_appearance
 from pipeline.detail.outline_points import outline_search
 from pipeline.detail.patch_points import patch_search
 from pipeline.detail.refine import MIN_OBSERVED_SHARE, DeformedSurface, refine_to_surface
-from pipeline.detail.surface_points import with_scaled_deviation
 from pipeline.fusion.untangling import untangled_head
 from pipeline.photometric_fit.depth_search import head_depth_factor
 from pipeline.stages.context import ReconstructionContext

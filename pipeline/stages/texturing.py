@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.projection import depth_maps
 from pipeline.head_model.regions import halves_of_face, pinnae, scalp
 from pipeline.part_labels.codes import Part
 from pipeline.stages.context import ReconstructionContext
@@ -20,8 +20,7 @@ from pipeline.texturing.chart_colours import ChartColours, chart_colours, with_t
 from pipeline.texturing.layout.normal_map import ReducedLayout, reduced_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.paint import find_layout, paint_head
-from pipeline.texturing.pores.close_views import CloseViews, read_close_views
-from pipeline.texturing.pores.skin_maps import SkinMaps, skin_maps, skin_share
+from pipeline.texturing.pores.skin_maps import CloseViews, SkinMaps, read_close_views, skin_maps, skin_share
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
 from pipeline.texturing.vertex_colours import Shown, Texture, texture
 from pipeline.warnings import ReportWarning

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, UInt8
 from pipeline.geometry.projection import packed_lens
 from pipeline.imaging.grey import LUMINANCE, blur_growth, noise_left, noise_level
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.stereo.crop_kernels import fill_lens_map
+from pipeline.stereo.depth_map_kernels import fill_lens_map
 from rig.camera import Camera, Intrinsics
 from rig.rig import Rig
 

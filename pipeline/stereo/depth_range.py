@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from pipeline.compute.threads import map_in_threads
-from pipeline.geometry.raster import depth_map
+from pipeline.geometry.projection import depth_map
 from pipeline.stereo.crops import MAX_UNSEEN_PX, Crop
-from pipeline.stereo.depth_range_kernels import find_depth_range
+from pipeline.stereo.depth_map_kernels import find_depth_range
 from pipeline.stereo.stack import Stack
 from rig.mesh import Mesh
 

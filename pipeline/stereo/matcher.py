@@ -14,10 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
 
 from pipeline.stereo.depth_range import DepthRange
-from pipeline.stereo.matching_kernels import Sight, farthest, make_scratch
-from pipeline.stereo.refine_kernels import propagate, slide
+from pipeline.stereo.matching_kernels import Sight, farthest, make_scratch, propagate, slide, sweep_view
 from pipeline.stereo.stack import SHADES, Stack
-from pipeline.stereo.sweep_kernels import sweep_view
 from rig.render.compute import ComputeDevice, DeviceArray
 
 Plane = Float32[np.ndarray, "h w"]
@@ -51,7 +49,7 @@ class Matcher(Protocol):
 
     def propagate(self, planes: Planes, parity: int, steps_px: Sequence[int], same_mm: float) -> None:
         """Lets pixels take over the planes of neighbours where these cost less, for the pixels of one colour of a
-        chequerboard (``parity`` 0 or 1). Changes ``planes`` in place; ``refine_kernels.propagate`` says how."""
+        chequerboard (``parity`` 0 or 1). Changes ``planes`` in place; ``matching_kernels.propagate`` says how."""
         ...
 
     def slide(self, most_px: float, depth: Plane, slopes: Float32[np.ndarray, "h w 2"]) -> tuple[Plane, Plane, Plane]:

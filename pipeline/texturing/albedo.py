@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.compute.threads import in_threads
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.texturing.chart_colours import ChartColours, levelled_by_chart
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, spread_texels
 from pipeline.texturing.light import Light, fit_light, transfer

@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.compute.threads import map_in_threads
-from pipeline.imaging.chart_plates import charts_in
-from pipeline.imaging.colour_chart import Chart, ChartCorrection, chart_correction, chart_normal
+from pipeline.imaging.colour_chart import Chart, ChartCorrection, chart_correction, chart_normal, charts_in
 from pipeline.texturing.light import BAND_FACTORS, Light, harmonics
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture

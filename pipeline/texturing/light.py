@@ -17,8 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.threads import in_threads
-from pipeline.geometry.projection import project_points
-from pipeline.geometry.raster import camera_depths, depth_map
+from pipeline.geometry.projection import camera_depths, depth_map, project_points
 from pipeline.texturing.neighbourhood import Neighbourhood
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at

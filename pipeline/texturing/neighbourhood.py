@@ -14,7 +14,7 @@ import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from pipeline.compute.threads import in_threads
-from pipeline.texturing.inpaint_kernels import LANES, by_rings, first_guess, relax
+from pipeline.texturing.paint_kernels import LANES, by_rings, first_guess, relax
 from pipeline.texturing.view_selection_kernels import level_view
 
 

@@ -12,16 +12,23 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion.refinement import neighbours
-from pipeline.fusion.refinement_kernels import blurred_over_mesh
-from pipeline.geometry.raster import camera_depths
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.fusion.vote_kernels import blurred_over_mesh
+from pipeline.geometry.projection import camera_depths
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings
-from pipeline.texturing.decision import Decision
-from pipeline.texturing.layout.charts import lay_out_charts
-from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, ModelLayout, NoLayout, model_layout, spread_texels
+from pipeline.texturing.layout.uv_unwrap import (
+    Atlas,
+    Layout,
+    ModelLayout,
+    NoLayout,
+    lay_out_charts,
+    model_layout,
+    spread_texels,
+)
 from pipeline.texturing.paint_kernels import paint_rows
 from pipeline.texturing.vertex_colours import Texture
+from pipeline.texturing.visibility import Decision
 from pipeline.warnings import ReportWarning
 from rig.mesh import Mesh
 from rig.messages.message import compose

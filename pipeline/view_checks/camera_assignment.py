@@ -83,7 +83,7 @@ def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignme
     if len(seen) < MIN_CAMERAS:
         return NOTHING
     hulls = [outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen]
-    if not _any_suspect(hulls, seen):
+    if not (mean_misfit(tangency_errors_px(hulls, seen)) > SUSPECT_MISFIT).any():  # more than good masks do
         return NOTHING
     misfit = _misfit_tensor(hulls, seen)
     return _judged(_least_misfit(misfit, seen), misfit, seen)
@@ -134,11 +134,6 @@ def with_masks(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
     return rig.subset(
         name for name in rig.names if name in silhouettes and silhouettes[name].distance.min() < -INSET_PX
     )
-
-
-def _any_suspect(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> bool:
-    """Tells whether the planes of any camera contradict the others more than good masks do."""
-    return bool((mean_misfit(tangency_errors_px(hulls, rig)) > SUSPECT_MISFIT).any())
 
 
 def tangency_errors_px(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np.ndarray, "n n 2"]:

@@ -79,8 +79,6 @@ GUARDS = (
     Guard(("scale-implausible",), ("diameters in the outlines",), "a head of the wrong size", kind="warns"),
     Guard(("outlines-loose",), ("tangent planes of most cameras",), "a head widened by loose masks", kind="warns"),
 )  # fmt: skip
-
-
 _BY_CODE = {code: guard for guard in GUARDS for code in guard.codes}
 
 

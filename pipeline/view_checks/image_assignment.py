@@ -31,8 +31,7 @@ from pipeline.view_checks.rig_agreement import loose_outlines, wrong_rig
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture, Features, reassign_images, turn_masks
 from rig.errors import EigenheadError
-from rig.messages.fault_groups import some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, some_of
 from rig.rig import Rig
 
 MAX_REENCODED = 25  # grey levels, 99 % of the pixels: JPEG of quality 50 changes 14, other views of four captures 78

@@ -26,8 +26,7 @@ from rig.capture import Capture
 from rig.colour_space import linear_from_srgb
 from rig.errors import EigenheadError
 from rig.image import ImageRgb
-from rig.messages.fault_groups import say_once
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, say_once
 from rig.rig import Rig
 
 MIN_VIEWS = 3

@@ -1,17 +1,22 @@
 """Judges the pictures of a shot: light, focus, and what the cameras look at. All are pure functions of pictures, clean
-plates and settings."""
+plates and settings. New clean plates must show an empty studio before they replace others: by what moves while they are
+taken, by their light, and by comparison with the plates in use.
+"""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from statistics import median
 
-from rig.acquisition.image_checks import Registration, blur_px, exposure, register
-from rig.acquisition.plates import Plates
-from rig.acquisition.shot import Fault, PictureCheck
+import numpy as np
+
+from rig.acquisition.image_checks import Registration, blur_px, disturbed, exposure, find_subject, noise_of, register
+from rig.acquisition.plates import NO_PLATES, Plates
+from rig.acquisition.shot import Fault, PictureCheck, ShotFailed
 from rig.formats.rig_toml import ShotConfig
 from rig.image import ImageRgb
 from rig.messages.message import compose
 
+SEEN_SHARE = 0.5  # of the cameras: all see a person in the seat; a change seen by one is of its own wall, or a bump
 OtherView = Callable[[str, Registration], str | None]
 
 LEVEL_WITHOUT_PLATES = 64.0  # a studio picture's mean, where there is no plate to compare with
@@ -127,3 +132,39 @@ def _whose_view(name: str, image: ImageRgb, registration: Registration, plates: 
     others = {other: register(image, plate).found for other, plate in plates.first.items() if other != name}
     best = max(others, key=lambda other: others[other], default=None)
     return best if best is not None and others[best] >= max(FOUND_LEAST, 2 * registration.found) else None
+
+
+class PlatesRefused(ShotFailed):
+    """Reports that new clean plates show a person. They are kept as the version ``version``; the old plates stay in
+    use."""
+
+    def __init__(self, faults: Sequence[Fault], version: str) -> None:
+        super().__init__(faults)
+        self.version = version
+
+
+def plate_faults(taken: Mapping[str, Sequence[ImageRgb]], live: Collection[str], shot: ShotConfig) -> list[Fault]:
+    """Returns the faults that pictures of the empty studio show by themselves. ``live``: cameras whose pictures come
+    from a sensor and are not recorded."""
+    faults = []
+    for name, images in taken.items():
+        if name in live and any(np.array_equal(images[0], other) for other in images[1:2]):
+            faults.append(Fault("frozen", name, compose("plates-equal")))
+        if disturbed(images, noise_of(images) or 0.0):
+            faults.append(Fault("disturbed", name, compose("plates-disturbed")))
+    first = {name: images[0] for name, images in taken.items()}
+    light = judge(first, examine(first, NO_PLATES), NO_PLATES, shot)
+    return faults + [fault for fault in light if fault.is_error]
+
+
+def occupied(taken: Mapping[str, Sequence[ImageRgb]], before: Plates) -> list[Fault]:
+    """Returns a fault for each camera whose new plate differs from the plate in use as if a person sat there. Returns
+    none where fewer than ``SEEN_SHARE`` of the cameras do."""
+    compared = [name for name in taken if name in before and taken[name][0].shape == before.first[name].shape]
+    positions = {name: find_subject(taken[name][0], before.first[name]) for name in compared}
+    faults = [
+        Fault("occupied", name, compose("plate-differs", percent=position.share * 100))
+        for name, position in positions.items()
+        if position is not None
+    ]
+    return faults if len(faults) >= SEEN_SHARE * len(compared) else []

@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rig.acquisition.judgement import examine, judge
-from rig.acquisition.plate_checks import PlatesRefused, occupied, plate_faults
+from rig.acquisition.judgement import PlatesRefused, examine, judge, occupied, plate_faults
 from rig.acquisition.plates import Plates, keep_plates, read_plates, use_plates, write_plates
 from rig.acquisition.shot import Fault, Shot, ShotFailed, Timing, certify
 from rig.acquisition.trigger import Fired, TriggerBox, TriggerError

@@ -16,28 +16,6 @@ from rig.messages.message import Message, MessageDocument, compose, read_message
 
 Status = Literal["in sync", "late", "dropped", "missing", "recorded"]
 
-FAULTS = {
-    "trigger": "the trigger box cannot be used",
-    "late-trigger": "the outputs of the trigger box rose late",
-    "missing": "the camera delivered no picture",
-    "dropped": "the camera's triggered frame got lost",
-    "late": "the camera's frame came late",
-    "frozen": "the camera sends the same picture again and again",
-    "size": "the picture has not the size of the calibration",
-    "lights-off": "every picture is dark",
-    "dark": "the camera's picture is dark",
-    "swapped": "the camera shows what another one should",
-    "view": "the camera does not see what its clean plates show",
-    "moved": "the camera moved since its clean plates",
-    "overexposed": "much of the picture is burnt out",
-    "blurred": "the picture is out of focus",
-    "setting": "the camera did not take a setting of rig.toml",
-    "plates": "there are no clean plates of the camera",
-    "empty": "nobody is in the camera's picture",
-    "cut-off": "the head is cut off by the edge of the picture",
-    "disturbed": "something moved while the clean plates were taken",
-    "occupied": "the new clean plates show somebody whom the old ones do not",
-}
 REMEDIES: dict[str, Message] = {
     "trigger": compose("remedy-trigger"),
     "late-trigger": compose("remedy-late-trigger"),
@@ -78,7 +56,7 @@ class FaultDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Holds one fault: its code (``FAULTS``), the camera that has it (None: the whole rig), and what was measured."""
+    """Holds one fault: its code (see ``REMEDIES``), camera that has it (None: the whole rig), and what was measured."""
 
     code: str
     camera: str | None

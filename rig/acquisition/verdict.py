@@ -9,9 +9,9 @@ from typing import Literal, TypedDict
 import numpy as np
 from jaxtyping import Bool
 
+from rig.acquisition.image_checks import SubjectPlace, find_subject, subject_of_mask
 from rig.acquisition.judgement import examine_picture, judge_checks, plate_level
 from rig.acquisition.shot import CheckDocument, Fault, PictureCheck
-from rig.acquisition.subject_place import SubjectPlace, find_subject, subject_of_mask
 from rig.formats.rig_toml import ShotConfig
 from rig.image import ImageRgb
 from rig.messages.message import compose

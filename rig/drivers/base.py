@@ -7,6 +7,7 @@ A driver belongs to one thread at a time (``rig.drivers.feed``).
 """
 
 import importlib
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, cast, runtime_checkable
@@ -126,3 +127,45 @@ def driver_for(camera: CameraConfig, folder: Path) -> Driver:
     DriverMissing."""
     module = cast(_DriverModule, importlib.import_module(f".{camera.driver}", __package__))
     return module.make(camera, folder)
+
+
+class Pace:
+    """Ticks ``fps`` times a second from its creation on. Ticks that nobody waited for are lost, as frames of a camera
+    are."""
+
+    def __init__(self, fps: float) -> None:
+        self._period_s = 1.0 / fps
+        self._started_s = time.monotonic()
+        self.beat = 0
+
+    def wait(self, timeout_s: float) -> bool:
+        """Sleeps until the next tick, or for ``timeout_s``. Tells whether there was a tick."""
+        passed = int((time.monotonic() - self._started_s) / self._period_s)
+        due = max(self.beat + 1, passed)
+        wait_s = self._started_s + due * self._period_s - time.monotonic()
+        if wait_s > timeout_s:
+            time.sleep(timeout_s)
+            return False
+        time.sleep(max(0.0, wait_s))
+        self.beat = due
+        return True
+
+
+class PacedDriver:
+    """Delivers frames at the camera's rate without a device."""
+
+    def __init__(self, camera: CameraConfig) -> None:
+        self._camera = camera
+        self._pace: Pace | None = None
+
+    def grab(self, timeout_s: float) -> Arrival:
+        """Waits for the next frame at the camera's rate. Raises GrabTimeout, CameraLost."""
+        if self._pace is None:
+            raise CameraLost(self._camera, compose("camera-not-open"))
+        if not self._pace.wait(timeout_s):
+            raise GrabTimeout(self._camera, timeout_s)
+        return Arrival(time.monotonic(), self._pace.beat)
+
+    def trigger(self) -> None:
+        """Does nothing: frames come at their own rate."""
+        return

@@ -4,11 +4,9 @@
 With ``plates = "FOLDER/background"`` in rig.toml, a recorded shot can be taken through a whole session.
 """
 
-import time
 from pathlib import Path
 
-from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout
-from rig.drivers.frame_clock import Pace
+from rig.drivers.base import CameraLost, CameraNotFound, Driver, Pace, PacedDriver
 from rig.errors import InputError
 from rig.formats.pictures.images import IMAGE_SUFFIXES, read_image
 from rig.formats.rig_toml import CameraConfig
@@ -23,18 +21,17 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
     return ReplayDriver(camera, folder)
 
 
-class ReplayDriver:
+class ReplayDriver(PacedDriver):
     """Delivers one recorded picture again and again at a steady rate."""
 
     live = False
 
     def __init__(self, camera: CameraConfig, folder: Path) -> None:
-        self._camera = camera
+        super().__init__(camera)
         capture, _, recorded = camera.identity.partition("#")
         self._images = folder / capture / "images"
         self._recorded = recorded or camera.name
         self._image: ImageRgb | None = None
-        self._pace: Pace | None = None
 
     def open(self, timeout_s: float) -> None:
         """Reads the camera's picture from the capture folder. Raises CameraNotFound."""
@@ -54,23 +51,11 @@ class ReplayDriver:
         """Returns no message: a recorded picture has no settings."""
         return ()
 
-    def grab(self, timeout_s: float) -> Arrival:
-        """Waits for the next frame at the camera's rate. Raises GrabTimeout, CameraLost."""
-        if self._pace is None:
-            raise CameraLost(self._camera, compose("camera-not-open"))
-        if not self._pace.wait(timeout_s):
-            raise GrabTimeout(self._camera, timeout_s)
-        return Arrival(time.monotonic(), self._pace.beat)
-
     def retrieve(self) -> ImageRgb:
         """Returns the recorded picture."""
         if self._image is None:
             raise CameraLost(self._camera, compose("camera-not-open"))
         return self._image
-
-    def trigger(self) -> None:
-        """Does nothing: a recorded picture comes at its own rate."""
-        return
 
     def close(self) -> None:
         """Forgets the recorded picture."""

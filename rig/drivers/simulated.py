@@ -8,8 +8,7 @@ trigger box, serve the studio (``rig.studio.devices.serve``).
 import time
 from pathlib import Path
 
-from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout
-from rig.drivers.frame_clock import Pace
+from rig.drivers.base import CameraLost, CameraNotFound, Driver, Pace, PacedDriver
 from rig.errors import InputError
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb
@@ -25,7 +24,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
     return SimulatedDriver(camera, name or camera.name, mesh_file=folder / file)
 
 
-class SimulatedDriver:
+class SimulatedDriver(PacedDriver):
     """Photographs an ``ImageSource`` or, if there is none, the simulated studio with the head of ``mesh_file`` in it.
     The studio is built when the driver is opened."""
 
@@ -34,11 +33,10 @@ class SimulatedDriver:
     def __init__(
         self, camera: CameraConfig, view: str, *, mesh_file: Path | None = None, source: ImageSource | None = None
     ) -> None:
-        self._camera = camera
+        super().__init__(camera)
         self._view = view
         self._mesh_file = mesh_file
         self._source = source
-        self._pace: Pace | None = None
 
     def open(self, timeout_s: float) -> None:
         """Builds the studio if needed, and starts the camera's rate. Raises CameraNotFound."""
@@ -54,23 +52,11 @@ class SimulatedDriver:
         ]
         return tuple(compose("no-setting-of-simulated", setting=key) for key in requested)
 
-    def grab(self, timeout_s: float) -> Arrival:
-        """Waits for the next frame at the camera's rate. Raises GrabTimeout, CameraLost."""
-        if self._pace is None:
-            raise CameraLost(self._camera, compose("camera-not-open"))
-        if not self._pace.wait(timeout_s):
-            raise GrabTimeout(self._camera, timeout_s)
-        return Arrival(time.monotonic(), self._pace.beat)
-
     def retrieve(self) -> ImageRgb:
         """Renders and returns the picture that the camera sees now. Raises CameraLost if it is not open."""
         if self._source is None or self._pace is None:
             raise CameraLost(self._camera, compose("camera-not-open"))
         return self._source(self._view, time.monotonic())
-
-    def trigger(self) -> None:
-        """Does nothing: a simulated camera runs at its own rate."""
-        return
 
     def close(self) -> None:
         """Stops the camera; the studio is kept."""

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline.evidence.gaze import PUPIL_DISTANCE
 from pipeline.evidence.measurements import DISTANCES
+from pipeline.evidence.pose import PUPIL_DISTANCE
 from pipeline.head_model.landmarks import NAMES
 from rig.atomic_write import write_atomically
 from rig.digest import document_sha256

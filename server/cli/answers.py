@@ -17,7 +17,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from pipeline.head_model.data_folder import DATA
+from pipeline.head_model.model_names import DATA
 from rig.errors import EigenheadError, InputError
 from rig.messages.message import compose, texts_of
 from rig.progress import Progress

@@ -21,8 +21,6 @@ from server.cli.answers import (
 )
 
 app = typer.Typer(rich_markup_mode=None)
-
-
 CameraFormat = Literal[
     "eigenhead", "colmap", "colmap-text", "caliscope", "aniposelib", "metashape", "realitycapture",
     "realitycapture-csv", "nerfstudio", "opencv-yaml", "blender",
@@ -184,7 +182,7 @@ def _calibrate_board(
 def _calibrate_scene(
     photographs: Path, out: Path, scale: Path | None, front: str | None, lenses: str | None, json_out: bool
 ) -> None:
-    from calibration.scene.report import write_scene_report
+    from calibration.scene.result import write_scene_report
     from calibration.scene.scene import calibrate_scene
     from rig.formats.cameras.cameras_json import write_rig
 

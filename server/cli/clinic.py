@@ -11,7 +11,7 @@ import typer
 from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, file_in, prepare_folder, warn
 
 if TYPE_CHECKING:
-    from pipeline.applications.clinic.comparison import Comparison
+    from pipeline.applications.clinic.comparison_files import Comparison
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -38,7 +38,7 @@ def compare(
     tables, and a PDF; what is below two combined standard deviations is grey."""
     if (out / "compare.json").exists() and not overwrite:
         raise Overwrites(out / "compare.json")
-    from pipeline.applications.clinic.comparison import compare as compare_visits
+    from pipeline.applications.clinic.comparison_files import compare as compare_visits
     from pipeline.applications.clinic.comparison_files import write_comparison
     from pipeline.applications.clinic.visit import read_visit
 
@@ -140,8 +140,14 @@ def measure(
 
     Prints each measure with its standard deviation and ISO name, and of every table of sizes how likely each size
     fits."""
-    from pipeline.applications.clinic.fitting import ISO_NAMES, MEASURES, Fitted, fitting_measures
-    from pipeline.applications.clinic.sizes import choose_size, read_size_tables
+    from pipeline.applications.clinic.fitting import (
+        ISO_NAMES,
+        MEASURES,
+        Fitted,
+        choose_size,
+        fitting_measures,
+        read_size_tables,
+    )
     from pipeline.applications.clinic.visit import read_visit
     from rig.messages.message import compose, documents_of
 

@@ -13,8 +13,7 @@ from typing import Any, Protocol, TypedDict
 from urllib.parse import quote
 
 from pipeline.compute.threads import THREADS, thread_count
-from pipeline.head_model.data_folder import MODELS, models_folder
-from pipeline.head_model.model_names import model_path
+from pipeline.head_model.model_names import MODELS, model_path, models_folder
 from rig.cache_folder import CACHE, cache_folder
 from rig.digest import sha256_of
 from rig.errors import EigenheadError

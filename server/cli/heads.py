@@ -29,7 +29,7 @@ from server.cli.answers import (
 )
 
 if TYPE_CHECKING:
-    from pipeline.applications.verification.limits import Limits
+    from pipeline.applications.verification.judgement import Limits
     from pipeline.applications.verification.report import VerificationReport
 
 app = typer.Typer(rich_markup_mode=None)
@@ -48,7 +48,7 @@ class LimitsMissed(EigenheadError):
 
 
 def _templates() -> tuple[str, ...]:
-    from pipeline.applications.templates.names import list_templates
+    from pipeline.applications.templates.header import list_templates
 
     return tuple(list_templates())
 
@@ -316,7 +316,7 @@ def verify_captures(
 def read_limits(path: Path | None) -> "Limits":
     """Reads limits from a TOML or JSON file. Those that it omits, or all without a file, have their defaults. Raises
     InputError."""
-    from pipeline.applications.verification.limits import limits_from_document
+    from pipeline.applications.verification.judgement import limits_from_document
     from server.tasks.settings_file import settings_document
 
     return limits_from_document(settings_document(path), path.name if path else "limits")

@@ -52,8 +52,8 @@ def model_import(
     It is kept among the models under its name.
     """
     from pipeline.applications.model_building.sources.imports import import_model
-    from pipeline.head_model.data_folder import models_folder
     from pipeline.head_model.model_file import save_model
+    from pipeline.head_model.model_names import models_folder
 
     with progress_bar() as report:
         parts = import_model(source, name=name, report=report)

@@ -125,8 +125,7 @@ def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
     ``realism``."""
     from dataclasses import replace
 
-    from rig.studio.sensor.preset import PRESET
-    from rig.studio.sensor.realism import made_real, realism_names
+    from rig.studio.sensor.preset import PRESET, made_real, realism_names
 
     with wrong_usage("--realism"):
         return made_real(

@@ -52,7 +52,7 @@ def template_add(
     Its unit and axes are found, or told by landmarks. Look at the picture that is written beside it: skin must lie on
     skin. `reconstruct --template NAME` then writes heads in its vertex order, with its polygons and texture
     coordinates; of a FLAME model it writes the parameters, too. The file stays under its own licence."""
-    from pipeline.applications.templates.names import new_path
+    from pipeline.applications.templates.header import new_path
 
     path = new_path(name or file.stem)
     if path.exists() and not overwrite:
@@ -90,8 +90,7 @@ def _registration_lines(figures: Mapping[str, float]) -> list[str]:
 @template_app.command("list", epilog="Example: eigenhead template list")
 def template_list(data: Data = None, json_out: Json = False) -> None:
     """List the templates at hand, and the models that carry them."""
-    from pipeline.applications.templates.header import BadTemplate, read_header
-    from pipeline.applications.templates.names import list_templates
+    from pipeline.applications.templates.header import BadTemplate, list_templates, read_header
 
     templates, lines = {}, []
     for name, path in list_templates().items():
@@ -111,7 +110,7 @@ def template_remove(
     name: Annotated[str, typer.Argument(help="A template of the list.")], data: Data = None, json_out: Json = False
 ) -> None:
     """Remove a template and its picture."""
-    from pipeline.applications.templates.names import remove_template
+    from pipeline.applications.templates.header import remove_template
 
     path = remove_template(name)
     answer({"name": name, "file": str(path)}, json_out, [f"removed {path}"])

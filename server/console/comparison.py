@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from pipeline.geometry.registration.procrustes import rigid_procrustes
+from pipeline.geometry.registration.rigid import rigid_procrustes
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.formats.meshes.ply import read_vertex_numbers
 from rig.mesh import Mesh

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.alignment.feature_points import locate_features
-from pipeline.geometry.registration.procrustes import procrustes
+from pipeline.geometry.registration.rigid import procrustes
 from pipeline.multiview.triangulation import CLICK_NOISE_PX, NoPoint, triangulate
 from rig.camera import Camera
 from rig.messages.message import Message, MessageDocument, compose

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.geometry.raster import picture
-from pipeline.results.clay import clay
+from pipeline.geometry.projection import picture
+from pipeline.results.overlays import clay
 from rig.camera import Camera, Intrinsics
 from rig.errors import EigenheadError
 from rig.formats.meshes.mesh_file import read_mesh

@@ -4,8 +4,7 @@ from collections.abc import Mapping
 
 from pydantic import Field
 
-from pipeline.applications.templates.header import BadTemplate, TemplateHeader, read_header
-from pipeline.applications.templates.names import list_templates
+from pipeline.applications.templates.header import BadTemplate, TemplateHeader, list_templates, read_header
 from pipeline.head_model.model_names import list_models, model_path, model_sha256
 from server.services.answer import Answer
 

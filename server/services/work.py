@@ -57,8 +57,7 @@ class ReconstructionRequest:
 
 
 def _template_faults(name: str, model: str) -> list[Message]:
-    from pipeline.applications.templates.header import check_template
-    from pipeline.applications.templates.names import template_path
+    from pipeline.applications.templates.header import check_template, template_path
     from pipeline.head_model.model_names import UnknownModel
 
     try:

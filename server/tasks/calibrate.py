@@ -151,8 +151,7 @@ def calibrate_folder(
 
 def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | None) -> CalibrationOutcome:
     from calibration.result import CalibrationRefused
-    from calibration.scene.report import write_scene_report
-    from calibration.scene.result import judge_scene
+    from calibration.scene.result import judge_scene, write_scene_report
     from calibration.scene.scene import calibrate_scene
     from rig.formats.cameras.cameras_json import write_rig
 

@@ -17,8 +17,7 @@ from rig.formats.cameras.dataset_json import DatasetFormat
 from rig.formats.meshes.flame_param import FILE, FlameParam, read_flame_param
 from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import Mesh
-from rig.messages.fault_groups import say_once
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, say_once
 from rig.progress import Progress
 
 if TYPE_CHECKING:

@@ -47,8 +47,7 @@ from rig.formats.pictures.picture_names import entry
 from rig.formats.pictures.work_size import WORK_PIXELS
 from rig.formats.rig_toml import ShotConfig
 from rig.image import ImageRgb, plates_for
-from rig.messages.fault_groups import say_once
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, say_once
 from rig.progress import Progress
 from rig.rig import Rig
 from server.storage.records import CameraSize, CaptureContent

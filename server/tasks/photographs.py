@@ -39,12 +39,10 @@ from rig.formats.captures.shot_files import find_files, picture_folder
 from rig.formats.pictures.images import is_picture, picture_size, write_image
 from rig.formats.pictures.picture_names import entry
 from rig.formats.pictures.work_size import WORK_PIXELS, work_rig
-from rig.messages.fault_groups import say_once
-from rig.messages.message import Message, compose, documents_of, read_message
+from rig.messages.message import Message, compose, documents_of, read_message, say_once
 from rig.plausibility import rig_faults
 from rig.progress import Progress
-from rig.rig import Rig
-from rig.spread_views import spread_views
+from rig.rig import Rig, spread_views
 
 CAMERAS, FIGURES, PAGE, CACHE = "cameras.json", "calibration.json", "calibration.html", ".cache"
 
@@ -124,7 +122,7 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
     made_of = _made_of(root, front)
     if (told_before := calibration_warnings(kept, made_of)) is not None:
         return told_before
-    from calibration.scene.report import write_scene_report
+    from calibration.scene.result import write_scene_report
     from calibration.scene.scene import calibrate_scene
 
     scale = entry(root, SCALE)

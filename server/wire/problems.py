@@ -65,8 +65,6 @@ PROBLEM_SCHEMA = {
         "error_messages": {"type": "array", "items": MESSAGE_SCHEMA, "description": "the faults as data"},
     },
 }
-
-
 Responses = dict[int | str, dict[str, Any]]  # FastAPI's type of a route's ``responses``
 
 

@@ -14,7 +14,7 @@ import nicegui
 import numpy as np
 import pytest
 
-from pipeline.geometry.raster import picture
+from pipeline.geometry.projection import picture
 from rig.camera import Camera, Intrinsics
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.formats.pictures.images import read_image

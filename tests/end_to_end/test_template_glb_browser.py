@@ -8,8 +8,8 @@ import pytest
 from pipeline.applications.templates.animated import AnimatedMesh, animated_mesh
 from pipeline.applications.templates.write.writers import animated_scene
 from pipeline.evidence.expression import build_blendshape_rig
+from pipeline.head_model.expressions import VISEMES
 from pipeline.head_model.model import load_model
-from pipeline.head_model.visemes import VISEMES
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.geometry import Similarity
 from rig.mesh import Mesh

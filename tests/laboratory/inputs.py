@@ -13,8 +13,7 @@ from pipeline.head_model.model import HeadModel, load_model
 from rig.errors import InputError
 from rig.progress import Progress
 from rig.render.renderer import Renderer
-from rig.studio.sensor.preset import PRESET
-from rig.studio.sensor.realism import made_real, realism_names
+from rig.studio.sensor.preset import PRESET, made_real, realism_names
 from server.cli.answers import progress_bar, wrong_usage
 from server.processes import python_command, python_environment
 from tests.laboratory.experiments.paper import span

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rig.mask_polarity import inverted_masks, subject_convention
+from rig.formats.pictures.mask_values import inverted_masks, subject_convention
 
 ROWS, COLUMNS = np.indices((240, 320))
 HEAD = ((COLUMNS - 160) / 60.0) ** 2 + ((ROWS - 110) / 75.0) ** 2 < 1.0

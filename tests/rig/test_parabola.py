@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rig.parabola import second_difference, vertex_offset
+from rig.geometry import second_difference, vertex_offset
 
 
 @pytest.mark.parametrize(("vertex", "bend"), [(0.0, -2.0), (0.3, -0.5), (-0.45, 3.0), (1.7, -1.0)])

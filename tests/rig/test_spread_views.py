@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rig.spread_views import spread_views
+from rig.rig import spread_views
 from tests.support.textured_wedge import wedge_rig
 
 

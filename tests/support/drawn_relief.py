@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from rig.studio.scene.skin_relief import LONGEST_MM, SHORTEST_MM, WAVES, SkinRelief
+from rig.studio.scene.skin_texture import LONGEST_MM, SHORTEST_MM, WAVES, SkinRelief
 
 
 def draw_relief(

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from pipeline.geometry.raster_kernels import rasterise
+from pipeline.geometry.projection_kernels import rasterise
 from pipeline.texturing.layout.uv_unwrap import Layout
 
 GRID = 512  # texels that are compared: 0.7 mm a texel, beyond what two fits differ by

@@ -8,7 +8,7 @@ import numpy as np
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.cameras.colmap import write_colmap
-from rig.formats.cameras.opencv_toml import write_aniposelib, write_caliscope
+from rig.formats.cameras.opencv_yaml import write_aniposelib, write_caliscope
 from rig.geometry import look_at
 from rig.rig import Rig
 

@@ -5,7 +5,7 @@ import struct
 from typing import Any
 
 from rig.formats.meshes.glb import scene_glb_bytes
-from rig.formats.meshes.obj import scene_obj_bytes
+from rig.formats.meshes.polygon_obj import scene_obj_bytes
 from rig.formats.meshes.scene import Part, Scene
 from rig.mesh import Mesh
 

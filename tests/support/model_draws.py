@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from pipeline.applications.model_building.training.model_metrics import generalisation, specificity
-from pipeline.applications.model_building.training.training import principal_components
+from pipeline.applications.model_building.training.training import generalisation, principal_components, specificity
 from pipeline.head_model.model import HeadModel
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from pipeline.contour_fit.contour import ContourSolution
 from pipeline.contour_fit.problem import Stage, State, first_evidence, make_problem
-from pipeline.geometry.raster import camera_depths
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection import camera_depths
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.head_model.gaussian_process import with_kernel
 from pipeline.head_model.model import HeadModel, assemble
 from pipeline.head_model.model_file import ModelParts

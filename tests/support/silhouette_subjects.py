@@ -15,9 +15,9 @@ from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.anatomy import anatomy
-from rig.studio.scene.clothes import shirt
 from rig.studio.scene.hair import grow
 from rig.studio.scene.subject import random_look, random_pose
+from rig.studio.scene.worn import shirt
 
 SPREAD_DEG, SPREAD_MM = 4.0, 12.0  # how subjects sit
 MODES = 60

@@ -6,8 +6,8 @@ import numpy as np
 import scipy.sparse as sparse
 import trimesh
 
-from pipeline.detail.nodes import Nodes, node_mesh
-from pipeline.detail.surface_points import SurfacePoints
+from pipeline.detail.dense_points import SurfacePoints
+from pipeline.detail.solve import Nodes, node_mesh
 from pipeline.head_model.subdivision import row_count, subdivision
 from pipeline.part_labels.codes import Part
 

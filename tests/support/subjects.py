@@ -22,8 +22,8 @@ from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.anatomy import anatomy
-from rig.studio.scene.clothes import shirt
 from rig.studio.scene.hair import HairStyle, grow
+from rig.studio.scene.worn import shirt
 
 SPREAD = 0.8  # section 5.2: Gaussian within +-0.8 standard deviations
 TURN, SHIFT_MM = 0.06, 8.0  # a seated subject: standard deviation of its pose

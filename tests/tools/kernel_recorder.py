@@ -9,9 +9,29 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from pipeline.compute.kernel_list import Kernel, text_from_type
+from numba import types
+
+from pipeline.compute.kernel_list import PACKAGE, Kernel, type_from_text
 from rig.jit import KeptFunction
+
+
+def text_from_type(kind: Any) -> str:
+    """Returns the list's notation of a Numba type. Raises ValueError if it has none."""
+    if isinstance(kind, types.Array):
+        text = f"{kind.dtype}[{kind.ndim}{kind.layout}]" + "r" * (not kind.mutable)
+    elif isinstance(kind, types.NamedTuple | types.NamedUniTuple):
+        module = kind.instance_class.__module__.removeprefix(PACKAGE + ".")
+        inside = ";".join(text_from_type(each) for each in kind.types)
+        text = f"{module}:{kind.instance_class.__name__}{{{inside}}}"
+    elif isinstance(kind, types.UniTuple):
+        text = f"{kind.count}*{kind.dtype}"
+    else:
+        text = str(kind)
+    if type_from_text(text) != kind:
+        raise ValueError(f"the list of kernels has no notation for {kind!r}")
+    return text
 
 
 @contextmanager

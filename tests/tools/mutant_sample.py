@@ -28,17 +28,16 @@ LEAST_S = 60.0  # a busy machine is no reason to call a mutant noticed
 IMAGING, TEXTURE = "tests/pipeline/imaging", "tests/pipeline/texturing"
 # The loops of geometry, silhouette cost and texture weights, and the tests that speak of them.
 LOOPS = {
-    "pipeline/geometry/projection_kernels.py": [f"{IMAGING}/test_projection.py"],
-    "pipeline/imaging/sampling_kernels.py": [f"{IMAGING}/test_sampling.py"],
-    "pipeline/imaging/contour_distance_kernels.py": [f"{IMAGING}/test_contour_distance.py"],
-    "pipeline/geometry/raster_kernels.py": [f"{IMAGING}/test_cpu_raster.py"],
+    "pipeline/geometry/projection_kernels.py": [f"{IMAGING}/test_projection.py", f"{IMAGING}/test_cpu_raster.py"],
+    "pipeline/imaging/sampling_kernels.py": [f"{IMAGING}/test_sampling.py", f"{IMAGING}/test_contour_distance.py"],
     "pipeline/contour_fit/rim_kernels.py": [
         "tests/pipeline/contour_fit/test_rim.py",
         "tests/pipeline/estimation/test_jacobians.py",
     ],
-    "pipeline/contour_fit/rim_jacobian_kernels.py": ["tests/pipeline/estimation/test_jacobians.py"],
-    "pipeline/texturing/visibility_kernels.py": [f"{TEXTURE}/test_visibility_kernels.py"],
-    "pipeline/texturing/view_selection_kernels.py": [f"{TEXTURE}/test_view_selection_kernels.py"],
+    "pipeline/texturing/view_selection_kernels.py": [
+        f"{TEXTURE}/test_visibility_kernels.py",
+        f"{TEXTURE}/test_view_selection_kernels.py",
+    ],
 }
 SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     **{ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq},

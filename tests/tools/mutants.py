@@ -18,7 +18,7 @@ HOURS_MOST = 6
 PACKAGES = ("rig", "pipeline", "calibration", "server")
 # What speaks of the module beside its namesake, or in its place.
 TESTS = {
-    "pipeline/geometry/registration/procrustes.py": ["tests/pipeline/alignment/test_landmarks.py"],
+    "pipeline/geometry/registration/rigid.py": ["tests/pipeline/alignment/test_landmarks.py"],
     "pipeline/simplex/xor_objective.py": ["tests/pipeline/simplex/test_xor_objective.py"],
     "rig/geometry.py": ["tests/rig/test_geometry.py"],
     "server/http/auth.py": ["tests/server/http/test_callers.py"],

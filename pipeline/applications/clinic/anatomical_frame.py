@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.applications.verification.measured import Measured
-from pipeline.results.slicer_landmarks import LPS_FROM_HEAD
+from pipeline.results.head_files import LPS_FROM_HEAD
 from rig.errors import InputError
 from rig.formats.meshes.markups import Axes, axes_turn
 from rig.geometry import RigidTransform
@@ -24,7 +24,6 @@ from rig.messages.message import compose
 Vector = Float[np.ndarray, " 3"]
 
 Plane = Literal["head", "frankfurt"]
-PLANES: tuple[Plane, ...] = ("head", "frankfurt")
 POINTS = ("porion_right", "porion_left", "orbitale_right", "orbitale_left")
 # An adult's bony orbit is 34 to 36 mm high, and the eye stands a little above its middle (Gray's Anatomy). The rim of
 # one person may lie 3 mm off, which tilts the plane by 2 degrees: mark orbitale where that matters.

@@ -16,8 +16,8 @@ from pipeline.applications.clinic.anatomical_frame import POINTS, AnatomicalFram
 from pipeline.applications.clinic.registration import Registration
 from pipeline.applications.clinic.visit import Visit
 from pipeline.applications.model_building.correspondence.scans import plain_name
-from pipeline.applications.verification.pictures import heat_colours
-from pipeline.results.slicer_landmarks import uncertainty
+from pipeline.applications.verification.write import heat_colours
+from pipeline.results.head_files import uncertainty
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.markups import Axes, MarkupPoint, markups_document, read_markups
 from rig.formats.meshes.ply import write_ply

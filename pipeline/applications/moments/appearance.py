@@ -16,9 +16,8 @@ from jaxtyping import Bool, Float, Float32, Int
 from pipeline.applications.moments.footage import Pictures
 from pipeline.applications.moments.sequence_person import Motion, SequencePerson
 from pipeline.compute.threads import map_in_threads
-from pipeline.geometry.projection import project_points
-from pipeline.geometry.raster import camera_depths
-from pipeline.geometry.raster_kernels import rasterise
+from pipeline.geometry.projection import camera_depths, project_points
+from pipeline.geometry.projection_kernels import rasterise
 from pipeline.head_model.expressions import BLINKS, plain_name
 from pipeline.imaging.grey import LUMINANCE
 from pipeline.photometric_fit.patches import spread_samples

@@ -17,8 +17,7 @@ from pipeline.applications.moments.sequence_person import Motion, SequencePerson
 from pipeline.applications.moments.track_frame import POSE, derivatives
 from pipeline.estimation.robust import GemanMcClure
 from pipeline.estimation.terms import Linear, Residuals, Term
-from pipeline.faces.crops import in_picture, make_pyramid
-from pipeline.faces.detection import MIN_SCORE, FaceDetection, crop_around
+from pipeline.faces.detection import MIN_SCORE, FaceDetection, crop_around, in_picture, make_pyramid
 from pipeline.faces.eyes import LIDS, LOWER, UPPER, find_eyes, opening_of
 from pipeline.faces.landmark_map import landmark_map
 from pipeline.faces.networks import LANDMARK_SIZE, FaceNetworks

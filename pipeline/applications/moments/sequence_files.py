@@ -29,7 +29,7 @@ from pipeline.applications.moments.point_cache import write_point_cache
 from pipeline.applications.moments.sequence import Course, smoothed, track_sequence, write_arrays
 from pipeline.applications.moments.sequence_person import Motion, SequencePerson
 from pipeline.applications.moments.track_frame import POSE
-from pipeline.geometry.raster import picture
+from pipeline.geometry.projection import picture
 from pipeline.head_model.expressions import plain_name
 from pipeline.head_model.model import load_model
 from pipeline.settings import Settings

@@ -32,8 +32,8 @@ from pipeline.applications.templates.eyeballs import STRAIGHT, Eyeball, lifted, 
 from pipeline.applications.templates.inner_mouth import InnerMouth, kept_off_teeth, placed_inner_mouth
 from pipeline.applications.templates.pivots import EYE_REACH_MM, Points, in_mouth, jaw_motions, pivots
 from pipeline.geometry.surface_index import SurfaceIndex
+from pipeline.head_model.expressions import VISEMES, mixed
 from pipeline.head_model.subdivision import boundary_loops
-from pipeline.head_model.visemes import VISEMES, mixed
 from rig.geometry import RigidTransform
 from rig.mesh import vertex_normals
 

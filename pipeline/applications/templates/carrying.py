@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.geometry.registration.procrustes import procrustes
+from pipeline.geometry.registration.nonrigid import landmark_warp
+from pipeline.geometry.registration.rigid import procrustes
 from pipeline.geometry.surface_index import SurfaceIndex
-from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.gaussian_process import spread_nodes
 
 CANDIDATES = 16  # triangles about a vertex that are looked at

@@ -42,7 +42,7 @@ class Eyeball:
         """Returns how far the surface lies from the centre in each direction (unit vectors), mm: the ball's or, within
         the limbus, the cornea's."""
         cosine = directions @ self.gaze
-        cornea = _cornea_centre(self.radius_mm)
+        cornea = float(np.sqrt(self.radius_mm**2 - LIMBUS_MM**2) - np.sqrt(CORNEA_MM**2 - LIMBUS_MM**2))
         inside = np.maximum(CORNEA_MM**2 - cornea**2 * (1.0 - cosine**2), 0.0)
         bulge = cornea * cosine + np.sqrt(inside)
         return np.where(cosine > _limbus_cosine(self.radius_mm), bulge, self.radius_mm)
@@ -60,11 +60,6 @@ class Eyeball:
         vertices = self.centre + self.reach(directions)[:, None] * directions
         angles = np.concatenate([[0.0], np.repeat(marks, SECTORS), [np.pi]])
         return Mesh(vertices, _outward(vertices, _ring_faces(len(marks)), self.centre), _colours(angles, pupil, limbus))
-
-
-def _cornea_centre(radius_mm: float) -> float:
-    """Returns how far the cornea's centre lies before the ball's."""
-    return float(np.sqrt(radius_mm**2 - LIMBUS_MM**2) - np.sqrt(CORNEA_MM**2 - LIMBUS_MM**2))
 
 
 def _limbus_cosine(radius_mm: float) -> float:

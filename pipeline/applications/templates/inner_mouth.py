@@ -18,8 +18,8 @@ from scipy.spatial import KDTree
 
 from pipeline.applications.templates.pivots import Points
 from pipeline.fusion.crossings import crossing_faces
-from pipeline.geometry.registration.procrustes import procrustes
-from pipeline.head_model.visemes import VISEMES, mixed
+from pipeline.geometry.registration.rigid import procrustes
+from pipeline.head_model.expressions import VISEMES, mixed
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 

@@ -10,8 +10,7 @@ from pipeline.applications.templates.flame_model import JOINTS, FlameModel
 from pipeline.applications.templates.registration import Registration, register
 from pipeline.applications.templates.template_file import Template
 from pipeline.head_model.model import HeadModel
-from pipeline.results.clay import SKIN, clay
-from pipeline.results.overlays import contact_sheet
+from pipeline.results.overlays import SKIN, clay, contact_sheet
 from rig.digest import sha256_of
 from rig.errors import InputError
 from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz, read_pickled_arrays

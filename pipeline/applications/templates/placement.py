@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.geometry.registration.procrustes import procrustes
+from pipeline.geometry.registration.rigid import procrustes
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from rig.errors import InputError

@@ -16,9 +16,8 @@ from scipy.sparse.csgraph import connected_components
 from pipeline.applications.templates.carrying import Attachment, SurfaceBinding, bind_vertices, surface_binding
 from pipeline.applications.templates.likeness import CANDIDATES, Likeness, SurfaceMarks, fit_model_to_mesh
 from pipeline.applications.templates.placement import Surface, find_place, outward, place_by_landmarks
-from pipeline.geometry.registration.nonrigid import Search, Target, draw_to_target
+from pipeline.geometry.registration.nonrigid import Search, Target, draw_to_target, landmark_warp
 from pipeline.geometry.surface_index import SurfaceIndex
-from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.gaussian_process import spread_nodes
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import vertex_areas

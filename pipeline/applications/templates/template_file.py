@@ -11,8 +11,15 @@ import numpy as np
 
 from pipeline.applications.templates.carrying import Attachment, SurfaceBinding
 from pipeline.applications.templates.flame_model import FlameModel
-from pipeline.applications.templates.header import FORMAT, WORDS, BadTemplate, TemplateHeader, header_words, read_meta
-from pipeline.applications.templates.names import template_path
+from pipeline.applications.templates.header import (
+    FORMAT,
+    WORDS,
+    BadTemplate,
+    TemplateHeader,
+    header_words,
+    read_meta,
+    template_path,
+)
 from pipeline.head_model.model import HeadModel
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz

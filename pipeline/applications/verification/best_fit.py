@@ -16,8 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.applications.verification.measured import Measured
 from pipeline.applications.verification.reference import Reference
-from pipeline.geometry.registration.rigid import Counterparts, fit_motion
-from pipeline.geometry.registration.search import ROUNDS, draw_rows, draw_surface_points, search_motions
+from pipeline.geometry.registration.rigid import (
+    ROUNDS,
+    Counterparts,
+    draw_rows,
+    draw_surface_points,
+    fit_motion,
+    search_motions,
+)
 from pipeline.geometry.surface_index import Hits
 from pipeline.head_model.landmarks import stacked
 from rig.errors import InputError

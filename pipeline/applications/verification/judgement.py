@@ -15,17 +15,21 @@ Repeatability is how far heads of one subject, shot several times, are from each
 vertices, so that each vertex is compared with itself. Rigid motions, without scale, remove where the subject sat: each
 head is laid on the mean of all over the given vertices, and the mean is computed anew (generalised Procrustes analysis
 without scale; Gower 1975, https://doi.org/10.1007/BF02291478).
+
+The default limits are about one and a half times what the simulated studio reaches with a bare mannequin of another
+population than the model's (tests/laboratory/notes/verification.md), so that a sound rig passes and one with a lasting
+fault does not.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import rankdata
 
 from pipeline.applications.verification.best_fit import BestFit, best_fit, counted
-from pipeline.applications.verification.limits import Check, Limits, checks
 from pipeline.applications.verification.measured import Measured
 from pipeline.applications.verification.reference import Reference
 from pipeline.evidence.measurements import DISTANCES
@@ -33,6 +37,7 @@ from pipeline.head_model.regions import REGIONS
 from rig.errors import InputError
 from rig.geometry import rigid_fit
 from rig.mesh import vertex_normals
+from rig.typed_tables import read_table
 
 ROUNDS = 20  # of laying on and averaging; three are usual
 STILL_MM = 1e-7  # a mean that moves by less is the mean
@@ -41,6 +46,46 @@ FORM_SHARE = 0.997  # of the area; the rest are outliers, as three of a thousand
 FEATURES = ("eyes", "nose", "mouth")
 MIN_COVERED = 0.2  # share of a region, below which it has no figures
 MIN_FACING = 0.5  # share of the judged face where both surfaces face the same way
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Holds the limit of each figure of a verification: the largest value allowed, except for ``least_covered``, which
+    is the smallest."""
+
+    face_rms_mm: float = 0.35  # deviation from the reference, of any capture
+    features_rms_mm: float = 0.8  # the same of eyes, nose and mouth, the worst of them
+    probing_form_mm: float = 4.5  # range of the deviations of 99.7 % of the face
+    size_error_percent: float = 0.3
+    distance_mm: float = 5.0  # RMS of the landmark distances: what nothing fixes along the surface slides
+    repeatability_mm: float = 0.2  # scatter over the face along its normal, RMS
+    least_covered: float = 0.9  # share of the face that the reference covers
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """Holds a figure beside its limit. ``value`` and ``passed`` are None if the captures or the reference do not
+    provide the figure."""
+
+    name: str
+    value: float | None
+    limit: float
+    passed: bool | None  # None: not judged
+
+
+def limits_from_document(document: Mapping[str, Any], subject: str = "limits") -> Limits:
+    """Returns the limits from decoded JSON or TOML. Raises InputError that names every unknown key and wrong value."""
+    return read_table(Limits, document, subject)
+
+
+def checks(limits: Limits, values: Mapping[str, float | None]) -> tuple[Check, ...]:
+    """Returns a check for every limit; ``values`` are the figures by the limits' names."""
+    found = []
+    for field in fields(limits):
+        limit, value = getattr(limits, field.name), values[field.name]
+        passed = None if value is None else value >= limit if field.name.startswith("least") else value <= limit
+        found.append(Check(field.name, value, limit, passed))
+    return tuple(found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,8 +6,7 @@ from importlib.metadata import version
 from typing import TypedDict
 
 from pipeline.applications.verification.best_fit import BestFit
-from pipeline.applications.verification.judgement import Judged, Judgement, RegionError
-from pipeline.applications.verification.limits import Limits
+from pipeline.applications.verification.judgement import Judged, Judgement, Limits, RegionError
 from pipeline.applications.verification.measured import ResultIdentity
 from pipeline.applications.verification.reference import Reference
 from rig.geometry import vector_from_rotation

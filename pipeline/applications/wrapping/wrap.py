@@ -38,7 +38,7 @@ from pipeline.faces.points import RIGHT_EYE_OUTLINE, point_table
 from pipeline.faces.subject import find_subject
 from pipeline.fusion.untangling import topology_of, untangled
 from pipeline.geometry.registration.nonrigid import draw_to_matches
-from pipeline.geometry.registration.procrustes import procrustes
+from pipeline.geometry.registration.rigid import procrustes
 from pipeline.geometry.surface_index import Hits, SurfaceIndex
 from pipeline.head_model.model import HeadModel, with_expressions
 from pipeline.multiview.triangulation import NoPoint, triangulate_many
@@ -49,8 +49,7 @@ from rig.image import ImageRgb
 from rig.mesh import Mesh, face_normals, vertex_normals
 from rig.messages.message import compose
 from rig.progress import Progress
-from rig.render.colour import HEADLIGHT, UNLIT, Light
-from rig.render.renderer import Renderer
+from rig.render.renderer import HEADLIGHT, UNLIT, Light, Renderer
 from rig.rig import Rig
 
 # Deviation of a found point, an axis: the network errs by 1 to 2 mm, but all points of a region together. With 2 mm the

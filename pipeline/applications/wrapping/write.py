@@ -9,12 +9,17 @@ import cv2
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from pipeline.applications.templates.write.mesh import template_materials, tile_suffix
-from pipeline.applications.templates.write.texture import MAX_TILES, Tile, corner_tiles, filled
+from pipeline.applications.templates.write.mesh import (
+    MAX_TILES,
+    Tile,
+    corner_tiles,
+    filled,
+    template_materials,
+    tile_suffix,
+)
 from pipeline.applications.wrapping.wrap import Wrapped, residual_colours, surface_in_head
-from pipeline.geometry.raster_kernels import interpolate, rasterise
-from pipeline.results.clay import clay
-from pipeline.results.overlays import contact_sheet
+from pipeline.geometry.projection_kernels import interpolate, rasterise
+from pipeline.results.overlays import clay, contact_sheet
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.ply import ply_bytes
 from rig.formats.meshes.polygon_obj import fan, polygon_obj_bytes

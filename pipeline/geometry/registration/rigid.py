@@ -1,14 +1,23 @@
 """Takes Gauss-Newton steps on the distances of points from a surface along its normals (Chen and Medioni 1992), over a
-motion and, if wanted, over the coefficients of a shape."""
+motion and, if wanted, over the coefficients of a shape; and searches a motion from many starts, by trimmed
+iterations of points closest in position and direction (Besl and McKay 1992, https://doi.org/10.1109/34.121791):
+briefly from all of them, longer from the best. Procrustes analysis (section 4.2, eq. 3) has a form with a
+covariance."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 
-from rig.geometry import Similarity, rotation_from_vector
+from pipeline.geometry.surface_index import SurfaceIndex
+from rig.geometry import RigidTransform, Similarity, cross_matrix, nearest_rotation, rotation_from_vector
 
+SCALE_SPREAD = 0.02  # prior on log scale: rigs are metric, and what is left is calibration's error of scale
+ITERATIONS = 20
+SURFACE_POINTS = 6000  # of the surface: 6 mm apart on a head
+TURN_MM = 30.0  # distance that a difference of one between unit normals counts as
 Points = Float[np.ndarray, "n 3"]
 
 
@@ -88,3 +97,136 @@ def solve_with_prior(
     diagonal += prior
     diagonal += np.where(prior > 0.0, 0.0, ridge * diagonal.mean())
     return np.linalg.solve(system, weighted.T.astype(float) @ (ahead * root) - prior * state)
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """Holds one round of the search: how many points and iterations of closest points it uses, and how many of the best
+    starts it keeps."""
+
+    points: int
+    iterations: int
+    share: float  # of the points, the nearest, that count: a scan may lack all but the face
+    kept: int
+
+
+ROUNDS = (Round(50, 6, 0.7, 60), Round(100, 12, 0.7, 16), Round(240, 25, 0.6, 8))
+
+
+def search_motions(
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    surface: Float[np.ndarray, "m 3"],
+    facing: Float[np.ndarray, "m 3"],
+    *,
+    turns: Float[np.ndarray, "t 3 3"],
+    places: Float[np.ndarray, "p 3"],
+) -> list[Similarity]:
+    """Returns the best starting motions of points in random order: every turn with the points' middle at every place is
+    tried briefly with few of them, fewer motions longer with more. ``normals`` and ``facing`` are unit normals of the
+    points and of ``surface``, points of the other surface."""
+    middle = points.mean(axis=0)
+    points = points - middle
+    tree = KDTree(np.concatenate([surface, TURN_MM * facing], axis=1))
+    rotations, translations = np.repeat(turns, len(places), axis=0), np.tile(places, (len(turns), 1))
+    for stage in ROUNDS:
+        some, facing_mm = points[: stage.points], TURN_MM * normals[: stage.points]
+        kept, means = int(stage.share * len(some)), np.full(len(rotations), np.inf)
+        for _ in range(stage.iterations):  # of all starts at once
+            there = np.einsum("kij,nj->kni", rotations, some) + translations[:, None]
+            turned = np.einsum("kij,nj->kni", rotations, facing_mm)
+            far, near = map(np.asarray, tree.query(np.concatenate([there, turned], axis=2)))
+            order = np.argsort(far, axis=1)[:, :kept]
+            means = np.take_along_axis(far, order, axis=1).mean(axis=1)
+            source, target = some[order], surface[np.take_along_axis(near, order, axis=1)]
+            source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
+            moments = np.einsum("kni,knj->kij", target - target_mean[:, None], source - source_mean[:, None])
+            rotations = np.stack([nearest_rotation(moment) for moment in moments])
+            translations = target_mean - np.einsum("kij,kj->ki", rotations, source_mean)
+        best = np.argsort(means)[: stage.kept]
+        rotations, translations = rotations[best], translations[best]
+    return [Similarity(1.0, r, t - r @ middle) for r, t in zip(rotations, translations, strict=True)]
+
+
+def draw_surface_points(
+    surface: SurfaceIndex, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Returns points drawn over a surface by area (middles of triangles), and their normals."""
+    corners = surface.corners
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    chosen = draw_rows(area, SURFACE_POINTS, rng)
+    return corners[chosen].mean(axis=1), surface.normals(chosen)
+
+
+def draw_rows(weights: Float[np.ndarray, " n"], count: int, rng: np.random.Generator) -> Int[np.ndarray, " k"]:
+    """Returns at most ``count`` different rows, drawn by their weights."""
+    return rng.choice(len(weights), min(count, int((weights > 0).sum())), replace=False, p=weights / weights.sum())
+
+
+def procrustes(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
+) -> Similarity:
+    """Computes the full ordinary Procrustes alignment: the similarity T that minimises eq. (3), ``sum_j w_j |target_j -
+    T(source_j)|^2``.
+
+    Dryden and Mardia, Statistical Shape Analysis, section 7.2; the determinant excludes mirror images. Raises
+    ValueError if the points lie on a line and determine no rotation.
+    """
+    share = np.full(len(source), 1.0 / len(source)) if weights is None else weights / weights.sum()
+    source_mean, target_mean = share @ source, share @ target
+    centred, wanted = source - source_mean, target - target_mean
+    covariance = (wanted * share[:, None]).T @ centred
+    singular = np.linalg.svd(covariance, compute_uv=False)
+    if singular[1] <= 1e-12 * singular[0]:
+        raise ValueError("points on a line determine no rotation")
+    rotation = nearest_rotation(covariance)
+    scale = float((rotation * covariance).sum() / (share @ (centred**2).sum(axis=1)))
+    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+
+def rigid_procrustes(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> RigidTransform:
+    """Computes the rigid motion that minimises eq. (3), as ``procrustes``: of the same turn, but without a scale, which
+    fits few points too well."""
+    rotation = procrustes(source, target).rotation
+    return RigidTransform(rotation, target.mean(axis=0) - rotation @ source.mean(axis=0))
+
+
+def generalised_procrustes(
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "n 3"],
+    source_covariance: Float[np.ndarray, "p p"],
+    target_covariance: Float[np.ndarray, "p p"],
+    *,
+    start: Similarity,
+    scale_spread: float = SCALE_SPREAD,
+) -> Similarity:
+    """Computes the most likely similarity T for ``target = T(source + e) + f``, where the errors e (head frame) and f
+    (world frame) are correlated between points.
+
+    Iterated generalised least squares from ``start``: the residual's covariance is ``s^2 R C R^T + F``, taken at the
+    last estimate. log s has the prior N(0, ``scale_spread``^2).
+    """
+    scale, rotation, translation = start.scale, start.rotation, start.translation
+    for _ in range(ITERATIONS):
+        turn = scale * np.kron(np.eye(len(source)), rotation)
+        whiten = np.linalg.inv(np.linalg.cholesky(turn @ source_covariance @ turn.T + target_covariance))
+        turned = scale * source @ rotation.T
+        residual = (target - turned - translation).ravel()
+        # columns: left turn about the head's origin, shift, log scale
+        shift = np.tile(np.eye(3), (len(turned), 1, 1))
+        jacobian = np.concatenate([-cross_matrix(turned), shift, turned[:, :, None]], axis=2).reshape(-1, 7)
+        rows = np.concatenate([whiten @ jacobian, np.eye(7)[6:] / scale_spread])
+        step = np.linalg.lstsq(rows, np.append(whiten @ residual, -np.log(scale) / scale_spread), rcond=None)[0]
+        rotation = rotation_from_vector(step[:3]) @ rotation
+        translation = translation + step[3:6]
+        scale *= float(np.exp(step[6]))
+        if np.linalg.norm(step[:3]) < 1e-10 and np.linalg.norm(step[3:6]) < 1e-8:
+            break
+    return Similarity(scale, rotation, translation)
+
+
+def block_diagonal(blocks: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "p p"]:
+    """Returns the joint covariance of points whose errors are independent, from the covariance of each."""
+    whole = np.zeros((len(blocks), 3, len(blocks), 3))
+    whole[np.arange(len(blocks)), :, np.arange(len(blocks)), :] = blocks
+    return whole.reshape(3 * len(blocks), -1)

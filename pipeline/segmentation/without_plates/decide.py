@@ -18,12 +18,12 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.compute.threads import task_pool
 from pipeline.imaging.masks import dilated, eroded, spread, without_holes
-from pipeline.multiview.scene_points import ScenePoints, find_scene_points
+from pipeline.multiview.scene_tracks import ScenePoints, find_scene_points
 from pipeline.segmentation.background import COARSE_COLUMNS, Background, coarse_size, plate_tolerance
 from pipeline.segmentation.foreground import CONCLUSIVE, Decision, colours_apart, find_mixtures, whole_subject
-from pipeline.segmentation.mean_field_kernels import MAX_ODDS
-from pipeline.segmentation.without_plates.head_seed import HeadSeed, head_core
-from pipeline.segmentation.without_plates.mask_search import CoarseMask, search_masks
+from pipeline.segmentation.mask_kernels import MAX_ODDS
+from pipeline.segmentation.without_plates.head_seed import HeadSeed
+from pipeline.segmentation.without_plates.mask_search import CoarseMask, head_core, search_masks
 from pipeline.segmentation.without_plates.viewing_volume import (
     ViewingVolume,
     ask_other_views,

@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter
 
 from pipeline.imaging.masks import dilated, eroded, spread
 from pipeline.multiview.upright import guessed_up
-from pipeline.segmentation.mean_field_kernels import MAX_ODDS, mean_field_sweeps
+from pipeline.segmentation.mask_kernels import MAX_ODDS, mean_field_sweeps
 from pipeline.segmentation.without_plates.head_seed import HeadSeed, beside_head, head_core
 from pipeline.segmentation.without_plates.viewing_volume import OtherViews, ViewingVolume, ask_other_views, reachable
 from rig.camera import Camera

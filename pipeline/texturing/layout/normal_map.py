@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 
 from pipeline.compute.array_cache import cached_arrays
 from pipeline.compute.threads import in_threads
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.head_model.decimation import decimate
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import boundary_vertices

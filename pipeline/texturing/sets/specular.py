@@ -19,13 +19,12 @@ from jaxtyping import Bool, Float, Float16, Float32, UInt8
 
 from pipeline.compute.threads import in_threads, map_in_threads
 from pipeline.compute.trace import traced
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.imaging.masks import box_around
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.texturing.decision import Decision
 from pipeline.texturing.layout.uv_unwrap import Layout, spread_texels
 from pipeline.texturing.paint_kernels import TAPS
-from pipeline.texturing.visibility import LINEAR
+from pipeline.texturing.visibility import LINEAR, Decision
 from rig.image import ImageRgb
 
 NORMAL_SHARE = 0.04  # of light at right angles that glTF's material mirrors (index of refraction 1.5)

@@ -17,14 +17,12 @@ from pipeline.geometry.projection import project_points
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import TextureSettings
-from pipeline.texturing.decision import Decision, pack_pictures
 from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout
 from pipeline.texturing.neighbourhood import fill_unknown, level_views
 from pipeline.texturing.paint import paint_texture
 from pipeline.texturing.sets.specular import Specular, specular_light
-from pipeline.texturing.view_selection_kernels import OUTLIER, blend_views
-from pipeline.texturing.visibility import FOOTPRINT_PX, LINEAR, sharpened
-from pipeline.texturing.visibility_kernels import sample_colours
+from pipeline.texturing.view_selection_kernels import OUTLIER, blend_views, sample_colours
+from pipeline.texturing.visibility import FOOTPRINT_PX, LINEAR, Decision, pack_pictures, sharpened
 from pipeline.warnings import ReportWarning
 from rig.colour_space import srgb_from_linear
 from rig.image import ImageRgb

@@ -31,19 +31,22 @@ from rig.formats.cameras.cameras_json import (
     write_rig,
 )
 from rig.formats.cameras.colmap import read_colmap, write_colmap
+from rig.formats.cameras.foreign import CamerasRead, head_of, program_of, unread_programs
 from rig.formats.cameras.metashape import read_metashape, write_metashape
-from rig.formats.cameras.opencv_toml import looks_like_aniposelib, read_toml, write_aniposelib, write_caliscope
-from rig.formats.cameras.opencv_yaml import read_yaml, write_yaml
-from rig.formats.cameras.reading import CamerasRead
+from rig.formats.cameras.opencv_yaml import (
+    looks_like_aniposelib,
+    read_toml,
+    read_yaml,
+    write_aniposelib,
+    write_caliscope,
+    write_yaml,
+)
 from rig.formats.cameras.realitycapture import looks_like_csv, read_csv, read_xmp, write_csv, write_xmp
 from rig.formats.cameras.transforms_json import read_nersemble, read_splatting, read_transforms, write_transforms
-from rig.formats.cameras.unread_programs import head_of, program_of, unread_programs
 from rig.formats.pictures.picture_names import entry, is_junk
-from rig.messages.fault_groups import some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, some_of
 from rig.recorded_lens import COEFFICIENTS
-from rig.rig import Rig
-from rig.spread_views import spread_views
+from rig.rig import Rig, spread_views
 
 READ = {
     "": {"format", "unit", "cameras", "scale_sigma"},

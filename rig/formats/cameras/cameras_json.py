@@ -11,8 +11,7 @@ from rig.camera import Camera, Distortion, Intrinsics
 from rig.errors import InputError
 from rig.formats.pictures.picture_names import safe_name
 from rig.geometry import RigidTransform, nearest_rotation
-from rig.messages.fault_groups import say_once
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, say_once
 from rig.recorded_lens import COEFFICIENTS, LensModel, RecordedLens
 from rig.rig import Rig
 

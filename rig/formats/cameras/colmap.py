@@ -17,8 +17,16 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.formats.cameras.cameras_json import CAMERAS_READ_MOST
-from rig.formats.cameras.foreign import Malformed, camera_entry, camera_names, lens_entry, parsed
-from rig.formats.cameras.reading import CamerasRead, Reading, shown
+from rig.formats.cameras.foreign import (
+    CamerasRead,
+    Malformed,
+    Reading,
+    camera_entry,
+    camera_names,
+    lens_entry,
+    parsed,
+    shown,
+)
 from rig.formats.pictures.picture_names import entry
 from rig.messages.message import Message, compose
 from rig.rig import Rig
@@ -42,8 +50,6 @@ REFUSED_MODELS = {
     **{7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION"},
     **{16: "EUCM", 17: "EQUIRECTANGULAR"},
 }
-
-
 COLMAP_NAMES = {number: name for name, (number, _) in COLMAP_MODELS.items()}
 
 

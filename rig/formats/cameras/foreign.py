@@ -1,11 +1,17 @@
 """Holds what all readers of other programs' files share: errors for damaged files, cameras' names, conversion of
-lenses."""
+lenses, and what a reader finds (faults, unused keys, cameras that take no part); and recognises, by names and
+beginnings, files of cameras that programs write and nothing here reads. A capture without cameras of a known format
+is one of photographs alone, whose cameras are found anew; whoever put other cameras beside them learns that they
+were not read."""
 
 import csv
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatch
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 from xml.etree import ElementTree
 
@@ -13,12 +19,53 @@ import numpy as np
 from jaxtyping import Float
 
 from rig.errors import InputError
+from rig.formats.cameras.cameras_json import FORMAT, rig_from_document
+from rig.formats.cameras.foreign_keys import ForeignKey, Table, says_nothing
 from rig.formats.pictures.picture_names import IMAGE_SUFFIXES, entry, picture_stem, safe_name
 from rig.geometry import rotation_from_vector
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, say_once, some_of
 from rig.recorded_lens import COEFFICIENTS, LensModel
+from rig.rig import Rig
 from rig.text import as_utf8
 
+VALUE_MOST = 40  # characters of a value in a message
+HEAD_BYTES = 1 << 16  # the words by which an XMP file is recognised stand near its beginning
+PATTERNS = (
+    ("transforms_*.json", "transforms.json in parts: join their frames in one transforms.json"),
+    ("poses_bounds.npy", "LLFF"),
+    ("cameras*.npz", "NeuS, IDR"),
+    ("*.sfm", "Meshroom"),
+    ("sfm_data*.json", "OpenMVG"),
+    ("bundle*.out", "Bundler"),
+    ("*.nvm", "VisualSFM"),
+    ("*calibrated_camera_parameters*.txt", "Pix4D"),
+    ("database.db", "COLMAP without a model: export it to sparse/0"),
+    ("*.ps[xz]", "Metashape: export its cameras as XML"),
+    ("*.r[cs]proj", "RealityCapture: export its cameras as XMP or CSV"),
+    ("*.fbx", "FBX: export COLMAP's model or transforms.json"),
+    ("*.abc", "Alembic: export COLMAP's model or transforms.json"),
+    ("*.mat", "MATLAB: write OpenCV's YAML"),
+    ("*.p4[dm]", "Pix4D: export its calibrated cameras as OpenCV's YAML"),
+    ("*.qca.txt", "Qualisys: write cameras.json"),
+    ("*.xcp", "Vicon: write cameras.json"),
+    ("*_cam.txt", "MVSNet: export COLMAP's model"),
+    ("*.usd[ac]", "USD: export COLMAP's model or transforms.json"),
+    ("*.opk", "positions and omega, phi, kappa without lenses: export Metashape's XML"),
+    ("*.chan", "Nuke's camera over time: export one camera a file of a program that is read"),
+)  # fmt: skip
+OPENCV_KEYS = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "\nK1:", "\nM1:")
+OPENCV = "OpenCV's calibration of one camera or a pair: write K_<name>, dist_<name>, R_<name> and T_<name> of all"
+CONTENTS = (  # endings, words of which a file holds one, and its program
+    ((".yaml", ".yml"), ("T_cn_cnm1", "distortion_model:"), "Kalibr: write its chain as OpenCV's YAML or cameras.json"),
+    ((".yaml", ".yml", ".xml"), OPENCV_KEYS, OPENCV),
+    ((".xml",), ("<BlocksExchange",), "ContextCapture's BlocksExchange: export Metashape's XML or COLMAP's model"),
+    ((".json",), ('"Calibration"', '"libCalib'), "calib.io: export OpenCV's YAML"),
+    ((".json",), ('"intrinsic_matrix"',), "Open3D: write one transforms.json of all cameras"),
+    ((".json",), ('"sfm_data_version"',), "OpenMVG: export COLMAP's model"),
+    ((".json",), ('"camera_poses"',), "MultiCal: write OpenCV's YAML"),
+    ((".json",), ('"distCoef"',), "Panoptic Studio: write OpenCV's YAML"),
+    ((".json",), ('"projection_type"',), "OpenSfM: export COLMAP's model"),
+)  # fmt: skip
 T = TypeVar("T")
 LENS_LOSS_PX = 0.02  # allowed error of a converted lens: a tenth of a calibration's error
 UTF16_DECLARED = re.compile(rb"(?i)^(\s*<\?xml[^>]*?)encoding=[\"']utf-(?:16|32)[^\"']*[\"']")
@@ -26,6 +73,95 @@ SKEW_LEAST = 1e-6  # in focal lengths; far below a visible error, above the roun
 LENS_KEY = re.compile(r"[kpst]\d")  # coefficients of OpenCV's lenses, among other parameters of a camera
 METRES_MOST = 30.0  # files with all cameras within 30 units of each other are in metres: no rig is 30 mm wide
 BYTES_MOST = 1 << 29  # far above the few megabytes of a rig's sparse model, whose 2D points may be many
+
+
+@dataclass(frozen=True, slots=True)
+class CamerasRead:
+    """Holds a rig, warnings of its reader, and the cameras of the file that take no part, each with the reason."""
+
+    rig: Rig
+    remarks: tuple[Message, ...] = ()
+    left_out: Mapping[str, Message] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class Reading:
+    """Collects findings while the file named ``subject`` is read."""
+
+    subject: str
+    faults: list[Message] = field(default_factory=list)
+    left_out: dict[str, Message] = field(default_factory=dict)
+    _meant: dict[tuple[str, ForeignKey], list[tuple[str, object]]] = field(default_factory=dict)
+    _unknown: dict[str, None] = field(default_factory=dict)
+
+    def judge(self, table: Table, values: Mapping[str, object], whose: str, *, place: str = "") -> None:
+        """Notes the keys of ``values`` that the table refuses, wants reported or does not contain.
+
+        ``whose`` is the camera's name, empty for keys of the whole file; ``place`` is the prefix of the keys in the
+        table."""
+        for key, value in values.items():
+            rule = table.get(place + key)
+            if rule is None:
+                self._unknown[place + key] = None
+            elif rule.treatment in ("refused", "told") and value is not None and not says_nothing(value, rule):
+                self._meant.setdefault((place + key, rule), []).append((whose, value))
+
+    def leave_out(self, name: str, why: Message) -> None:
+        """Notes that a camera takes no part, and why."""
+        self.left_out[name] = why
+
+    def finish(self, entries: Sequence[Mapping[str, object]]) -> CamerasRead:
+        """Builds the rig from ``eigenhead-cameras/1`` entries and returns it with all notes. Raises InputError naming
+        every fault."""
+        warnings: list[Message] = []
+        for (key, rule), cases in self._meant.items():
+            whose, value = _whose([name for name, _ in cases], key), shown(cases[0][1])
+            sentence = compose("key-is", whose=whose, value=value, why=rule.why)
+            if rule.treatment == "refused":
+                self.faults.append(sentence)
+            else:
+                warnings.append(
+                    compose("unknown-key", remark=compose("key-not-used", file=self.subject, told=sentence))
+                )
+        if self._unknown:
+            keys = some_of([shown(key) for key in self._unknown])
+            remark = compose("keys-unknown", file=self.subject, count=len(self._unknown), keys=keys)
+            warnings.append(compose("unknown-key", remark=remark))
+        warnings += [compose("view-left-out", remark=sentence) for sentence in self._left_out()]
+        names = [str(entry.get("name")) for entry in entries]
+        try:
+            rig = rig_from_document({"format": FORMAT, "unit": "mm", "cameras": list(entries)}, self.subject)
+        except InputError as error:
+            faults = [*self.faults, *error.faults]
+            raise InputError(self.subject, [*say_once(faults, names), *self._left_out()]) from None
+        if self.faults:
+            raise InputError(self.subject, say_once(self.faults, names))
+        return CamerasRead(rig, tuple(warnings), MappingProxyType(dict(self.left_out)))
+
+    def _left_out(self) -> list[Message]:
+        reasons: dict[Message, list[str]] = {}
+        for name, why in self.left_out.items():
+            reasons.setdefault(why, []).append(name)
+        return [
+            compose("cameras-left-out", cameras=some_of(names), why=why, file=self.subject)
+            for why, names in reasons.items()
+        ]
+
+
+def shown(value: object, most: int = VALUE_MOST) -> str:
+    """Returns a value as Python writes it, shortened to ``most`` characters inside its quotation marks."""
+    if isinstance(value, str):
+        return repr(value if len(value) <= most else value[: most - 3] + "...")
+    text = repr(value)
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def _whose(names: Sequence[str], key: str) -> str | Message:
+    """Names a key together with the cameras that have it; a key of the whole file is named alone."""
+    cameras = [name for name in names if name]
+    if len(cameras) == 1:
+        return key.replace("<name>", cameras[0]) if "<name>" in key else f"{cameras[0]}.{key}"
+    return compose("key-of-cameras", cameras=len(cameras), names=some_of(cameras), key=key) if cameras else key
 
 
 class Malformed(ValueError):
@@ -216,3 +352,32 @@ def corner_radius(size: tuple[int, int], focal: tuple[float, float], centre: tup
     """Returns the radius (of ``X / Z``) of the picture's farthest corner from the optical axis."""
     across, down = (max(c, n - c) / f if f > 0 else np.nan for n, f, c in zip(size, focal, centre, strict=True))
     return float(np.hypot(across, down))
+
+
+def unread_programs(folder: Path) -> list[Message]:
+    """Returns, for each program, the files of cameras in ``folder`` that are not read."""
+    files: dict[str, list[str]] = {}
+    for path in sorted(folder.iterdir()):
+        if path.is_file() and (program := program_of(path)):
+            files.setdefault(program, []).append(path.name)
+    return [compose("cameras-of-program", files=some_of(names), program=program) for program, names in files.items()]
+
+
+def program_of(path: Path) -> str | None:
+    """Returns the program that wrote a file of cameras which is not read, and a remedy; None for another file."""
+    named = (program for pattern, program in PATTERNS if fnmatch(path.name.lower(), pattern))
+    held = (
+        program
+        for endings, words, program in CONTENTS
+        if path.suffix.lower() in endings and any(word in head_of(path) for word in words)
+    )
+    return next(named, None) or next(held, None)
+
+
+def head_of(path: Path) -> str:
+    """Returns the beginning of a text, by which its format is recognised; nothing if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return as_utf8(file.read(HEAD_BYTES)).decode("utf-8", "replace")
+    except (OSError, ValueError):
+        return ""

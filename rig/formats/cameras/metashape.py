@@ -17,19 +17,20 @@ from rig.camera import Camera
 from rig.errors import InputError
 from rig.formats.cameras.foreign import (
     LENS_LOSS_PX,
+    CamerasRead,
+    Reading,
     brown_conrady,
     camera_entry,
     camera_names,
     corner_radius,
     lens_entry,
     parsed,
+    shown,
     word_numbers,
     xml_root,
 )
 from rig.formats.cameras.foreign_keys import METASHAPE
-from rig.formats.cameras.reading import CamerasRead, Reading, shown
-from rig.messages.fault_groups import some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, some_of
 from rig.rig import Rig
 
 KEYS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")

@@ -21,18 +21,20 @@ from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
 from rig.formats.cameras.foreign import (
+    CamerasRead,
+    Reading,
     brown_conrady,
     camera_entry,
     camera_names,
     corner_radius,
     lens_entry,
     parsed,
+    shown,
     sized,
     word_numbers,
     xml_root,
 )
 from rig.formats.cameras.foreign_keys import REALITYCAPTURE, REALITYCAPTURE_CSV
-from rig.formats.cameras.reading import CamerasRead, Reading, shown
 from rig.formats.pictures.picture_names import is_junk, picture_stem
 from rig.messages.message import Message, compose
 from rig.rig import Rig

@@ -18,6 +18,8 @@ from rig.camera import Camera
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import is_number
 from rig.formats.cameras.foreign import (
+    CamerasRead,
+    Reading,
     camera_entry,
     camera_names,
     lens_entry,
@@ -25,10 +27,10 @@ from rig.formats.cameras.foreign import (
     millimetres_of,
     number_array,
     pose_matrix,
+    shown,
     sized,
 )
 from rig.formats.cameras.foreign_keys import TRANSFORMS
-from rig.formats.cameras.reading import CamerasRead, Reading, shown
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 

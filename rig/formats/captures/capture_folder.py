@@ -30,8 +30,7 @@ from rig.digest import sha256_of
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import find_rig_file, no_rig_fault, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras.cameras_json import CAMERAS_LEAST, write_rig
-from rig.formats.cameras.reading import CamerasRead
-from rig.formats.cameras.unread_programs import program_of, unread_programs
+from rig.formats.cameras.foreign import CamerasRead, program_of, unread_programs
 from rig.formats.captures.capture_masks import MaskSubjects, mask_subjects
 from rig.formats.captures.features_json import document_from_features, features_from_bytes
 from rig.formats.captures.shot_files import (
@@ -44,12 +43,10 @@ from rig.formats.captures.shot_files import (
 )
 from rig.formats.pictures.images import cut_out_alpha, decode_image_file, page_count, picture_size, write_image
 from rig.formats.pictures.picture_names import entry, is_junk
-from rig.formats.pictures.picture_rims import fill_rims
-from rig.formats.pictures.picture_samples import WHOLE_BITS, measure_samples
+from rig.formats.pictures.picture_samples import WHOLE_BITS, fill_rims, measure_samples
 from rig.formats.pictures.work_size import work_features, work_rig, work_share
 from rig.image import ImageRgb, is_grey
-from rig.messages.fault_groups import say_once, some_of
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, say_once, some_of
 from rig.plausibility import rig_faults
 from rig.rig import Rig
 from rig.text import suggest

@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from rig.formats.pictures.mask_values import MaskReading, Plane, Share, read_masks
+from rig.formats.pictures.mask_values import MaskReading, Plane, Share, inverted_masks, read_masks
 from rig.formats.pictures.work_size import at_share, work_rig, work_share
-from rig.mask_polarity import inverted_masks
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 

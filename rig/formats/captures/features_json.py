@@ -7,8 +7,7 @@ import numpy as np
 
 from rig.camera import Camera
 from rig.capture import Features
-from rig.messages.fault_groups import say_once
-from rig.messages.message import Message, compose
+from rig.messages.message import Message, compose, say_once
 from rig.rig import Rig
 
 FILE = "features.json"

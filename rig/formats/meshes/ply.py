@@ -20,14 +20,8 @@ PLY_VERTEX = np.dtype(
     + [("quality", "<f4"), ("views", "u1")]
 )
 PLY_PART_VERTEX = np.dtype([*PLY_VERTEX.descr, ("part", "u1")])
-
-
 PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
-
-
 PLY_TEXTURED_FACE = np.dtype([*PLY_FACE.descr, ("numbers", "u1"), ("texcoord", "<f4", 6)])
-
-
 PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 

@@ -19,18 +19,15 @@ from PIL import Image, UnidentifiedImageError
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError, how_to_install
-from rig.formats.pictures.mask_values import Plane, mask_plane
+from rig.formats.pictures.mask_values import Plane, mask_plane, subject_convention
 from rig.formats.pictures.picture_names import HEIC_SUFFIXES, IMAGE_SUFFIXES, RAW_SUFFIXES
 from rig.formats.pictures.picture_samples import TIFF, WHOLE_BITS
 from rig.formats.pictures.work_size import at_share, halvings
 from rig.image import ImageRgb
-from rig.mask_polarity import subject_convention
 from rig.messages.message import Message, compose
 
 # Pillow's names. JPEG covers the MPO that many phones write into a .jpg, PPM all of Netpbm's maps.
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM")
-
-
 PictureKind = Literal["colour", "grey", "mask"]
 JPEG = b"\xff\xd8\xff"
 NO_MEMORY = -4  # cv::Error::StsNoMem
@@ -62,8 +59,6 @@ COLOUR_FLAGS = (  # the reducing ones give BGR; OpenCV has no RGB variant of the
 )
 PAGED_SUFFIXES = (".tif", ".tiff", ".webp")  # of files that hold several pictures
 PIXELS_MOST = 100_000_000  # 100 Mpx, the largest studio backs; more is a decompression bomb
-
-
 # Sensor noise does not repeat, so a search for repeats is useless: this halves the time and saves a sixth of space.
 PNG_OPTIONS = [
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),

@@ -15,7 +15,7 @@ from rig.formats.meshes.ply import write_ply
 from rig.formats.pictures.images import write_image
 from rig.studio.scene.eyes import LIMBUS_MM
 from rig.studio.scene.simulate import SimulatedCapture
-from rig.studio.sensor.realism import REALISM, made_real
+from rig.studio.sensor.preset import REALISM, made_real
 
 
 def simulate_to_folder(

@@ -14,8 +14,7 @@ from trimesh.remesh import subdivide
 
 from rig.geometry import Similarity
 from rig.mesh import Mesh, boundary_edges
-from rig.studio.scene.anatomy import Landmarks
-from rig.studio.scene.grids import grid_faces
+from rig.studio.scene.anatomy import Landmarks, grid_faces
 from rig.studio.scene.skin_texture import eye_gap
 
 Vector = Float[np.ndarray, " 3"]

@@ -1,7 +1,8 @@
 """Makes hair as geometry: a lumpy shell over the scalp, and strands that roughen its outline.
 
 The shell is a grid of directions from the middle of the skull. Its radius is that of the head plus the thickness of the
-hair, which decreases to below the skin beyond the hairline.
+hair, which decreases to below the skin beyond the hairline. Beyond it are a sheet that hangs down around the neck, a
+bun on the crown, a full beard (a copy of the lower face, thicker), and curls: ridges that wind over the surface.
 """
 
 from dataclasses import dataclass
@@ -10,12 +11,27 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from rig.mesh import vertex_normals
-from rig.studio.scene.anatomy import Anatomy
-from rig.studio.scene.curls import curled
-from rig.studio.scene.grids import finer_grid, grid_faces
-from rig.studio.sensor.noise import around
+from rig.errors import InputError
+from rig.mesh import Mesh, vertex_normals
+from rig.messages.message import compose
+from rig.studio.scene.anatomy import Anatomy, Landmarks, finer_grid, grid_faces
+from rig.studio.scene.skin_texture import smoothstep
+from rig.studio.sensor.sensor import around, waves
 
+Points = Float[np.ndarray, "n 3"]
+
+SHEET_ROWS, SHEET_COLUMNS = 150, 260
+FRONT_EDGE_DEG = 112.0  # from the back: just before the ears
+TOP_MM = 34.0  # above the ears' openings: there the sheet lies within the shell
+INWARD = 0.22  # how fast hair may fall back inwards below the widest place: mm a mm
+OUTWARD = 1.3  # how fast it is pushed outwards by shoulders
+BUN_ROWS, BUN_COLUMNS = 60, 120
+BUN_ELEVATION_DEG = 58.0  # over the back of the head
+SUNK_MM = 2.0  # below the skin where no beard grows
+Vertices = Float[np.ndarray, "v 3"]
+
+RIDGE_SHARE = 0.5  # how high curls stand, against the distance from one to the next
+VALLEY = 0.45  # tone between curls, where little light falls
 ROWS, COLUMNS = 84, 176  # from the crown down to 62 degrees below the horizon, and around
 CURLED_FINER = 2  # times as many of both under curls
 LOWEST_DEG = -62.0
@@ -178,3 +194,173 @@ def grow_strands(
     points[..., 0] = rng.uniform(0, 500, (count, 1, 1))
     points[..., 1] = (np.linspace(0, 1, STRAND_POINTS) * length)[:, :, None]
     return vertices, ribbons.reshape(-1, 3), points.reshape(-1, 3), np.repeat(root, 2 * STRAND_POINTS)
+
+
+def curled(
+    vertices: Vertices, normals: Vertices, curl_mm: float, amount: Float[np.ndarray, " v"], rng: np.random.Generator
+) -> tuple[Vertices, Float[np.ndarray, " v"]]:
+    """Raises curls on a surface of hair. Returns the new vertices, and a shade for each, relative to the hair's tone. A
+    ridge winds along where a random field is near zero.
+
+    Args:
+        vertices: of the smooth surface (mm), a few to each curl.
+        normals: unit, outward.
+        curl_mm: distance from curl to curl.
+        amount: 0 (none) to 1, for each vertex.
+        rng: draws the ridges.
+    """
+    swirl = waves(rng, vertices, 1.6 * curl_mm, 2.6 * curl_mm)
+    ridge = np.exp(-((swirl / 0.5) ** 2))
+    tuft = 0.3 * waves(rng, vertices, 3.0 * curl_mm, 6.0 * curl_mm)
+    height = amount * curl_mm * RIDGE_SHARE * (1.4 * ridge - 0.7 + tuft)
+    shade = 1.0 + amount * (VALLEY + (1.15 - VALLEY) * ridge - 1.0)
+    return vertices + height[:, None] * normals, shade
+
+
+def grow_beard(head: Mesh, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
+    """Grows beard and moustache on a head (head frame, mm). ``style`` sets thickness, curls and strands.
+
+    Raises InputError for a head without landmarks.
+    """
+    if not body.landmarks:
+        raise InputError("beard", [compose("beard-without-landmarks")])
+    share = beard_share(head.vertices, body)
+    faces = head.faces[(share[head.faces] > 0.0).any(axis=1)]
+    normals = vertex_normals(head.vertices, head.faces)
+    outward = normals - np.array([0.0, 0.45, 0.0])
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    chin = np.exp(-((head.vertices[:, 1] - body.chin_y) ** 2) / (2 * 26.0**2))
+    height = share * style.thickness_mm * (0.45 + 0.55 * chin) - SUNK_MM * (1.0 - np.clip(4.0 * share, 0.0, 1.0))
+    vertices = head.vertices + height[:, None] * outward
+    vertices, shade = curled(vertices, normals, style.curl_mm, np.clip(2.0 * share, 0.0, 1.0), rng)
+    along = 3.0 * (np.array([0.0, -1.0, 0.15]) + 0.3 * normals)
+    strands = grow_strands(vertices, faces, along, (share > 0.3).astype(float), style, rng)
+    return Hair(vertices, faces, vertices * (1.0, 0.4, 1.0), shade, *strands)
+
+
+def beard_share(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
+    """Returns how densely beard grows at each vertex, 0 to 1: on jaw, chin and upper lip, up to the ears, not on the
+    lips."""
+    marks, (x, y, z) = body.landmarks, vertices.T
+    mouth, ears = marks["stomion"], body.ears
+    across = (x - mouth[0]) / body.half_breadth
+    cheek = mouth[1] + 6.0 + (ears[1] - mouth[1]) * np.minimum(np.abs(across), 1.0) ** 3
+    lip = marks["subnasale"][1] - 5.0 - 0.02 * (x - mouth[0]) ** 2  # the moustache's upper edge
+    share = smoothstep(4.0, -5.0, y - np.maximum(cheek, lip))
+    share *= smoothstep(-26.0, -12.0, y - body.chin_y - 0.3 * np.abs(x - mouth[0]))
+    share *= smoothstep(4.0, 14.0, z - ears[2])
+    return share * (1.0 - _lips(vertices, marks))
+
+
+def _lips(vertices: Float[np.ndarray, "v 3"], marks: Landmarks) -> Float[np.ndarray, " v"]:
+    right, left = marks["cheilion_right"], marks["cheilion_left"]
+    top, bottom = marks["labiale_superius"][1] + 0.5, marks["labiale_inferius"][1] - 3.5
+    half = (left[0] - right[0]) / 2
+    across = (vertices[:, 0] - (left[0] + right[0]) / 2) / (half + 1.0)
+    down = (vertices[:, 1] - (top + bottom) / 2) / (0.5 * (top - bottom))
+    return smoothstep(1.35, 0.9, np.hypot(across, down))
+
+
+def hang(shell: Hair, below: Points, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
+    """Makes the sheet of hair that hangs down from the shell to ``style.hanging_mm`` below the openings of the ears.
+
+    Args:
+        shell: the hair over the scalp.
+        below: vertices that the sheet must stay outside of: head, neck and shirt (head frame, mm).
+        body: has the position of the ears.
+        style: thickness and length.
+        rng: draws locks and ends.
+    """
+    axis = body.ears - np.array([0.0, 0.0, 12.0]) * body.unit
+    angle = np.radians(np.linspace(-FRONT_EDGE_DEG, FRONT_EDGE_DEG, SHEET_COLUMNS))
+    length = (style.hanging_mm + 7.0 * around(rng, 1, SHEET_COLUMNS, 1, 28)[0] + TOP_MM) * body.unit
+    drop = np.linspace(0.0, 1.0, SHEET_ROWS)[:, None] * length
+    radius = _fall(shell, below - axis, axis, style, body.unit, length.max())
+    row = drop / length.max() * (SHEET_ROWS - 1)
+    radius = cv2.remap(
+        radius, np.tile(np.arange(SHEET_COLUMNS, dtype=np.float32), (SHEET_ROWS, 1)), row.astype(np.float32), 1
+    )
+    hung = np.clip(drop / (60.0 * body.unit), 0.0, 1.0)
+    radius = radius + hung * (
+        1.6 * around(rng, SHEET_ROWS, SHEET_COLUMNS, 3, 34) + 2.0 * around(rng, SHEET_ROWS, SHEET_COLUMNS, 2, 11)
+    )
+    edge = np.clip((np.degrees(np.abs(angle)) - FRONT_EDGE_DEG + 16.0) / 16.0, 0.0, 1.0)
+    radius -= 16.0 * body.unit * edge**2  # its front edge turns in towards the neck
+    ring = np.stack([np.sin(angle + np.pi), np.zeros_like(angle), np.cos(angle + np.pi)], axis=1)
+    sheet = axis + radius[:, :, None] * ring + (TOP_MM * body.unit - drop)[:, :, None] * np.array([0.0, 1.0, 0.0])
+    vertices, faces = sheet.reshape(-1, 3), grid_faces(SHEET_ROWS, SHEET_COLUMNS, closed=False)[:, ::-1]
+    if (vertex_normals(vertices, faces) * np.tile(ring, (SHEET_ROWS, 1))).sum() < 0:
+        faces = faces[:, ::-1]
+    points = np.stack([np.tile(angle * 85.0, (SHEET_ROWS, 1)), drop, np.zeros_like(drop)], axis=-1).reshape(-1, 3)
+    shade = 1.0 - 0.25 * np.tile(edge, (SHEET_ROWS, 1)).ravel()
+    if style.curl_mm:
+        vertices, curl_shade = curled(
+            vertices, vertex_normals(vertices, faces), style.curl_mm, np.ones(sheet[..., 0].size), rng
+        )
+        shade = shade * curl_shade
+    along = np.concatenate([np.diff(sheet, axis=0), np.diff(sheet[-2:], axis=0)]).reshape(-1, 3)
+    strands = grow_strands(vertices, faces, along, hung.ravel(), style, rng)
+    return Hair(vertices, faces, points, shade, *strands, one_sided=False)
+
+
+def _fall(
+    shell: Hair, below: Points, axis: Float[np.ndarray, " 3"], style: HairStyle, unit: float, length_mm: float
+) -> Float[np.ndarray, "r c"]:
+    """Returns the radius (float32) by drop and angle: the shell's, then straight down except over what pushes out."""
+    hair = _envelope(shell.shell[np.unique(shell.shell_faces)] - axis, unit, length_mm)
+    solid = _envelope(below, unit, length_mm)
+    step = length_mm / (SHEET_ROWS - 1)
+    drop = np.arange(SHEET_ROWS) * step
+    layer = np.clip(drop / 50.0, 0.0, 1.0) * 0.55 * style.thickness_mm
+    sunk = (2.0 + 0.7 * style.curl_mm) * (1.0 - np.clip(drop / 40.0, 0.0, 1.0))
+    radius = np.empty((SHEET_ROWS, SHEET_COLUMNS), np.float32)
+    radius[0] = hair[0] - sunk[0]
+    for i in range(1, SHEET_ROWS):
+        pushed = np.maximum(hair[i] - sunk[i], solid[i] + layer[i])
+        radius[i] = np.minimum(np.maximum(pushed, radius[i - 1] - INWARD * step), radius[i - 1] + OUTWARD * step)
+    return cv2.GaussianBlur(radius, (0, 0), sigmaX=4.0, sigmaY=3.0, borderType=cv2.BORDER_REPLICATE)
+
+
+def _envelope(points: Points, unit: float, length_mm: float) -> Float[np.ndarray, "r c"]:
+    """Returns the outermost radius about the vertical axis by drop and angle (float32), 0 where there is nothing."""
+    limit = np.radians(FRONT_EDGE_DEG)
+    angle = np.arctan2(-points[:, 0], -points[:, 2])
+    row = np.rint((TOP_MM * unit - points[:, 1]) / length_mm * (SHEET_ROWS - 1)).astype(int)
+    column = np.rint((angle + limit) / (2 * limit) * (SHEET_COLUMNS - 1)).astype(int)
+    inside = (row >= 0) & (row < SHEET_ROWS) & (column >= 0) & (column < SHEET_COLUMNS)
+    radius = np.zeros((SHEET_ROWS, SHEET_COLUMNS), np.float32)
+    np.maximum.at(
+        radius, (row[inside], column[inside]), np.hypot(points[inside, 0], points[inside, 2]).astype(np.float32)
+    )
+    return np.asarray(cv2.morphologyEx(radius, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)), np.float32)
+
+
+def knot(shell: Hair, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
+    """Makes a bun of twisted hair on the crown, with the radius ``style.bun_mm``."""
+    elevation = np.radians(BUN_ELEVATION_DEG)
+    outward = np.array([0.0, np.sin(elevation), -np.cos(elevation)])
+    arms = shell.shell - body.ears
+    seat = shell.shell[np.argmax(arms @ outward - np.linalg.norm(np.cross(arms, outward), axis=1))]
+    centre = seat + 0.5 * style.bun_mm * outward
+    polar, around_axis = np.meshgrid(
+        np.linspace(0.0, np.pi, BUN_ROWS), np.arange(BUN_COLUMNS) * 2 * np.pi / BUN_COLUMNS, indexing="ij"
+    )
+    twist = np.cos(6 * around_axis + 4.5 * polar) * np.sin(polar)
+    lumps = 0.05 * around(rng, BUN_ROWS, BUN_COLUMNS, 4, 8) * np.sin(polar)
+    radius = style.bun_mm * (1.0 + 0.06 * twist + lumps)
+    side = np.array([1.0, 0.0, 0.0])
+    ahead = np.cross(outward, side)
+    across, up = radius * np.sin(polar), 0.82 * radius * np.cos(polar)
+    offset = [
+        (across * np.cos(around_axis))[..., None] * side,
+        (across * np.sin(around_axis))[..., None] * ahead,
+        up[..., None] * outward,
+    ]
+    vertices, faces = (centre + sum(offset)).reshape(-1, 3), grid_faces(BUN_ROWS, BUN_COLUMNS)
+    if (vertex_normals(vertices, faces) * (vertices - centre)).sum() < 0:
+        faces = faces[:, ::-1]
+    points = np.stack([(around_axis + 0.75 * polar) * style.bun_mm, polar * 20.0, np.zeros_like(polar)], axis=-1)
+    shade = 1.0 + 0.3 * twist.ravel()
+    along = 3.0 * np.cross(outward, vertices - centre) / style.bun_mm
+    strands = grow_strands(vertices, faces, along, np.sin(polar).ravel(), style, rng)
+    return Hair(vertices, faces, points.reshape(-1, 3), shade, *strands)

@@ -23,14 +23,12 @@ from rig.render.photograph import Gallery, Part
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.eyes import Eye
-from rig.studio.scene.hairstyles import restyled
 from rig.studio.scene.lights import LAMPS, Lamp
-from rig.studio.scene.subject import Look, Subject, dress, random_look, random_pose
+from rig.studio.scene.subject import Look, Subject, dress, random_look, random_pose, restyled
 from rig.studio.scene.visible import VisiblePoints, part_masks, visible_points
 from rig.studio.sensor.faults import Fault
-from rig.studio.sensor.noise import smooth
 from rig.studio.sensor.preset import Preset
-from rig.studio.sensor.sensor import Sensor, drift, expose, focus, rolled
+from rig.studio.sensor.sensor import Sensor, drift, expose, focus, rolled, smooth
 
 Vector = Float[np.ndarray, " 3"]
 Plane = Float[np.ndarray, "h w"]

@@ -1,6 +1,12 @@
-"""Sets how imperfect the simulated studio is. ``PRESET`` is what every benchmark uses."""
+"""Sets how imperfect the simulated studio is, and adds by name what real photographs of skin have. ``PRESET`` is what
+every benchmark uses."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+from rig.errors import InputError
+from rig.messages.message import compose
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +22,7 @@ class Preset:
     )
     defocus_px: float = 0.7  # standard deviation of the blur
     hair: bool = True
-    hairstyle: tuple[str, ...] = ()  # names of ``scene.hairstyles``, in place of the hair that the seed draws
+    hairstyle: tuple[str, ...] = ()  # names of ``scene.subject.HAIRSTYLES``, in place of the hair that the seed draws
     clothes: bool = True
     texture: bool = True  # brows, lips, pores, freckles; False paints the skin in one colour
     backdrop_unevenness: float = 1.0  # 0: one flat colour; 1: folds, panels, a gradient
@@ -30,7 +36,7 @@ class Preset:
     rolling_ms: float = 0.0  # from the first row's readout to the last's; 0: all rows at once (global shutter)
     sway_mm_s: float = 20.0  # how fast the subject moves meanwhile, in a direction of its own each time
     samples: int = 4  # coverage samples a pixel
-    # What real skin and real cameras do (``sensor.realism`` has names for it); nothing of it by default.
+    # What real skin and real cameras do (``REALISM`` has names for it); nothing of it by default.
     pores: float = 1.0  # contrast of pores and freckles, by the painted one
     oil: float = 0.0  # strength of sharp highlights on forehead, nose, cheeks and chin
     scattering_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)  # over which diffuse red, green and blue light spreads
@@ -59,3 +65,35 @@ CLEAN = Preset(
     feature_noise_px=0.0,
 )
 """No imperfection at all: for telling what an imperfection costs."""
+
+Change = Callable[[Preset], Preset]
+
+
+def _with(**changes: float | bool | tuple[float, float, float]) -> Change:
+    return lambda preset: replace(preset, **changes)
+
+
+REALISM: Mapping[str, Change] = MappingProxyType({
+    "smooth": _with(pores=0.15),
+    "oily": _with(oil=1.0),
+    "scattering": _with(scattering_mm=(3.0, 1.1, 0.6)),
+    "mosaic": _with(mosaic=True, read_noise=0.004),
+    "jpeg": _with(jpeg_quality=92),
+})  # fmt: skip
+"""Pores are all but gone in a photograph of 1 px per 0.5 mm; scattering as the path-traced captures have it (Jensen et
+al. 2001 measured 3.67, 1.37 and 0.68 mm of mean free path); a read-out noise of one level in mid grey, and JPEG as
+cameras write it."""
+
+
+def made_real(preset: Preset, names: Sequence[str]) -> Preset:
+    """Returns the preset with the named changes of ``REALISM``. Raises InputError for an unknown name."""
+    if unknown := [name for name in names if name not in REALISM]:
+        raise InputError("realism", [compose("none-of", value=name, known=[*REALISM]) for name in unknown])
+    for name in names:
+        preset = REALISM[name](preset)
+    return preset
+
+
+def realism_names(text: str | None) -> tuple[str, ...]:
+    """Reads the names in ``NAME[,NAME]``; ``all`` stands for all of ``REALISM``, None for none."""
+    return tuple(REALISM) if text == "all" else tuple(text.split(",")) if text else ()

@@ -46,8 +46,6 @@ from server.wire.send_file import media_type, send_archive, send_file, send_zip
 router = APIRouter(prefix="/v1", tags=["jobs"])
 Reader = Annotated[Caller, Depends(require("read"))]
 Submitter = Annotated[Caller, Depends(require("submit"))]
-
-
 LOOKS_MOST = 8  # of a key's event streams in each ``poll_s``, at two queries; where there are more, each waits longer
 streams = Counter[str]()  # open ones, by key
 

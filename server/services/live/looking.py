@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.applications.moments.live_head import LiveHead, follow, meet, mesh_faces
-from pipeline.faces.crops import make_pyramid
-from pipeline.faces.detection import find_large_faces
+from pipeline.faces.detection import find_large_faces, make_pyramid
 from pipeline.faces.eyes import closed_by_openings
 from pipeline.faces.networks import LANDMARKS, FaceNetworks, load_networks
 from pipeline.faces.points import place_face

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rig.acquisition.commands import board_shot
-from rig.acquisition.plate_checks import PlatesRefused
+from rig.acquisition.judgement import PlatesRefused
 from rig.acquisition.plates import PlatesVersion, link_plates, plates_versions
 from rig.acquisition.session import RigSession
 from rig.acquisition.shot import ShotDocument, ShotFailed

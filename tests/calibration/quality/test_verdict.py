@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from calibration.quality.checks import Check
-from calibration.quality.verdict import CameraEvidence, judge
+from calibration.quality.checks import CameraEvidence, Check, judge
 from rig.messages.message import verbatim
 
 SOUND = CameraEvidence(views=12, focal_share=0.004, pose_sigma_px=0.1, covered=0.6)

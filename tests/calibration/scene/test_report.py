@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from calibration.scene.report import scene_page
+from calibration.scene.result import scene_page
 from calibration.scene.scale import scale_from_head
 from rig.messages.message import verbatim
 from tests.support.textured_wedge import solved

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.adjustment.gauge import image_distance
-from calibration.silhouette_refinement.single import VIEWS_LEAST, refine_one
+from calibration.scene.scene import VIEWS_LEAST, refine_one
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import rig_from_directions
 from tests.support.silhouette_subjects import captures_of, disturbed, rms

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from pipeline.results.clay import clay
-from pipeline.results.overlays import ImageRgb, contact_sheet, difference
+from pipeline.results.overlays import ImageRgb, clay, contact_sheet, difference
 from rig.mesh import Mesh
 
 GREY = 200

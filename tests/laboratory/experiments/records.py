@@ -20,7 +20,6 @@ from pipeline.contour_fit import (
     prior_term,
     problem,
     rim,
-    rim_jacobian_kernels,
     rim_kernels,
     rim_term,
 )
@@ -33,7 +32,7 @@ from rig.progress import Progress, discard_progress
 # What rows of the contour solver depend on, for keys.
 CONTOUR = (
     *(levenberg_marquardt, terms, contour, problem, head_problem, rim_term, prior_term),
-    *(clutter, noise_model, rim, rim_kernels, rim_jacobian_kernels, projection_kernels, sampling_kernels),
+    *(clutter, noise_model, rim, rim_kernels, projection_kernels, sampling_kernels),
 )
 
 

@@ -4,9 +4,8 @@ from pathlib import Path
 from typing import Annotated
 
 from pipeline.applications.model_building.sources.imports import import_model
-from pipeline.head_model.data_folder import models_folder
 from pipeline.head_model.model import HeadModel, assemble, load_model
-from pipeline.head_model.model_names import model_path
+from pipeline.head_model.model_names import model_path, models_folder
 from rig.errors import InputError
 
 SHARED = Path("../shared/data")

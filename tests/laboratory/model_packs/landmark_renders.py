@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.faces.crops import make_pyramid
-from pipeline.faces.detection import FaceDetection, crop_around, find_face_at
+from pipeline.faces.detection import FaceDetection, crop_around, find_face_at, make_pyramid
 from pipeline.faces.networks import FaceNetworks
 from pipeline.faces.points import point_table
 from pipeline.head_model.expressions import closed_lids

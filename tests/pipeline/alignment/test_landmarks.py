@@ -16,7 +16,7 @@ from pipeline.alignment.landmarks import (
     feature_alignment,
     landmark_statistics,
 )
-from pipeline.geometry.registration.procrustes import generalised_procrustes, procrustes
+from pipeline.geometry.registration.rigid import generalised_procrustes, procrustes
 from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS, mirrored
 from pipeline.head_model.model import HeadModel
 from rig.camera import Camera, Intrinsics

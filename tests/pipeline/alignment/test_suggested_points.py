@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.alignment.suggested_points import locate_landmarks, suggest_points
+from pipeline.alignment.feature_checks import locate_landmarks, suggest_points
 from pipeline.faces.landmark_map import LandmarkMap, landmark_map
 from pipeline.faces.matching import MatchedFaces, complete_match
 from pipeline.faces.triangulated_face import triangulate_face

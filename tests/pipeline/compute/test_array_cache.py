@@ -143,7 +143,7 @@ def test_a_file_that_nobody_used_for_a_month_goes_and_one_in_use_stays(folder: P
 KEPT = """
 from pipeline.head_model.model import load_model
 from pipeline.photometric_fit.refine import finer
-from pipeline.head_model.model_basis import model_basis
+from pipeline.head_model.gaussian_process import model_basis
 from pipeline.settings import Settings
 model = model_basis(load_model(), Settings())
 fine, patches, at_centres = finer(model)

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 from numba import types
 
-from pipeline.compute.kernel_list import LIST, Kernel, by_module, listed_kernels, text_from_type, type_from_text
+from pipeline.compute.kernel_list import LIST, Kernel, by_module, listed_kernels, type_from_text
 from pipeline.fusion.vote_kernels import Pixels
 from server.processes import python_command, python_environment
+from tests.tools.kernel_recorder import text_from_type
 
 
 def test_every_line_names_a_loop_and_its_types() -> None:

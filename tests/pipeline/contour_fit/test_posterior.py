@@ -5,8 +5,8 @@ import pytest
 
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, vertex_deviation_mm, with_estimated_prior
+from pipeline.head_model.gaussian_process import model_basis
 from pipeline.head_model.model import HeadModel, load_model
-from pipeline.head_model.model_basis import model_basis
 from pipeline.settings import Settings
 from rig.geometry import Similarity
 

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.contour_fit.contour import finish, solve_contour
+from pipeline.contour_fit.contour import finish, judged_by, solve_contour, with_span_misfit
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import vertex_deviation_mm
-from pipeline.contour_fit.span_misfit import judged_by, with_span_misfit
 from pipeline.head_model.gaussian_process import with_kernel
 from pipeline.head_model.model import HeadModel, load_model, with_modes
 from pipeline.settings import FittingSettings

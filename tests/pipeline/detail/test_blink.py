@@ -5,8 +5,8 @@ import pytest
 
 from pipeline.contour_fit.fit import Fit
 from pipeline.detail.blink import blink_shift, blinks_of, estimate_eyelid_closure, with_lids
+from pipeline.detail.dense_points import SurfacePoints
 from pipeline.detail.eyelids import EyeEvidence
-from pipeline.detail.surface_points import SurfacePoints
 from pipeline.head_model.model import HeadModel, load_model, with_expressions, with_modes
 from rig.geometry import Similarity
 from rig.mesh import vertex_normals

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from pipeline.detail.dense_points import SurfacePoints
 from pipeline.detail.depth_bias import measure_bias, points_on_face, without_window_bias
-from pipeline.detail.surface_points import SurfacePoints
 from pipeline.part_labels.codes import Part
-from pipeline.stereo.window_bias import REACH_MM, WINDOW_MM, WindowBias, windowed_height, without_bias
+from pipeline.stereo.depth_map import REACH_MM, WINDOW_MM, WindowBias, windowed_height, without_bias
 from rig.mesh import Mesh
 
 NOISE_MM = 0.1

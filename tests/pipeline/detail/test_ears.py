@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from pipeline.detail.dense_points import SurfacePoints, thinned
 from pipeline.detail.ears import with_ears_in_place
-from pipeline.detail.surface_points import SurfacePoints, thinned
 from pipeline.head_model.model import load_model
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.detail.folds import folded, unfolded
+from pipeline.detail.refine import folded, unfolded
 from tests.support.subdivided_spheres import subdivided_sphere
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.contour_fit.rim import make_topology, pack_views
-from pipeline.detail.outline_points import HELD_MM, OutlineSearch
+from pipeline.detail.dense_points import SurfacePoints
+from pipeline.detail.outline_points import OutlineSearch
 from pipeline.detail.refine import deform_to_points
-from pipeline.detail.surface_points import SurfacePoints
 from pipeline.part_labels.codes import Part
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import look_at
@@ -71,15 +71,3 @@ def test_offsets_lead_from_the_base_to_the_outline() -> None:
     observed = search().observed(vertices, now, 3.0)
     assert len(observed.offset_mm) > 500
     np.testing.assert_allclose(observed.offset_mm, TRUE_MM - RADIUS_MM, atol=0.05)  # chords of 5 mm sag by 0.04 mm
-
-
-def test_support_is_whole_on_a_rim_that_meets_its_outline_and_fades_beside_it() -> None:
-    vertices, _, _ = subdivided_sphere()
-    true = vertices * (TRUE_MM / RADIUS_MM)
-    support = search().support(true)
-    before = TRUE_MM**2 / RANGE_MM  # so far before the middle lies a sphere's rim, towards the camera
-    beside = np.abs(np.abs(true[:, :2]) - before).min(axis=1)
-    assert support[beside < 1.0].min() > 0.9
-    assert support[beside > 4.0 * HELD_MM].max() < 1e-3
-    assert search().support(vertices).max() == 0.0  # 2 mm inside the outline
-    assert search(1.0).support(true).max() == 0.0

@@ -5,10 +5,9 @@ import pytest
 
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import vertex_deviation_mm
+from pipeline.detail.dense_points import SurfacePoints, thinned, with_scaled_deviation
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids
-from pipeline.detail.folds import folded
-from pipeline.detail.refine import SHARED_ERROR, DeformedSurface, deform_to_points, refine_to_surface
-from pipeline.detail.surface_points import SurfacePoints, thinned, with_scaled_deviation
+from pipeline.detail.refine import SHARED_ERROR, DeformedSurface, deform_to_points, folded, refine_to_surface
 from pipeline.fusion.untangling import head_topology, spoilt_faces
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.detail.surface_points import SurfacePoints, thinned
+from pipeline.detail.dense_points import SurfacePoints, thinned
 from pipeline.part_labels.codes import Part
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.evidence.gaze import angles_deg, pupil_distance, pupils
+from pipeline.evidence.pose import angles_deg, pupil_distance, pupils
 from pipeline.faces.irises import BEHIND_MM, Iris, UnseenEye
 from pipeline.results.report import eyes_document
 from pipeline.results.report_types import EyeReport

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.faces.crops import Crop, in_picture, make_pyramid
+from pipeline.faces.detection import Crop, in_picture, make_pyramid
 
 
 def coordinates(width: int, height: int) -> np.ndarray:

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.faces.crops import make_pyramid
-from pipeline.faces.detection import crop_around, find_face_at, find_faces
+from pipeline.faces.detection import crop_around, find_face_at, find_faces, make_pyramid
 from pipeline.faces.networks import FaceNetworks, load_networks
 from tests.support.drawn_faces import OUTER_EYE_CORNERS, drawn_face, turned_about
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.faces.crops import make_pyramid
-from pipeline.faces.detection import FaceDetection, find_faces
+from pipeline.faces.detection import FaceDetection, find_faces, make_pyramid
 from pipeline.faces.eyes import eye_openings, find_eyes
 from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.networks import FaceNetworks

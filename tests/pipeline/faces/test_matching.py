@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.faces.detection import FaceDetection
-from pipeline.faces.matching import MatchedFaces, match_faces
+from pipeline.faces.matching import EYE_DISTANCE_MM, MatchedFaces, complete_match, find_subject_face
 from pipeline.faces.points import point_table
 from rig.camera import Camera, Intrinsics
 from rig.geometry import RigidTransform, Similarity, look_at, rotation_from_vector
@@ -38,6 +38,15 @@ def seen(
 
 def both(*many: dict[str, tuple[FaceDetection, ...]]) -> dict[str, tuple[FaceDetection, ...]]:
     return {name: tuple(face for one in many for face in one.get(name, ())) for name in RIG.names}
+
+
+def match_faces(
+    candidates: dict[str, tuple[FaceDetection, ...]],
+    rig: Rig,
+    eye_distance_mm: tuple[float, float] | None = EYE_DISTANCE_MM,
+) -> MatchedFaces | None:
+    best = find_subject_face(candidates, rig, eye_distance_mm)
+    return best and complete_match(best, candidates, rig)
 
 
 def matched(candidates: dict[str, tuple[FaceDetection, ...]], rig: Rig = RIG, **options: object) -> MatchedFaces:

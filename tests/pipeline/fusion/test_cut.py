@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.fusion.cut import FAR_MM, find_cut
 from pipeline.fusion.grid import whole_box
+from pipeline.fusion.signed_distance import FAR_MM, find_cut
 from pipeline.fusion.view_stack import ViewStack, stack_views
 from pipeline.geometry.nearest import PointTree, nearest
 from rig.mesh import Mesh

@@ -8,8 +8,7 @@ import trimesh
 
 from pipeline.fusion.fusion import BustSurface, NoSurface, finished, fuse, mask_warnings
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.stereo.depth_map import DepthMap
-from pipeline.stereo.window_bias import WindowBias
+from pipeline.stereo.depth_map import DepthMap, WindowBias
 from rig.mesh import Mesh, face_normals
 from rig.progress import discard_progress
 from rig.rig import Rig

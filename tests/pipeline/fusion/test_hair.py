@@ -21,7 +21,7 @@ from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
 from pipeline.part_labels.votes import PartVotes
-from pipeline.stereo.window_bias import WindowBias
+from pipeline.stereo.depth_map import WindowBias
 from rig.mesh import Mesh
 from rig.progress import discard_progress
 from rig.rig import Rig

@@ -13,8 +13,7 @@ from pipeline.fusion.view_stack import stack_views
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
 from pipeline.part_labels.votes import PartVotes, vote_parts
-from pipeline.stereo.depth_map import DepthMap
-from pipeline.stereo.window_bias import WindowBias
+from pipeline.stereo.depth_map import DepthMap, WindowBias
 from rig.camera import Camera
 from rig.mesh import Mesh
 from rig.progress import discard_progress

@@ -7,8 +7,7 @@ import pytest
 
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.fusion.grid import Grid, refined, whole_box
-from pipeline.fusion.grid_kernels import crossed_at_rim, interpolated
-from pipeline.fusion.net_kernels import component_of, compose_well
+from pipeline.fusion.grid_kernels import component_of, compose_well, crossed_at_rim, interpolated
 from pipeline.fusion.untangling import CLEAN, mesh_faults, smooth_spots, topology_of
 from pipeline.geometry.surface_nets import surface_net
 from tests.support.closed_meshes import one_fan_a_vertex

@@ -8,8 +8,8 @@ import pytest
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
-from pipeline.detail.nodes import solving_nodes
 from pipeline.detail.smooth_field import smooth_field
+from pipeline.detail.solve import solving_nodes
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.fusion.untangling import (
     MeshFaults,
@@ -22,8 +22,8 @@ from pipeline.fusion.untangling import (
     untangled,
     untangled_head,
 )
+from pipeline.head_model.gaussian_process import model_basis
 from pipeline.head_model.model import HeadModel, load_model
-from pipeline.head_model.model_basis import model_basis
 from pipeline.settings import Settings
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import face_normals, vertex_normals

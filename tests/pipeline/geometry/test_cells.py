@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.geometry.cells import sorted_into_cells
+from pipeline.geometry.nearest import sorted_into_cells
 
 WIDE = 2.0
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.geometry.fans import corners_at_vertices
+from pipeline.geometry.surface_index import corners_at_vertices
 
 
 def test_corners_are_those_of_a_stable_sort() -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.geometry.normals import facing_cosine
+from pipeline.geometry.surface_index import facing_cosine
 
 
 def test_cosines_are_those_between_normals_and_lines_of_sight() -> None:

@@ -1,7 +1,7 @@
 import numpy as np
 
-from pipeline.geometry.raster import camera_depths, depth_map
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection import camera_depths, depth_map
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from rig.mesh import face_normals
 from tests.support.scenes import ellipsoid, fan, pixel_grid, ray_ellipsoid
 

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.head_model.expressions import ARKIT
-from pipeline.head_model.visemes import VISEMES, mixed
+from pipeline.head_model.expressions import ARKIT, VISEMES, mixed
 
 NAMES = ["sil", "PP", "FF", "TH", "DD", "kk", "CH", "SS", "nn", "RR", "aa", "E", "I", "O", "U"]
 PAGE = Path(__file__).parents[3] / "docs" / "templates.md"

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.imaging.chart_plates import charts_in, empty_plates
+from pipeline.imaging.colour_chart import charts_in, empty_plates
 from tests.pipeline.imaging.test_colour_chart import photograph, placed
 
 WALL = photograph(placed(0.01, 0.0), np.eye(3))

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.imaging.contour_distance import BAND_PX, distance_to_level
+from pipeline.imaging.masks import BAND_PX, distance_to_level
 from pipeline.imaging.silhouette import signed_distance
 
 

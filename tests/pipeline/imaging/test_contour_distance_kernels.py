@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from pipeline.imaging.contour_distance_kernels import refine_distance, segments_of_level
+from pipeline.imaging.sampling_kernels import refine_distance, segments_of_level
 
 LEVEL = 0.5
 # Greys of eight bits never lie at the level itself, as those of masks do not.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.multiview.parallax import USUAL, depth_factor, parallax
+from pipeline.multiview.triangulation import USUAL, depth_factor, parallax
 
 VIEW, VALUE = np.array([[0, 1]]), np.ones((1, 2))
 

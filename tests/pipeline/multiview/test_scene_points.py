@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.multiview.scene_points import find_scene_points, neighbouring_pairs
+from pipeline.multiview.scene_tracks import find_scene_points, neighbouring_pairs
 from tests.support.textured_wedge import SLOPE, photograph, wedge_rig
 
 

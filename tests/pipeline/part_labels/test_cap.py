@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.contour_fit.cap_outline import without_cap
-from pipeline.detail.cap_points import skin_under_cap
-from pipeline.detail.surface_points import SurfacePoints
+from pipeline.contour_fit.bare_outline import without_cap
+from pipeline.detail.dense_points import SurfacePoints, skin_under_cap
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.part_labels.appearance_cells import Cells
 from pipeline.part_labels.cap import Cap, cap_cells, colour_of

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from_mask
 from pipeline.part_labels.appearance_cells import head_guide, make_cells
 from pipeline.part_labels.codes import CHANNELS, Part
@@ -25,8 +25,7 @@ from pipeline.part_labels.labelling import (
 from rig.mesh import Mesh
 from rig.rig import Rig
 from rig.studio.scene.anatomy import anatomy
-from rig.studio.scene.beard import grow_beard
-from rig.studio.scene.hair import HairStyle, grow
+from rig.studio.scene.hair import HairStyle, grow, grow_beard
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import Subject
 from tests.rig.studio.test_images import egg_head

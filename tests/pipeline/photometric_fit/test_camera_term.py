@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.photometric_fit.camera_term import camera_sensitivity
-from pipeline.photometric_fit.camera_term_kernels import read_with_slopes
-from pipeline.photometric_fit.correlation_kernels import read
+from pipeline.photometric_fit.depth_search import camera_sensitivity
+from pipeline.photometric_fit.patch_kernels import read, read_with_slopes
 from rig.camera import Camera
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.studio.scene.layout import default_layout

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from pipeline.photometric_fit.hair_mask import under_hair
-from pipeline.photometric_fit.patches import Patches
+from pipeline.photometric_fit.patches import Patches, under_hair
 
 
 def row_of_patches(count: int) -> tuple[Patches, np.ndarray]:

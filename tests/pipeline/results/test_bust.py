@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from pipeline.contour_fit.fit import Fit
+from pipeline.detail.dense_points import SurfacePoints
 from pipeline.detail.depth_bias import points_on_face
-from pipeline.detail.surface_points import SurfacePoints
 from pipeline.head_model.model import load_model
 from pipeline.part_labels.codes import Part
 from pipeline.results.reconstruction import Reconstruction
@@ -22,7 +22,7 @@ from pipeline.stages.depth import Depth
 from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
-from pipeline.stereo.window_bias import WindowBias
+from pipeline.stereo.depth_map import WindowBias
 from pipeline.warnings import Detail
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear

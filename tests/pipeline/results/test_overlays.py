@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from pipeline.results.clay import DARKEST, LAMP, SKIN, clay, lit
-from pipeline.results.overlays import PART_COLOURS, TINT, tinted
+from pipeline.results.overlays import DARKEST, LAMP, PART_COLOURS, SKIN, TINT, clay, lit, tinted
 from rig.mesh import Mesh
 from tests.support.scenes import ellipsoid
 

@@ -8,8 +8,8 @@ import pytest
 
 from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.measurements import Landmark
+from pipeline.results.head_files import landmarks_document
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.results.slicer_landmarks import landmarks_document
 from pipeline.results.write import write_result
 from pipeline.settings import settings_from_document
 from rig.capture import Capture

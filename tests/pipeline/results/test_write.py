@@ -12,7 +12,7 @@ from pipeline.evidence.measurements import Landmark, Measurement
 from pipeline.faces.matching import complete_match
 from pipeline.faces.subject import SubjectFaces
 from pipeline.faces.triangulated_face import triangulate_face
-from pipeline.geometry.raster import depth_map
+from pipeline.geometry.projection import depth_map
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.results import report
 from pipeline.results.overlays import FITTED_COLOUR, INPUT_COLOUR, KEY_PX, PART_COLOURS, TINT, overlay

@@ -4,8 +4,8 @@ import numpy as np
 
 from pipeline.segmentation.background import ANY_COLOUR_ODDS
 from pipeline.segmentation.foreground import find_shadows
+from pipeline.segmentation.mask_kernels import solve_alpha
 from pipeline.segmentation.matting import COARSE_ALPHA_SIGMA, LINEAR, SHADE
-from pipeline.segmentation.matting_kernels import solve_alpha
 
 WALL, SKIN = (103, 103, 105), (221, 180, 165)
 NOISE = 1.5  # levels

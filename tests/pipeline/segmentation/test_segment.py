@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.segmentation.segment import _without_specks, segment, segment_view
+from pipeline.segmentation.segment import _decided, _refined, _without_specks, segment
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.captures.capture_folder import read_capture
 from rig.formats.pictures.images import read_image
+from rig.image import ImageRgb
 from rig.messages.message import texts_of
 from rig.progress import discard_progress
 from rig.rig import Rig
@@ -27,6 +28,11 @@ from tests.support.noisy_captures import noisier
 from tests.support.shared_data import shared
 
 BACKDROP = (0.20, 0.30, 0.35)
+
+
+def segmented(image: ImageRgb, plates: tuple[ImageRgb, ...]) -> Silhouette:
+    """From its clean plates alone, without other cameras."""
+    return _refined(image, _decided(image, plates))
 
 
 def errors(silhouette: Silhouette, truth: np.ndarray) -> tuple[float, np.ndarray]:
@@ -57,7 +63,7 @@ def errors(silhouette: Silhouette, truth: np.ndarray) -> tuple[float, np.ndarray
 )
 def test_the_contour_is_where_the_formula_says(scene: Scene) -> None:
     image, plates, truth = compose(scene)
-    silhouette = segment_view(image, plates)
+    silhouette = segmented(image, plates)
     iou, off = errors(silhouette, truth)
     assert silhouette.quality.usable
     assert iou > 0.997
@@ -69,7 +75,7 @@ def test_the_contour_is_where_the_formula_says(scene: Scene) -> None:
 
 def test_mask_and_distance_agree_and_the_quality_names_the_cut() -> None:
     image, plates, _ = compose(Scene())
-    silhouette = segment_view(image, plates)
+    silhouette = segmented(image, plates)
     np.testing.assert_array_equal(silhouette.mask, silhouette.distance < 0)
     assert silhouette.distance.dtype == np.float32
     assert silhouette.quality.cut_off == ("bottom",)
@@ -81,7 +87,7 @@ def test_mask_and_distance_agree_and_the_quality_names_the_cut() -> None:
 @pytest.mark.parametrize("gain", [0.8, 1.0, 1.25])
 def test_an_exposure_change_is_measured(gain: float) -> None:
     image, plates, _ = compose(Scene(gain=gain, drift=0.0))
-    found = segment_view(image, plates).quality.figures["gain"]
+    found = segmented(image, plates).quality.figures["gain"]
     # In sRGB codes a gain g of light is near g^(1/2.4); the curve's toe bends it by a few parts in a thousand.
     assert np.allclose(found, gain ** (1 / 2.3), atol=0.01)
 
@@ -89,14 +95,14 @@ def test_an_exposure_change_is_measured(gain: float) -> None:
 def test_noise_is_measured() -> None:
     for noise in (0.01, 0.02):
         image, plates, _ = compose(Scene(noise=noise))
-        figures = segment_view(image, plates).quality.figures
+        figures = segmented(image, plates).quality.figures
         assert figures["noise_levels"] == pytest.approx(255 * noise * np.sqrt(2), rel=0.08)
 
 
 def test_a_grey_picture_is_compared_with_plates_in_colour() -> None:
     image, plates, truth = compose(Scene(backdrop=(0.9, 0.6, 0.05), pattern=0.1))
     grey = np.repeat(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
-    iou, off = errors(segment_view(grey, plates), truth)
+    iou, off = errors(segmented(grey, plates), truth)
     assert iou > 0.99
     assert abs(np.median(off)) < 0.2
 
@@ -113,14 +119,14 @@ FAULTS = [
 @pytest.mark.parametrize("scene", FAULTS)
 def test_one_view_is_right_or_says_that_it_is_not(scene: Scene) -> None:
     image, plates, truth = compose(scene)
-    silhouette = segment_view(image, plates)
+    silhouette = segmented(image, plates)
     iou, _ = errors(silhouette, truth)
     assert iou > 0.99 or silhouette.quality.warnings
 
 
 def test_nobody_there_is_reported() -> None:
     plates, later = (compose(Scene(seed=seed))[1] for seed in (0, 5))
-    silhouette = segment_view(later[0], plates)
+    silhouette = segmented(later[0], plates)
     assert not silhouette.quality.usable
     assert "no subject" in silhouette.quality.warnings[0].text
     assert np.isfinite(silhouette.distance).all()
@@ -245,7 +251,7 @@ def test_noise_of_six_levels_makes_no_holes(scan: tuple[Capture, Rig]) -> None:
     """Shaded skin and a backdrop of its colour: there were holes of 137 to 349 px in cam01 and cam02."""
     noisy = noisier(scan[0], 6.0)
     for name in ("cam01", "cam02"):
-        found = segment_view(noisy.images[name], noisy.backgrounds[name])
+        found = segmented(noisy.images[name], noisy.backgrounds[name])
         missing = (true_mask(name) & ~found.mask).astype(np.uint8)
         areas = cv2.connectedComponentsWithStats(missing)[2][1:, cv2.CC_STAT_AREA]
         assert areas.max() < 100, name  # what is left are bays of the outline
@@ -277,7 +283,7 @@ def row(folder: str, view: str, size: float) -> Row:
         cv2.resize(picture, None, fx=size, fy=size, interpolation=cv2.INTER_AREA)
         for picture in (capture.images[view], *capture.backgrounds[view])
     ]
-    silhouette = segment_view(pictures[0], tuple(pictures[1:]))
+    silhouette = segmented(pictures[0], tuple(pictures[1:]))
     truth = true_mask(view, folder)
     at = (contour_points(truth) + 0.5) * size - 0.5
     x, y = (np.ascontiguousarray(at[:, k], np.float32)[None] for k in (0, 1))

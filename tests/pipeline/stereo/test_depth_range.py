@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.geometry.raster import depth_map
+from pipeline.geometry.projection import depth_map
 from pipeline.multiview.visual_hull import hull_extent
 from pipeline.stereo.crops import make_crops
 from pipeline.stereo.depth_range import BEFORE_HEAD_MM, DepthRange, find_depth_ranges

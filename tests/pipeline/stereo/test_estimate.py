@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.stereo.depth_map import DepthMap, points_world
-from pipeline.stereo.estimate import estimate_depth
-from pipeline.stereo.refinement import take_specks_off
+from pipeline.stereo.estimate import estimate_depth, take_specks_off
 from rig.camera import Distortion
 from rig.rig import Rig
 from tests.pipeline.stereo.ray_scene import Ball, fan, first_hit, shoot

@@ -11,13 +11,14 @@ from pipeline.stereo.depth_range import DepthRange, find_depth_ranges
 from pipeline.stereo.estimate import (
     COARSEST_LEVEL,
     CONTRAST_LEVELS,
+    LABELS,
     PIXEL_MM,
     choose_neighbours,
     estimate_depth,
+    label_strides,
     square_pattern,
 )
 from pipeline.stereo.matcher import GROUP, SHADERS, Matcher, Planes, matching_on
-from pipeline.stereo.search import LABELS, label_strides
 from pipeline.stereo.stack import Stack, stack_crops
 from rig.camera import Distortion
 from rig.progress import discard_progress

@@ -5,9 +5,17 @@ import pytest
 
 from pipeline.stereo.crops import make_crops
 from pipeline.stereo.depth_range import DepthRange
-from pipeline.stereo.estimate import CONTRAST_LEVELS, PIXEL_MM, choose_neighbours, square_pattern
+from pipeline.stereo.estimate import (
+    CONTRAST_LEVELS,
+    PIXEL_MM,
+    SEARCH_PIXEL_MM,
+    choose_neighbours,
+    find_search_level,
+    first_fields,
+    slopes_around,
+    square_pattern,
+)
 from pipeline.stereo.matcher import Matching
-from pipeline.stereo.search import SEARCH_PIXEL_MM, find_search_level, first_fields, slopes_around
 from pipeline.stereo.stack import stack_crops
 from rig.camera import Camera
 from rig.studio.scene.layout import default_layout

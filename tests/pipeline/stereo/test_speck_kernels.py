@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.stereo.speck_kernels import fill_specks, mark_specks
+from pipeline.stereo.depth_map_kernels import fill_specks, mark_specks
 
 HEIGHT, WIDTH = 40, 50
 GAP_MM, MOST_PX = 1.0, 30

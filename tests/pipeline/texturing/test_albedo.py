@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.projection import depth_maps
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import TextureSettings
 from pipeline.texturing.albedo import DIM_SHARE, Albedo, estimate_albedo, shine_left

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.texturing.likeness import MIN_LIKENESS, find_unlike
+from pipeline.texturing.vertex_colours import MIN_LIKENESS, find_unlike
 
 VERTICES = 2_000
 HALF = np.arange(VERTICES) < VERTICES // 2

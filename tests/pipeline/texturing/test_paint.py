@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.projection import depth_maps
 from pipeline.settings import TextureSettings
 from pipeline.texturing.layout.uv_unwrap import Layout, unwrap
 from pipeline.texturing.neighbourhood import Neighbourhood, neighbours

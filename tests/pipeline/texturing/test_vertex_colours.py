@@ -10,7 +10,7 @@ import pytest
 import scipy.sparse
 import scipy.sparse.linalg
 
-from pipeline.geometry.raster import depth_map, depth_maps
+from pipeline.geometry.projection import depth_map, depth_maps
 from pipeline.head_model.subdivision import boundary_loops, close_loop
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import minimum_filter
 
-from pipeline.texturing.visibility import unclipped
-from pipeline.texturing.visibility_kernels import (
+from pipeline.texturing.view_selection_kernels import (
     POOR,
     SLOPE_SLACK,
     WINDOW,
@@ -13,6 +12,7 @@ from pipeline.texturing.visibility_kernels import (
     sample_colours,
     visibility_weights,
 )
+from pipeline.texturing.visibility import unclipped
 from rig.colour_space import linear_from_srgb
 
 LIMITS = (1.5, 3.0, 0.35, 4.0)  # margin px, hidden mm, least facing, sharpness

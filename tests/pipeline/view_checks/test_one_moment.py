@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.faces.detection import FaceDetection
-from pipeline.faces.matching import match_faces
+from pipeline.faces.matching import complete_match, find_subject_face
 from pipeline.faces.points import direction_from_face, point_table, view_bias
 from pipeline.faces.subject import SubjectFaces
 from pipeline.view_checks.one_moment import LOWER_LIP, judge_moments
@@ -31,7 +31,8 @@ def test_a_view_of_another_moment_is_named(moved_mm, rows, named) -> None:
         pixels += size_px * view_bias(direction_from_face(AT_ORIGIN, camera))
         box = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
         found[camera.name] = (FaceDetection(pixels, np.zeros(468), 40.0, box, 0.0),)
-    warnings = judge_moments(SubjectFaces(found, match_faces(found, FIVE), FIVE.names), FIVE)
+    best = find_subject_face(found, FIVE, None)
+    warnings = judge_moments(SubjectFaces(found, best and complete_match(best, found, FIVE), FIVE.names), FIVE)
     assert [warning.parameters["camera"] for warning in warnings] == named
     # The camera looks down at the face: a vertical step is seen shortened.
     offsets_mm = np.array([warning.parameters["offset_mm"] for warning in warnings], float)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rig.acquisition.plate_checks import occupied, plate_faults
+from rig.acquisition.judgement import occupied, plate_faults
 from rig.acquisition.plates import NO_PLATES, Plates
 from rig.formats.rig_toml import ShotConfig
 from tests.support.textured_studio import NAMES, FlatStudio

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from rig.acquisition.commands import COLUMNS, NoCalibration, board_shots, capture, check, preview, take_plates
-from rig.acquisition.plate_checks import PlatesRefused
+from rig.acquisition.judgement import PlatesRefused
 from rig.acquisition.plates import plates_versions, read_plates, write_plates
 from rig.acquisition.session import RigSession
-from rig.acquisition.shot import FAULTS, WARNINGS, ShotFailed, Timing, certify
+from rig.acquisition.shot import REMEDIES, WARNINGS, ShotFailed, Timing, certify
 from rig.camera import Camera, Intrinsics
 from rig.capture import Capture as CaptureValue
 from rig.drivers.base import Frame
@@ -284,7 +284,7 @@ def test_a_camera_that_runs_freely_or_was_recorded_is_not_the_triggers_fault() -
 
 
 def test_every_warning_is_a_fault_that_is_explained() -> None:
-    assert set(FAULTS) > WARNINGS
+    assert set(REMEDIES) > WARNINGS
 
 
 def test_board_shots_need_neither_calibration_nor_plates(

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rig.acquisition.subject_place import SubjectPlace, find_subject, subject_of_mask
+from rig.acquisition.image_checks import SubjectPlace, find_subject, subject_of_mask
 from rig.formats.pictures.images import read_image
 from tests.support.shared_data import shared
 from tests.support.textured_studio import FlatStudio

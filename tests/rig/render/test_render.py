@@ -14,9 +14,8 @@ from rig.camera import Camera, Distortion, Intrinsics
 from rig.errors import InputError
 from rig.geometry import RigidTransform, look_at
 from rig.mesh import Mesh
-from rig.render.colour import HEADLIGHT
 from rig.render.context import WrongThread
-from rig.render.renderer import Renderer, is_closed
+from rig.render.renderer import HEADLIGHT, Renderer, is_closed
 from rig.render.tile_packing import BLOCK_PX, ImageTooLarge, pack
 from rig.rig import Rig
 from tests.support import oracles

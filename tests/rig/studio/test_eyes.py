@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.projection import depth_maps
 from pipeline.head_model.model import load_model
 from rig.camera import Camera, Intrinsics
 from rig.errors import InputError

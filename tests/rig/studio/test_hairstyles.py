@@ -8,17 +8,12 @@ import pytest
 from rig.errors import InputError
 from rig.mesh import Mesh, face_normals, vertex_normals
 from rig.render.renderer import Renderer
-from rig.studio.scene.anatomy import Anatomy, anatomy
-from rig.studio.scene.beard import beard_share
-from rig.studio.scene.curls import curled
-from rig.studio.scene.grids import finer_grid, grid_faces
-from rig.studio.scene.hair import HairStyle, grow
-from rig.studio.scene.hairstyles import HAIRSTYLES, restyled
-from rig.studio.scene.headwear import cap, glasses
+from rig.studio.scene.anatomy import Anatomy, anatomy, finer_grid, grid_faces
+from rig.studio.scene.hair import HairStyle, beard_share, curled, grow, hang, knot
 from rig.studio.scene.layout import default_layout
-from rig.studio.scene.long_hair import hang, knot
 from rig.studio.scene.simulate import SimulatedCapture, simulate
-from rig.studio.scene.subject import Look, Subject, dress
+from rig.studio.scene.subject import HAIRSTYLES, Look, Subject, dress, restyled
+from rig.studio.scene.worn import cap, glasses
 from rig.studio.sensor.preset import CLEAN
 from tests.rig.studio.test_images import egg_head
 

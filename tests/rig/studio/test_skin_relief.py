@@ -3,7 +3,7 @@
 import numpy as np
 
 from rig.mesh import Mesh
-from rig.studio.scene.skin_relief import EDGE_MM, FADE, SkinRelief, relieved
+from rig.studio.scene.skin_texture import EDGE_MM, FADE, SkinRelief, relieved
 from tests.support.drawn_relief import draw_relief
 
 RADIUS_MM, SLOPE = 4.0, 0.15

@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 import pytest
 
-from pipeline.applications.templates.names import UnknownTemplate
+from pipeline.applications.templates.header import UnknownTemplate
 from pipeline.head_model.model_names import UnknownModel, model_path, model_sha256
 from pipeline.settings import document_from_settings, settings_from_document
 from rig.errors import InputError

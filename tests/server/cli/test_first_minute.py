@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.head_model.data_folder import data_folder, models_folder
+from pipeline.head_model.model_names import data_folder, models_folder
 from rig.studio.sensor.faults import KINDS
 from server.cli.main import main
 from tests.server.cli.test_main import run as run_apart

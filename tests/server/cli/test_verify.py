@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.applications.verification.limits import Limits
+from pipeline.applications.verification.judgement import Limits
 from pipeline.head_model.model import load_model
 from rig.errors import InputError
 from rig.formats.meshes.ply import write_ply

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
-from pipeline.applications.templates.names import new_path
+from pipeline.applications.templates.header import new_path
 from pipeline.applications.templates.template_file import save_template
 from pipeline.head_model.model import load_model
 from rig.errors import EigenheadError, InputError

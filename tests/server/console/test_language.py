@@ -12,7 +12,7 @@ from typing import get_args
 
 from nicegui.translations import translations
 
-from calibration.quality import verdict as calibration_verdict
+from calibration.quality import checks as calibration_checks
 from pipeline.evidence.measurements import DISTANCES
 from rig.acquisition import shot, verdict
 from server.console.theme import PAGES
@@ -57,12 +57,12 @@ def vocabulary() -> Iterator[str]:
     """Words that reach the pages as values."""
     yield from ("queued", "running", *FINISHED)
     yield from (*get_args(BatchState), *(f"{state} (captures)" for state in ITEM_STATES))
-    yield from (*get_args(verdict.Verdict), *get_args(calibration_verdict.Word), *get_args(shot.Status))
+    yield from (*get_args(verdict.Verdict), *get_args(calibration_checks.Word), *get_args(shot.Status))
     yield from (title for _, _, title in PAGES)
     yield from (name.replace("_", " ") for name in DISTANCES)
     yield from KINDS
     yield from (*CHECKS, *PARTS)
-    yield from shot.FAULTS.keys() - named_faults().keys()
+    yield from shot.REMEDIES.keys() - named_faults().keys()
     yield from ("left", "right", "top", "bottom", "width", "height", "first", "second", "simulated", "real")
     yield from ("capture", "captures", "job", "jobs")  # what a message counts, or what it found faults in
     yield from translations["en-US"].values()
@@ -79,7 +79,7 @@ def named_faults() -> dict[str, str]:
 
 
 def test_every_code_of_a_fault_is_named() -> None:
-    assert {named_faults().get(code, code) for code in shot.FAULTS} - german().keys() == set()
+    assert {named_faults().get(code, code) for code in shot.REMEDIES} - german().keys() == set()
 
 
 def test_no_entry_of_the_table_is_unused() -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.head_model.data_folder import DATA
+from pipeline.head_model.model_names import DATA
 from server.services.templates import templates_at_hand
 from tests.support.template_headers import header_file
 

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.head_model.data_folder import DATA
-from pipeline.head_model.model_names import model_path
+from pipeline.head_model.model_names import DATA, model_path
 from rig.errors import InputError
 from rig.messages.message import Message
 from server.services.work import ReconstructionRequest

@@ -11,11 +11,20 @@ alone, on heads outside its span, it pulls vertices to wrong positions. Two fact
 and its mirror image are equally likely, so the covariance is averaged with its mirror image. And distant parts of a
 head are nearly independent, so the covariance is multiplied by a Gaussian of the distance between vertices, which keeps
 the correlation of neighbours and frees the rest (localised Gaussian process morphable models, Luethi et al. 2018,
-*Gaussian Process Morphable Models*, section 3.3). The prior is a mixture of the plain and the localised covariance."""
+*Gaussian Process Morphable Models*, section 3.3). The prior is a mixture of the plain and the localised covariance.
 
-from collections.abc import Sequence
+Rays are cast from the vertical axis through the head outwards. A ray is (angle, height): angle 0 looks along +z (out of
+the face), pi/2 along +x (the subject's left); height is y. Scans are worked on in several processes, for SuperLU and
+numpy hold the interpreter."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import get_context
+from typing import TypeVar
 
 import numpy as np
 import scipy.sparse as sparse
@@ -24,12 +33,18 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from pipeline.applications.model_building.correspondence.cylinder import CylinderIndex, coordinates, points_at
-from pipeline.applications.model_building.correspondence.parallel import Workers, workers
+from pipeline.applications.model_building.correspondence.cylinder_kernels import CELL_MM, bin_triangles, cast_rays
 from pipeline.applications.model_building.correspondence.scans import Scan
-from pipeline.geometry.registration.nonrigid import Search, Target, dots, draw_to_target, match_points, oriented_tree
+from pipeline.geometry.registration.nonrigid import (
+    Search,
+    Target,
+    dots,
+    draw_to_target,
+    landmark_warp,
+    match_points,
+    oriented_tree,
+)
 from pipeline.geometry.registration.rigid import motion_columns, solve_with_prior
-from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.landmarks import NAMES, stacked
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.pca import align
@@ -38,6 +53,13 @@ from rig.geometry import RigidTransform, rigid_fit
 from rig.mesh import edges_of, vertex_normals
 from rig.progress import Progress
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+FEW = 12  # with fewer items the processes' start (two seconds) costs more than they save
+_BLAS_THREADS = "OPENBLAS_NUM_THREADS"
+_CHUNK = 4  # items per message: the task's constant data (a prior of 40 MB) is sent once for each chunk
+PerVertex = Float[np.ndarray, " N"]
 _TAUBIN = (0.5, -0.53)  # weights of a step that smooths and of one that restores the size
 _SMOOTHINGS = 4  # pairs of steps: they halve the noise of points; 8 would remove fine shape too
 # Normals lead while the shape is millimetres off; close by they would pin a vertex to where its own, still wrong,
@@ -51,6 +73,89 @@ _SPARE = 100  # directions of the sketch beyond those kept
 _BLOCK = 600
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 _SYMMETRIC = 0.99  # share of edges that must exist mirrored too; not all do, since quads may be split differently
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Workers:
+    """Runs a module-level function, or a partial of one, over items in several processes."""
+
+    pool: ProcessPoolExecutor | None
+
+    def over(
+        self, work: Callable[[Item], Result], items: Sequence[Item], stage: str, report: Progress | None
+    ) -> list[Result]:
+        """Runs ``work`` on the items and returns the results in their order. Raises the exception of the first item
+        that fails."""
+        results = map(work, items) if self.pool is None else self.pool.map(work, items, chunksize=_CHUNK)
+        out = []
+        for result in results:
+            out.append(result)
+            if report:
+                report(stage, len(out) / len(items))
+        return out
+
+
+@contextmanager
+def workers(count: int, items: int) -> Iterator[Workers]:
+    """Yields ``count`` processes for ``items`` pieces of work; for few items the work runs in this process."""
+    if count < 2 or items < FEW:
+        yield Workers(None)
+        return
+    # fresh interpreters: a fork would copy locks that threads (BLAS, numba) of this process hold
+    with _single_threaded_children(), ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
+        yield Workers(pool)
+
+
+@contextmanager
+def _single_threaded_children() -> Iterator[None]:
+    """Makes processes that are started in the block use one thread for linear algebra, as there is one process for each
+    core."""
+    before = os.environ.get(_BLAS_THREADS)
+    os.environ[_BLAS_THREADS] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_BLAS_THREADS]
+        else:
+            os.environ[_BLAS_THREADS] = before
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cast:
+    """Holds where rays meet a surface: radius (mm) and triangle, NaN and -1 where they do not."""
+
+    radii: PerVertex
+    triangles: Int[np.ndarray, " N"]
+
+
+def coordinates(points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, " _"], ...]:
+    """Returns angle (-pi to pi), height and radius (mm) of points about the axis x = z = 0."""
+    return np.arctan2(points[:, 0], points[:, 2]), points[:, 1], np.hypot(points[:, 0], points[:, 2])
+
+
+def points_at(angles: PerVertex, heights: PerVertex, radii: PerVertex) -> Float[np.ndarray, "N 3"]:
+    """Returns points from angle, height and radius: the inverse of ``coordinates``."""
+    return np.stack([radii * np.sin(angles), heights, radii * np.cos(angles)], 1)
+
+
+class CylinderIndex:
+    """Holds a triangle surface (mm, axis x = z = 0) prepared for rays from the axis."""
+
+    def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
+        self._vertices = np.ascontiguousarray(vertices, float)
+        self._faces = np.ascontiguousarray(faces, np.int64)
+        self._low = float(vertices[:, 1].min())
+        self._rows = int((vertices[:, 1].max() - self._low) / CELL_MM) + 1
+        self._start, self._members = bin_triangles(self._vertices, self._faces, self._low, self._rows)
+
+    def cast(self, angles: PerVertex, heights: PerVertex, near: PerVertex | None = None) -> Cast:
+        """Returns each ray's hit whose radius is nearest to ``near`` (mm), or without ``near`` the outermost hit."""
+        wanted = np.full(len(angles), np.inf) if near is None else np.asarray(near, float)
+        found, triangles = cast_rays(
+            self._vertices, self._faces, self._low, self._rows, self._start, self._members, angles, heights, wanted
+        )
+        return Cast(found, triangles)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

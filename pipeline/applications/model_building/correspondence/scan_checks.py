@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from pipeline.applications.model_building.correspondence.cylinder import CylinderIndex
+from pipeline.applications.model_building.correspondence.correspondence import CylinderIndex
 from pipeline.applications.model_building.correspondence.scans import Scan
 from pipeline.head_model.landmarks import NAMES, PAIRED, mirrored, stacked
 from pipeline.head_model.model import HeadModel

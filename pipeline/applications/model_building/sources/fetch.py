@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import IO
 
 from pipeline.applications.model_building.sources.imports import import_model
-from pipeline.head_model.data_folder import models_folder
 from pipeline.head_model.model_file import ModelParts, save_model
+from pipeline.head_model.model_names import models_folder
 from rig.errors import EigenheadError
 from rig.progress import Progress
 

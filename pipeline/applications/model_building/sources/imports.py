@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 from scipy.spatial.distance import cdist
 
 from pipeline.applications.model_building.training.training import Training, above_neck, face_region, finish
+from pipeline.geometry.registration.nonrigid import landmark_warp
 from pipeline.geometry.registration.rigid import motion_about, motion_columns, solve_with_prior
 from pipeline.geometry.surface_index import Hits, SurfaceIndex
-from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.expressions import Expressions, visible
 from pipeline.head_model.landmarks import MIDLINE, NAMES, mirrored
 from pipeline.head_model.model import HeadModel, load_model

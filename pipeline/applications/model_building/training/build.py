@@ -10,8 +10,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.applications.model_building.correspondence.correspondence import Matching, correspond
-from pipeline.applications.model_building.correspondence.parallel import workers
+from pipeline.applications.model_building.correspondence.correspondence import Matching, correspond, workers
 from pipeline.applications.model_building.correspondence.scan_checks import Checked, check
 from pipeline.applications.model_building.correspondence.scans import Scan, find_scans, read_scan
 from pipeline.applications.model_building.training.training import Training, train

@@ -12,17 +12,23 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.applications.model_building.correspondence.correspondence import (
+    CylinderIndex,
     Matching,
     common_frame,
     on_reference,
+    points_at,
     prepared,
     warp_and_resample,
 )
-from pipeline.applications.model_building.correspondence.cylinder import CylinderIndex, points_at
 from pipeline.applications.model_building.correspondence.scans import Scan
-from pipeline.applications.model_building.training import model_metrics
-from pipeline.applications.model_building.training.training import USED_MODES
-from pipeline.geometry.raster import picture
+from pipeline.applications.model_building.training.training import (
+    USED_MODES,
+    compactness,
+    components_of,
+    generalisation,
+    specificity,
+)
+from pipeline.geometry.projection import picture
 from pipeline.head_model.landmarks import NAMES
 from pipeline.head_model.model import HeadModel
 from rig.camera import Camera, Intrinsics
@@ -218,13 +224,11 @@ def curves_figure(model: HeadModel, *, report: Progress | None = None) -> Image:
         c for c in (1, 2, 5, 10, 20, 40, USED_MODES, 100, 137) if c <= min(len(model.modes), len(model.scores) - 1)
     ]
     region = model.levels["cage"].face_region
-    components = model_metrics.components_of(model.mean, model.modes, model.scores)
-    compact = model_metrics.compactness(model.sigma)
-    apart = model_metrics.generalisation(components, region, counts, report=report)
+    components = components_of(model.mean, model.modes, model.scores)
+    compact = compactness(model.sigma)
+    apart = generalisation(components, region, counts, report=report)
     heads = (model.mean + np.tensordot(model.scores, model.modes, 1)).astype(float)
-    special = {
-        c: model_metrics.specificity(components.mean, components.modes[:c], heads, region, draws=30) for c in counts
-    }
+    special = {c: specificity(components.mean, components.modes[:c], heads, region, draws=30) for c in counts}
     charts = [
         ("compactness: share of variance", {k + 1: float(v) for k, v in enumerate(compact)}),
         ("generalisation: leave one out, mm", apart),

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from pipeline.head_model.model import HeadModel
 from pipeline.reconstruct import reconstruct
-from pipeline.results.clay import clay
+from pipeline.results.overlays import clay
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
 from rig.camera import Camera

@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.geometry.raster import depth_map, picture
+from pipeline.geometry.projection import depth_map, picture
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.masks import eroded
 from pipeline.imaging.silhouette import Silhouette, signed_distance
-from pipeline.multiview.scene_points import find_scene_points
+from pipeline.multiview.scene_tracks import find_scene_points
 from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.segmentation.segment import segment
@@ -35,8 +35,7 @@ from rig.formats.captures.capture_folder import capture_root
 from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.render.renderer import Renderer
-from rig.rig import Rig
-from rig.spread_views import spread_views
+from rig.rig import Rig, spread_views
 from server.tasks.photographs import read_or_calibrate
 from server.tasks.prepare import prepare_kernels
 from tests.laboratory.experiments.records import Bench, Outcome, Row

@@ -27,8 +27,8 @@ from scipy.spatial import KDTree
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import vertex_deviation_mm
 from pipeline.contour_fit.rim import find_rim, make_topology, pack_views
-from pipeline.geometry.raster import camera_depths, depth_maps
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection import camera_depths, depth_maps
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import vertex_areas

@@ -15,7 +15,6 @@ from scipy.spatial import KDTree
 
 from pipeline.contour_fit.fit import Fit
 from pipeline.head_model.model import HeadModel, with_modes
-from pipeline.imaging.silhouette import xor_cost
 from pipeline.settings import FittingSettings
 from pipeline.simplex import hierarchy as schedule
 from pipeline.simplex import nelder_mead
@@ -244,7 +243,7 @@ def scores(model: HeadModel, fit: Fit, subject: Planted, rig: Rig, renderer: Ren
     apart = [KDTree(b).query(a, workers=2)[0].max() for a, b in ((found, true), (true, found))]
     pose = fit.world_from_head
     return {
-        "xor": sum(xor_cost(theirs[name], ours[name]) for name in ours),
+        "xor": float(sum(np.count_nonzero(theirs[name] ^ ours[name]) for name in ours)),
         "l2": float(np.sqrt((distance**2).sum())),
         "hausdorff": float(max(apart)),
         "mean_error_mm": float(distance[model.levels["full"].face_region].mean()),

@@ -12,7 +12,7 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.evidence.gaze import pupil_distance
+from pipeline.evidence.pose import pupil_distance
 from pipeline.faces import irises as finding
 from pipeline.faces import limbus as edges
 from pipeline.faces.irises import Iris, find_irises
@@ -25,8 +25,7 @@ from rig.studio.scene import eyes as studio_eyes
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.subject import Subject, with_gaze
-from rig.studio.sensor.preset import PRESET
-from rig.studio.sensor.realism import REALISM, made_real
+from rig.studio.sensor.preset import PRESET, REALISM, made_real
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.shapes import OPEN_TRIANGLES
 

@@ -26,7 +26,7 @@ from pipeline.faces.subject import find_subject
 from pipeline.head_model.model import HeadModel
 from pipeline.segmentation.segment import segment
 from pipeline.settings import OutputSettings, Settings
-from pipeline.texturing import likeness
+from pipeline.texturing import vertex_colours
 from pipeline.view_checks import head_size, one_moment, usable_views
 from pipeline.view_checks.guards import GUARDS, FaceEvidence, Guard, Guards, find_face_evidence
 from pipeline.view_checks.lens_distortion import judge_distortion
@@ -98,7 +98,7 @@ def guards(
     ``<fault>_named`` and ``<fault>_planted``."""
     judge = partial(judge_fitted, model, renderer) if fitted else judge_views
     name = "guards-fitted" if fitted else "guards"
-    records = bench.records(name, key_of(model.sha256, draws, one_moment, head_size, usable_views, likeness))
+    records = bench.records(name, key_of(model.sha256, draws, one_moment, head_size, usable_views, vertex_colours))
     jobs = {path.name: partial(judge_folder, path, _other(path, folders), draws, judge) for path in folders}
     studio = partial(judge_studio, model, renderer, judge)
     jobs |= {f"studio {n} {KINDS[n % len(KINDS)].what}": partial(studio, n) for n in range(subjects)}

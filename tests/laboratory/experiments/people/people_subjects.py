@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.projection import depth_maps
 from pipeline.head_model.expressions import closed_lids, plain_name
 from pipeline.head_model.landmarks import SEVEN_POINTS
 from pipeline.head_model.model import HeadModel, Level
@@ -32,8 +32,7 @@ from rig.studio.scene.simulate import simulate
 from rig.studio.scene.subject import Colour, Subject, random_look
 from rig.studio.scene.visible import PARTS, VisiblePoints, sees
 from rig.studio.sensor.faults import Fault
-from rig.studio.sensor.preset import PRESET, Preset
-from rig.studio.sensor.realism import REALISM, made_real
+from rig.studio.sensor.preset import PRESET, REALISM, Preset, made_real
 from tests.laboratory.experiments.people.view_subsets import even_views, frontal_views, is_circle
 from tests.laboratory.experiments.surface.visible_surface import read_visible
 from tests.support.layouts import circle_directions, row_directions
@@ -121,7 +120,7 @@ class StudioKind:
     expression: Mapping[str, float] = field(default_factory=dict)  # weights under Apple's names
     skin: Colour | None = None
     is_before_own_colour: bool = False  # hair, clothes and backdrop alike, and dark
-    realism: tuple[str, ...] = ()  # of ``sensor.realism``
+    realism: tuple[str, ...] = ()  # of ``REALISM``
     unevenness: float = 1.0  # of the backdrop; 0.15 is the plain wall of a living room
 
 

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float
 from pipeline.applications.clinic.anatomical_frame import frankfurt_axes
 from pipeline.applications.clinic.fitting import UprightHead, head_circumference
 from pipeline.applications.verification.measured import Measured
-from pipeline.contour_fit import bare_outline, cap_outline, noise_model
-from pipeline.detail import cap_points
+from pipeline.contour_fit import bare_outline, noise_model
+from pipeline.detail import dense_points
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
@@ -34,11 +34,10 @@ from rig.mesh import Mesh
 from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import anatomy
-from rig.studio.scene.hairstyles import restyled
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
-from rig.studio.scene.subject import Look, Subject, random_look
-from rig.studio.scene.tight_cap import TightCap, above_edge_mm
+from rig.studio.scene.subject import Look, Subject, random_look, restyled
+from rig.studio.scene.worn import TightCap, above_edge_mm
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD
@@ -77,9 +76,7 @@ def capped(
     """Runs this module's experiment: ``subjects`` heads of the model's span and as many of ``others``, each with the
     next cap. Figures are ``<group>_<without|with>_<cranium|girth|stated>_mm``: means over the group (``own``,
     ``others``) of the median distance, of the absolute error of the girth, and of the median stated deviation."""
-    records = bench.records(
-        "capped", key_of(model.sha256, Settings(), cap_finder, cap_outline, bare_outline, cap_points)
-    )
+    records = bench.records("capped", key_of(model.sha256, Settings(), cap_finder, bare_outline, dense_points))
     populations = {"own": (model, IN_SPAN_MODES, IN_SPAN_SPREAD)}
     if others is not None:
         populations["others"] = (others, len(others.modes), 1.0)

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float, Float32, Int32, UInt8
 from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
-from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.projection import depth_maps
 from pipeline.geometry.surface_index import SurfaceIndex
-from pipeline.results.clay import clay
+from pipeline.results.overlays import clay
 from rig.mesh import Mesh
 from rig.rig import Rig
 from rig.studio.scene.visible import PARTS, sample_surface, sees

@@ -23,10 +23,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from pipeline.contour_fit import posterior, span_misfit
+from pipeline.contour_fit import contour, posterior
 from pipeline.evidence import measurements
 from pipeline.evidence.measurements import DISTANCES, Landmark, Measurement
-from pipeline.geometry.raster import camera_depths, depth_map
+from pipeline.geometry.projection import camera_depths, depth_map
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
@@ -44,8 +44,7 @@ from rig.mesh import Mesh, boundary_edges
 from rig.progress import Progress, discard_progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.visible import PARTS
-from rig.studio.sensor.preset import PRESET
-from rig.studio.sensor.realism import made_real
+from rig.studio.sensor.preset import PRESET, made_real
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
 from tests.laboratory.experiments.paper.span import weighted_quantile
@@ -83,11 +82,11 @@ def hidden(
 
     ``model``: fitted; heads are drawn from it, too. ``captures``: folders with a truth beside them, by name.
     ``renderer``: for the studio. ``others``: another population, from which as many heads are drawn. ``subjects``:
-    heads of each population. ``realism``: names of ``rig.studio.sensor.realism``, with which each head is photographed
+    heads of each population. ``realism``: names of ``rig.studio.sensor.preset``, with which each head is photographed
     once more.
     """
     key = key_of(
-        model.sha256, others.sha256 if others else "", Settings(), posterior, span_misfit, photo_refine, measurements
+        model.sha256, others.sha256 if others else "", Settings(), posterior, contour, photo_refine, measurements
     )
     records = bench.records("hidden", key)
     seeds = range(FIRST_SEED, FIRST_SEED + subjects)

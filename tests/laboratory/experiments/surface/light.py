@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.geometry.raster import depth_map
+from pipeline.geometry.projection import depth_map
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging import colour_chart
 from pipeline.imaging.masks import box_around
@@ -25,7 +25,7 @@ from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
-from pipeline.texturing import albedo, chart_colours, decision
+from pipeline.texturing import albedo, chart_colours, visibility
 from pipeline.texturing import light as fitted_light
 from pipeline.texturing.albedo import Albedo
 from rig.capture import Capture
@@ -73,7 +73,7 @@ def light(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int =
     ``model``: fitted; heads are drawn from it, too. ``renderer``: for the studio. ``subjects``: heads in the studio.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head", albedo="file", texture_size=2048))
-    code = (fitted_light, albedo, decision, chart_colours, colour_chart)
+    code = (fitted_light, albedo, visibility, chart_colours, colour_chart)
     records = bench.records("light", key_of(model.sha256, settings, LIGHTS, *code))
     rows = []
     for number in range(subjects):

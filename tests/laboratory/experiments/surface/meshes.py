@@ -15,12 +15,12 @@ import scipy.sparse as sparse
 from jaxtyping import Float
 from scipy.sparse.linalg import SuperLU, splu
 
-from pipeline.detail.nodes import solving_nodes
 from pipeline.detail.smooth_field import SmoothField, smooth_field
+from pipeline.detail.solve import solving_nodes
 from pipeline.fusion import crossing_kernels, crossings, untangling
 from pipeline.fusion.untangling import MeshFaults, Topology, clean_mean_head, head_topology, mesh_faults, topology_of
+from pipeline.head_model.gaussian_process import model_basis
 from pipeline.head_model.model import HeadModel
-from pipeline.head_model.model_basis import model_basis
 from pipeline.settings import Settings
 from rig.errors import InputError
 from rig.formats.meshes.ply import read_head_ply

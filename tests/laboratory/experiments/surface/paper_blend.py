@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.texturing.layout.uv_unwrap import Layout
 from pipeline.texturing.vertex_colours import blend_as_paper

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.reconstruct import reconstruct
@@ -31,7 +31,7 @@ from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.texturing import Texturing, texture_head
 from pipeline.texturing.layout.uv_unwrap import Layout
-from pipeline.texturing.pores.skin_maps import heights_of
+from pipeline.texturing.pores.skin_maps import MID_CODE, MM_PER_CODE
 from rig.formats.pictures.images import write_image
 from rig.geometry import RigidTransform
 from rig.image import ImageRgb
@@ -149,7 +149,12 @@ def patch_of(
     whole = np.zeros(inside.shape, bool)
     whole[inside] = shot.relief.share(places) > 0.99
     steps = [float(np.nanmedian(np.linalg.norm(np.diff(points, axis=axis), axis=2))) for axis in (0, 1)]
-    return heights_of(fine.skin.displacement[box]), true, whole, float(np.sqrt(steps[0] * steps[1]))
+    return (
+        (fine.skin.displacement[box].astype(np.float32) - MID_CODE) * np.float32(MM_PER_CODE),
+        true,
+        whole,
+        float(np.sqrt(steps[0] * steps[1])),
+    )
 
 
 def texels_near(

@@ -21,10 +21,9 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import DEFAULT_DIRECTIONS_DEG, rig_from_directions
 from rig.studio.scene.simulate import Scene, build_scene, shoot, view_light
-from rig.studio.scene.skin_relief import SkinRelief
+from rig.studio.scene.skin_texture import SkinRelief
 from rig.studio.scene.subject import Subject, random_look, random_pose
-from rig.studio.sensor.preset import PRESET
-from rig.studio.sensor.realism import made_real
+from rig.studio.sensor.preset import PRESET, made_real
 from rig.studio.sensor.sensor import expose
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD
 from tests.support.drawn_relief import draw_relief

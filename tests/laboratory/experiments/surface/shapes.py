@@ -16,7 +16,7 @@ from pipeline.applications.templates.contact import WEIGHTS, RestSurface, crossi
 from pipeline.applications.templates.registration import register
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.head_model.model import HeadModel
-from pipeline.results.clay import clay
+from pipeline.results.overlays import clay
 from rig.geometry import Similarity
 from rig.mesh import Mesh
 from tests.laboratory.experiments import markdown

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial import KDTree
 
-from pipeline.geometry.projection import project_points
-from pipeline.geometry.raster import camera_depths
+from pipeline.geometry.projection import camera_depths, project_points
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions, pinnae
 from pipeline.results.reconstruction import Reconstruction

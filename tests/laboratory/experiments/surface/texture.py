@@ -19,9 +19,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from pipeline.geometry.projection import project_points
-from pipeline.geometry.raster import camera_depths, depth_maps
-from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.projection import camera_depths, depth_maps, project_points
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.reconstruct import reconstruct
 from pipeline.results.head_files import encoded

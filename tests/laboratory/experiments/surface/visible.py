@@ -23,9 +23,9 @@ from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.head_model.subdivision import vertex_areas
-from pipeline.part_labels.votes import SKIN
+from pipeline.part_labels.codes import Part
 from pipeline.reconstruct import reconstruct
-from pipeline.results.clay import clay
+from pipeline.results.overlays import clay
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
 from rig.errors import EigenheadError
@@ -33,8 +33,7 @@ from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.studio.scene.visible import PARTS, VisiblePoints
-from rig.studio.sensor.preset import PRESET
-from rig.studio.sensor.realism import made_real
+from rig.studio.sensor.preset import PRESET, made_real
 from tests.laboratory.experiments.paper.detail import (
     IN_SPAN_MODES,
     IN_SPAN_SPREAD,
@@ -81,7 +80,7 @@ def visible(
 
     ``model``: fitted; heads are drawn from it, too. ``captures``: folders with a truth beside them, by name.
     ``renderer``: for the studio. ``subjects``: heads in the studio, with the hair styles of ``STYLES`` in turn.
-    ``realism``: names of ``rig.studio.sensor.realism``, with which each head is photographed once more.
+    ``realism``: names of ``rig.studio.sensor.preset``, with which each head is photographed once more.
     """
     records = bench.records("visible", key_of(model.sha256, Settings()))
     jobs: list[tuple[str, str, Callable[[], Known]]] = []
@@ -168,7 +167,7 @@ def seen_of(bust: BustSurface) -> Mesh:
 
 def head_to_bust(head_world: Mesh, bust: BustSurface) -> Float[np.ndarray, " n"]:
     """Returns the distances (mm) of the bust's visible skin to the head, where the head is within 5 mm."""
-    skin = bust.mesh_world.vertices[bust.part == SKIN]
+    skin = bust.mesh_world.vertices[bust.part == Part.SKIN]
     far = SurfaceIndex(head_world.vertices, head_world.faces, 1.0).closest(skin).distances
     return far[far < 5.0]
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from pipeline.geometry.raster import depth_map
+from pipeline.geometry.projection import depth_map
 from pipeline.imaging.silhouette import silhouette_from_mask
 from rig.mesh import boundary_edges
 from tests.laboratory.experiments.visual_hull import visual_hull

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.applications.clinic.comparison import compare
-from pipeline.applications.clinic.comparison_files import FILES, write_comparison
-from pipeline.applications.verification.pictures import UNTOLD
+from pipeline.applications.clinic.comparison_files import FILES, compare, write_comparison
+from pipeline.applications.verification.write import UNTOLD
 from pipeline.evidence.measurements import Measurement
 from rig.errors import InputError
 from rig.formats.meshes.mesh_file import read_mesh

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.applications.clinic.sizes import SizeTable, choose_size, read_size_tables
+from pipeline.applications.clinic.fitting import SizeTable, choose_size, read_size_tables
 from rig.errors import InputError
 
 TABLE = """format = "eigenhead-sizes/1"

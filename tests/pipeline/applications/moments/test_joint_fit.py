@@ -10,8 +10,8 @@ from pipeline.applications.moments.take import OTHER_PERSON, differ_by
 from pipeline.contour_fit.contour import ContourSolution, finish, last_problem, solve_contour
 from pipeline.contour_fit.prior_term import LOG_SCALE, SCALE_SPREAD
 from pipeline.contour_fit.problem import POSE
+from pipeline.head_model.gaussian_process import basis_of
 from pipeline.head_model.model import HeadModel
-from pipeline.head_model.model_basis import basis_of
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity, rotation_from_vector

@@ -10,18 +10,18 @@ from jaxtyping import Float, Int
 from pipeline.applications.templates.animated import PRESS_MM, Neutral, carried_shapes, parted_shapes, shut_lips
 from pipeline.applications.templates.carrying import SurfaceBinding, bind_vertices, surface_binding
 from pipeline.applications.templates.contact import crossings, rest_surface
-from pipeline.applications.templates.eye_picture import (
+from pipeline.applications.templates.eyeballs import AHEAD, Eyeball
+from pipeline.applications.templates.write.writers import (
     SIZE_PX,
     PhotographedEyes,
     darkest_direction,
     eyeball_uv,
     paint_eyeball,
 )
-from pipeline.applications.templates.eyeballs import AHEAD, Eyeball
-from pipeline.geometry.raster import depth_map
+from pipeline.geometry.projection import depth_map
+from pipeline.head_model.expressions import VISEMES, mixed
 from pipeline.head_model.model import HeadModel, load_model
 from pipeline.head_model.subdivision import opened_faces
-from pipeline.head_model.visemes import VISEMES, mixed
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at

@@ -12,7 +12,7 @@ from pipeline.applications.templates.eyeballs import Eyeball, lifted, placed_eye
 from pipeline.applications.templates.write.writers import animated_scene
 from pipeline.fusion.crossings import crossing_faces
 from rig.formats.meshes.glb import scene_glb_bytes
-from rig.formats.meshes.obj import scene_obj_bytes
+from rig.formats.meshes.polygon_obj import scene_obj_bytes
 from rig.formats.meshes.scene import Part, Scene
 from rig.formats.meshes.usdz import scene_usdz_bytes
 from rig.geometry import rotation_from_vector

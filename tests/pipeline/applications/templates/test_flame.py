@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.applications.templates.flame_fit import fit_flame, surface_jacobian
-from pipeline.applications.templates.flame_model import FlameModel, FlameParameters
+from pipeline.applications.templates.flame_model import FlameModel, FlameParameters, fit_flame, surface_jacobian
 from pipeline.applications.templates.header import BadTemplate
 from pipeline.applications.templates.make import read_flame
 from pipeline.applications.templates.template_file import read_template, save_template

@@ -8,13 +8,21 @@ import numpy as np
 import pytest
 
 from pipeline.applications.templates.carrying import bind_vertices, surface_binding
-from pipeline.applications.templates.header import BadTemplate, OtherModel, check_template, read_header
-from pipeline.applications.templates.names import UnknownTemplate, WrongName, list_templates, new_path, remove_template
+from pipeline.applications.templates.header import (
+    BadTemplate,
+    OtherModel,
+    UnknownTemplate,
+    WrongName,
+    check_template,
+    list_templates,
+    new_path,
+    read_header,
+    remove_template,
+)
 from pipeline.applications.templates.template_file import Template, load_template, read_template, save_template
 from pipeline.applications.templates.write.mesh import write_template
-from pipeline.head_model.data_folder import DATA
 from pipeline.head_model.model import HeadModel
-from pipeline.head_model.model_names import UnknownModel, model_path
+from pipeline.head_model.model_names import DATA, UnknownModel, model_path
 from pipeline.settings import Settings, settings_from_document
 from pipeline.texturing.layout.uv_unwrap import Atlas, model_layout
 from rig.errors import InputError

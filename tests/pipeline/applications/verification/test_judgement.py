@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.applications.verification.judgement import judge, judge_one, weighted_range
-from pipeline.applications.verification.limits import Limits
+from pipeline.applications.verification.judgement import Limits, judge, judge_one, weighted_range
 from pipeline.applications.verification.reference import Reference
 from rig.errors import InputError
 from rig.mesh import Mesh

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.applications.verification.limits import Limits, checks, limits_from_document
+from pipeline.applications.verification.judgement import Limits, checks, limits_from_document
 from rig.errors import InputError
 
 

@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.applications.verification.judgement import judge
-from pipeline.applications.verification.limits import Limits
+from pipeline.applications.verification.judgement import Limits, judge
 from pipeline.applications.verification.measured import ResultIdentity
-from pipeline.applications.verification.pictures import draw, heat_colours, scale_end
 from pipeline.applications.verification.reference import Reference
 from pipeline.applications.verification.report import Occasion, report_document
-from pipeline.applications.verification.write import certificate_pdf, write_verification
+from pipeline.applications.verification.write import certificate_pdf, draw, heat_colours, scale_end, write_verification
 from pipeline.results.pdf_page import latin
 from rig.formats.pictures.images import read_image
 from tests.support.measured_heads import mannequin, marks, measured_head

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from pipeline.geometry.raster_kernels import rasterise
-from pipeline.texturing.layout.charts import lay_out_charts
-from pipeline.texturing.layout.uv_unwrap import Layout
+from pipeline.geometry.projection_kernels import rasterise
+from pipeline.texturing.layout.uv_unwrap import Layout, lay_out_charts
 from rig.mesh import Mesh, face_normals
 from tests.support.scenes import ellipsoid
 

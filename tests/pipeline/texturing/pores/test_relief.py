@@ -4,12 +4,20 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.texturing.decision import window_table
 from pipeline.texturing.layout.uv_unwrap import Layout
 from pipeline.texturing.paint_kernels import Pictures
-from pipeline.texturing.pores.close_views import plain_choice
-from pipeline.texturing.pores.relief import HalfPictures, Patches, SkinDetail, Strips, estimate_detail, without_slow
-from pipeline.texturing.pores.texel_frames import COARSE, TexelFrames
+from pipeline.texturing.pores.relief import (
+    COARSE,
+    HalfPictures,
+    Patches,
+    SkinDetail,
+    Strips,
+    TexelFrames,
+    estimate_detail,
+    without_slow,
+)
+from pipeline.texturing.pores.skin_maps import plain_choice
+from pipeline.texturing.visibility import window_table
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 
 SIZE, TEXEL_MM, SLOPE_OF_LIGHT = 256, 0.1, (0.5, 0.2)

@@ -6,17 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from pipeline.geometry.projection import project_points
-from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.projection import depth_maps, project_points
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.settings import TextureSettings
-from pipeline.texturing.decision import Decision
 from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout, unwrap
 from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.paint import paint_texture
 from pipeline.texturing.sets.specular import exposure_ratios
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
 from pipeline.texturing.vertex_colours import texture
+from pipeline.texturing.visibility import Decision
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.image import ImageRgb

@@ -9,9 +9,8 @@ import pytest
 
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import read_cameras
+from rig.formats.cameras.foreign import OPENCV_KEYS, PATTERNS, CamerasRead
 from rig.formats.cameras.foreign_keys import FOREIGN_KEYS, ForeignKey, Table, Treatment, says_nothing
-from rig.formats.cameras.reading import CamerasRead
-from rig.formats.cameras.unread_programs import OPENCV_KEYS, PATTERNS
 from rig.messages.message import Message
 from tests.support.fan_rig import POINTS
 from tests.support.planted_keys import PLANTS, VALUES, base

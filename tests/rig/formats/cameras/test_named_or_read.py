@@ -12,7 +12,7 @@ import pytest
 from rig.camera import Camera, Distortion
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import find_rig_file, read_cameras, rig_files, write_rig_file
-from rig.formats.cameras.unread_programs import program_of
+from rig.formats.cameras.foreign import program_of
 from rig.formats.captures.capture_folder import read_capture, unread_files, write_capture
 from rig.formats.captures.shot_files import find_files
 from rig.formats.pictures.picture_names import entry, match_names, safe_name

@@ -12,7 +12,7 @@ from rig.camera import Distortion, Intrinsics
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import FORMATS, find_rig_file, read_rig_file, rig_file_parts, write_rig_file
 from rig.formats.cameras.colmap import write_colmap
-from rig.formats.cameras.opencv_toml import write_aniposelib
+from rig.formats.cameras.opencv_yaml import write_aniposelib
 from rig.formats.pictures.images import write_image
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig

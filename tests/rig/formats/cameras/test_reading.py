@@ -3,10 +3,9 @@
 import pytest
 
 from rig.errors import InputError
+from rig.formats.cameras.foreign import Reading, shown
 from rig.formats.cameras.foreign_keys import ForeignKey
-from rig.formats.cameras.reading import Reading, shown
-from rig.messages.fault_groups import say_once, some_of
-from rig.messages.message import compose, texts_of
+from rig.messages.message import compose, say_once, some_of, texts_of
 
 TABLE = {
     "shutter": ForeignKey("refused", "calibrate without it", (0,)),

@@ -12,7 +12,7 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_json import read_rig, write_rig
 from rig.formats.captures.archive import ArchiveLimits, pack_folder
 from rig.formats.captures.capture_folder import read_capture
-from rig.formats.captures.serials import BODY_SERIAL, DNG_SERIAL, EXIF_IFD, camera_serial, with_serials
+from rig.formats.captures.shot_files import BODY_SERIAL, DNG_SERIAL, EXIF_IFD, camera_serial, with_serials
 from rig.messages.message import texts_of
 from server.cli.check import checked
 from server.tasks.child import WorkerContext

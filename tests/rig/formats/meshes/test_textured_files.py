@@ -12,8 +12,8 @@ import pytest
 import trimesh
 
 from rig.formats.meshes.glb import scene_glb_bytes
-from rig.formats.meshes.obj import mtl_bytes, scene_obj_bytes
 from rig.formats.meshes.ply import ply_bytes, read_head_ply
+from rig.formats.meshes.polygon_obj import mtl_bytes, scene_obj_bytes
 from rig.formats.meshes.printing import stl_bytes, threemf_bytes
 from rig.formats.meshes.scene import Part, Scene, Skin
 from rig.formats.meshes.usdz import scene_usdz_bytes

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rig.formats.pictures.picture_rims import empty_rim, fill_rims
+from rig.formats.pictures.picture_samples import empty_rim, fill_rims
 
 SHAPE = 96, 128
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.geometry.raster import depth_map, picture
+from pipeline.geometry.projection import depth_map, picture
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import OutputSettings, Settings

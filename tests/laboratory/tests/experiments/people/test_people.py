@@ -14,7 +14,7 @@ from pipeline.warnings import WARNING_CODES
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError
 from rig.rig import Rig
-from rig.studio.scene.hairstyles import HAIRSTYLES
+from rig.studio.scene.subject import HAIRSTYLES
 from rig.studio.scene.visible import VisiblePoints
 from tests.laboratory.experiments.people import people as experiment
 from tests.laboratory.experiments.people.people import (

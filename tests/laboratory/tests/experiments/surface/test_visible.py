@@ -7,7 +7,7 @@ from pipeline.fusion.fusion import BustSurface
 from rig.capture import Capture
 from rig.mesh import Mesh, face_normals
 from rig.rig import Rig
-from rig.studio.scene.hairstyles import HAIRSTYLES
+from rig.studio.scene.subject import HAIRSTYLES
 from rig.studio.scene.visible import VisiblePoints
 from tests.laboratory.experiments.paper.detail import Known
 from tests.laboratory.experiments.surface.visible import (

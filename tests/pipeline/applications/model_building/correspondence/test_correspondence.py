@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.applications.model_building.correspondence.cylinder import CylinderIndex, coordinates, points_at
+from pipeline.applications.model_building.correspondence.correspondence import CylinderIndex, coordinates, points_at
 from pipeline.applications.model_building.correspondence.scans import find_scans, plain_name, read_landmarks
 from pipeline.applications.model_building.training.figures import Scanner, scan_head
+from pipeline.geometry.registration.nonrigid import landmark_warp
 from pipeline.geometry.surface_index import SurfaceIndex
-from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.landmarks import NAMES
 from pipeline.head_model.model import load_model
 from rig.errors import InputError

@@ -10,14 +10,15 @@ from scipy.spatial.distance import cdist
 
 from pipeline.applications.model_building.correspondence import correspondence as prior
 from pipeline.applications.model_building.correspondence.correspondence import (
+    FEW,
     Correspondence,
     Matching,
     _resampled,
     correspond,
     nearest_mean,
     prepared,
+    workers,
 )
-from pipeline.applications.model_building.correspondence.parallel import FEW, workers
 from pipeline.applications.model_building.correspondence.scans import Scan
 from pipeline.applications.model_building.training.figures import Scanner, scan_head
 from pipeline.geometry.surface_index import SurfaceIndex

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.applications.model_building.training.delivered import Population, pooled, updated
+from pipeline.applications.verification.delivered_heads import Population, pooled, updated
 from pipeline.head_model.pca import orthogonalised, principal_components
 
 VERTICES = 240

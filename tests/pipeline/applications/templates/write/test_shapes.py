@@ -11,8 +11,8 @@ from pipeline.applications.templates.write.writers import template_writers
 from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.expression import BlendshapeRig, build_blendshape_rig
 from pipeline.faces.irises import Iris, UnseenEye
+from pipeline.head_model.expressions import VISEMES
 from pipeline.head_model.model import load_model
-from pipeline.head_model.visemes import VISEMES
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings

@@ -122,3 +122,33 @@ def _cosine(corners, direction):
     nx, ny, nz = aby * acz - abz * acy, abz * acx - abx * acz, abx * acy - aby * acx
     along = nx * direction[0] + ny * direction[1] + nz * direction[2]
     return along / max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-18)
+
+
+@njit(cache=True, nogil=True)
+def sort_corners(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sorts the corners of faces (f, 3) by their vertices, by counting: those of vertex v are ``corner[start[v]:start[v
+    + 1]]``, numbers of the corners row by row, in order."""
+    start, corner = np.zeros(count + 1, np.int64), np.empty(faces.size, np.int64)
+    for f in range(len(faces)):
+        for k in range(3):
+            start[faces[f, k] + 1] += 1
+    for v in range(count):
+        start[v + 1] += start[v]
+    taken = start[:-1].copy()
+    for f in range(len(faces)):
+        for k in range(3):
+            v = faces[f, k]
+            corner[taken[v]] = 3 * f + k
+            taken[v] += 1
+    return start, corner
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def cosines_towards(place: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Returns the cosine between the unit normal (n, 3) of each of the points (n, 3) and the direction to a place."""
+    cosine = np.empty(len(points))
+    for n in range(len(points)):
+        x, y, z = place[0] - points[n, 0], place[1] - points[n, 1], place[2] - points[n, 2]
+        along = x * normals[n, 0] + y * normals[n, 1] + z * normals[n, 2]
+        cosine[n] = along / np.sqrt(x * x + y * y + z * z)
+    return cosine

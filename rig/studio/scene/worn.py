@@ -1,16 +1,37 @@
-"""Makes what is worn on the head: a cap with a visor, and glasses. Glasses have rims and no panes, as studios
-request."""
+"""Makes what is worn: shoulders in a shirt, for a head whose mesh ends at the neck, a cap with a visor, a swim or wig
+cap (the scalp, pushed out), and glasses. Glasses have rims and no panes, as studios request."""
 
+from dataclasses import dataclass
+
+import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
 from rig.errors import InputError
-from rig.mesh import face_normals
+from rig.mesh import Mesh, boundary_edges, face_normals, vertex_normals
 from rig.messages.message import compose
-from rig.studio.scene.anatomy import Anatomy
-from rig.studio.scene.grids import grid_faces
+from rig.studio.scene.anatomy import Anatomy, grid_faces
 from rig.studio.scene.hair import COLUMNS, LOWEST_DEG, ROWS, outer_radius
+from rig.studio.sensor.sensor import around
 
+CLOTH_COLUMNS = 120
+# Rings from the collar down: drop below the collar, half width, half depth (mm); the first two follow the neck.
+RINGS = (
+    (0, 0, 0),
+    (14, 0, 0),
+    (34, 112, 78),
+    (52, 150, 90),
+    (76, 183, 100),
+    (110, 205, 110),
+    (170, 214, 118),
+    (330, 216, 122),
+)
+BUST_MM = 95.0  # a mesh that reaches this far below the collar brings its own shoulders
+# The edge: height above the ears' openings over depth in front of them (mm), behind to front. Ears stay free.
+EDGE = np.array([(-200, -32), (-62, -28), (-38, 14), (-22, 40), (16, 42), (34, 50), (60, 62), (200, 70)], float)
+SUNK_MM = 2.0  # of the edge below the skin
+CREASED_MM = 22.0  # from the edge, over which folds fade
+RIDGES = (11, 17, 29)  # folds around the head, added up
 Vertices = Float[np.ndarray, "v 3"]
 Vector = Float[np.ndarray, " 3"]
 
@@ -24,6 +45,41 @@ PANELS, SEAM_MM = 6, 0.9
 VISOR_DEG, VISOR_MM, VISOR_THICK_MM = 62.0, 66.0, 2.4
 RIM_MM, TEMPLE_MM = 1.7, 2.0  # radii of the tubes of glasses
 SIDES = 10  # of a tube
+
+
+@dataclass(frozen=True, slots=True)
+class TightCap:
+    """Describes a cap: its albedo (linear RGB), its thickness, how high the folds near its edge stand, how much darker
+    they are, and whether it shines as silicone does."""
+
+    colour: tuple[float, float, float]
+    thickness_mm: float = 1.0
+    folds_mm: float = 0.0
+    creases: float = 0.0
+    glossy: bool = True
+
+
+def lay_cap(
+    head: Mesh, body: Anatomy, cap: TightCap, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 3"]]:
+    """Lays a cap on a head (head frame, mm). Returns its vertices, triangles, and albedo (linear RGB) by vertex."""
+    above = above_edge_mm(head.vertices, body)
+    faces = head.faces[(above[head.faces] > 0.0).any(axis=1)]
+    rows, corners = np.unique(faces, return_inverse=True)
+    out, normals = head.vertices[rows] - body.ears, vertex_normals(head.vertices, head.faces)[rows]
+    turn, above = np.arctan2(out[:, 0], out[:, 2]), above[rows]
+    waves = sum(np.sin(count * turn + rng.uniform(0.0, 2.0 * np.pi)) for count in RIDGES) / len(RIDGES)
+    fold = np.clip(waves, 0.0, 1.0) * np.exp(-np.maximum(above, 0.0) / CREASED_MM)
+    height = np.where(above > 0.0, cap.thickness_mm + cap.folds_mm * fold, -SUNK_MM)
+    shade = 1.0 - cap.creases * (np.abs(waves) * np.exp(-np.maximum(above, 0.0) / (2.0 * CREASED_MM)))
+    albedo = np.array(cap.colour) * shade[:, None]
+    return head.vertices[rows] + height[:, None] * normals, corners.reshape(-1, 3), albedo
+
+
+def above_edge_mm(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
+    """Returns how far above the edge of a cap each vertex of a head lies (mm); negative where the cap ends lower."""
+    relative = (vertices - body.ears) / body.unit
+    return (relative[:, 1] - np.interp(relative[:, 2], EDGE[:, 0], EDGE[:, 1])) * body.unit
 
 
 def cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, body: Anatomy) -> Surface:
@@ -149,3 +205,70 @@ def _directions(elevation: Float[np.ndarray, "r 1"], azimuth: Float[np.ndarray, 
 def _outward(vertices: Vertices, faces: Int[np.ndarray, "f 3"], centre: Vector) -> Int[np.ndarray, "f 3"]:
     away = (face_normals(vertices, faces) * (vertices - centre)[faces[:, 0]]).sum()
     return faces if away > 0 else faces[:, ::-1]
+
+
+def shirt(
+    head: Mesh, body: Anatomy, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "s 3"], Int[np.ndarray, "f 3"]] | None:
+    """Makes a shirt for a head whose mesh ends at the neck: vertices (head frame, mm) and outward faces. Returns None
+    for a bust, which has shoulders."""
+    vertices = head.vertices
+    collar_y = body.chin_y - 27.0 * body.unit
+    if vertices[:, 1].min() < collar_y - BUST_MM or vertices[:, 1].min() > collar_y:
+        return None
+    rim = vertices[np.unique(boundary_edges(head.faces))]
+    rim = rim[rim[:, 1] < body.chin_y]
+    if len(rim):  # the cut through the neck must not show
+        collar_y = min(max(collar_y, float(rim[:, 1].max()) + 7.0), body.chin_y - 12.0)
+    neck = vertices[np.abs(vertices[:, 1] - collar_y) < 8.0]
+    axis = (neck.min(axis=0) + neck.max(axis=0)) / 2
+    rings = _rings(vertices, collar_y, axis)
+    grid = _denser(rings)
+    folds = 2.2 * around(rng, len(grid), CLOTH_COLUMNS, 9, 16) + 0.8 * around(rng, len(grid), CLOTH_COLUMNS, 18, 40)
+    out = (grid - axis) * (1, 0, 1)
+    out /= np.linalg.norm(out, axis=2, keepdims=True)
+    grid = grid + out * (folds * np.clip(np.linspace(-0.3, 1, len(grid)), 0.0, 1)[:, None])[:, :, None]
+    points = grid.reshape(-1, 3)
+    faces = grid_faces(len(grid), CLOTH_COLUMNS)
+    outward = (face_normals(points, faces) * out.reshape(-1, 3)[faces[:, 0]]).sum()
+    return points, faces if outward > 0 else faces[:, ::-1]
+
+
+def _rings(
+    vertices: Float[np.ndarray, "v 3"], collar_y: float, axis: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "r c 3"]:
+    """Returns outlines from the collar down; each encloses the neck at its height and the ring above."""
+    angle = np.arange(CLOTH_COLUMNS) * 2 * np.pi / CLOTH_COLUMNS
+    across, ahead = np.sin(angle), np.cos(angle)
+    rings, reach = [], np.zeros(CLOTH_COLUMNS)
+    for drop, half_width, half_depth in RINGS:
+        reach = np.maximum(reach, _neck(vertices, collar_y - drop, axis))
+        if half_width:
+            planned = ((np.abs(across) / half_width) ** 2.5 + (np.abs(ahead) / half_depth) ** 2.5) ** (-1 / 2.5)
+            reach = np.maximum(reach, planned)
+        y = collar_y - drop - 9.0 * np.maximum(ahead, 0) * (drop < 20)  # the neckline is lower in front
+        rings.append(np.stack([axis[0] + reach * across, y, axis[2] + reach * ahead], axis=1))
+    return np.array(rings)
+
+
+def _neck(vertices: Float[np.ndarray, "v 3"], y: float, axis: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " c"]:
+    """Returns the radius around the axis by angle, with room for the cloth; 0 below the mesh."""
+    near = vertices[np.abs(vertices[:, 1] - y) < 9.0] - axis
+    radius = np.zeros(CLOTH_COLUMNS, np.float32)
+    if len(near) < 20:
+        return radius.astype(float)
+    column = np.rint(np.arctan2(near[:, 0], near[:, 2]) / (2 * np.pi) * CLOTH_COLUMNS).astype(int) % CLOTH_COLUMNS
+    np.maximum.at(radius, column, np.hypot(near[:, 0], near[:, 2]))
+    wrapped = np.tile(radius, 3)[None]
+    wrapped = cv2.GaussianBlur(cv2.dilate(wrapped, np.ones((1, 9), np.uint8)), (0, 0), 2.0)
+    return wrapped[0, CLOTH_COLUMNS : 2 * CLOTH_COLUMNS] + 3.0
+
+
+def _denser(rings: Float[np.ndarray, "r c 3"]) -> Float[np.ndarray, "n c 3"]:
+    at = np.linspace(0, len(rings) - 1, 8 * len(rings))
+    flat = rings.reshape(len(rings), -1)
+    smooth = np.stack([np.interp(at, np.arange(len(rings)), column) for column in flat.T], axis=1)
+    kernel = np.array([1, 2, 3, 2, 1]) / 9.0
+    padded = np.concatenate([2 * smooth[:1] - smooth[2:0:-1], smooth, 2 * smooth[-1:] - smooth[-2:-4:-1]])
+    blurred = sum(kernel[i] * padded[i : i + len(smooth)] for i in range(5))
+    return np.asarray(blurred).reshape(len(at), -1, 3)

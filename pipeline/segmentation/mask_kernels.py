@@ -1,7 +1,8 @@
-"""Compiled loops of ``pipeline.segmentation.matting``."""
+"""Compiled loops of ``foreground``, ``segment`` and ``matting``."""
 
 import numpy as np
 
+from pipeline.geometry.projection_kernels import LENS, NEAREST_MM, distorted, placed
 from pipeline.imaging.sampling_kernels import bilinear
 from rig.jit import njit
 
@@ -11,6 +12,125 @@ OTHER = 10.0  # log odds that a pixel must show against every mixture before it 
 # 1 px inside the true one; 4 % do now.
 BRIGHTEST = 1.16
 MAX_ALPHA_INFORMATION = 25.0  # 1 / variance of one pixel's alpha, below which it is averaged in a wider window
+MAX_DISSENT = 3  # more dissent than this is not counted
+MIN_WITNESSES = 4  # cameras that must see a point before it can be allowed
+STEPS = 96  # points on a ray: 4 mm on a subject of 400 mm
+SLACK = 1.0  # mask pixels by which a point may miss a mask
+MAX_ODDS = 6.0  # log odds are clipped there, so that one pixel cannot outvote its eight neighbours for ever
+
+
+@njit(cache=True, nogil=True)
+def mean_field_sweeps(odds: np.ndarray, residual: np.ndarray, strength: float, sweeps: int) -> np.ndarray:
+    """Returns half the log odds (h, w) of each pixel after mean-field sweeps over its eight neighbours, by Gauss-Seidel
+    in alternating order.
+
+    ``odds`` (h, w) are the log odds of each pixel by itself. Two neighbours are linked by ``strength``, less the more
+    their ``residual`` (h, w, c; standard deviations) differs: the coupling is strength exp(-|difference|^2 / 18), and
+    0.71 of that along diagonals.
+    """
+    height, width = odds.shape
+    steps = ((0, 1), (1, 0), (1, 1), (1, -1))
+    links = np.zeros((4, height, width), np.float32)
+    undecided = undecided_pixels(odds)
+    for place in undecided:
+        for back in range(2):
+            for k in range(4):
+                y = place // width - back * steps[k][0]
+                x = place % width - back * steps[k][1]
+                v, u = y + steps[k][0], x + steps[k][1]
+                if y >= 0 and 0 <= x < width and v < height and 0 <= u < width:
+                    square = 0.0
+                    for c in range(residual.shape[2]):
+                        square += (residual[y, x, c] - residual[v, u, c]) ** 2
+                    links[k, y, x] = strength * np.exp(-square / 18.0) * (1.0 if k < 2 else 0.7071)
+    field = 0.5 * odds
+    mean = np.tanh(field)
+    for sweep in range(sweeps):
+        for step in range(len(undecided)):
+            place = undecided[step] if sweep % 2 == 0 else undecided[len(undecided) - 1 - step]
+            y, x = place // width, place % width
+            total = 0.5 * odds[y, x]
+            for k in range(4):
+                dy, dx = steps[k]
+                if y + dy < height and 0 <= x + dx < width:
+                    total += links[k, y, x] * mean[y + dy, x + dx]
+                if y - dy >= 0 and 0 <= x - dx < width:
+                    total += links[k, y - dy, x - dx] * mean[y - dy, x - dx]
+            field[y, x] = total
+            mean[y, x] = np.tanh(total)
+    return field
+
+
+@njit(cache=True, nogil=True)
+def undecided_pixels(odds: np.ndarray) -> np.ndarray:
+    """Returns the pixels (flat indices) that can change: those within two pixels of one whose log odds are not clipped,
+    or differ from theirs."""
+    height, width = odds.shape
+    out = np.empty(height * width, np.int64)
+    count = 0
+    for y in range(height):
+        for x in range(width):
+            sure = abs(odds[y, x]) >= MAX_ODDS
+            for v in range(max(0, y - 2), min(height, y + 3)):
+                for u in range(max(0, x - 2), min(width, x + 3)):
+                    sure = sure and odds[v, u] == odds[y, x]
+                if not sure:
+                    break
+            if not sure:
+                out[count] = y * width + x
+                count += 1
+    return out[:count]
+
+
+@njit(cache=True, nogil=True)
+def least_dissent(
+    origin: np.ndarray,
+    rays: np.ndarray,
+    span: tuple[float, float],
+    cameras: np.ndarray,
+    distances: np.ndarray,
+    scales: np.ndarray,
+) -> np.ndarray:
+    """Returns, for each ray (n), the smallest number of cameras that see background at any one of its points, int8; -1
+    if no point is seen by ``MIN_WITNESSES`` cameras. Numbers above ``MAX_DISSENT`` are not counted further.
+
+    ``origin`` (3) and ``rays`` (n, 3) are in the world frame; points lie at distances in ``span`` (mm) along them.
+    ``cameras`` are rows of ``packed_camera``; ``distances`` (k, h, w) the distances (px) to each camera's mask,
+    negative where unknown, in images reduced by ``scales`` (k).
+    """
+    out = np.full(len(rays), -1, np.int8)
+    step = (span[1] - span[0]) / STEPS
+    for n in range(len(rays)):
+        best = MAX_DISSENT + 1
+        for s in range(STEPS):
+            reach = span[0] + (s + 0.5) * step
+            x, y, z = (origin[0] + reach * rays[n, 0], origin[1] + reach * rays[n, 1], origin[2] + reach * rays[n, 2])
+            seen, against = 0, 0
+            for k in range(len(cameras)):
+                p = cameras[k]
+                cx, cy, cz = placed(p, x, y, z)
+                if cz <= NEAREST_MM:
+                    continue
+                column, row = distorted(cx / cz, cy / cz, p[LENS:])
+                i, j = int((row + 0.5) / scales[k]), int((column + 0.5) / scales[k])
+                if row < 0 or column < 0 or i >= distances.shape[1] or j >= distances.shape[2]:
+                    continue
+                away = distances[k, i, j]
+                if away < 0:
+                    continue
+                seen += 1
+                against += away > SLACK + 0.5 * step * p[LENS] / (cz * scales[k])
+                if against >= best:
+                    break
+            if seen >= MIN_WITNESSES and against < best:
+                best = against
+                if best == 0:
+                    break
+        if best <= MAX_DISSENT:
+            out[n] = best
+        elif best == MAX_DISSENT + 1:
+            out[n] = MAX_DISSENT
+    return out
 
 
 @njit(cache=True, nogil=True, inline="always")
