@@ -22,8 +22,7 @@ from server.errors import Conflict, NotFound
 from server.services.erasure import HoldingsOut, erase_captures, holdings
 from server.services.jobs import Jobs
 from server.services.records import Found, moment_now
-from server.services.rigs.backend import SHOT_BYTES, RigBackend
-from server.services.rigs.simulated import SimulatedRig
+from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
 from server.services.texts import check_texts, checked_tags, typed_tags
 from server.services.work import refuse_board
 from server.settings import ServiceSettings
