@@ -1,8 +1,8 @@
 """Lists the public type of every problem and of every failed job, with its title: stable names on which programs may
 rely.
 
-Types are written out here, and a title is its type's words. They are not derived from names of classes or from messages, since those may change. On the
-wire ``urn:eigenhead:problem:`` stands before a type.
+Types are written out here, and a title is its type's words. They are not derived from names of classes or from
+messages, since those may change. On the wire ``urn:eigenhead:problem:`` stands before a type.
 """
 
 URN = "urn:eigenhead:problem:"
