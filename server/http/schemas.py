@@ -13,7 +13,7 @@ from rig.acquisition.verdict import Verdict
 from server.services.answer import Answer, JobSettings, MessageOut, Moment, Said, as_data
 from server.services.records import CalibrationOut, FileOut, JobOut, PersonOut, SessionOut
 from server.services.texts import PLAIN, TAG_MOST, TAGS_MOST, TEXT_MOST
-from server.storage.records import JsonObject
+from server.storage.records import JsonObject, ViewChecksOut
 
 Id = Annotated[str, Field(pattern="^[0-9a-f]{28}$", description="28 hex digits")]
 Text = Annotated[str, Field(max_length=TEXT_MOST, pattern=PLAIN)]
@@ -344,25 +344,6 @@ class Lights(Received):
     outputs: list[Annotated[int, Field(ge=0, le=3)]] = Field(
         max_length=4, description="light outputs of the trigger box that are on during a shot"
     )
-
-
-class SubjectOut(Answer):
-    """Describes where the subject is in a picture. (A person of the library is ``PersonOut``.)"""
-
-    share: float = Field(description="of the picture's area")
-    cut_off: list[str] = Field(description="edges of the picture that cut the head: top, left, right")
-    outline: list[list[float]] = Field(description="corners, in pixels of the picture")
-
-
-class ViewChecksOut(Answer):
-    """Holds what was measured on one camera's picture."""
-
-    mean: float | None = Field(None, description="mean value, 0 to 255")
-    clipped_share: float | None = Field(None, description="of pixels at 255 in every channel")
-    blur_px: float | None = Field(None, description="standard deviation of the edge spread")
-    background_found: float | None = Field(None, description="share of the clean plate's patches that were found")
-    background_moved_px: float | None = None
-    subject: SubjectOut | None = None
 
 
 class CaptureChecks(Answer):

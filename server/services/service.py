@@ -152,7 +152,7 @@ def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
     engine = open_database(settings)
     library = Library(engine)
     store = Store(settings.data, library, open_capture_blobs(settings, engine), settings.free_bytes)
-    library.reconcile(store)
+    library.reconcile(store.changes, store.found)
     migrate(settings)
     jobs, rig = Jobs(settings, store, engine, library), open_rig(settings)
     webhooks = Webhooks(engine, settings.webhook_origins)
