@@ -1,169 +1,46 @@
 """Lists the public type of every problem and of every failed job, with its title: stable names on which programs may
 rely.
 
-Types are written out here. They are not derived from names of classes or from messages, since those may change. On the
-wire ``urn:eigenhead:problem:`` stands before a type.
+Types are written out here, and a title is its type's words. They are not derived from names of classes or from
+messages, since those may change. On the wire ``urn:eigenhead:problem:`` stands before a type.
 """
 
 URN = "urn:eigenhead:problem:"
 
+REFUSED = """
+batch-active batch-ended board-shot calibration-active calibration-poor camera-missing capture-in-use
+capture-missing changed-since consent-missing data-unwritable database-unavailable deliveries-off delivery-active
+delivery-failed disk-full file-damaged first-key foreign-origin idempotency-conflict import-failed imports-off
+internal-error job-active key-invalid key-missing no-board no-capture no-result no-parquet none-failed
+not-calibrated not-found object-missing other-board other-rig own-key plates-failed plates-occupied result-missing
+rig-unavailable scope-missing shot-failed simulated-rig some-refused still-writing store-denied store-unavailable
+too-few-shots too-late too-many-checks too-many-uploads too-many-batches too-many-jobs upload-busy upload-too-large
+url-refused
+"""  # what a request asks and the service refuses
+REFUSED_BY_HTTP = """
+bad-request body-silent body-too-large checksum-mismatch client-gone conflict field-too-large fields-too-many
+file-missing file-repeated forbidden header-too-large http-error internal-server-error invalid-request
+length-required malformed-body method-not-allowed not-acceptable range-not-satisfiable request-entity-too-large
+service-unavailable too-many-requests tus-version unauthorized unknown-checksum unprocessable-entity
+unsupported-media-type upload-length upload-metadata wrong-offset
+"""  # what HTTP itself refuses
+UNUSABLE = """
+check-out-of-memory check-too-long invalid-archive invalid-board invalid-calibration invalid-cameras invalid-capture
+invalid-captures invalid-cleanplates invalid-cursor invalid-expression invalid-features invalid-form
+invalid-frontcamera invalid-input invalid-key invalid-model invalid-photographs invalid-picture invalid-plates
+invalid-queue invalid-rig invalid-scale invalid-settings invalid-tags
+"""  # input that cannot be used
+FAILED = """
+bad-model bad-template calibration-refused cannot-fetch cannot-import compute-unavailable damaged-network
+egl-unavailable eigenhead-error exchanged-pictures image-too-large implausible-result no-clinic no-landmark-map
+no-layout no-point no-subject no-surface no-usd not-a-manifold other-model out-of-memory pose-graph-error
+same-pictures shipped-model too-few-captures too-few-features too-few-views unexplained-outlines unknown-model
+unknown-template work-crashed worker-died wrong-board wrong-features wrong-name wrong-rig wrong-scale wrong-thread
+"""  # why a job failed
 PROBLEM_TYPES = {
-    # What a request asks and the service refuses
-    "batch-active": "Batch active",
-    "batch-ended": "Batch ended",
-    "board-shot": "Board shot",
-    "calibration-active": "Calibration active",
-    "calibration-poor": "Calibration poor",
-    "camera-missing": "Camera missing",
-    "capture-in-use": "Capture in use",
-    "capture-missing": "Capture missing",
-    "changed-since": "Changed since",
-    "consent-missing": "Consent missing",
-    "data-unwritable": "Data unwritable",
-    "database-unavailable": "Database unavailable",
-    "deliveries-off": "Deliveries off",
-    "delivery-active": "Delivery active",
-    "delivery-failed": "Delivery failed",
-    "disk-full": "Disk full",
-    "file-damaged": "File damaged",
-    "first-key": "First key",
-    "foreign-origin": "Foreign origin",
-    "idempotency-conflict": "Idempotency conflict",
-    "import-failed": "Import failed",
-    "imports-off": "Imports off",
-    "internal-error": "Internal error",
-    "job-active": "Job active",
-    "key-invalid": "Key invalid",
-    "key-missing": "Key missing",
-    "no-board": "No board",
-    "no-capture": "No capture",
-    "no-result": "No result",
-    "no-parquet": "No parquet",
-    "none-failed": "None failed",
-    "not-calibrated": "Not calibrated",
-    "not-found": "Not found",
-    "object-missing": "Object missing",
-    "other-board": "Other board",
-    "other-rig": "Other rig",
-    "own-key": "Own key",
-    "plates-failed": "Plates failed",
-    "plates-occupied": "Plates occupied",
-    "result-missing": "Result missing",
-    "rig-unavailable": "Rig unavailable",
-    "scope-missing": "Scope missing",
-    "shot-failed": "Shot failed",
-    "simulated-rig": "Simulated rig",
-    "some-refused": "Some refused",
-    "still-writing": "Still writing",
-    "store-denied": "Store denied",
-    "store-unavailable": "Store unavailable",
-    "too-few-shots": "Too few shots",
-    "too-late": "Too late",
-    "too-many-checks": "Too many checks",
-    "too-many-uploads": "Too many uploads",
-    "too-many-batches": "Too many batches",
-    "too-many-jobs": "Too many jobs",
-    "upload-busy": "Upload busy",
-    "upload-too-large": "Upload too large",
-    "url-refused": "Url refused",
-    # What HTTP itself refuses
-    "bad-request": "Bad request",
-    "body-silent": "Body silent",
-    "body-too-large": "Body too large",
-    "checksum-mismatch": "Checksum mismatch",
-    "client-gone": "Client gone",
-    "conflict": "Conflict",
-    "field-too-large": "Field too large",
-    "fields-too-many": "Fields too many",
-    "file-missing": "File missing",
-    "file-repeated": "File repeated",
-    "forbidden": "Forbidden",
-    "header-too-large": "Header too large",
-    "http-error": "Http error",
-    "internal-server-error": "Internal server error",
-    "invalid-request": "Invalid request",
-    "length-required": "Length required",
-    "malformed-body": "Malformed body",
-    "method-not-allowed": "Method not allowed",
-    "not-acceptable": "Not acceptable",
-    "range-not-satisfiable": "Range not satisfiable",
-    "request-entity-too-large": "Request entity too large",
-    "service-unavailable": "Service unavailable",
-    "too-many-requests": "Too many requests",
-    "tus-version": "Tus version",
-    "unauthorized": "Unauthorized",
-    "unknown-checksum": "Unknown checksum",
-    "unprocessable-entity": "Unprocessable entity",
-    "unsupported-media-type": "Unsupported media type",
-    "upload-length": "Upload length",
-    "upload-metadata": "Upload metadata",
-    "wrong-offset": "Wrong offset",
-    # Input that cannot be used
-    "check-out-of-memory": "Check out of memory",
-    "check-too-long": "Check too long",
-    "invalid-archive": "Invalid archive",
-    "invalid-board": "Invalid board",
-    "invalid-calibration": "Invalid calibration",
-    "invalid-cameras": "Invalid cameras",
-    "invalid-capture": "Invalid capture",
-    "invalid-captures": "Invalid captures",
-    "invalid-cleanplates": "Invalid cleanplates",
-    "invalid-cursor": "Invalid cursor",
-    "invalid-expression": "Invalid expression",
-    "invalid-features": "Invalid features",
-    "invalid-form": "Invalid form",
-    "invalid-frontcamera": "Invalid frontcamera",
-    "invalid-input": "Invalid input",
-    "invalid-key": "Invalid key",
-    "invalid-model": "Invalid model",
-    "invalid-photographs": "Invalid photographs",
-    "invalid-picture": "Invalid picture",
-    "invalid-plates": "Invalid plates",
-    "invalid-queue": "Invalid queue",
-    "invalid-rig": "Invalid rig",
-    "invalid-scale": "Invalid scale",
-    "invalid-settings": "Invalid settings",
-    "invalid-tags": "Invalid tags",
-    # Why a job failed
-    "bad-model": "Bad model",
-    "bad-template": "Bad template",
-    "calibration-refused": "Calibration refused",
-    "cannot-fetch": "Cannot fetch",
-    "cannot-import": "Cannot import",
-    "compute-unavailable": "Compute unavailable",
-    "damaged-network": "Damaged network",
-    "egl-unavailable": "Egl unavailable",
-    "eigenhead-error": "Eigenhead error",
-    "exchanged-pictures": "Exchanged pictures",
-    "image-too-large": "Image too large",
-    "implausible-result": "Implausible result",
-    "no-clinic": "No clinic",
-    "no-landmark-map": "No landmark map",
-    "no-layout": "No layout",
-    "no-point": "No point",
-    "no-subject": "No subject",
-    "no-surface": "No surface",
-    "no-usd": "No usd",
-    "not-a-manifold": "Not a manifold",
-    "other-model": "Other model",
-    "out-of-memory": "Out of memory",
-    "pose-graph-error": "Pose graph error",
-    "same-pictures": "Same pictures",
-    "shipped-model": "Shipped model",
-    "too-few-captures": "Too few captures",
-    "too-few-features": "Too few features",
-    "too-few-views": "Too few views",
-    "unexplained-outlines": "Unexplained outlines",
-    "unknown-model": "Unknown model",
-    "unknown-template": "Unknown template",
-    "work-crashed": "Work crashed",
-    "worker-died": "Worker died",
-    "wrong-board": "Wrong board",
-    "wrong-features": "Wrong features",
-    "wrong-name": "Wrong name",
-    "wrong-rig": "Wrong rig",
-    "wrong-scale": "Wrong scale",
-    "wrong-thread": "Wrong thread",
+    kind: kind.replace("-", " ").capitalize()
+    for kinds in (REFUSED, REFUSED_BY_HTTP, UNUSABLE, FAILED)
+    for kind in kinds.split()
 }
 
 INPUT_TYPES = {

@@ -27,7 +27,7 @@ REPLACED = {
     "Linger": "DrainRequestBody",
     "MOST_AGAINST": "MAX_CONTRADICTING_VIEWS",
     "OwnPictures": "ImageAssignment",
-    "PageOf": "CursorPage",
+    "PageOf": "Page",
     "Posable": "BlendshapeRig",
     "PriorAt": "LinearisedPriorTerm",
     "QuadraticAt": "LinearisedQuadratic",

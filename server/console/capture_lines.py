@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from typing import TypedDict, cast
+from typing import cast
 
 from rig.acquisition.shot import CameraSyncDocument, SyncDocument
-from rig.messages.message import MessageDocument, compose, documents_of
+from rig.messages.message import compose, documents_of
 from server.console.page import shared
 from server.console.removal import removals
 from server.errors import NotFound
@@ -16,39 +16,15 @@ from server.storage.records import CaptureRecord, JsonObject
 from server.tasks.simulate import SimulatedCertificate, SimulatedSync
 
 OF_RECORD = (
-    "id",
-    "created",
-    "source",
-    "label",
-    "expression",
-    "front",
-    "features",
-    "bytes",
-    "session",
-    "board",
-    "verdict",
+    *("id", "created", "source", "label", "expression", "front"),
+    *("features", "bytes", "session", "board", "verdict"),
 )
 SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are found on the page Subjects
 
 
-class JobOfCapture(TypedDict):
-    """Holds a job of a capture. ``progress`` (0 to 1) is None unless the job runs."""
-
-    id: str
-    state: str
-    progress: float | None
-
-
-class SyncLine(TypedDict):
-    """Holds a sentence on how nearly the pictures of a shot show the same moment. ``good``: they do."""
-
-    message: MessageDocument
-    good: bool
-
-
-def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JobOfCapture]]:
-    """Returns the jobs of each capture, newest first, with the progress of those that run. Jobs that are being removed
-    are left out."""
+def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JsonObject]]:
+    """Returns the jobs of each capture, newest first, with the progress (0 to 1) of those that run. Jobs that are being
+    removed are left out."""
     found = service.jobs.of_captures(captures)
     running = [job for jobs in found.values() for job, state in jobs if state == "running"]
     progress = {job.id: job.progress for job in service.jobs.of(running)}
@@ -60,7 +36,7 @@ def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JobOfCa
     }
 
 
-def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> JsonObject:
+def capture_line(record: CaptureRecord, jobs: list[JsonObject]) -> JsonObject:
     """Converts a capture's record to an entry of a list. ``jobs``: the capture's jobs, as ``jobs_of`` returns them;
     ``size``: of the first camera's pictures (px); ``sizes``: width and height by camera."""
     return {
@@ -76,8 +52,9 @@ def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> JsonObject:
     }
 
 
-def sync_line(shot: Mapping[str, object]) -> SyncLine:
-    """Makes a sentence on how nearly the pictures of a shot show the same moment. ``shot`` is its certificate."""
+def sync_line(shot: Mapping[str, object]) -> JsonObject:
+    """Makes a sentence on how nearly the pictures of a shot show the same moment, and tells whether they do (``good``).
+    ``shot`` is its certificate."""
     lines = sync_of(shot)
     late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
     if late:
@@ -85,10 +62,8 @@ def sync_line(shot: Mapping[str, object]) -> SyncLine:
     spread_ms = cast(SyncDocument, shot["sync"])["spread_ms"] if "sync" in shot else None
     if spread_ms is None:
         return {"message": compose("cameras-in-sync", count=len(lines)).document(), "good": True}
-    return {
-        "message": compose("cameras-in-sync-within", count=len(lines), spread_ms=spread_ms).document(),
-        "good": True,
-    }
+    within = compose("cameras-in-sync-within", count=len(lines), spread_ms=spread_ms)
+    return {"message": within.document(), "good": True}
 
 
 def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:

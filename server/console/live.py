@@ -14,7 +14,7 @@ from rig.messages.message import Message, compose
 from rig.progress import Progress
 from server.console.live_frame import LiveFrame, measured_frame
 from server.services.live.live import document_of
-from server.services.rigs.backend import PREVIEW_WIDTH, RigBackend, jpeg, reduced
+from server.services.rigs import PREVIEW_WIDTH, RigBackend, jpeg, reduced
 from server.services.service import Service
 from server.tasks.child import Child, WorkerContext
 from server.wire.problems import problem_from

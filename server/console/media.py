@@ -12,7 +12,7 @@ import json
 import threading
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypedDict, cast
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -42,7 +42,7 @@ from server.errors import NotFound
 from server.services.keys import Caller
 from server.services.service import Service
 from server.storage.face_cache import FoundFace
-from server.storage.records import CaptureRecord
+from server.storage.records import CaptureRecord, JsonObject
 from server.tasks.child import WorkerContext
 from server.wire.batch_files import SheetFormat, TableFormat, send_sheet, send_table
 from server.wire.multipart import receive_calibration_pictures, receive_capture
@@ -62,20 +62,6 @@ FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 
 _live: dict[int, LiveView] = {}
 _drawing = threading.Lock()
-
-
-class CameraView(TypedDict):
-    """Holds a pinhole camera (px). ``camera_from_head``: rows of a 4 x 4 matrix (metres); the head frame is that of
-    head.glb."""
-
-    name: str
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    camera_from_head: list[list[float]]
 
 
 def session(scope: str) -> Any:
@@ -374,9 +360,10 @@ def outline(mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "y x 4"]:
     return np.dstack([np.full(small.shape, value, np.uint8) for value in COLOUR] + [alpha])
 
 
-def camera_views(rig: Rig, report: Report) -> list[CameraView]:
-    """Returns every camera of a capture as seen from the head. The head's pose is that of ``report``, its size the true
-    one: x_world = R x_head + s t."""
+def camera_views(rig: Rig, report: Report) -> list[JsonObject]:
+    """Returns every camera of a capture as seen from the head, as a pinhole camera (px) with ``camera_from_head``: rows
+    of a 4 x 4 matrix (metres) in the frame of head.glb. The head's pose is that of ``report``, its size the true one:
+    x_world = R x_head + s t."""
     pose = report["world_from_head"]
     shift = np.array(pose["translation"]) * pose["scale"]
     world_from_head = RigidTransform(np.array(pose["rotation"]), shift)
@@ -419,8 +406,8 @@ def straightened_face(face: FoundFace, camera: Camera) -> FoundFace:
     return {**face, "box_px": [float(side) for side in box], "points": straight.tolist()}
 
 
-def _view(camera: Camera, camera_from_head: RigidTransform) -> CameraView:
+def _view(camera: Camera, camera_from_head: RigidTransform) -> JsonObject:
     lens, matrix = camera.intrinsics, np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = camera_from_head.rotation, camera_from_head.translation / MM
     pinhole = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
-    return cast(CameraView, {"name": camera.name, **pinhole, "camera_from_head": matrix.tolist()})
+    return {"name": camera.name, **pinhole, "camera_from_head": matrix.tolist()}

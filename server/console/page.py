@@ -19,7 +19,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse
 
 from rig.errors import InputError
-from rig.messages.message import Message, MessageDocument, compose
+from rig.messages.message import Message, compose
 from server.console.head_pictures import draw_first_view, warm_up
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.removal import removals
@@ -334,19 +334,11 @@ async def show(name: str, page: type[Page], **initial: str | None) -> RedirectRe
     return None
 
 
-class Followed(TypedDict):
-    """Holds the progress (0 to 1) of a job that was started in this tab of the browser. The state of a job that was
-    removed is ``gone``."""
+def followed_jobs(service: Service, ids: Sequence[str]) -> list[JsonObject]:
+    """Returns the progress of the jobs with these ids, in their order. The state of one that was removed is ``gone``.
+    The answer is shared by all pages."""
 
-    id: str
-    state: str
-    progress: float
-
-
-def followed_jobs(service: Service, ids: Sequence[str]) -> list[Followed]:
-    """Returns the progress of the jobs with these ids, in their order. The answer is shared by all pages."""
-
-    def make() -> list[Followed]:
+    def make() -> list[JsonObject]:
         known = {job.id: job for job in service.jobs.of(ids)}
         return [
             {"id": i, "state": known[i].state, "progress": round(known[i].progress, 2)}
@@ -358,25 +350,15 @@ def followed_jobs(service: Service, ids: Sequence[str]) -> list[Followed]:
     return shared.get(("followed", ids), FOLLOW_S / 2, make)
 
 
-class Status(TypedDict):
-    """Holds what every page shows of the service. ``faults``: what to do, by the part that is not well; ``starting``:
-    parts that will be well soon; ``jobs``: how many are queued or run; ``empty``: there is no capture; ``local``: the
-    caller has no API key and needs none."""
+def status_of(service: Service, caller: Caller) -> JsonObject | None:
+    """Returns what every page shows of the service. Returns None if the caller's API key was removed.
 
-    starting: list[str]
-    faults: dict[str, MessageDocument]
-    jobs: int
-    disk: MessageDocument
-    empty: bool
-    local: bool
-
-
-def status_of(service: Service, caller: Caller) -> Status | None:
-    """Returns what every page shows of the service. Returns None if the caller's API key was removed."""
+    ``faults``: what to do, by the part that is not well; ``starting``: parts that will be well soon; ``jobs``: how many
+    are queued or run; ``empty``: there is no capture; ``local``: the caller has no API key and needs none."""
     if caller_of(service, {"key_id": caller.key}) is None:
         return None
 
-    def make() -> Status:
+    def make() -> JsonObject:
         checks = readiness(service)
         wrong = {name: check.detail.document() for name, check in checks.items() if not check.ok and not check.starting}
         starting = [name for name, check in checks.items() if check.starting]
@@ -387,11 +369,9 @@ def status_of(service: Service, caller: Caller) -> Status | None:
             "jobs": counts["queued"] + counts["running"],
             "disk": compose("gigabytes-free", gb=service.store.free_bytes() / 1e9).document(),
             "empty": service.captures.newest() is None,
-            "local": False,
         }
 
-    shown: Status = shared.get("status", STATUS_S / 2, make)
-    return {**shown, "local": caller.key == "local"}
+    return shared.get("status", STATUS_S / 2, make) | {"local": caller.key == "local"}
 
 
 def shown_detail(detail: Message) -> Message:

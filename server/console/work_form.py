@@ -4,13 +4,14 @@ A preset is a named choice of a job's settings. Whoever needs other settings wri
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NotRequired, TypedDict, cast
+from typing import NotRequired, cast
 
 from pipeline.settings import settings_from_document
-from rig.messages.message import Message, MessageDocument, compose
+from rig.messages.message import Message, compose
 from server.console.page import Chosen
 from server.services.templates import templates_at_hand
 from server.services.work import ReconstructionRequest
+from server.storage.records import JsonObject
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,21 +52,6 @@ def settings_of(preset: str | None) -> Mapping[str, object]:
     return next((known.settings for known in PRESETS if known.id == (preset or "")), {})
 
 
-class PresetLine(TypedDict):
-    """Holds a preset (a named choice of settings) as an entry of a form's list."""
-
-    id: str
-    title: MessageDocument
-    explanation: MessageDocument
-
-
-class TemplateLine(TypedDict):
-    """Holds a template as an entry of a form's list. ``models``: names of the model that has it."""
-
-    name: str
-    models: list[str]
-
-
 class WorkForm(Chosen):
     """Holds what a form asks before a job is queued. ``method``: id of a preset."""
 
@@ -74,12 +60,12 @@ class WorkForm(Chosen):
     template: NotRequired[str | None]
 
 
-def preset_lines() -> list[PresetLine]:
+def preset_lines() -> list[JsonObject]:
     """Converts all presets to entries of a form's list."""
     return [{"id": p.id, "title": p.title.document(), "explanation": p.explanation.document()} for p in PRESETS]
 
 
-def template_lines() -> list[TemplateLine]:
+def template_lines() -> list[JsonObject]:
     """Converts the templates whose model is at hand to entries of a form's list."""
     return [
         {"name": template.name, "models": list(template.models)} for template in templates_at_hand() if template.models

@@ -20,7 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from rig.messages.message import compose
 from server.http.auth import FairShares, check_caller
 from server.http.openapi import CHANGES, describe, operation_name
-from server.http.routes import batches, calibrations, captures, jobs, live, operations, rig, sessions, storage, uploads
+from server.http.routes import batches, calibrations, captures, jobs, live, operations, rig, sessions, uploads
 from server.metrics import Metrics
 from server.services.health import check_egl, check_store, store_places
 from server.services.retention import sweep
@@ -43,7 +43,7 @@ POLICY = (  # NiceGUI writes scripts and styles into its pages, and Vue compiles
 )
 SAFE_HEADERS = ((b"content-security-policy", POLICY.encode()), (b"x-content-type-options", b"nosniff"))
 
-MODULES = (captures, calibrations, jobs, batches, sessions, uploads, rig, live, storage, operations)
+MODULES = (captures, calibrations, jobs, batches, sessions, uploads, rig, live, operations)
 MountPages = Callable[[FastAPI, ServiceSettings], None]
 
 log = structlog.get_logger()

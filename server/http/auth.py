@@ -55,6 +55,13 @@ def require(scope: str) -> Callable[..., Caller]:
     return authenticate
 
 
+Reader = Annotated[Caller, Depends(require("read"))]
+Taker = Annotated[Caller, Depends(require("capture"))]
+Submitter = Annotated[Caller, Depends(require("submit"))]
+Eraser = Annotated[Caller, Depends(require("erase"))]
+Admin = Annotated[Caller, Depends(require("admin"))]
+
+
 async def check_caller(request: Request) -> None:
     """Raises a 401 or 403 problem if the caller cannot be identified. Scopes are not checked."""
     await run_in_threadpool(_caller, request, await bearer(request))

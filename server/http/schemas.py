@@ -1,19 +1,19 @@
-"""Defines what requests of HTTP have in common, those about captures, sessions and jobs, and answers that the services
-do not make themselves: captures, results and lists."""
+"""Defines what requests of HTTP have in common, those about captures, sessions, jobs, the rig and calibrations, and
+answers that the services do not make themselves: captures, results and lists."""
 
 import base64
 import binascii
 from typing import Annotated, Literal
 
 from fastapi import Header, Query
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from rig.acquisition.verdict import Verdict
 from server.services.answer import Answer, JobSettings, MessageOut, Moment, Said, as_data
-from server.services.records import FileOut, JobOut, PersonOut, SessionOut
+from server.services.records import CalibrationOut, FileOut, JobOut, PersonOut, SessionOut
 from server.services.texts import PLAIN, TAG_MOST, TAGS_MOST, TEXT_MOST
-from server.storage.records import JsonObject
+from server.storage.records import JsonObject, ViewChecksOut
 
 Id = Annotated[str, Field(pattern="^[0-9a-f]{28}$", description="28 hex digits")]
 Text = Annotated[str, Field(max_length=TEXT_MOST, pattern=PLAIN)]
@@ -42,12 +42,15 @@ class Received(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
+def example(*documents: JsonObject) -> ConfigDict:
+    """Returns the configuration of a request that the description of HTTP shows by these examples."""
+    return ConfigDict(json_schema_extra={"examples": [*documents]})
+
+
 class NewSession(Received):
     """Begins a session of one subject."""
 
-    model_config = ConfigDict(
-        json_schema_extra={"examples": [{"label": "Anna", "consent": "signed 2026-03-01, for research"}]}
-    )
+    model_config = example({"label": "Anna", "consent": "signed 2026-03-01, for research"})
 
     label: Text = ""
     consent: Text = Field("", description="note on the subject's consent")
@@ -56,7 +59,7 @@ class NewSession(Received):
 class NewCapture(Received):
     """Requests a shot with the rig."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"label": "Anna", "expression": "neutral"}]})
+    model_config = example({"label": "Anna", "expression": "neutral"})
 
     session: Id | None = None
     label: Text = ""
@@ -69,7 +72,7 @@ class NewCapture(Received):
 class NewImport(Received):
     """Requests a capture from an archive on another server."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"url": "https://store.example/anna.tar.gz"}]})
+    model_config = example({"url": "https://store.example/anna.tar.gz"})
 
     url: str = Field(
         max_length=2000,
@@ -84,7 +87,7 @@ class NewImport(Received):
 class SessionEdit(Received):
     """Changes the label or the consent note of a session. Keys that are left out keep their values."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"label": "Anna B."}]})
+    model_config = example({"label": "Anna B."})
 
     label: Text | None = None
     consent: Text | None = None
@@ -94,7 +97,7 @@ class CaptureEdit(Received):
     """Changes a capture. Keys that are left out keep their values; ``"session": null`` removes the capture from its
     session."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"expression": "smile"}]})
+    model_config = example({"expression": "smile"})
 
     session: Id | None = None
     label: Text | None = None
@@ -105,9 +108,7 @@ class CaptureEdit(Received):
 class NewFeatures(Received):
     """Holds feature points: for each point the pixel in each camera that shows it."""
 
-    model_config = ConfigDict(
-        json_schema_extra={"examples": [{"points": {"pronasale": {"cam00": [511.2, 402.7], "cam03": [433.0, 398.1]}}}]}
-    )
+    model_config = example({"points": {"pronasale": {"cam00": [511.2, 402.7], "cam03": [433.0, 398.1]}}})
 
     format: Literal["eigenhead-features/1"] = "eigenhead-features/1"
     points: dict[str, dict[str, list[float]]]
@@ -139,15 +140,11 @@ DELIVER_TO = "where the result is delivered to, in a folder of the job's id; a p
 class NewJob(Received):
     """Requests a reconstruction of a capture."""
 
-    model_config = ConfigDict(
-        json_schema_extra={
-            "examples": [
-                {
-                    "capture_id": EXAMPLE_ID,
-                    "name": "Anna, fine",
-                    "settings": {"detail": "fine", "outputs": {"formats": ["glb", "obj"]}},
-                }
-            ]
+    model_config = example(
+        {
+            "capture_id": EXAMPLE_ID,
+            "name": "Anna, fine",
+            "settings": {"detail": "fine", "outputs": {"formats": ["glb", "obj"]}},
         }
     )
 
@@ -164,7 +161,7 @@ class NewJob(Received):
 class NewSessionJobs(Received):
     """Requests a reconstruction of every capture of a session that shows a head."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"settings": {"detail": "fine"}}]})
+    model_config = example({"settings": {"detail": "fine"}})
 
     model: str | None = Field(None, max_length=200)
     settings: JobSettings | None = None
@@ -174,7 +171,7 @@ class NewSessionJobs(Received):
 class Restart(Received):
     """Repeats a job. Keys that are left out have the values of the old job."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"settings": {"method": "simplex"}}]})
+    model_config = example({"settings": {"method": "simplex"}})
 
     model: str | None = Field(None, max_length=200)
     settings: JobSettings | None = None
@@ -282,7 +279,7 @@ Ids = Annotated[list[Id], Field(min_length=1, max_length=1000)]
 class CaptureBulk(Received):
     """Requests one action on many captures. Each of them succeeds or is refused by itself."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"action": "remove", "ids": [EXAMPLE_ID]}]})
+    model_config = example({"action": "remove", "ids": [EXAMPLE_ID]})
 
     action: Literal["remove", "erase", "reconstruct", "move", "tag", "untag"] = Field(
         description="remove: pictures go, heads stay; erase: nothing stays; reconstruct: a job each; move: to a "
@@ -298,7 +295,7 @@ class CaptureBulk(Received):
 class JobBulk(Received):
     """Requests one action on many jobs. Each of them succeeds or is refused by itself."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"action": "cancel", "ids": [EXAMPLE_ID]}]})
+    model_config = example({"action": "cancel", "ids": [EXAMPLE_ID]})
 
     action: Literal["cancel", "restart", "remove"]
     ids: Ids
@@ -307,7 +304,7 @@ class JobBulk(Received):
 class NewExport(Received):
     """Requests a job's head in another format."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"as": "obj"}]})
+    model_config = example({"as": "obj"})
 
     form: Literal["glb", "ply", "obj", "usdz", "stl", "3mf"] = Field(alias="as")
     template: str | None = Field(None, description="also head-NAME.obj, in this template's vertex order", max_length=40)
@@ -323,6 +320,105 @@ class NewExport(Received):
 class NewDelivery(Received):
     """Requests that a job's result is delivered to an object store."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"to": "s3://studio/heads/"}]})
+    model_config = example({"to": "s3://studio/heads/"})
 
     to: DeliverTo | None = Field(None, description=f"{DELIVER_TO}; left out, the one that the job was submitted with")
+
+
+class CameraSettingsEdit(Received):
+    """Changes a camera's settings. A key that is left out keeps its value. With null the service no longer sets the
+    value, and the camera keeps the one that it has."""
+
+    model_config = example({"exposure_ms": 8.0, "gain_db": 0.0})
+
+    exposure_ms: float | None = Field(None, ge=0.001, le=60_000)
+    gain_db: float | None = Field(None, ge=-60, le=60)
+    white_balance_k: int | None = Field(None, ge=1000, le=20_000)
+
+
+class Lights(Received):
+    """Holds which lamps are on during a shot."""
+
+    model_config = example({"outputs": [0, 1]})
+
+    outputs: list[Annotated[int, Field(ge=0, le=3)]] = Field(
+        max_length=4, description="light outputs of the trigger box that are on during a shot"
+    )
+
+
+class CaptureChecks(Answer):
+    """Holds what was measured on each camera's picture, by camera. It is empty for captures of earlier versions."""
+
+    cameras: dict[str, ViewChecksOut]
+
+
+class PlatesOut(Answer):
+    """Describes a version of the clean plates that is stored."""
+
+    id: str
+    taken: Moment
+    cameras: list[str]
+    refused: tuple[Said, ...] = Field(description="why they were not put to use")
+    refused_messages = as_data("refused", list[MessageOut])
+    in_use: bool
+
+
+class PlatesList(Answer):
+    """Holds all stored versions of the clean plates, newest first."""
+
+    versions: list[PlatesOut]
+
+
+class UsePlates(Received):
+    """Selects a version of the clean plates."""
+
+    model_config = example({"version": "20261122T215052123456Z"})
+
+    version: str = Field(max_length=64, description="an id of GET /v1/rig/background")
+
+
+class BackgroundOut(Answer):
+    """Describes the clean plates that were just taken: the cameras, and how many pictures of each."""
+
+    cameras: list[str]
+    plates: int
+    note: Annotated[str, BeforeValidator(lambda note: "" if note is None else str(note))]
+    note_message: MessageOut | None = Field(None, validation_alias="note")
+
+
+class NewCalibration(Received):
+    """Requests a calibration from shots that the rig took of the board or, from a scene, of anything."""
+
+    model_config = example(
+        {"board": {"kind": "charuco", "columns": 12, "rows": 9, "square_mm": 30.0}, "captures": [EXAMPLE_ID]},
+        {"from": "scene", "scale": {"tag": {"dictionary": "DICT_4X4_50", "size_mm": 40.0}}, "captures": [EXAMPLE_ID]},
+    )
+
+    source: Literal["board", "scene"] = Field("board", alias="from", description="scene: the pictures show no board")
+    board: JsonObject | None = Field(None, description="as board.toml: kind, columns, rows, square_mm, ...")
+    scale: JsonObject | None = Field(None, description="from a scene, as scale.json: a known length")
+    captures: list[Id] = Field(min_length=1, max_length=500)
+    label: Text = ""
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> "NewCalibration":
+        if self.source == "board" and (self.board is None or self.scale is not None):
+            raise ValueError("from a board wants board, and no scale")
+        if self.source == "scene" and self.board is not None:
+            raise ValueError("from a scene takes no board")
+        return self
+
+
+class UseCalibration(Received):
+    """Selects the calibration that the rig uses from now on."""
+
+    model_config = example({"calibration_id": EXAMPLE_ID})
+
+    calibration_id: Id
+    poor: bool = Field(False, description="use it although its verdict is poor")
+
+
+class CalibrationList(Answer):
+    """Holds all calibrations, newest first."""
+
+    calibrations: list[CalibrationOut]

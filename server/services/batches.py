@@ -24,7 +24,7 @@ from server.errors import Conflict, DiskFull, NotFound, TooMany
 from server.services.deliveries import destination
 from server.services.job_rows import STATES, STATUSES
 from server.services.jobs import Jobs
-from server.services.records import BatchCounts, BatchOut, Found, JobOut, moment_of
+from server.services.records import BatchCounts, BatchOut, JobOut, moment_of
 from server.services.texts import check_texts
 from server.services.webhooks import Webhooks
 from server.services.work import ReconstructionRequest
@@ -32,6 +32,7 @@ from server.settings import ServiceSettings
 from server.storage.batches import ENQUEUED, GONE, WAITING, BatchItem, BatchRow, BatchState, Tally
 from server.storage.database import slots_by_queue
 from server.storage.library import Library
+from server.storage.pages import Page
 from server.storage.records import CaptureRecord, JobRequest
 from server.storage.store import Store, is_id, new_id, repeatable_id
 
@@ -135,11 +136,11 @@ class Batches:
 
     def page(
         self, sought: str = "", state: BatchState | None = None, limit: int = 100, cursor: str | None = None
-    ) -> Found[BatchOut]:
+    ) -> Page[BatchOut]:
         """Returns one page of the batches with all words of ``sought`` in their label, newest first. Raises InputError
         for a cursor of another list."""
         page = self._index.page(sought, state, limit, cursor)
-        return Found(tuple(self._batches(self._index.of(page.ids))), page.next, page.total)
+        return page.of(self._batches(self._index.of(page.items)))
 
     def of(self, ids: Sequence[str]) -> list[BatchOut]:
         """Returns the batches with these ids, in their order; ids of no batch are left out."""

@@ -21,13 +21,13 @@ from rig.messages.message import compose
 from server.errors import Conflict, NotFound
 from server.services.erasure import HoldingsOut, erase_captures, holdings
 from server.services.jobs import Jobs
-from server.services.records import Found, moment_now
-from server.services.rigs.backend import SHOT_BYTES, RigBackend
-from server.services.rigs.simulated import SimulatedRig
+from server.services.records import moment_now
+from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
 from server.services.texts import check_texts, checked_tags, typed_tags
 from server.services.work import refuse_board
 from server.settings import ServiceSettings
 from server.storage.library import CaptureQuery, Library
+from server.storage.pages import Page
 from server.storage.records import CaptureContent, CaptureRecord
 from server.storage.store import Store, StoredFile, new_id
 from server.tasks.child import ChildProcessPool, WorkFailed
@@ -132,11 +132,11 @@ class Captures:
         s = self._settings
         return ArchiveLimits(members=s.archive_members, total_bytes=s.archive_bytes, ratio=s.archive_ratio)
 
-    def page(self, query: CaptureQuery, limit: int = 100, cursor: str | None = None) -> Found[CaptureRecord]:
+    def page(self, query: CaptureQuery, limit: int = 100, cursor: str | None = None) -> Page[CaptureRecord]:
         """Returns one page of the captures that match a query, ``limit`` at most. ``cursor`` is that of the page
         before. Raises InputError for a cursor of another list."""
         page = self._library.captures(query, limit, cursor)
-        return Found(tuple(self.of(page.ids)), page.next, page.total)
+        return page.of(self.of(page.items))
 
     def of(self, ids: Sequence[str]) -> list[CaptureRecord]:
         """Returns the captures with these ids, in their order; ids of no capture are left out."""

@@ -35,7 +35,7 @@ from server.services.job_rows import (
     moment,
     request_of,
 )
-from server.services.records import DeliveryOut, Found, JobOut
+from server.services.records import DeliveryOut, JobOut
 from server.services.results import Results
 from server.services.webhooks import messages_of
 from server.services.work import ReconstructionRequest, refuse_board
@@ -45,6 +45,7 @@ from server.storage.database import alive_workers, portions, workers
 from server.storage.events import EventLog, JobEvent
 from server.storage.job_index import JobIndex, JobQuery
 from server.storage.library import Library
+from server.storage.pages import Page
 from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest
 from server.storage.store import Store, StoredFile, is_id, new_id, repeatable_id
 
@@ -189,11 +190,11 @@ class Jobs:
         rows = self.client.list_workflows(name=WORKFLOW, workflow_ids=ids, status=status, limit=limit, sort_desc=True)
         return self._jobs(rows)
 
-    def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[JobOut]:
+    def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Page[JobOut]:
         """Returns one page of the jobs that match a query, ``limit`` at most. A word of the search that names a state
         ("failed") selects jobs in that state. Raises InputError for a cursor of another list."""
         page = self.index.page(by_state(query), limit, cursor)
-        return Found(tuple(self.of(page.ids)), page.next, page.total)
+        return page.of(self.of(page.items))
 
     def of(self, ids: Sequence[str]) -> list[JobOut]:
         """Returns the jobs with these ids, in their order; ids of no job are left out."""
@@ -212,7 +213,7 @@ class Jobs:
     def of_captures(self, captures: Collection[str]) -> dict[str, list[tuple[str, str]]]:
         """Returns the id and state of every job of each capture, newest first."""
         found = self.index.of_captures(captures)
-        return {capture: [(job.id, STATES[job.status]) for job in jobs] for capture, jobs in found.items()}
+        return {capture: [(job, STATES[status]) for job, status in jobs] for capture, jobs in found.items()}
 
     def active(self, *, capture: str | None = None, session: str | None = None, key: str | None = None) -> list[str]:
         """Lists the ids of queued and running jobs. They can be restricted to one capture, session or API key."""

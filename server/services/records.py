@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Generic, Literal, TypeVar
+from typing import Literal
 
 from pydantic import Field
 
@@ -12,18 +12,6 @@ from rig.messages.message import Message
 from server.services.answer import Answer, JobSettings, MessageOut, Moment, Said, State, as_data
 from server.storage.batches import BatchState
 from server.storage.records import JsonObject
-
-T = TypeVar("T")
-
-
-@dataclass(frozen=True, slots=True)
-class Found(Generic[T]):
-    """Holds one page of a list. ``next``: cursor of the next page, None on the last; ``total``: number of items on all
-    pages."""
-
-    items: tuple[T, ...]
-    next: str | None
-    total: int
 
 
 class JobError(Answer):

@@ -20,9 +20,7 @@ from server.services.jobs import Jobs, migrate
 from server.services.keys import Keys
 from server.services.live.live import Live
 from server.services.records import CalibrationOut, JobOut, RigOut
-from server.services.rigs.backend import RigBackend
-from server.services.rigs.real import RealRig
-from server.services.rigs.simulated import SimulatedRig
+from server.services.rigs import RealRig, RigBackend, SimulatedRig
 from server.services.sessions import Sessions
 from server.services.storage_use import StorageCount
 from server.services.threads import Threads
@@ -154,7 +152,7 @@ def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
     engine = open_database(settings)
     library = Library(engine)
     store = Store(settings.data, library, open_capture_blobs(settings, engine), settings.free_bytes)
-    library.reconcile(store)
+    library.reconcile(store.changes, store.found)
     migrate(settings)
     jobs, rig = Jobs(settings, store, engine, library), open_rig(settings)
     webhooks = Webhooks(engine, settings.webhook_origins)

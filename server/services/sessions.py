@@ -7,9 +7,10 @@ from dataclasses import asdict, replace
 from server.errors import NotFound
 from server.services.erasure import erase_captures
 from server.services.jobs import Jobs
-from server.services.records import Found, PersonOut, SessionOut, moment_now
+from server.services.records import PersonOut, SessionOut, moment_now
 from server.services.texts import check_texts
 from server.storage.library import Library, SubjectOrder, subject_of
+from server.storage.pages import Page
 from server.storage.records import SessionRecord
 from server.storage.store import Store, new_id
 
@@ -28,13 +29,13 @@ class Sessions:
         self._store.add_session(record)
         return _with_captures(record, [])
 
-    def page(self, sought: str = "", limit: int = 100, cursor: str | None = None) -> Found[SessionOut]:
+    def page(self, sought: str = "", limit: int = 100, cursor: str | None = None) -> Page[SessionOut]:
         """Returns one page of the sessions in whose label or consent note all words of ``sought`` occur, newest first.
         Raises InputError for a cursor of another list."""
         page = self._library.sessions(sought, limit, cursor)
-        captures = self._library.captures_of(page.ids)
-        records = [record for identity in page.ids if (record := self._record(identity)) is not None]
-        return Found(tuple(_with_captures(record, captures[record.id]) for record in records), page.next, page.total)
+        captures = self._library.captures_of(page.items)
+        records = [record for identity in page.items if (record := self._record(identity)) is not None]
+        return page.of(_with_captures(record, captures[record.id]) for record in records)
 
     def subjects(
         self,
@@ -44,21 +45,21 @@ class Sessions:
         cursor: str | None = None,
         *,
         tag: str | None = None,
-    ) -> Found[PersonOut]:
+    ) -> Page[PersonOut]:
         """Returns one page of subjects. Sessions with the same label are one subject. ``tag``: only subjects with a
         capture that has this tag. Raises InputError for a cursor of another list."""
         page = self._library.subjects(sought, order, limit, cursor, tag)
-        captures = self._library.captures_of([session for sessions in page.subjects for session in sessions])
+        captures = self._library.captures_of([session for sessions in page.items for session in sessions])
         all_captures = [capture for some in captures.values() for capture in some]
         jobs, tags = self._jobs.of_captures(all_captures), self._library.tags_of(all_captures)
         found = []
-        for sessions in page.subjects:
+        for sessions in page.items:
             records = [record for session in sessions if (record := self._record(session)) is not None]
             if records:
                 theirs = {capture: jobs[capture] for session in sessions for capture in captures[session]}
                 theirs_tags = {tag.casefold(): tag for capture in theirs for tag in tags.get(capture, ())}
                 found.append(_subject(records, theirs, list(theirs_tags.values())))
-        return Found(tuple(found), page.next, page.total)
+        return page.of(found)
 
     def captures_of_subject(self, session: str | None) -> list[str]:
         """Lists the ids of all captures of the person whom a session shows, other sessions included. The list is empty

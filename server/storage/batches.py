@@ -14,7 +14,7 @@ from sqlalchemy.exc import IntegrityError
 
 from server.storage.database import AT_ONCE, batch_items, batches, portions
 from server.storage.job_index import ENQUEUED, RUNNING, engine_jobs
-from server.storage.pages import CursorPage, Order, contains, folded, page_of, storable, words_of
+from server.storage.pages import Order, Page, contains, folded, page_of, storable, words_of
 
 Wish = Literal["running", "paused", "cancelled"]
 BatchState = Literal["running", "paused", "cancelled", "finished"]
@@ -95,7 +95,7 @@ class BatchIndex:
             found = {row.id: _row(row) for row in rows}
         return [found[identity] for identity in ids if identity in found]
 
-    def page(self, sought: str, state: BatchState | None, limit: int, cursor: str | None) -> CursorPage:
+    def page(self, sought: str, state: BatchState | None, limit: int, cursor: str | None) -> Page[str]:
         """Returns one page of batches, newest first. All words of ``sought`` must occur in the label; a word may also
         be the batch's id. Raises InputError for a cursor of another list."""
         rows = sa.select().select_from(batches)

@@ -9,6 +9,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TypedDict, cast
@@ -16,8 +17,8 @@ from typing import TypedDict, cast
 import cv2
 
 from rig.atomic_write import write_atomically
-from server.storage.code_digest import code_digest
 
+PIPELINE = Path(__file__).resolve().parents[2] / "pipeline"
 ROOMS = ("alignment", "faces", "geometry", "head_model", "multiview")
 SUFFIX = ".faces.json"
 
@@ -63,3 +64,13 @@ def _key(inputs: Mapping[str, str]) -> str:
     files = {name: digest for name, digest in sorted(inputs.items()) if name != "features.json"}
     document = [files, version("eigenhead"), cv2.__version__, code_digest(ROOMS)]
     return hashlib.sha256(json.dumps(document).encode()).hexdigest()
+
+
+@cache
+def code_digest(rooms: tuple[str, ...]) -> str:
+    """Returns the SHA-256 of all code in the named rooms (paths below ``pipeline``), which is part of a cached file's
+    name: a new version of the code makes the file anew. It is computed once a process."""
+    digest = hashlib.sha256()
+    for path in sorted(path for room in rooms for path in (PIPELINE / room).glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -14,7 +14,7 @@ from sqlalchemy.exc import IntegrityError
 
 from server.storage.database import batch_items, capture_index, job_index, portions
 from server.storage.library import captures_with
-from server.storage.pages import CursorPage, Order, contains, folded, is_or_ends, page_of, words_of
+from server.storage.pages import Order, Page, contains, folded, is_or_ends, page_of, words_of
 from server.storage.records import JobRequest
 
 ENQUEUED = ("DELAYED", "ENQUEUED")
@@ -33,14 +33,6 @@ class JobQuery:
     session: str | None = None
     batch: str | None = None
     order: JobOrder = "-created"
-
-
-@dataclass(frozen=True, slots=True)
-class JobOfCapture:
-    """Holds the id of a job, and its status in the job engine's words ("PENDING")."""
-
-    id: str
-    status: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +82,7 @@ class JobIndex:
                 )
         return len(bare)
 
-    def page(self, query: JobQuery, limit: int, cursor: str | None = None) -> CursorPage:
+    def page(self, query: JobQuery, limit: int, cursor: str | None = None) -> Page[str]:
         """Returns one page of the jobs that match a query. Raises InputError for a cursor of another list."""
         status = self._status.c
         rows = sa.select().select_from(self._status).where(status.name == self._workflow)
@@ -146,9 +138,10 @@ class JobIndex:
                 before[row.queue_name] = places[row.workflow_uuid] + 1
         return places
 
-    def of_captures(self, captures: Collection[str]) -> dict[str, list[JobOfCapture]]:
-        """Returns the jobs of each of the captures, newest first. A capture without jobs has an empty list."""
-        found: dict[str, list[JobOfCapture]] = {capture: [] for capture in captures}
+    def of_captures(self, captures: Collection[str]) -> dict[str, list[tuple[str, str]]]:
+        """Returns id and status, in the job engine's words ("PENDING"), of the jobs of each of the captures, newest
+        first. A capture without jobs has an empty list."""
+        found: dict[str, list[tuple[str, str]]] = {capture: [] for capture in captures}
         status = self._status.c
         joined = job_index.join(self._status, status.workflow_uuid == job_index.c.job_id)
         query = sa.select(job_index.c.capture_id, job_index.c.job_id, status.status).select_from(joined)
@@ -156,7 +149,7 @@ class JobIndex:
         with self._engine.connect() as connection:
             for some in portions(captures):
                 for row in connection.execute(query.where(job_index.c.capture_id.in_(some))):
-                    found[row.capture_id].append(JobOfCapture(row.job_id, row.status))
+                    found[row.capture_id].append((row.job_id, row.status))
         return found
 
     def known(self, ids: Collection[str]) -> set[str]:

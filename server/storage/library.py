@@ -5,7 +5,7 @@ at each start, corrects rows that differ: after a backup was restored, a record 
 folder of an earlier version.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,9 +15,8 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DataError
 
 from server.storage.database import capture_index, capture_tags, portions, scrub, session_index
-from server.storage.pages import CursorPage, Order, contains, folded, is_or_ends, page_of, storable, words_of
+from server.storage.pages import Order, Page, contains, folded, is_or_ends, page_of, storable, words_of
 from server.storage.records import CaptureRecord, SessionRecord
-from server.storage.store import Store
 
 UNJUDGED = "none"  # the verdict of captures that were not judged
 CaptureOrder = Literal["-created", "created", "label", "-label", "verdict", "-bytes"]
@@ -41,15 +40,6 @@ class CaptureQuery:
     before: str | None = None
     tag: str | None = None
     order: CaptureOrder = "-created"
-
-
-@dataclass(frozen=True, slots=True)
-class SubjectPage:
-    """Holds one page of subjects, each as the ids of the subject's sessions, newest first."""
-
-    subjects: tuple[tuple[str, ...], ...]
-    next: str | None
-    total: int
 
 
 class Library:
@@ -81,7 +71,7 @@ class Library:
         """Overwrites what deleted rows left in the database's files, names of people included."""
         scrub(self._engine)
 
-    def captures(self, query: CaptureQuery, limit: int, cursor: str | None = None) -> CursorPage:
+    def captures(self, query: CaptureQuery, limit: int, cursor: str | None = None) -> Page[str]:
         """Returns one page of the captures that match a query. Raises InputError for a cursor of another list."""
         table = capture_index.c
         rows = sa.select().select_from(capture_index)
@@ -163,7 +153,7 @@ class Library:
         with self._engine.connect() as connection:
             return [*connection.scalars(sa.select(session_index.c.id).where(session_index.c.subject == subject))]
 
-    def sessions(self, sought: str, limit: int, cursor: str | None = None) -> CursorPage:
+    def sessions(self, sought: str, limit: int, cursor: str | None = None) -> Page[str]:
         """Returns one page of the sessions in which all words of ``sought`` occur, newest first. Raises InputError for
         a cursor of another list."""
         rows = sa.select().select_from(session_index)
@@ -175,9 +165,9 @@ class Library:
 
     def subjects(
         self, sought: str, order: SubjectOrder, limit: int, cursor: str | None = None, tag: str | None = None
-    ) -> SubjectPage:
-        """Returns one page of subjects. Sessions of one name are one subject; a session without a name is a subject by
-        itself. A subject is as new as its newest session.
+    ) -> Page[tuple[str, ...]]:
+        """Returns one page of subjects, each as the ids of its sessions, newest first. Sessions of one name are one
+        subject; a session without a name is a subject by itself. A subject is as new as its newest session.
 
         ``tag``: only subjects with a capture that has this tag. Raises InputError for a cursor of another list.
         """
@@ -197,26 +187,26 @@ class Library:
         wanted = Order(by, one.c.newest, order.startswith("-"))
         with self._engine.connect() as connection:
             page = page_of(connection, sa.select().select_from(one), wanted, limit, cursor)
-            theirs = sa.select(table.subject).where(table.id.in_(page.ids))
+            theirs = sa.select(table.subject).where(table.id.in_(page.items))
             sessions = sa.select(table.id, table.subject).where(table.subject.in_(theirs)).order_by(table.id.desc())
             found: dict[str, list[str]] = {}
             for row in connection.execute(sessions):
                 found.setdefault(row.subject, []).append(row.id)
         of = {identity: tuple(ids) for ids in found.values() for identity in ids}
-        there = (of[identity] for identity in page.ids if identity in of)  # the others were erased since the page
-        return SubjectPage(tuple(there), page.next, page.total)
+        there = (of[identity] for identity in page.items if identity in of)  # the others were erased since the page
+        return page.of(there)
 
-    def reconcile(self, store: Store) -> int:
+    def reconcile(self, changes: Callable[[str], Mapping[str, int]], found: Callable[[str, str], Record | None]) -> int:
         """Makes the index agree with the records in the data folder. Returns how many rows differed. A record that no
-        row can hold is left out and logged."""
+        row can hold is left out and logged. ``changes`` and ``found`` are those of the ``Store``."""
         mended = 0
         for table, kind in ((capture_index, "captures"), (session_index, "sessions")):
             with self._engine.connect() as connection:
                 known = {row.id: row.changed for row in connection.execute(sa.select(table.c.id, table.c.changed))}
-            there = store.changes(kind)  # asked second: what is added in between is no stray row
+            there = changes(kind)  # asked second: what is added in between is no stray row
             self._drop(table, gone := [identity for identity in known if identity not in there])
             differing = [identity for identity, changed in there.items() if known.get(identity) != changed]
-            records = [record for identity in differing if (record := store.found(kind, identity)) is not None]
+            records = [record for identity in differing if (record := found(kind, identity)) is not None]
             if table is capture_index:
                 self._drop_tags(gone)
             mended += len(gone) + self._put_fitting(table, records, there)

@@ -17,6 +17,7 @@ from typing import Protocol
 from rig.digest import sha256_of
 from rig.messages.message import Message, compose
 from server.errors import InvalidInput, Unavailable
+from server.storage.folders import sync_folder
 
 AGAIN_S = 10  # until a client asks again for what a store did not do
 BLOCK_BYTES = 1 << 20
@@ -125,11 +126,7 @@ class FolderObjects:
                 part.replace(target)
             finally:
                 part.unlink(missing_ok=True)
-            folder = os.open(target.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            sync_folder(target.parent)
 
     def fetch(self, key: str, path: Path, sha256: str | None = None, admit: Admission = any_size) -> str:
         """Writes an object to a file, as in ``ObjectStore``."""

@@ -7,8 +7,9 @@ as fast as the first.
 
 import base64
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import sqlalchemy as sa
 
@@ -18,18 +19,22 @@ from rig.messages.message import compose
 WORDS_MOST = 10  # of a search: each is one comparison with every row
 ID_LEAST = 6  # digits of an id's end that name it
 Value = str | int | None
+T = TypeVar("T")
+V = TypeVar("V")
 
 
 @dataclass(frozen=True, slots=True)
-class CursorPage:
-    """Holds the ids of one page of a list, in the list's order.
+class Page(Generic[T]):
+    """Holds one page of a list, in the list's order. ``next``: cursor of the next page, None on the last; ``total``:
+    number of items on all pages."""
 
-    ``next``: cursor of the next page, None on the last; ``total``: number of items on all pages.
-    """
-
-    ids: tuple[str, ...]
+    items: tuple[T, ...]
     next: str | None
     total: int
+
+    def of(self, items: Iterable[V]) -> "Page[V]":
+        """Returns the page with these items in place of its own."""
+        return Page(tuple(items), self.next, self.total)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +105,7 @@ def no_cursor() -> InputError:
 
 def page_of(
     connection: sa.Connection, rows: sa.Select, order: Order, limit: int, cursor: str | None, *, searched: bool = False
-) -> CursorPage:
+) -> Page[str]:
     """Returns one page of a list: the rows of the query ``rows`` in ``order``, after ``cursor``, ``limit`` at most.
 
     ``searched``: the query is slow, so the total is counted within it and not by a second one. Raises InputError for a
@@ -118,7 +123,7 @@ def page_of(
         total = found[0].total
     more = len(found) > limit
     ids = tuple(row.id for row in found[:limit])
-    return CursorPage(ids, cursor_of(found[limit - 1].value, ids[-1], total) if more else None, total)
+    return Page(ids, cursor_of(found[limit - 1].value, ids[-1], total) if more else None, total)
 
 
 def words_of(sought: str) -> Sequence[str]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Generic, NotRequired, TypedDict, TypeVar
 
-from pydantic import PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import BaseModel, Field, PlainSerializer, PlainValidator, TypeAdapter
 
 from rig.acquisition.face_sighting import FaceSighting
 from rig.acquisition.shot import Fault, read_fault
@@ -168,26 +168,26 @@ RIG_ADJUSTMENT = RecordFormat(RigAdjustment, "eigenhead-rig-adjustment/1")
 UPLOAD = RecordFormat(UploadRecord, "eigenhead-upload/1")
 
 
-@dataclass(frozen=True, slots=True)
-class _Subject:
-    share: float
-    cut_off: list[str]
-    outline: list[list[float]]
+class SubjectOut(BaseModel):
+    """Describes where the subject is in a picture. (A person of the library is ``PersonOut``.)"""
+
+    share: float = Field(description="of the picture's area")
+    cut_off: list[str] = Field(description="edges of the picture that cut the head: top, left, right")
+    outline: list[list[float]] = Field(description="corners, in pixels of the picture")
 
 
-@dataclass(frozen=True, slots=True)
-class _View:
-    """The shape of a ``ViewDocument``, whose own type pydantic reads from Python 3.12 on."""
+class ViewChecksOut(BaseModel):
+    """Holds what was measured on one camera's picture."""
 
-    mean: float | None = None
-    clipped_share: float | None = None
-    blur_px: float | None = None
-    background_found: float | None = None
+    mean: float | None = Field(None, description="mean value, 0 to 255")
+    clipped_share: float | None = Field(None, description="of pixels at 255 in every channel")
+    blur_px: float | None = Field(None, description="standard deviation of the edge spread")
+    background_found: float | None = Field(None, description="share of the clean plate's patches that were found")
     background_moved_px: float | None = None
-    subject: _Subject | None = None
+    subject: SubjectOut | None = None
 
 
-_CHECKS = TypeAdapter(dict[str, _View])
+_CHECKS = TypeAdapter(dict[str, ViewChecksOut])
 
 
 def read_checks(document: Any) -> dict[str, ViewDocument]:

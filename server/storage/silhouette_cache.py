@@ -27,7 +27,7 @@ from rig.capture import Capture
 from rig.messages.message import documents_of, read_message
 from rig.progress import Progress
 from rig.rig import Rig
-from server.storage.code_digest import code_digest
+from server.storage.face_cache import code_digest
 
 SUFFIX = ".silhouettes"
 ROOMS = (

@@ -29,7 +29,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import structlog
 
@@ -40,6 +40,7 @@ from rig.messages.message import Message, compose
 from server.errors import DiskFull, NotFound
 from server.storage.capture_blobs import CaptureBlobs
 from server.storage.folders import move_durably, newest, sync_folder
+from server.storage.library import Library
 from server.storage.records import (
     CALIBRATION,
     CAPTURE,
@@ -91,27 +92,6 @@ def _digest(path: Path, *_: int) -> str:
     return sha256_of(path)
 
 
-class RecordIndex(Protocol):
-    """Declares the methods of an index of the data folder. ``Store`` calls them after it has written or removed a
-    record."""
-
-    def put_capture(self, record: CaptureRecord, changed: int) -> None:
-        """Notes that a capture's record was written at ``changed`` (time of the file, ns)."""
-        ...
-
-    def drop_capture(self, identity: str) -> None:
-        """Notes that a capture was removed."""
-        ...
-
-    def put_session(self, record: SessionRecord, changed: int) -> None:
-        """Notes that a session's record was written at ``changed`` (time of the file, ns)."""
-        ...
-
-    def drop_session(self, identity: str) -> None:
-        """Notes that a session was removed."""
-        ...
-
-
 _THINGS = {
     "captures": compose("thing-capture"),
     "jobs": compose("thing-job"),
@@ -126,7 +106,7 @@ class Store:
     becomes part of a path."""
 
     def __init__(
-        self, data: Path, index: RecordIndex | None = None, blobs: CaptureBlobs | None = None, spare: int = 0
+        self, data: Path, index: Library | None = None, blobs: CaptureBlobs | None = None, spare: int = 0
     ) -> None:
         """``blobs``: where files of captures are kept, too; ``spare``: bytes that fetching them leaves free."""
         self.data, self._index, self.blobs, self._spare = data, index, blobs, spare
@@ -258,10 +238,8 @@ class Store:
     def captures(self) -> Iterator[CaptureRecord]:
         """Yields the records of all captures, newest first. Damaged records are set aside and left out."""
         for identity in self.ids("captures"):
-            folder = self.data / "captures" / identity
-            record = self._read(folder / "record.json", CAPTURE, folder)
-            if record is not None:
-                yield record
+            with suppress(NotFound):
+                yield self.capture(identity)
 
     def change_capture(self, identity: str, change: Callable[[CaptureRecord], CaptureRecord]) -> CaptureRecord:
         """Replaces the record of a capture by what ``change`` returns for it, and returns the new record. Changes wait
@@ -347,12 +325,6 @@ class Store:
         if record is None:
             raise NotFound(compose("thing-session"), identity)
         return record
-
-    def sessions(self) -> Iterator[SessionRecord]:
-        """Yields the records of all sessions, newest first. Damaged records are set aside and left out."""
-        for identity in self.ids("sessions"):
-            with suppress(NotFound):
-                yield self.session(identity)
 
     def remove(self, path: Path) -> None:
         """Deletes a file or folder. It is first renamed into ``trash``, so that it is gone from sight even if the

@@ -4,7 +4,7 @@ sheet."""
 from collections.abc import Callable, Mapping
 from typing import TypedDict, cast, get_args
 
-from rig.messages.message import Message, MessageDocument, compose, documents_of
+from rig.messages.message import Message, compose, documents_of
 from server.batch.table import has_parquet
 from server.console.page import Action, Chosen, Page, serve_page, shared
 from server.console.pages.jobs import listed_jobs
@@ -21,31 +21,6 @@ FAILED_SHOWN = 20  # of the batch that is looked at; the page Jobs has all
 ASKED = ("find", "state", "after")
 
 
-class FailedJob(TypedDict):
-    """Holds a failed job with the label of its capture. ``why`` lists every fault, or the one reason."""
-
-    id: str
-    capture: str
-    why: list[MessageDocument]
-
-
-class BatchesState(TypedDict):
-    """Holds one page of the list of batches. ``total`` counts those on all pages."""
-
-    batches: list[JsonObject]
-    next: str | None
-    total: int
-
-
-class BatchesShown(BatchesState):
-    """Holds what the page shows. ``batch``: the selected batch, which may be on another page of the list; ``failed``:
-    its newest failed jobs; ``parquet``: whether Parquet tables can be made."""
-
-    batch: JsonObject | None
-    failed: list[FailedJob]
-    parquet: bool
-
-
 class BatchForm(TypedDict):
     """Holds the form of a new batch: what the captures' labels begin with, the batch's label, and the level of detail
     (empty: the default)."""
@@ -58,10 +33,11 @@ class BatchForm(TypedDict):
 class BatchesPage(Page, component="batches.js"):
     """Shows the list of batches, and the selected one with its progress and failed jobs."""
 
-    def look(self) -> BatchesShown:
-        """Returns the state of the page: a page of the list, and the selected batch with its failed jobs."""
+    def look(self) -> JsonObject:
+        """Returns the state of the page: a page of the list, and the selected batch, which may be on another page, with
+        its newest failed jobs. ``parquet``: whether Parquet tables can be made."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
-        state: BatchesState = shared.get(
+        state: JsonObject = shared.get(
             ("batches", *requested.values()), 0.5, lambda: batches_state(self.service, requested)
         )
         chosen = self.choice.get("batch")
@@ -74,17 +50,18 @@ class BatchesPage(Page, component="batches.js"):
         return {**state, "batch": batch, "failed": failed, "parquet": parquet}
 
 
-def batches_state(service: Service, requested: Mapping[str, str | None]) -> BatchesState:
-    """Returns one page of the list of batches, newest first."""
+def batches_state(service: Service, requested: Mapping[str, str | None]) -> JsonObject:
+    """Returns one page of the list of batches, newest first. ``total`` counts those on all pages."""
     state = cast(BatchState, requested["state"]) if requested["state"] in get_args(BatchState) else None
     page = service.batches.page(requested["find"] or "", state, SHOWN, requested["after"])
     return {"batches": [batch.model_dump() for batch in page.items], "next": page.next, "total": page.total}
 
 
-def failed_jobs(service: Service, batch: str) -> list[FailedJob]:
-    """Returns the newest ``FAILED_SHOWN`` failed jobs of a batch."""
+def failed_jobs(service: Service, batch: str) -> list[JsonObject]:
+    """Returns the newest ``FAILED_SHOWN`` failed jobs of a batch, each with the label of its capture and ``why``: every
+    fault, or the one reason."""
 
-    def make() -> list[FailedJob]:
+    def make() -> list[JsonObject]:
         failed = service.jobs.page(JobQuery("", STATUSES["failed"], batch=batch), FAILED_SHOWN).items
         listed = listed_jobs(service, failed)
         return [

@@ -5,14 +5,15 @@ from collections.abc import Mapping
 from typing import NotRequired, TypedDict
 
 from rig.errors import InputError
-from rig.messages.message import Message, MessageDocument, compose
-from server.console.coverage import Corners, Coverage, advice, detect_shot, summary
+from rig.messages.message import Message, compose
+from server.console.coverage import Corners, advice, detect_shot, summary
 from server.console.page import Action, Chosen, Page, remove_later, serve_page, shared, shown_failure
 from server.console.removal import removals
 from server.errors import Conflict, InvalidInput
 from server.services.captures import CaptureMetadata
 from server.services.records import CalibrationOut
 from server.services.service import Service
+from server.storage.records import JsonObject
 
 LABEL = "calibration board"
 SHOTS_LEAST = 3
@@ -55,26 +56,6 @@ class Shots:
 shots = Shots()
 
 
-class RigLine(TypedDict):
-    """Holds what the page shows of the rig. ``is_measured``: a calibration that this service made is in use."""
-
-    kind: str
-    calibration: str | None
-    is_measured: bool
-
-
-class CalibrationState(TypedDict):
-    """Holds what the page shows: calibrations, the rig, and the coverage of the board's shots with advice for the next
-    one."""
-
-    calibrations: list[Mapping[str, object]]
-    rig: RigLine
-    board: Mapping[str, object]
-    shots: int
-    coverage: list[Coverage]
-    advice: MessageDocument
-
-
 class BoardForm(TypedDict):
     """Holds the form that describes the calibration board, with the keys of ``board.toml``."""
 
@@ -97,7 +78,7 @@ class UseForm(Chosen):
 class CalibrationPage(Page, component="calibration.js"):
     """Shows the shots of the board so far, and the list of calibrations with their reports."""
 
-    def look(self) -> CalibrationState:
+    def look(self) -> JsonObject:
         """Returns the state of the page, which is the same for all callers."""
         return shared.get("calibration page", 0.4, lambda: calibration_state(self.service))
 
@@ -107,8 +88,9 @@ def known_calibrations(service: Service, age_s: float) -> list[CalibrationOut]:
     return shared.get("calibrations", age_s, service.calibrations.find)
 
 
-def calibration_state(service: Service) -> CalibrationState:
-    """Returns what the page shows: calibrations, rig, and the shots of the board so far."""
+def calibration_state(service: Service) -> JsonObject:
+    """Returns what the page shows: calibrations, rig, and the coverage of the board's shots so far with advice for the
+    next one. ``is_measured``: a calibration that this service made is in use."""
     rig = service.rig.describe()
     names = [camera.name for camera in rig.cameras]
     lines = summary(names, [corners for _, corners in shots.taken])

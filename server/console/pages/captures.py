@@ -18,7 +18,7 @@ from server.console.page import (
     shared,
 )
 from server.console.removal import removals
-from server.console.work_form import PresetLine, TemplateLine, WorkForm, chosen_work, preset_lines, template_lines
+from server.console.work_form import WorkForm, chosen_work, preset_lines, template_lines
 from server.services.bulk import each
 from server.services.service import Service
 from server.services.texts import typed_tags
@@ -27,21 +27,6 @@ from server.storage.records import JsonObject
 
 SHOWN = 50  # captures of a page
 ASKED = ("find", "session", "verdict", "tag", "sort", "after", "capture")
-
-
-class CapturesState(TypedDict):
-    """Holds one page of the list of captures. ``chosen``: the selected capture, which may be on another page of the
-    list."""
-
-    captures: list[JsonObject]
-    chosen: JsonObject | None
-    next: str | None
-    total: int
-    sessions: list[JsonObject]
-    tags: list[str]
-    models: list[str]
-    presets: list[PresetLine]
-    templates: list[TemplateLine]
 
 
 class EditForm(Chosen):
@@ -76,11 +61,11 @@ class BulkForm(WorkForm):
 class CapturesPage(Page, component="captures.js"):
     """Shows the list of captures, and the selected one with its pictures, outlines and jobs."""
 
-    def look(self) -> CapturesState:
+    def look(self) -> JsonObject:
         """Returns the state of the page. The selected capture stays selected when others arrive, so that nobody removes
         a capture other than the one shown."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
-        state: CapturesState = shared.get(
+        state: JsonObject = shared.get(
             ("captures", *requested.values()), 0.3, lambda: captures_state(self.service, requested)
         )
         if state["chosen"] is not None and (self.choice.get("capture") or None) == requested["capture"]:
@@ -88,9 +73,9 @@ class CapturesPage(Page, component="captures.js"):
         return state
 
 
-def captures_state(service: Service, requested: Mapping[str, str | None]) -> CapturesState:
+def captures_state(service: Service, requested: Mapping[str, str | None]) -> JsonObject:
     """Returns one page of the captures that match what is requested, each with its jobs. Captures that are being
-    removed are left out."""
+    removed are left out. ``chosen``: the selected capture, which may be on another page of the list."""
     order = cast(CaptureOrder, requested["sort"] if requested["sort"] in get_args(CaptureOrder) else "-created")
     query = CaptureQuery(
         requested["find"] or "", requested["session"], requested["verdict"], tag=requested["tag"], order=order

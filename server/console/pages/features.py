@@ -6,7 +6,7 @@ It may be skipped: without points the pipeline finds the alignment by itself.
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import NotRequired, TypedDict
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS
 from rig.messages.message import Message, MessageDocument, compose
 from server.console.found_faces import found_faces
-from server.console.guides import Guides, Helps, mean_landmarks, nearest_views
+from server.console.guides import Guides, mean_landmarks, nearest_views
 from server.console.media import rig_of
 from server.console.page import Action, Page, serve_page, shared
 from server.console.removal import removals
@@ -23,54 +23,11 @@ from server.services.service import Service
 from server.services.work import ReconstructionRequest
 from server.storage.face_cache import PixelsOfPoints
 from server.storage.library import CaptureQuery
-from server.storage.records import CaptureRecord
+from server.storage.records import CaptureRecord, JsonObject
 from server.tasks.ingest import Points
 
 VIEWS = 4
 CHOICES = 100  # captures to choose from; the page Captures leads to all
-
-
-class CaptureChoice(TypedDict):
-    """Holds a capture in the list to choose from. ``features``: it has points already."""
-
-    id: str
-    label: str
-    created: str
-    features: bool
-
-
-class Size(TypedDict):
-    """Holds the name of a camera and the size of its pictures in pixels."""
-
-    name: str
-    width: int
-    height: int
-
-
-class Picking(Helps):
-    """Holds the points of one capture and the aids for picking more; pixels are those of the picture files.
-
-    ``names``: all points, of which the first seven are those of section 4.2; ``suggested``: suggestions that nobody has
-    accepted yet; ``dirty``: there are points that are not saved; ``is_contradictory``: contradictions must be confirmed
-    before the points are saved.
-    """
-
-    id: str
-    cameras: list[Size]
-    views: list[str]
-    names: list[str]
-    points: Points
-    suggested: Points
-    dirty: bool
-    is_contradictory: bool
-
-
-class FeaturesShown(TypedDict):
-    """Holds what the page shows: the captures to choose from, and the points of the chosen one."""
-
-    captures: list[CaptureChoice]
-    capture: Picking | None
-    requested: NotRequired[str | None]
 
 
 class Place(TypedDict):
@@ -140,9 +97,9 @@ class FeaturesPage(Page, component="features.js"):
 
     picked: Picked | None = None
 
-    def look(self) -> FeaturesShown:
+    def look(self) -> JsonObject:
         """Returns the captures to choose from, and the points of the chosen one with the aids for picking more."""
-        captures: list[CaptureChoice] = shared.get("choices", 2.0, lambda: captures_to_pick(self.service))
+        captures: list[JsonObject] = shared.get("choices", 2.0, lambda: captures_to_pick(self.service))
         chosen = self.choice.get("capture") or (captures[0]["id"] if captures else None)
         known = any(capture["id"] == chosen for capture in captures)
         if not known and chosen is not None:  # an older one, by its address
@@ -153,7 +110,13 @@ class FeaturesPage(Page, component="features.js"):
             return {"captures": captures, "capture": None, "requested": self.choice.get("capture")}
         return {"captures": captures, "capture": self._picking(chosen)}
 
-    def _picking(self, capture_id: str) -> Picking:
+    def _picking(self, capture_id: str) -> JsonObject:
+        """Returns the points of one capture and the aids for picking more; pixels are those of the picture files.
+
+        ``names``: all points, of which the first seven are those of section 4.2; ``suggested``: suggestions that nobody
+        has accepted yet; ``dirty``: there are points that are not saved; ``is_contradictory``: contradictions must be
+        confirmed before the points are saved.
+        """
         record = self.service.store.capture(capture_id)
         rig = shared.get(("cameras", capture_id), 3600.0, lambda: rig_of(self.service.store.capture_files(capture_id)))
         picked = self.picked
@@ -167,7 +130,7 @@ class FeaturesPage(Page, component="features.js"):
         nearest, chosen = nearest_views(rig, record.front, VIEWS), self.choice.get("views")
         return {
             "id": capture_id,
-            "cameras": [{"name": c.name, "width": c.width, "height": c.height} for c in record.cameras],
+            "cameras": [asdict(camera) for camera in record.cameras],
             "views": nearest,
             "names": [*SEVEN_POINTS, *(name for name in NAMES if name not in SEVEN_POINTS)],
             "points": points,
@@ -186,13 +149,13 @@ class FeaturesPage(Page, component="features.js"):
         return self.picked
 
 
-def captures_to_pick(service: Service) -> list[CaptureChoice]:
+def captures_to_pick(service: Service) -> list[JsonObject]:
     """Returns the newest ``CHOICES`` captures that show a head."""
     captures = service.captures.page(CaptureQuery(board=False), CHOICES)
     return [choice_of(record) for record in captures.items if record.id not in removals]
 
 
-def choice_of(record: CaptureRecord) -> CaptureChoice:
+def choice_of(record: CaptureRecord) -> JsonObject:
     """Converts a capture's record to an entry of the list to choose from."""
     return {"id": record.id, "label": record.label, "created": record.created, "features": record.features}
 

@@ -7,7 +7,7 @@ from typing import NotRequired, TypedDict, cast, get_args
 
 from pipeline.head_model.model_names import list_models
 from rig.errors import InputError
-from rig.messages.message import Message, MessageDocument, compose
+from rig.messages.message import Message, compose
 from server.console.page import (
     Action,
     Chosen,
@@ -37,46 +37,6 @@ SOUGHT_MOST = 1000  # queued jobs among which a search looks for the next ones
 ACTIVE = (*STATUSES["running"], *STATUSES["queued"])
 ASKED = ("find", "state", "sort", "batch", "after")
 LOG_LINES = 200
-
-
-class LogLine(TypedDict):
-    """Holds when a stage or state began, in seconds after the first event of the job."""
-
-    at_s: float
-    text: str
-
-
-class JobDetail(TypedDict):
-    """Holds the log of a job and, once it has finished, what report.json says of each camera, the warnings, and whether
-    there are pictures."""
-
-    id: str
-    log: list[LogLine]
-    cameras: list[JsonObject]
-    warnings: list[MessageDocument]
-    seconds: dict[str, float]
-    stopped_because: str | None
-    evaluations: int | None
-    pictures: bool
-
-
-class JobsState(TypedDict):
-    """Holds one page of the list of jobs. The first page begins with those that run and wait. ``waiting``: how many
-    more wait."""
-
-    jobs: list[JsonObject]
-    counts: dict[str, int]
-    waiting: int
-    next: str | None
-    total: int
-    models: list[str]
-
-
-class JobsShown(JobsState):
-    """Holds what the page shows. ``job``: the selected job, which may be on another page of the list."""
-
-    job: JsonObject | None
-    detail: JobDetail | None
 
 
 class SettingsForm(TypedDict, total=False):
@@ -114,11 +74,11 @@ class ListedJob:
 class JobsPage(Page, component="jobs.js"):
     """Shows the list of jobs, and the selected one with its log and, once it has finished, its figures."""
 
-    def look(self) -> JobsShown:
-        """Returns one page of the list, and the selected job with its details. Without a selection that is a running
-        job."""
+    def look(self) -> JsonObject:
+        """Returns one page of the list, and the selected job, which may be on another page, with its details. Without a
+        selection that is a running job."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
-        state: JobsState = shared.get(("jobs", *requested.values()), 0.3, lambda: jobs_state(self.service, requested))
+        state: JsonObject = shared.get(("jobs", *requested.values()), 0.3, lambda: jobs_state(self.service, requested))
         first = next((job for job in state["jobs"] if job["state"] == "running"), next(iter(state["jobs"]), None))
         chosen = self.choice.get("job")
         known = next((job for job in state["jobs"] if job["id"] == chosen), None)
@@ -130,9 +90,9 @@ class JobsPage(Page, component="jobs.js"):
         return {**state, "job": job, "detail": None if job is None else job_detail(self.service, job["id"])}
 
 
-def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JobsState:
+def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JsonObject:
     """Returns one page of the jobs that match what is requested: those that run, then the queue in its order, then
-    those that have ended, newest first."""
+    those that have ended, newest first. ``waiting``: how many more wait."""
     sought, after = requested["find"] or "", requested["after"]
     order = cast(JobOrder, requested["sort"] if requested["sort"] in get_args(JobOrder) else "-created")
     state = requested["state"] if requested["state"] in STATUSES else None
@@ -180,11 +140,12 @@ def job_line(listed: ListedJob) -> JsonObject:
     return {**line, "capture": listed.capture, "captured": listed.captured}
 
 
-def job_detail(service: Service, job_id: str) -> JobDetail:
-    """Returns the details of a job. They are cached, for an hour once it has finished. Raises NotFound."""
+def job_detail(service: Service, job_id: str) -> JsonObject:
+    """Returns the log of a job and, once it has finished, what report.json says of each camera, the warnings, and
+    whether there are pictures. They are cached, then for an hour. Raises NotFound."""
     finished = service.jobs.state(job_id) in FINISHED
 
-    def make() -> JobDetail:
+    def make() -> JsonObject:
         events = service.jobs.events.since(job_id, 0, limit=10_000)
         report = read_report(service, job_id) if finished else None
         cameras = {} if report is None else report.get("cameras", {})
@@ -202,9 +163,9 @@ def job_detail(service: Service, job_id: str) -> JobDetail:
     return shared.get(("detail", job_id, finished), 3600.0 if finished else 0.4, make)
 
 
-def log_lines(events: list[JobEvent]) -> list[LogLine]:
+def log_lines(events: list[JobEvent]) -> list[JsonObject]:
     """Returns when each stage or state of a job began, in seconds after the first event."""
-    lines: list[LogLine] = []
+    lines: list[JsonObject] = []
     for event in events:
         text = event.document.get("stage") or event.document.get("state") or ""
         if not lines or lines[-1]["text"] != text:

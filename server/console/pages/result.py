@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import TypedDict
 
 from nicegui.elements import scene
 
@@ -25,22 +24,12 @@ SHOWN = 60  # heads to choose from; the search finds the others
 SUBJECTS_HEADS = 100
 
 
-class ResultShown(TypedDict):
-    """Holds what the page shows. ``results``: the newest heads that match the search, those of the shown head's
-    subject, and the shown head; ``total``: how many match."""
-
-    results: list[JsonObject]
-    total: int
-    job: JsonObject | None
-    requested: str | None
-
-
 class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS)}):
     """Shows one head in 3D with its figures, and the heads to choose from."""
 
-    def look(self) -> ResultShown:
-        """Returns the shown head and the heads to choose from. A head that arrives meanwhile does not replace the shown
-        one."""
+    def look(self) -> JsonObject:
+        """Returns the shown head and the heads to choose from: the newest that match the search, those of the shown
+        head's subject, and the shown one, which none that arrives meanwhile replaces. ``total``: how many match."""
         sought, chosen = self.choice.get("find") or "", self.choice.get("job")
         results, total = shared.get(("results", sought), 1.0, lambda: newest_heads(self.service, sought))
         if chosen is None:

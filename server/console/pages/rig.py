@@ -4,12 +4,11 @@ trigger."""
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import TypedDict, cast
+from typing import cast
 
 from pipeline.results.report_types import Report
 from rig.acquisition.plates import PlatesVersion
-from rig.acquisition.shot import CameraSyncDocument
-from rig.messages.message import Message, MessageDocument, compose, documents_of
+from rig.messages.message import Message, compose, documents_of
 from server.console.capture_lines import capture_line, sessions_list, sync_of
 from server.console.media import live_view
 from server.console.page import Action, Chosen, Page, serve_page, shared, shown_detail
@@ -21,111 +20,29 @@ from server.services.captures import CaptureMetadata
 from server.services.records import CalibrationOut
 from server.services.service import Service
 from server.storage.records import JsonObject
-from server.tasks.simulate import SimulatedSync
-
-
-class Tile(TypedDict):
-    """Holds one camera: the state of its driver, its sync in the last shot's certificate, and whether it has moved."""
-
-    name: str
-    driver: str
-    state: str
-    sync: CameraSyncDocument | SimulatedSync | None
-    moved: bool
-
-
-class InUse(TypedDict):
-    """Holds the calibration that every capture gets. ``rms_px``: its RMS reprojection error (px)."""
-
-    label: str
-    created: str
-    rms_px: float | None
-
-
-class LastCapture(TypedDict):
-    """Holds the id, time and source of the newest capture."""
-
-    id: str
-    created: str
-    source: str
-
-
-class PlatesLine(TypedDict):
-    """Holds a version of the clean plates and why it was refused, if it was."""
-
-    id: str
-    taken: str
-    faults: list[MessageDocument]
-
-
-class PlatesShown(TypedDict):
-    """Holds when the clean plates in use were taken, the version before them, and a newer one that was refused."""
-
-    taken: str
-    before: PlatesLine | None
-    refused: PlatesLine | None
-
-
-class RigShown(TypedDict):
-    """Holds what the page shows of the rig, the same to all callers. ``ask_consent``: captures need a session with a
-    note of consent."""
-
-    kind: str
-    ready: bool
-    cameras: list[Tile]
-    faults: list[MessageDocument]
-    calibration: str | None
-    in_use: InUse | None
-    sessions: list[JsonObject]
-    last: LastCapture | None
-    plates: PlatesShown | None
-    ask_consent: bool
-
-
-class JobStrip(TypedDict):
-    """Holds what the page shows of a job that was started on it. ``detail``: why it failed or cannot begin."""
-
-    id: str
-    state: str
-    stage: str
-    progress: float
-    eta_s: float | None
-    detail: MessageDocument | None
-
-
-class RigPageShown(RigShown):
-    """Holds what the page shows. ``shot``: the capture taken here on which the operator has not decided; ``job``: the
-    job started here last."""
-
-    shot: JsonObject | None
-    job: JobStrip | None
 
 
 class RigPage(Page, component="rig.js"):
     """Shows the rig: live pictures, state, calibration and clean plates, and the shot that was just taken."""
 
-    def look(self) -> RigPageShown:
-        """Returns the state of the rig, and the shot and job that were started on this page."""
-        state: RigShown = shared.get("rig", 0.4, lambda: rig_state(self.service))
+    def look(self) -> JsonObject:
+        """Returns the state of the rig, the shot taken here on which the operator has not decided, and the job started
+        here last."""
+        state: JsonObject = shared.get("rig", 0.4, lambda: rig_state(self.service))
         job = job_strip(self.service, self.choice.get("job"))
         return {**state, "shot": shot_taken(self.service, self.choice.get("shot")), "job": job}
 
 
-def job_strip(service: Service, identity: str | None) -> JobStrip | None:
-    """Returns what the page shows of a job; None if there is none or it is being removed."""
+def job_strip(service: Service, identity: str | None) -> JsonObject | None:
+    """Returns what the page shows of a job, with ``detail``: why it failed or cannot begin. Returns None if there is
+    none or it is being removed."""
     jobs = service.jobs.of([identity]) if identity is not None and identity not in removals else []
     if not jobs:
         return None
     job = jobs[0]
     detail = shown_detail(job.error.detail) if job.error is not None else job.notice
-    return {
-        "id": job.id,
-        "state": job.state,
-        "stage": job.stage,
-        "progress": job.progress,
-        "eta_s": job.eta_s,
-        "detail": None if detail is None else detail.document(),
-    }
+    shown = job.model_dump(include={"id", "state", "stage", "progress", "eta_s"})
+    return shown | {"detail": None if detail is None else detail.document()}
 
 
 def shot_taken(service: Service, identity: str | None) -> JsonObject | None:
@@ -138,22 +55,15 @@ def shot_taken(service: Service, identity: str | None) -> JsonObject | None:
     return None
 
 
-def rig_state(service: Service) -> RigShown:
-    """Returns what the page shows beside the live pictures: drivers, the last shot's sync, calibration and clean
-    plates."""
+def rig_state(service: Service) -> JsonObject:
+    """Returns what the page shows beside the live pictures, the same to all callers: drivers, the last shot's sync,
+    which cameras have moved, calibration and clean plates."""
     rig = service.rig.describe()
     last = service.captures.newest()
     sync = {} if last is None or last.shot is None else sync_of(last.shot)
     moved = moved_cameras(service)
-    cameras: list[Tile] = [
-        {
-            "name": camera.name,
-            "driver": camera.driver,
-            "state": camera.state,
-            "sync": sync.get(camera.name),
-            "moved": camera.name in moved,
-        }
-        for camera in rig.cameras
+    cameras = [
+        camera.model_dump() | {"sync": sync.get(camera.name), "moved": camera.name in moved} for camera in rig.cameras
     ]
     return {
         "kind": rig.kind,
@@ -169,9 +79,9 @@ def rig_state(service: Service) -> RigShown:
     }
 
 
-def plates_shown(versions: list[PlatesVersion]) -> PlatesShown | None:
-    """Returns what the page shows of the clean plates, from their versions, newest first. Returns None if no version is
-    in use, as in the simulated studio."""
+def plates_shown(versions: list[PlatesVersion]) -> JsonObject | None:
+    """Returns when the clean plates in use were taken, the version before them, and a newer one that was refused, from
+    their versions, newest first. Returns None if no version is in use, as in the simulated studio."""
     in_use = next((version for version in versions if version.in_use), None)
     if in_use is None:
         return None
@@ -180,26 +90,20 @@ def plates_shown(versions: list[PlatesVersion]) -> PlatesShown | None:
     return {"taken": in_use.taken, "before": _plates_line(before), "refused": _plates_line(refused)}
 
 
-def _plates_line(version: PlatesVersion | None) -> PlatesLine | None:
+def _plates_line(version: PlatesVersion | None) -> JsonObject | None:
     return (
         None if version is None else {"id": version.id, "taken": version.taken, "faults": documents_of(version.refused)}
     )
 
 
-def calibration_in_use(service: Service) -> InUse | None:
-    """Returns label, time and residual of the calibration that every capture gets; None if this service did not make
-    it."""
+def calibration_in_use(service: Service) -> JsonObject | None:
+    """Returns label, time and RMS reprojection error (px) of the calibration that every capture gets; None if this
+    service did not make it."""
     if service.calibrations.in_use() is None:
         return None
     known: list[CalibrationOut] = shared.get("calibrations", 2.0, service.calibrations.find)
-    for camera in known:
-        if camera.in_use:
-            return {
-                "label": camera.label,
-                "created": camera.created,
-                "rms_px": cast(float | None, camera.figures.get("rms_px")),
-            }
-    return None
+    used = next((one for one in known if one.in_use), None)
+    return used and {"label": used.label, "created": used.created, "rms_px": used.figures.get("rms_px")}
 
 
 def moved_cameras(service: Service) -> set[str]:

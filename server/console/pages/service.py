@@ -6,7 +6,7 @@ from typing import TypedDict
 from nicegui.events import GenericEventArguments
 
 from rig.errors import InputError
-from rig.messages.message import Message, MessageDocument, compose
+from rig.messages.message import Message, compose
 from server.console.page import Action, Chosen, Page, remove_all_later, serve_page, shared
 from server.errors import Conflict
 from server.services.keys import LOCAL, SCOPES, Caller
@@ -31,38 +31,6 @@ MEANINGS = {
 }
 
 
-class KeyLine(TypedDict):
-    """Holds an API key without its secret. ``is_yours``: the caller uses it."""
-
-    id: str
-    name: str
-    scopes: list[str]
-    created: str
-    is_yours: bool
-
-
-class SettingLine(TypedDict):
-    """Holds one setting of retention: its environment variable, its value in words, and its meaning."""
-
-    name: str
-    variable: str
-    value: MessageDocument
-    means: MessageDocument
-
-
-class ServiceShown(TypedDict):
-    """Holds what the page shows. ``keys``: None for a caller who may not see them; ``open``: there are no API keys, so
-    that whoever sits at this machine may do everything."""
-
-    keys: list[KeyLine] | None
-    open: bool
-    scopes: list[str]
-    admin: bool
-    retention: list[SettingLine]
-    upcoming: list[dict[str, object]]
-    storage: JsonObject
-
-
 class KeyForm(TypedDict):
     """Holds the name and the scopes of a new API key."""
 
@@ -76,8 +44,9 @@ class ServicePage(Page, component="service.js"):
 
     secret: str | None = None  # of a key that was made a moment ago, until the page has it
 
-    def look(self) -> ServiceShown:
-        """Returns the state of the page. Only callers with the scope admin see the keys."""
+    def look(self) -> JsonObject:
+        """Returns the state of the page. Only callers with the scope admin see the keys. ``open``: there are no API
+        keys, so that whoever sits at this machine may do everything."""
         admin, service = self.caller.may("admin"), self.service
         return {
             "keys": [*key_lines(service, self.caller)] if admin else None,
@@ -101,7 +70,7 @@ def storage_shown(service: Service) -> JsonObject:
     return service.storage.use().model_dump() | {"data": str(service.store.data.resolve())}
 
 
-def key_lines(service: Service, caller: Caller) -> list[KeyLine]:
+def key_lines(service: Service, caller: Caller) -> list[JsonObject]:
     """Converts all API keys to entries of the page's list, oldest first. ``caller`` decides which key is yours."""
     return [
         {
@@ -115,7 +84,7 @@ def key_lines(service: Service, caller: Caller) -> list[KeyLine]:
     ]
 
 
-def setting_lines(s: ServiceSettings) -> list[SettingLine]:
+def setting_lines(s: ServiceSettings) -> list[JsonObject]:
     """Converts the settings of retention to entries of the page's list, with their values in words."""
     values = {
         "keep_captures_days": _days(s.keep_captures_days),

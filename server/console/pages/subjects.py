@@ -1,38 +1,31 @@
 """The page Subjects: people as cards, each with a picture of the newest head and links to shots and heads."""
 
 from collections.abc import Mapping
-from typing import TypedDict, cast, get_args
+from typing import cast, get_args
 
 from rig.messages.message import Message
 from server.console.page import Action, Page, serve_page, shared
 from server.console.pages.captures import SessionForm, new_session
 from server.services.service import Service
 from server.storage.library import SubjectOrder
+from server.storage.records import JsonObject
 
 SHOWN = 48
 ASKED = ("find", "tag", "sort", "after")
 
 
-class SubjectsState(TypedDict):
-    """Holds one page of the list of subjects. ``tags``: the tags of all captures, to choose from."""
-
-    subjects: list[Mapping[str, object]]
-    tags: list[str]
-    next: str | None
-    total: int
-
-
 class SubjectsPage(Page, component="subjects.js"):
     """Shows the people of the library, each with a picture of the newest head."""
 
-    def look(self) -> SubjectsState:
+    def look(self) -> JsonObject:
         """Returns one page of the list of subjects."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
         return shared.get(("subjects", *requested.values()), 1.0, lambda: subjects_state(self.service, requested))
 
 
-def subjects_state(service: Service, requested: Mapping[str, str | None]) -> SubjectsState:
-    """Returns one page of the subjects that match a search and a tag, in the requested order."""
+def subjects_state(service: Service, requested: Mapping[str, str | None]) -> JsonObject:
+    """Returns one page of the subjects that match a search and a tag, in the requested order, and the tags of all
+    captures, to choose from."""
     order = cast(SubjectOrder, requested["sort"] if requested["sort"] in get_args(SubjectOrder) else "-created")
     subjects = service.sessions.subjects(
         requested["find"] or "", order, SHOWN, requested["after"], tag=requested["tag"]

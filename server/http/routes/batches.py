@@ -3,11 +3,11 @@ heads."""
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Response
+from fastapi import APIRouter, Query, Response
 from fastapi.responses import StreamingResponse
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-from server.http.auth import ServiceOf, require
+from server.http.auth import Reader, ServiceOf, Submitter
 from server.http.schemas import (
     DELIVER_TO,
     EXAMPLE_ID,
@@ -20,10 +20,10 @@ from server.http.schemas import (
     Received,
     Sought,
     Text,
+    example,
 )
 from server.services.answer import JobSettings
 from server.services.batches import PRIORITY, BatchRequest, Selection
-from server.services.keys import Caller
 from server.services.records import BatchOut
 from server.services.work import ReconstructionRequest
 from server.storage.batches import BatchState
@@ -31,8 +31,6 @@ from server.wire.batch_files import PARQUET_TYPE, PDF_TYPE, SheetFormat, TableFo
 from server.wire.problems import Responses, documented
 
 router = APIRouter(prefix="/v1", tags=["batches"])
-Reader = Annotated[Caller, Depends(require("read"))]
-Submitter = Annotated[Caller, Depends(require("submit"))]
 TEXT = {"schema": {"type": "string"}}
 TABLE: Responses = {200: {"content": {"text/csv": TEXT, PARQUET_TYPE: {}}}, **documented(404, 409)}
 SHEET: Responses = {200: {"content": {"text/html": TEXT, PDF_TYPE: {}}}, **documented(404)}
@@ -41,13 +39,8 @@ SHEET: Responses = {200: {"content": {"text/html": TEXT, PDF_TYPE: {}}}, **docum
 class NewBatch(Received):
     """Requests a batch. Its captures are named in one of three ways: ``captures``, ``session`` or ``prefix``."""
 
-    model_config = ConfigDict(
-        json_schema_extra={
-            "examples": [
-                {"label": "Study 4", "prefix": "S4-", "settings": {"detail": "fine"}},
-                {"captures": [EXAMPLE_ID]},
-            ]
-        }
+    model_config = example(
+        {"label": "Study 4", "prefix": "S4-", "settings": {"detail": "fine"}}, {"captures": [EXAMPLE_ID]}
     )
 
     captures: list[Id] | None = Field(None, min_length=1, max_length=100_000)

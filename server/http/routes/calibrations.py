@@ -1,17 +1,15 @@
 """Declares the routes of calibrations, made from an archive of board pictures or from shots that the rig took."""
 
 import json
-from typing import Annotated
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse
 from pydantic import ValidationError
 
 from rig.messages.message import compose
-from server.http.auth import ServiceOf, require
-from server.http.calibration_schemas import CalibrationList, NewCalibration
-from server.services.keys import Caller
+from server.http.auth import Reader, ServiceOf, Taker
+from server.http.schemas import CalibrationList, NewCalibration
 from server.services.records import CalibrationOut
 from server.wire.multipart import check_length, described_form, receive_calibration_pictures
 from server.wire.patience import IDLE_TIMEOUT_S, with_idle_timeout
@@ -19,8 +17,6 @@ from server.wire.problems import Problem, Responses, documented
 from server.wire.send_file import send_file
 
 router = APIRouter(prefix="/v1/calibrations", tags=["calibrations"])
-Reader = Annotated[Caller, Depends(require("read"))]
-Taker = Annotated[Caller, Depends(require("capture"))]
 JSON_BYTES = 1 << 20
 
 BODY = described_form(

@@ -5,16 +5,16 @@ from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse
 
 from rig.errors import InputError
 from rig.messages.message import compose
 from server.errors import Forbidden
-from server.http.auth import ServiceOf, require
-from server.http.rig_schemas import CaptureChecks
+from server.http.auth import Reader, ServiceOf, Submitter, Taker
 from server.http.schemas import (
     CaptureBulk,
+    CaptureChecks,
     CaptureEdit,
     CaptureList,
     CaptureOut,
@@ -32,7 +32,6 @@ from server.services.bulk import BulkOut, each
 from server.services.captures import CaptureMetadata
 from server.services.erasure import HoldingsOut
 from server.services.imports import fetch_stored_capture
-from server.services.keys import Caller
 from server.services.records import JobOut
 from server.services.texts import PLAIN, TEXT_MOST, checked_tags
 from server.services.work import ReconstructionRequest
@@ -45,8 +44,6 @@ from server.wire.problems import Responses, documented
 from server.wire.send_file import send_file
 
 router = APIRouter(prefix="/v1", tags=["captures"])
-Reader = Annotated[Caller, Depends(require("read"))]
-Taker = Annotated[Caller, Depends(require("capture"))]
 
 FIELDS = ("session", "label", "expression")
 OF_JOB = ("model", "name", "settings", "deliver_to")
@@ -228,11 +225,7 @@ def delete_capture(
     openapi_extra=described_form(ARCHIVE, (*FIELDS, "model", "name", "deliver_to"), tags=TAGS, settings="JSON object"),
 )
 async def reconstruct_upload(
-    service: ServiceOf,
-    caller: Annotated[Caller, Depends(require("submit"))],
-    request: Request,
-    response: Response,
-    idempotency_key: Idempotency = None,
+    service: ServiceOf, caller: Submitter, request: Request, response: Response, idempotency_key: Idempotency = None
 ) -> JobOut:
     """Receives a capture and queues its job in one call. The same Idempotency-Key with the same files and settings
     returns the first job."""

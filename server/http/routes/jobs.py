@@ -14,7 +14,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from rig.errors import InputError
 from rig.messages.message import compose
-from server.http.auth import ServiceOf, require
+from server.http.auth import Reader, ServiceOf, Submitter
 from server.http.schemas import (
     Cursor,
     Idempotency,
@@ -34,7 +34,6 @@ from server.http.schemas import (
 from server.services.answer import State
 from server.services.bulk import BulkOut, each
 from server.services.job_rows import FINISHED, STATUSES
-from server.services.keys import Caller
 from server.services.records import JobOut
 from server.services.work import ReconstructionRequest
 from server.storage.job_index import JobOrder, JobQuery
@@ -44,8 +43,6 @@ from server.wire.problems import Responses, documented
 from server.wire.send_file import media_type, send_archive, send_file, send_zip
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
-Reader = Annotated[Caller, Depends(require("read"))]
-Submitter = Annotated[Caller, Depends(require("submit"))]
 LOOKS_MOST = 8  # of a key's event streams in each ``poll_s``, at two queries; where there are more, each waits longer
 streams = Counter[str]()  # open ones, by key
 

@@ -4,17 +4,15 @@ from collections.abc import AsyncIterator
 from typing import Annotated
 
 import anyio
-from fastapi import APIRouter, Depends, Header, Query, Response
+from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import StreamingResponse
 
-from server.http.auth import ServiceOf, require
-from server.services.keys import Caller
+from server.http.auth import Reader, ServiceOf
 from server.services.live.seen import LiveOut
 from server.services.service import Service
 from server.wire.problems import documented
 
 router = APIRouter(prefix="/v1/rig", tags=["rig"])
-Reader = Annotated[Caller, Depends(require("read"))]
 EVENTS = "text/event-stream"
 LOOK_S = 0.05
 UNKEPT = {"Cache-Control": "no-store"}

@@ -1,37 +1,49 @@
-"""Declares the routes of health, readiness, metrics, models, templates, keys and webhooks, and the page that shows the
-API; and their documents."""
+"""Declares the routes of storage, retention, health, readiness, metrics, models, templates, keys and webhooks, and the
+page that shows the API; and their documents."""
 
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from fastapi import APIRouter, Depends, Response
+from fastapi import APIRouter, Response
 from fastapi.responses import FileResponse
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from rig.messages.message import compose
-from server.http.auth import ServiceOf, require
-from server.http.schemas import Received
+from server.http.auth import Admin, Reader, ServiceOf
+from server.http.schemas import Received, example
 from server.metrics import MEDIA_TYPE
 from server.services.answer import Answer
 from server.services.health import InfoOut, about, exposition, readiness
-from server.services.keys import Caller
 from server.services.records import NewWebhookOut, WebhookOut
+from server.services.retention import UpcomingOut, upcoming
 from server.services.service import CheckOut
+from server.services.storage_use import StorageOut
 from server.services.templates import TemplateOut, templates_at_hand
 from server.services.texts import PLAIN
 from server.wire.problems import Problem, documented
 
 router = APIRouter()
-Reader = Annotated[Caller, Depends(require("read"))]
-Admin = Annotated[Caller, Depends(require("admin"))]
 DOCS = Path(__file__).parents[1] / "static" / "docs.html"
+
+
+class RetentionOut(Answer):
+    """Describes how long captures, results and caches are kept, and what is removed next."""
+
+    keep_captures_days: float | None = Field(description="null: for ever")
+    keep_results_days: float | None = Field(description="null: for ever")
+    keep_jobs: int | None = Field(description="finished jobs; null: all")
+    make_room: bool = Field(description="whether the oldest results go when the disk is full")
+    free_bytes: int
+    cache_bytes: int
+    upload_hours: float
+    upcoming: list[UpcomingOut] = Field(description="what goes next if nothing comes, jobs first")
 
 
 class NewWebhook(Received):
     """Adds an address to which the service announces the end of every job and batch."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"url": "https://lab.example/hooks/heads"}]})
+    model_config = example({"url": "https://lab.example/hooks/heads"})
 
     url: str = Field(pattern="^https?://[^\\x00-\\x1f\\x7f]*$", max_length=2000)
 
@@ -39,9 +51,7 @@ class NewWebhook(Received):
 class NewKey(Received):
     """Requests an API key with scopes. ``admin`` includes the other scopes."""
 
-    model_config = ConfigDict(
-        json_schema_extra={"examples": [{"name": "console", "scopes": ["read", "capture", "submit"]}]}
-    )
+    model_config = example({"name": "console", "scopes": ["read", "capture", "submit"]})
 
     name: str = Field(min_length=1, max_length=200, pattern=PLAIN)
     scopes: list[Literal["read", "capture", "submit", "erase", "admin"]] = Field(min_length=1, max_length=5)
@@ -107,6 +117,21 @@ class TemplateList(Answer):
     """Holds the templates at hand, sorted by name."""
 
     templates: list[TemplateOut]
+
+
+@router.get("/v1/storage", tags=["operations"], responses=documented())
+def get_storage(service: ServiceOf, caller: Reader) -> StorageOut:
+    """Returns the bytes of each kind of data, as they were last measured. If that is older than five minutes, a new
+    measurement starts, but the answer does not wait for it."""
+    return service.storage.use()
+
+
+@router.get("/v1/retention", tags=["operations"], responses=documented())
+def get_retention(service: ServiceOf, caller: Reader) -> RetentionOut:
+    """Returns how long captures and finished jobs are kept (set by the variables ``EIGENHEAD_KEEP_...``), and what is
+    removed next."""
+    settings = {name: getattr(service.settings, name) for name in RetentionOut.model_fields if name != "upcoming"}
+    return RetentionOut(**settings, upcoming=upcoming(service))
 
 
 @router.get("/docs", include_in_schema=False)

@@ -6,21 +6,25 @@ from contextlib import suppress
 from typing import Annotated
 
 import anyio
-from fastapi import APIRouter, Depends, Query, Response
+from fastapi import APIRouter, Query, Response
 from fastapi.responses import StreamingResponse
 
 from server.errors import Unavailable
-from server.http.auth import ServiceOf, require
-from server.http.calibration_schemas import UseCalibration
-from server.http.rig_schemas import BackgroundOut, CameraSettingsEdit, Lights, PlatesList, PlatesOut, UsePlates
-from server.services.keys import Caller
+from server.http.auth import Reader, ServiceOf, Taker
+from server.http.schemas import (
+    BackgroundOut,
+    CameraSettingsEdit,
+    Lights,
+    PlatesList,
+    PlatesOut,
+    UseCalibration,
+    UsePlates,
+)
 from server.services.records import CameraSettingsOut, RigOut
 from server.services.service import Service
 from server.wire.problems import documented
 
 router = APIRouter(prefix="/v1/rig", tags=["rig"])
-Reader = Annotated[Caller, Depends(require("read"))]
-Taker = Annotated[Caller, Depends(require("capture"))]
 PARTS = "multipart/x-mixed-replace; boundary=frame"
 PICTURE_EVERY_S = 0.25
 UNKEPT = {"Cache-Control": "no-store"}

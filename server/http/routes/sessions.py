@@ -1,20 +1,14 @@
 """Declares the routes of sessions, the captures of one subject, and of their erasure."""
 
-from typing import Annotated
+from fastapi import APIRouter, Response
 
-from fastapi import APIRouter, Depends, Response
-
-from server.http.auth import ServiceOf, require
+from server.http.auth import Eraser, Reader, ServiceOf, Taker
 from server.http.schemas import Cursor, Limit, NewSession, SessionEdit, SessionList, Sought, SubjectList, WithTag
-from server.services.keys import Caller
 from server.services.records import SessionOut
 from server.storage.library import SubjectOrder
 from server.wire.problems import documented
 
 router = APIRouter(prefix="/v1", tags=["sessions"])
-Reader = Annotated[Caller, Depends(require("read"))]
-Taker = Annotated[Caller, Depends(require("capture"))]
-Eraser = Annotated[Caller, Depends(require("erase"))]
 
 
 @router.post("/sessions", status_code=201, responses=documented(400, 413, 415, 507))

@@ -25,7 +25,7 @@ from rig.rig import Rig
 from server.errors import Refused
 from server.services.live.seen import LiveOut, Seen, Word, word_out
 from server.services.live.words import Speaker, lamps_of
-from server.services.rigs.backend import RigBackend
+from server.services.rigs import RigBackend
 from server.tasks.child import Child, WorkerContext
 
 EVERY_S = 0.3  # from look to look at least

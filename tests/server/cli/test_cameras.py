@@ -17,7 +17,7 @@ from rig.formats.cameras.cameras_json import read_rig, write_rig
 from rig.formats.pictures.images import write_image
 from server.cli.answers import CannotWrite
 from server.cli.main import app
-from server.http.calibration_schemas import NewCalibration
+from server.http.schemas import NewCalibration
 from tests.server.cli.test_main import run
 from tests.support.board_sessions import CHARUCO, rig_of
 from tests.support.services import ROOT

@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from server.http.tus import append
+from server.http.routes.uploads import append
 from server.services.threads import Threads
 from server.services.uploads import ResumableUploads
 from server.settings import ServiceSettings

@@ -18,9 +18,7 @@ from rig.messages.message import texts_of
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from rig.studio.scene.layout import default_layout
 from server.errors import Conflict, NotFound, Unavailable
-from server.services.rigs.backend import jpeg, reduced
-from server.services.rigs.real import RealRig
-from server.services.rigs.simulated import SimulatedRig
+from server.services.rigs import RealRig, SimulatedRig, jpeg, reduced
 from server.services.service import open_rig
 from server.settings import ServiceSettings
 from tests.rig.acquisition.test_session import flat_rig
@@ -130,7 +128,7 @@ def test_settings_reach_the_driver_and_are_kept(
         configured[camera.name] = camera
         return driver_for(camera, folder)
 
-    monkeypatch.setattr("server.services.rigs.real.RigSession", lambda config: RigSession(config, noting))
+    monkeypatch.setattr("server.services.rigs.RigSession", lambda config: RigSession(config, noting))
     rig.look()
     assert configured["cam03"].exposure_ms is None
     changed = rig.set_camera("cam03", {"exposure_ms": 8.0, "gain_db": 3.0})

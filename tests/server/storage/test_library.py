@@ -13,7 +13,7 @@ from rig.errors import InputError
 from server.settings import ServiceSettings
 from server.storage.database import capture_index, open_database
 from server.storage.library import CaptureQuery, Library, subject_of
-from server.storage.pages import CursorPage, page_of
+from server.storage.pages import Page, page_of
 from server.storage.records import CAPTURE, CaptureRecord, SessionRecord
 from server.storage.store import Store
 from tests.server.storage.test_records import capture_record, stored
@@ -45,7 +45,7 @@ def walked(library: Library, query: CaptureQuery, limit: int) -> list[str]:
     found, cursor = [], None
     while True:
         page = library.captures(query, limit, cursor)
-        found += page.ids
+        found += page.items
         if (cursor := page.next) is None:
             return found
 
@@ -54,11 +54,11 @@ def test_pages_go_on_where_they_ended_whatever_comes_and_goes(store: Store, libr
     for number in range(1, 8):
         stored(store, capture(number))
     first = library.captures(CaptureQuery(), 3)
-    assert (first.ids, first.total) == ((identity(7), identity(6), identity(5)), 7)
+    assert (first.items, first.total) == ((identity(7), identity(6), identity(5)), 7)
     stored(store, capture(9))  # a newer one, and one of the first page goes
     store.remove_capture(identity(6))
     second = library.captures(CaptureQuery(), 3, first.next)
-    assert second.ids == (identity(4), identity(3), identity(2))
+    assert second.items == (identity(4), identity(3), identity(2))
     assert library.captures(CaptureQuery(), 3, second.next).next is None
 
 
@@ -74,7 +74,7 @@ def test_every_order_shows_each_capture_once_though_values_are_equal(
     query = CaptureQuery(order=order)  # type: ignore[arg-type]
     found = walked(library, query, 4)
     assert sorted(found) == [identity(number) for number in range(1, 12)]
-    assert found == list(library.captures(query, 100).ids)
+    assert found == list(library.captures(query, 100).items)
     if order == "label":
         labels = [store.capture(one).label.casefold() for one in found]
         assert labels == sorted(labels)
@@ -86,7 +86,7 @@ def test_words_are_found_in_the_capture_and_in_its_session(store: Store, library
     stored(store, capture(3, label="front", board=True))
 
     def found(sought: str, **more: object) -> tuple[str, ...]:
-        return library.captures(replace(CaptureQuery(sought), **more), 10).ids
+        return library.captures(replace(CaptureQuery(sought), **more), 10).items
 
     assert found("müller") == found("POOR änne") == found("100%_l") == (identity(2),)
     assert found("2") == ()  # a digit stands in too many ids
@@ -124,15 +124,15 @@ def test_sessions_of_one_name_are_one_person(store: Store, library: Library) -> 
     for number, label in ((1, "Anna"), (2, "bert"), (3, "anna "), (4, ""), (5, "")):
         store.add_session(session(number, label))
     page = library.subjects("", "-created", 10)
-    assert page.subjects == ((identity(5),), (identity(4),), (identity(3), identity(1)), (identity(2),))
+    assert page.items == ((identity(5),), (identity(4),), (identity(3), identity(1)), (identity(2),))
     assert page.total == 4
     by_name = library.subjects("", "label", 2)
-    assert by_name.subjects == ((identity(4),), (identity(5),))
-    assert library.subjects("", "label", 2, by_name.next).subjects == ((identity(3), identity(1)), (identity(2),))
-    assert library.subjects("anna", "-created", 10).subjects == ((identity(3), identity(1)),)
+    assert by_name.items == ((identity(4),), (identity(5),))
+    assert library.subjects("", "label", 2, by_name.next).items == ((identity(3), identity(1)), (identity(2),))
+    assert library.subjects("anna", "-created", 10).items == ((identity(3), identity(1)),)
     assert library.sessions_of(subject_of(session(1, "ANNA"))) == [identity(1), identity(3)]
     store.remove_session(identity(3))
-    assert library.subjects("anna", "-created", 10).subjects == ((identity(1),),)
+    assert library.subjects("anna", "-created", 10).items == ((identity(1),),)
 
 
 def test_each_start_mends_what_differs_from_the_records(tmp_path: Path, library: Library) -> None:
@@ -140,20 +140,20 @@ def test_each_start_mends_what_differs_from_the_records(tmp_path: Path, library:
     for number in (1, 2, 3):
         stored(bare, capture(number, label=f"old {number}", tags=(f"tag {number}", "all")))
     bare.add_session(session(4, "Anna"))
-    assert library.captures(CaptureQuery(), 10).ids == ()
-    assert library.reconcile(bare) == 4
-    assert library.reconcile(bare) == 0
+    assert library.captures(CaptureQuery(), 10).items == ()
+    assert library.reconcile(bare.changes, bare.found) == 4
+    assert library.reconcile(bare.changes, bare.found) == 0
     assert library.tags(2) == ["all", "tag 1"]
-    assert library.captures(CaptureQuery(tag="Tag 2"), 10).ids == (identity(2),)
+    assert library.captures(CaptureQuery(tag="Tag 2"), 10).items == (identity(2),)
     shutil.rmtree(bare.folder("captures", identity(1)))  # by somebody else
     path = bare.folder("captures", identity(2)) / "record.json"  # from a backup
     path.write_text(json.dumps(CAPTURE.document(capture(2, label="restored"))))
     (bare.folder("captures", identity(3)) / "record.json").write_text("{")
-    assert library.reconcile(bare) == 2
+    assert library.reconcile(bare.changes, bare.found) == 2
     assert library.tags(9) == ["all", "tag 3"], "the damaged one goes when it was found damaged"
-    assert library.captures(CaptureQuery("restored"), 10).ids == (identity(2),)
-    library.reconcile(bare)
-    assert library.captures(CaptureQuery(), 10).ids == (identity(2),)  # the damaged one was set aside
+    assert library.captures(CaptureQuery("restored"), 10).items == (identity(2),)
+    library.reconcile(bare.changes, bare.found)
+    assert library.captures(CaptureQuery(), 10).items == (identity(2),)  # the damaged one was set aside
     assert library.tags(9) == []
 
 
@@ -162,9 +162,9 @@ def test_a_record_that_no_column_takes_does_not_keep_the_service_from_starting(s
     for number in range(1, 6):
         stored(bare, capture(number, bytes=1 << 70 if number == 3 else 1, label="Anna\0", tags=("a\0b",)))
     bare.add_session(SessionRecord(identity(9), "2026-01-01T00:00:00.000Z", "Anna\0", ""))
-    assert library.reconcile(store) == 5
-    assert library.captures(CaptureQuery("anna", tag="ab"), 10).ids == tuple(identity(n) for n in (5, 4, 2, 1))
-    assert library.subjects("anna", "-created", 10).subjects == ((identity(9),),)
+    assert library.reconcile(store.changes, store.found) == 5
+    assert library.captures(CaptureQuery("anna", tag="ab"), 10).items == tuple(identity(n) for n in (5, 4, 2, 1))
+    assert library.subjects("anna", "-created", 10).items == ((identity(9),),)
     with library._engine.connect() as connection:
         stored_texts = [*connection.scalars(sa.select(capture_index.c.label)), *library.tags(10)]
     assert not any("\0" in text for text in stored_texts)
@@ -176,10 +176,10 @@ def test_a_page_of_people_passes_over_who_was_erased_meanwhile(
     for number in (1, 2):
         store.add_session(session(number, f"Anna {number}"))
 
-    def page_then_erasure(*arguments: Any, **named: Any) -> CursorPage:
+    def page_then_erasure(*arguments: Any, **named: Any) -> Page:
         page = page_of(*arguments, **named)
         store.remove_session(identity(1))
         return page
 
     monkeypatch.setattr("server.storage.library.page_of", page_then_erasure)
-    assert library.subjects("", "-created", 10).subjects == ((identity(2),),)
+    assert library.subjects("", "-created", 10).items == ((identity(2),),)

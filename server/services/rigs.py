@@ -1,4 +1,8 @@
-"""Makes the real cameras that a rig.toml describes usable as the service's rig."""
+"""The rig behind ``POST /v1/captures``: the simulated studio, or real cameras that a rig.toml names.
+
+A calibration that was put to use lies in ``<data>/rig/cameras.json``. Every later capture gets a copy of it. Until
+there is one, captures get the rig's own: the studio's layout, or the file that rig.toml names.
+"""
 
 import json
 import threading
@@ -6,6 +10,10 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
 
 from rig.acquisition.commands import board_shot
 from rig.acquisition.judgement import PlatesRefused
@@ -20,12 +28,17 @@ from rig.formats.captures.capture_folder import write_capture
 from rig.formats.pictures.images import write_image
 from rig.formats.rig_toml import RigConfig, adjusted, read_rig_config
 from rig.image import ImageRgb
-from rig.messages.message import compose, message_of
+from rig.messages.message import Message, compose, message_of
 from rig.rig import Rig
 from server.errors import Conflict, NotFound, Unavailable
 from server.services.records import CameraOut, CameraSettingsOut, CleanPlates, RigOut
-from server.services.rigs.backend import check_names, jpeg, rig_state
 from server.storage.records import RIG_ADJUSTMENT, RigAdjustment
+from server.tasks.child import Child, WorkFailed
+from server.tasks.simulate import SimulatedCertificate, look, simulated
+
+SHOT_BYTES = 64 << 20  # that a shot may take on the disk
+PREVIEW_WIDTH = 640  # pixels
+PREVIEW_QUALITY = 80  # of JPEG, 0 to 100
 
 
 class RealRig:
@@ -230,3 +243,139 @@ class RealRig:
             if self._config.calibration_file is not None:
                 return read_rig(self._config.calibration_file)
         return None
+
+
+class SimulatedRig:
+    """Takes shots of the simulated studio, one at a time. A child process with an OpenGL context of its own renders
+    them. The true shape of each subject is written beside its capture."""
+
+    def __init__(self, calibration: Path) -> None:
+        self._calibration = calibration
+        self._child = Child(niceness=3)
+        self._one_at_a_time = threading.Lock()
+
+    def describe(self) -> RigOut:
+        """Returns the state of the studio, whose cameras are always ready."""
+        cameras = [CameraOut(name=name, driver="simulated", state="ready") for name in self._rig().names]
+        return rig_state("simulated", "simulated", cameras, [], "own" if self._calibration.is_file() else "studio")
+
+    def calibrated(self) -> Rig:
+        """Returns the calibration that was put to use, or the studio's own layout."""
+        return read_rig(self._calibration) if self._calibration.is_file() else self._rig()
+
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> SimulatedCertificate:
+        """Takes a shot of a person, also if ``board`` is set, since the studio has no board. Raises Unavailable if the
+        child process fails."""
+        with self._one_at_a_time:
+            try:
+                shot = self._child.remote(simulated)(folder=str(folder), seed=seed)
+            except WorkFailed as error:
+                raise Unavailable("shot-failed", error.message, [error.message]) from error
+        if self._calibration.is_file():
+            write_rig(self.calibrated(), folder / "files" / "cameras.json")
+        return shot
+
+    def look(self) -> Mapping[str, ImageRgb]:
+        """Renders what each camera sees. The subject is the same every time."""
+        with self._one_at_a_time:
+            return self._child.remote(look)(cameras=list(self._rig().names))
+
+    def preview(self, camera: str) -> bytes:
+        """Renders what one camera sees, as a JPEG file. Raises NotFound for an unknown camera."""
+        if camera not in self._rig():
+            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
+        with self._one_at_a_time:
+            return jpeg(self._child.remote(look)(cameras=[camera])[camera])
+
+    def camera_settings(self, camera: str) -> CameraSettingsOut:
+        """Returns settings without values, since simulated cameras have none. Raises NotFound for an unknown camera."""
+        if camera not in self._rig():
+            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
+        return CameraSettingsOut(exposure_ms=None, gain_db=None, white_balance_k=None, unmet=())
+
+    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettingsOut:
+        """Raises Conflict, since simulated cameras cannot be set; NotFound for an unknown camera."""
+        self.camera_settings(camera)
+        raise _fixed_studio()
+
+    def lights(self) -> tuple[int, ...]:
+        """Returns no outputs: the studio's lights are fixed."""
+        return ()
+
+    def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
+        """Raises Conflict, since the studio's lights are fixed."""
+        raise _fixed_studio()
+
+    def take_background(self) -> CleanPlates:
+        """Takes no pictures, since the studio takes clean plates with every shot. Returns its cameras and a note that
+        says so."""
+        return CleanPlates(self._rig().names, 2, compose("hint-studio-plates"))
+
+    def plates(self) -> list[PlatesVersion]:
+        """Returns no versions: the studio keeps no clean plates."""
+        return []
+
+    def use_plates(self, version: str) -> None:
+        """Raises NotFound, since the studio keeps no clean plates."""
+        raise NotFound(compose("thing-plates-version"), version, compose("hint-studio-plates"))
+
+    def use(self, calibration: Path) -> None:
+        """Writes the calibration into every later capture in place of the studio's true cameras. Raises Conflict if it
+        has other cameras."""
+        check_names(read_rig(calibration), self._rig().names)
+        self._calibration.parent.mkdir(exist_ok=True)
+        write_rig(read_rig(calibration), self._calibration)
+
+    def close(self) -> None:
+        """Ends the child process that renders."""
+        self._child.close()
+
+    @staticmethod
+    def _rig() -> Rig:
+        from rig.studio.scene.layout import default_layout
+
+        return default_layout()
+
+
+def _fixed_studio() -> Conflict:
+    return Conflict("simulated-rig", compose("simulated-rig-fixed"))
+
+
+RigBackend = RealRig | SimulatedRig
+
+
+def check_names(rig: Rig, names: tuple[str, ...]) -> None:
+    """Raises Conflict, naming the cameras that only one of both has, unless a calibration is of the cameras
+    ``names``."""
+    if set(rig.names) != set(names):
+        differing = sorted(set(rig.names) ^ set(names))
+        faults = [compose("camera-in-one-alone", camera=name) for name in differing]
+        raise Conflict("other-rig", compose("calibration-of-other-rig"), faults)
+
+
+def rig_state(
+    identity: str,
+    kind: Literal["simulated", "real"],
+    cameras: list[CameraOut],
+    faults: list[Message],
+    calibration: str | None,
+) -> RigOut:
+    """Returns the state of a rig, which is ready if it has no fault and no camera is missing."""
+    ready = not faults and all(camera.state != "missing" for camera in cameras)
+    return RigOut(id=identity, kind=kind, ready=ready, cameras=cameras, faults=tuple(faults), calibration=calibration)
+
+
+def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:
+    """Encodes an RGB image as a JPEG file. An image wider than ``width`` pixels is reduced to that width."""
+    small = reduced(image, width)
+    done, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])
+    assert done
+    return data.tobytes()
+
+
+def reduced(image: ImageRgb, width: int) -> ImageRgb:
+    """Returns an image no wider than ``width`` pixels; its proportions stay. A smaller image is returned as it is."""
+    if image.shape[1] <= width:
+        return image
+    size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
