@@ -201,8 +201,8 @@ def _side(board: Board, key: str) -> int:
     return board.columns if "width" in key else board.rows
 
 
-def write_board_pdf(board: Board, path: Path) -> None:
-    """Writes the board as a PDF at true scale, on the smallest paper that holds it, with a ruler for the print."""
+def write_board_pdf(board: Board, path: Path) -> tuple[float, float]:
+    """Writes the board as a PDF at true scale, with a ruler, on the smallest paper that holds it: returned, mm."""
     width, height = board.columns * board.square_mm, board.rows * board.square_mm
     page = _paper(width, height)
     pdf = FPDF(unit="mm", format=page)
@@ -220,6 +220,7 @@ def write_board_pdf(board: Board, path: Path) -> None:
         pdf.rect(left + x, top + y, w, h, style="F")
     _draw_foot(pdf, board, page)
     write_atomically(path, bytes(pdf.output()))
+    return page
 
 
 def _paper(width: float, height: float) -> tuple[float, float]:

@@ -142,7 +142,9 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
     _warn_of_versions(folder, share_tasks)
     if not has_parquet():
         warn(compose("batch-no-parquet", install=how_to_install("parquet")).text)
-    answer(_document(outcomes, out, files, share, count, display.seconds()), json_out, [str(file) for file in files])
+    document = _document(outcomes, out, files, share, count, display.seconds())
+    counts = ", ".join(f"{document[state]} {state}" for state in ("made", "kept", "failed"))
+    answer(document, json_out, [*map(str, files), counts])
     if failed:
         fail(str(CapturesFailed([outcome.name for outcome in failed], len(share_tasks))))
 

@@ -15,6 +15,7 @@ from server.cli.answers import (
     prepare_file,
     prepare_folder,
     progress_bar,
+    switch,
     warn,
     warn_of_replacement,
     wrong_usage,
@@ -44,9 +45,7 @@ def board(
     from calibration.board.board import board_from_document, write_board, write_board_pdf
 
     if out.suffix.lower() not in ("", ".pdf"):
-        raise typer.BadParameter(
-            f"{out.suffix!r} is nothing that a board is written as; give a .pdf", param_hint="--out"
-        )
+        raise typer.BadParameter(f"{out.suffix!r}: a board is written as .pdf", param_hint="--out")
     columns, _, rows = squares.partition("x")
     if not (columns.isdigit() and rows.isdigit()):
         raise typer.BadParameter(f"{squares!r} is not like 9x6", param_hint="--squares")
@@ -55,10 +54,10 @@ def board(
         chosen = board_from_document(document, "board")
     for path in (out, out.with_name("board.toml")):
         prepare_file(path, overwrite=overwrite)
-    write_board_pdf(chosen, out)
+    paper = "{:g} x {:g} mm".format(*write_board_pdf(chosen, out))
     write_board(chosen, out.with_name("board.toml"))
     written = {"pdf": str(out), "board": str(out.with_name("board.toml"))}
-    answer(written, json_out, list(written.values()))
+    answer(written, json_out, [*written.values(), f"print on paper of {paper} at 100 %, then measure the pattern"])
 
 
 @app.command(
@@ -87,11 +86,9 @@ def calibrate(
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
     previous: Annotated[Path | None, typer.Option(help="The rig's last cameras.json.", exists=True)] = None,
     intrinsics_only: Annotated[
-        bool, typer.Option("--intrinsics-only", help="Of a board: each camera's lens alone; no common moments needed.")
+        bool, switch("--intrinsics-only", "A board: each lens alone; moments may differ.")
     ] = False,
-    anyway: Annotated[
-        bool, typer.Option("--anyway", help="Of a board: write cameras.json even where checks refuse it.")
-    ] = False,
+    anyway: Annotated[bool, switch("--anyway", "Of a board: write cameras.json even where checks refuse it.")] = False,
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:

@@ -63,39 +63,41 @@ def export(
     metres."""
     from pipeline.settings import FORMATS, OutputSettings
 
+    hospital, patients = form in ("dicom", "nifti"), form in ("slicer", "dicom", "nifti")
+    head = form in FORMATS
+    unused: dict[str, object] = {
+        "--axes": axes != "LPS" and form != "slicer", "--plane": plane != "head" and not patients,
+        "--marked": marked and not patients, "--patient": patient != "anonymous" and not hospital,
+        "--template": template and not head, "--morphs": morphs and not head, "--albedo": albedo and not head,
+        "--result": result and (head or patients), "--settings": settings and (head or patients),
+    }  # fmt: skip
+    for option in filter(unused.get, unused):
+        raise typer.BadParameter(f"changes nothing in {form}; leave it out", param_hint=option)
+    sign = out / (f"head.{form}" if head else "frame.json" if patients else "transforms.json")
+    if (head and out.resolve() == source.resolve()) or (sign.exists() and not overwrite):
+        raise Overwrites(sign)
     if form in FORMATS:
         outputs = OutputSettings(formats=(form,), template=template, morphs=morphs, albedo="file" if albedo else "none")
-        _export_head(source, out, outputs, overwrite=overwrite, json_out=json_out)
+        _export_head(source, out, outputs, json_out=json_out)
     elif form in ("slicer", "dicom", "nifti"):
         if not (patient.isascii() and patient.isalnum() and len(patient) <= LONGEST_PSEUDONYM):
             raise typer.BadParameter(f"at most {LONGEST_PSEUDONYM} letters and digits", param_hint="--patient")
-        _export_patient(
-            source, out, form, axes, plane, marked=marked, patient=patient, overwrite=overwrite, json_out=json_out
-        )
+        _export_patient(source, out, form, axes, plane, marked=marked, patient=patient, json_out=json_out)
     else:
-        _export_dataset(source, out, form, result=result, settings=settings, overwrite=overwrite, json_out=json_out)
+        _export_dataset(source, out, form, result=result, settings=settings, json_out=json_out)
 
 
-def _export_head(result: Path, out: Path, outputs: "OutputSettings", *, overwrite: bool, json_out: bool) -> None:
+def _export_head(result: Path, out: Path, outputs: "OutputSettings", *, json_out: bool) -> None:
     """Writes a result's head in another format."""
     from server.tasks.export_result import export_result
 
-    if out.resolve() == result.resolve() or ((out / f"head.{outputs.formats[0]}").exists() and not overwrite):
-        raise Overwrites(out / f"head.{outputs.formats[0]}")
     prepare_folder(out)
     files = export_result(result, out, outputs)
     answer({"out": str(out), "files": files}, json_out, [f"{out}  {', '.join(files)}"])
 
 
 def _export_dataset(
-    capture: Path,
-    out: Path,
-    form: "DatasetFormat",
-    *,
-    result: Path | None,
-    settings: Path | None,
-    overwrite: bool,
-    json_out: bool,
+    capture: Path, out: Path, form: "DatasetFormat", *, result: Path | None, settings: Path | None, json_out: bool
 ) -> None:
     """Writes a capture as a data set."""
     from pipeline.settings import settings_from_document
@@ -106,8 +108,6 @@ def _export_dataset(
 
     wanted = settings_from_document(settings_document(settings))
     check_apart(out, capture)
-    if (out / "transforms.json").exists() and not overwrite:
-        raise Overwrites(out / "transforms.json")
     prepare_folder(out)
     with progress_bar() as report, folder_of(capture) as folder:
         exported = export_folder(folder, out, form, result=result, chosen=wanted, report=report)
@@ -131,17 +131,14 @@ def _export_patient(
     *,
     marked: Path | None,
     patient: str,
-    overwrite: bool,
     json_out: bool,
 ) -> None:
     """Writes a result's head in a patient's axes."""
     from pipeline.applications.clinic.anatomical_frame import frankfurt_axes, head_axes
     from pipeline.applications.clinic.hospital_files import HOSPITAL_AXES, write_hospital_files
-    from pipeline.applications.clinic.patient_files import FRAME_FILE, marked_points, write_patient_files
+    from pipeline.applications.clinic.patient_files import marked_points, write_patient_files
     from pipeline.applications.clinic.visit import read_visit
 
-    if (out / FRAME_FILE).exists() and not overwrite:
-        raise Overwrites(out / FRAME_FILE)
     visit = read_visit(result)
     points = marked_points(marked, visit, axes)
     axes = axes if form == "slicer" else HOSPITAL_AXES[form]

@@ -68,7 +68,7 @@ def model_build(
     scans: Annotated[
         Path, typer.Argument(help="A folder of PLY, OBJ or GLB scans and their landmarks, or of results.", exists=True)
     ],
-    out: Annotated[Path, typer.Option(help="The model file to write.", dir_okay=False)],
+    out: Annotated[Path, typer.Option(help="The file to write; --model takes it.", dir_okay=False)],
     *,
     name: Annotated[str | None, typer.Option(help="What to call it.")] = None,
     skip_bad: Annotated[bool, typer.Option(help="Leave out scans that cannot be used, instead of stopping.")] = False,
@@ -154,7 +154,7 @@ def model_remove(
 ) -> None:
     """Remove a head model.
 
-    One that was imported, built or fetched; the shipped one stays."""
+    One that was imported or fetched; the shipped one stays."""
     from pipeline.head_model.model_names import remove_model
 
     path = remove_model(name)

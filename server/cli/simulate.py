@@ -29,21 +29,18 @@ Expressions = Annotated[
     list[str] | None, typer.Option(help="NAME=WEIGHT, 0 to 1; may be repeated. `eigenhead model info` lists the names.")
 ]
 Gaze = Annotated[
-    tuple[float, float] | None,
-    typer.Option(help="Azimuth (to the subject's left) and elevation, degrees: eyeballs that look there."),
+    tuple[float, float] | None, typer.Option(help="Azimuth (to the subject's left) and elevation of the eyes, degrees.")
 ]
 Faults = Annotated[
     list[str] | None, typer.Option(help=f"KIND[:CAMERA][=AMOUNT]; may be repeated. Kinds: {', '.join(KINDS)}.")
 ]
-BoardShots = Annotated[bool, typer.Option("--board", help="OUT/CAMERA/SHOT.png of the default board, and board.toml.")]
+BoardShots = Annotated[bool, typer.Option("--board", help="OUT/CAMERA/SHOT.png of a board, and board.toml.")]
+BoardFile = Annotated[Path | None, typer.Option(help="--board: of your own board; else 12 x 9 of 30 mm.", exists=True)]
 Realism = Annotated[
-    str | None,
-    typer.Option(help="NAME[,NAME] of what real photographs have: smooth, oily, scattering, mosaic, jpeg; or all."),
+    str | None, typer.Option(help="NAME[,NAME] of real photographs: smooth, oily, scattering, mosaic, jpeg; or all.")
 ]
 Frames = Annotated[int | None, typer.Option(help="Frames of a subject that moves and speaks.", min=2)]
-Served = Annotated[
-    bool, typer.Option("--serve", help="Keep the studio running as cameras and a trigger box, until Ctrl-C.")
-]
+Served = Annotated[bool, typer.Option("--serve", help="Run the studio as cameras and a trigger box, until Ctrl-C.")]
 
 
 @app.command(
@@ -70,6 +67,7 @@ def simulate(
     gaze: Gaze = None,
     fault: Faults = None,
     board: BoardShots = False,
+    board_file: BoardFile = None,
     sequence: Frames = None,
     serve: Served = False,
     port: Annotated[int, typer.Option(help="--serve: of the cameras; 0 takes a free one.", min=0, max=65535)] = 0,
@@ -85,7 +83,7 @@ def simulate(
     chosen |= {"rolling_ms": rolling_ms, "hair": not no_hair, "polarised": polarised}
     chosen["hairstyle"] = tuple(hair.split(",")) if hair else ()
     preset = _studio_preset(realism, **chosen)
-    _check_use(gaze, served_board=serve and board)
+    _check_use(gaze, served_board=serve and (board or board_file is not None))
     if serve:
         from server.tasks.subjects import SubjectChoice
 
@@ -95,9 +93,8 @@ def simulate(
         return
     if out is None:
         raise typer.BadParameter("say where the capture goes, or --serve", param_hint="OUT")
-    if board:
-        _photograph_board(out, seed, overwrite, json_out)
-        return
+    if board or board_file:
+        return _photograph_board(out, board_file, seed, overwrite, json_out)
     _check_planted(fault or [], expression or [])
     _make_way(out, overwrite)
     if sequence:
@@ -129,10 +126,8 @@ def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
     from rig.studio.sensor.realism import made_real, realism_names
 
     with wrong_usage("--realism"):
-        return made_real(
-            replace(PRESET, **{key: value for key, value in chosen.items() if value is not None}),
-            realism_names(realism),
-        )
+        named = {key: value for key, value in chosen.items() if value is not None}
+        return made_real(replace(PRESET, **named), realism_names(realism))
 
 
 def _check_planted(faults: list[str], expression: list[str]) -> None:
@@ -150,18 +145,19 @@ def _check_planted(faults: list[str], expression: list[str]) -> None:
             weights_from_text(expression, load_model().expressions.names)
 
 
-def _photograph_board(out: Path, seed: int, overwrite: bool, json_out: bool) -> None:
-    """Writes ``BOARD_SHOTS`` pictures of the default board by each of the studio's cameras as <camera>/<shot>.png, and
+def _photograph_board(out: Path, board_file: Path | None, seed: int, overwrite: bool, json_out: bool) -> None:
+    """Writes ``BOARD_SHOTS`` pictures of the board by each of the studio's cameras as <camera>/<shot>.png, and
     board.toml; the true cameras beside them."""
     import numpy as np
 
-    from calibration.board.board import Board, board_poses, photograph_board, write_board
+    from calibration.board.board import Board, board_poses, photograph_board, read_board, write_board
     from rig.formats.cameras.cameras_json import write_rig
     from rig.formats.pictures.images import write_image
     from rig.studio.scene.layout import default_layout
 
+    board = read_board(board_file) if board_file else Board("charuco", 12, 9, 30.0)
+    rng, studio = np.random.default_rng(seed), default_layout()
     _make_way(out, overwrite, "board.toml")
-    board, rng, studio = Board("charuco", 12, 9, 30.0), np.random.default_rng(seed), default_layout()
     with progress_bar() as report:
         for shot, pose in enumerate(board_poses(board, BOARD_SHOTS, rng)):
             report("simulate", shot / BOARD_SHOTS)

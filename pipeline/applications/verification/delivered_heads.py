@@ -74,9 +74,12 @@ def read_delivered(
 
 def _model_of(folder: Path, folders: tuple[Path, ...]) -> ModelParts:
     """Returns the one model that made all results. Raises InputError."""
-    made = {(identity.model, identity.sha256) for identity in map(identity_of, folders)}
+    made: dict[tuple[str, str], list[str]] = {}
+    for place, identity in zip(folders, map(identity_of, folders), strict=True):
+        made.setdefault((identity.model, identity.sha256), []).append(place.relative_to(folder).as_posix())
     if len(made) > 1:
-        raise InputError(str(folder), [compose("results-of-models", models=tuple(sorted({name for name, _ in made})))])
+        models = tuple(f"{name} [{', '.join(places[:3])}]" for (name, _), places in sorted(made.items()))
+        raise InputError(str(folder), [compose("results-of-models", models=models)])
     ((name, sha256),) = made
     for path in list_models().values():
         if model_sha256(path) == sha256:

@@ -96,7 +96,7 @@ def no_rig_fault(folder: Path) -> Message:
     if archives:
         return compose("archives-inside", archives=some_of(archives))
     inner = sorted(path for path in folder.iterdir() if path.is_dir() and not is_junk(path.name))
-    captures = [path.name for path in inner if find_rig_file(path) is not None]
+    captures = [path.name for path in inner if path.suffix != ".truth" and find_rig_file(path)]
     return compose("captures-inside", captures=some_of(captures)) if len(captures) > 1 else NO_RIG
 
 

@@ -205,7 +205,7 @@ TEMPLATES = {
     "line-strange-row": "line {line}: a corner names {row}, which is no row of the file",
     "lines-more": "and {more} lines more",
     "mesh-large": "has more than {vertices:,} vertices or {corners:,} corners, which is no template: decimate it",
-    "no-vertices": "holds no vertices",
+    "no-vertices": "holds no vertices: wanted is an OBJ file",
     "no-faces": "holds no faces",
     "face-beyond-vertices": "a face names vertex {row}, and there are {held}",
     "face-beyond-texture": "a face names texture {row}, and there are {held}",

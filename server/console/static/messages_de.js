@@ -1045,7 +1045,7 @@ export default {
   "line-strange-row": "Zeile {line}: Eine Ecke nennt {row}, was keine Zeile der Datei ist",
   "lines-more": "und {more} weitere Zeilen",
   "mesh-large": "hat mehr als {vertices:,} Punkte oder {corners:,} Ecken und ist damit keine Vorlage: das Netz vereinfachen",
-  "no-vertices": "enthält keine Punkte",
+  "no-vertices": "enthält keine Punkte: erwartet wird eine OBJ-Datei",
   "no-faces": "enthält keine Flächen",
   "face-beyond-vertices": "eine Fläche nennt den Punkt {row}, und es gibt {held}",
   "face-beyond-texture": "eine Fläche nennt die Texturkoordinate {row}, und es gibt {held}",

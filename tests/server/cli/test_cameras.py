@@ -25,14 +25,17 @@ from tests.support.textured_wedge import wedge_rig, write_photographs
 
 
 @pytest.mark.slow
-def test_the_studio_shows_a_board_that_gives_its_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_studio_shows_an_own_board_that_gives_its_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("server.cli.simulate.BOARD_SHOTS", 8)
     shots, out = tmp_path / "shots", tmp_path / "cameras.json"
-    assert CliRunner().invoke(app, ["simulate", str(shots), "--board", "--seed", "3"]).exit_code == 0
+    printed = CliRunner().invoke(
+        app, ["board", "--squares", "10x7", "--square-mm", "40", "--out", f"{tmp_path}/own.pdf"]
+    )
+    assert "paper of 420 x 594 mm" in printed.stdout
+    assert CliRunner().invoke(app, ["simulate", str(shots), f"--board-file={tmp_path}/board.toml"]).exit_code == 0
     for folder in sorted(shots.glob("cam*"))[6:]:  # six cameras show it as well as eleven
         shutil.rmtree(folder)
-    words = ["calibrate", str(shots), "--board", str(shots / "board.toml"), "--out", str(out), "--anyway"]
-    assert CliRunner().invoke(app, words).exit_code == 0
+    assert run("calibrate", str(shots), f"--board={shots}/board.toml", f"--out={out}", "--anyway").returncode == 0
     calibrated, studio = read_rig(out), read_rig(tmp_path / "shots.truth" / "cameras.json")
     true = pdist([studio[name].centre_world for name in calibrated.names])
     # Corners are found to 0.05 px, 0.03 mm at the board; the focal length of 8 views to 0.3 px, 0.2 mm of depth.
@@ -125,9 +128,7 @@ def test_formats_of_several_files_are_told_from_those_of_one(tmp_path: Path) -> 
 def test_a_board_is_written_as_pdf_alone(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["board", "--out", str(tmp_path / "b.xyz")])
     assert done.exit_code == 2
-    assert "'.xyz' is nothing that a board is written as; give a .pdf" in " ".join(
-        done.stderr.replace("│", " ").split()
-    )
+    assert "'.xyz': a board is written as .pdf" in " ".join(done.stderr.replace("│", " ").split())
     assert list(tmp_path.iterdir()) == []
 
 

@@ -42,9 +42,7 @@ OFFSETS_MM = np.array([(0, 0, 0), (0, 62, 0), (0, -60, 0)], float)
 @pytest.fixture(scope="module")
 def shot(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> tuple[Path, np.ndarray]:
     """A capture with plates, and points (mm) inside the head that every picture shows as dots."""
-    folder = (
-        small_studio_captures(tmp_path_factory.mktemp("shots"), 1, renderer, first=2) / "s2"
-    )  # all views of which are usable
+    folder = small_studio_captures(tmp_path_factory.mktemp("shots"), 1, renderer, first=2) / "s2"  # all are usable
     capture, rig = read_capture(folder)
     points = rig.centre_world() + OFFSETS_MM
     images = {camera.name: with_dots(capture.images[camera.name], camera, points) for camera in rig}
@@ -225,6 +223,7 @@ def test_a_data_set_is_replaced_only_on_request(shot: tuple[Path, np.ndarray], t
     exported(shot[0], out, "nerfstudio", "--overwrite")
     assert sorted(path.name for path in out.iterdir()) == ["images", "masks", "transforms.json"]
     assert len(list((out / "images").iterdir())) == 6
+    assert "changes nothing in nerfstudio" in CliRunner().invoke(app, [*again, "--plane=frankfurt"]).output
     inside = CliRunner().invoke(app, ["export", str(shot[0]), "--as", "nerfstudio", "--out", str(shot[0] / "images")])
     assert "the capture's own pictures" in str(inside.exception)
 

@@ -83,6 +83,6 @@ def test_what_makes_no_model_is_named(tmp_path: Path) -> None:
         build_from_results(tmp_path, tmp_path / "out.npz", name="out")
     document = json.loads((tmp_path / "a" / "report.json").read_text())
     (tmp_path / "a" / "report.json").write_text(json.dumps(document | {"model": {"name": "ict", "sha256": "0" * 64}}))
-    with pytest.raises(InputError, match=r"several models or versions \(ict, makehuman-138\)"):
+    with pytest.raises(InputError, match=r"versions \(ict \[a\], makehuman-138 \[b, c\]\)"):
         build_from_results(tmp_path, tmp_path / "out.npz", name="out")
     assert not (tmp_path / "out.npz").exists()
