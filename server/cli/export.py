@@ -76,10 +76,10 @@ def export(
     sign = out / (f"head.{form}" if head else "frame.json" if patients else "transforms.json")
     if (head and out.resolve() == source.resolve()) or (sign.exists() and not overwrite):
         raise Overwrites(sign)
-    if head:
+    if form in FORMATS:
         outputs = OutputSettings(formats=(form,), template=template, morphs=morphs, albedo="file" if albedo else "none")
         _export_head(source, out, outputs, json_out=json_out)
-    elif patients:
+    elif form in ("slicer", "dicom", "nifti"):
         if not (patient.isascii() and patient.isalnum() and len(patient) <= LONGEST_PSEUDONYM):
             raise typer.BadParameter(f"at most {LONGEST_PSEUDONYM} letters and digits", param_hint="--patient")
         _export_patient(source, out, form, axes, plane, marked=marked, patient=patient, json_out=json_out)

@@ -49,9 +49,8 @@ def message_of(result: Result) -> str:
 def test_status_0_and_where_the_table_lies(shots: Path, tmp_path: Path) -> None:
     done = invoke(shots, "--out", tmp_path / "heads", "--workers", 2)
     assert done.exit_code == 0
-    assert done.stdout.splitlines() == [
-        str(tmp_path / "heads" / n) for n in ("heads.csv", "heads.parquet", "sheet.html", "sheet.pdf")
-    ]
+    files = [str(tmp_path / "heads" / name) for name in ("heads.csv", "heads.parquet", "sheet.html", "sheet.pdf")]
+    assert done.stdout.splitlines() == [*files, "3 made, 0 kept, 0 failed"]
     assert "3 of 3: " in done.stderr
     again = invoke(shots, "--out", tmp_path / "heads", "--json")
     document = json.loads(again.stdout)
