@@ -82,6 +82,6 @@ sbom: setup ## what an installation is made of: CycloneDX, out/sbom.json
 audit: setup ## known faults of the locked packages, asked of osv.dev; fails where it cannot ask
 	$(UV) audit --locked --preview-features audit
 
-mutants: setup ## MODULE=rig/geometry.py, or SAMPLE=50 of compiled loops: changes code and tells what no test notices
+mutants: setup ## MODULE=rig/geometry.py: changes code and tells what no test notices
 	$(UV) sync --locked --quiet --group docs --group mutants
-	$(BIN)/python -m tests.tools.$(if $(SAMPLE),mutant_sample $(SAMPLE),mutants $(MODULE))
+	$(BIN)/python -m tests.tools.mutants $(MODULE)
