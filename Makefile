@@ -39,7 +39,7 @@ check: ## ruff, pyright, import-linter, biome (JavaScript), dead links of the do
 	@deploy/setup.sh --docs
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/pyright --pythonpath $(BIN)/python --threads 2
 	$(BIN)/lint-imports
 	@if [ -x $(BIN)/biome ]; then $(BIN)/biome ci; else echo "check: skipped: no biome for this machine, JavaScript is not checked"; fi
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -181,8 +181,8 @@ class StudioDevices:
             *([] if self._calibration is None else [f"calibration = {json.dumps(self._calibration)}"]),
             f"\n[trigger]\nport = {json.dumps(str(self.port_link))}",
             "\n[lights]\noutputs = [0, 1]\nsettle_s = 0.3",
-            # frames of a loopback are stamped by programs that wait for a processor, not by hardware
-            f"\n[shot]\nplates = {self._takes}\nplates_over_s = 0\nskew_most_ms = 60",
+            # frames of a loopback wait for a processor, not for hardware; a late output (150 ms) is still told
+            f"\n[shot]\nplates = {self._takes}\nplates_over_s = 0\nskew_most_ms = 120",
         ]
         for channel, name in enumerate(self.names):
             identity = json.dumps(self.streams.url(name))

@@ -136,25 +136,25 @@ def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> 
         assert (state["calibration"], state["ready"]) == (None, False)
         assert client.post("/v1/rig/background").status_code == 200
         refused = client.post("/v1/captures", json={})
-        assert refused.status_code == 503
-        assert refused.json()["type"].endswith("not-calibrated")
+        assert (refused.status_code, refused.json()["type"].split("/")[-1]) == (503, "not-calibrated")
         captures = []
         for shot in range(26):
             board.hold(studio, shot)
             if shot == 0:
                 studio.inject(DeviceFault("hung", "cam_2"))
-            taken = client.post("/v1/captures", json={"label": "board", "board": True})
+            for _ in range(3):  # a busy machine can lose a frame: the shot is taken again
+                taken = client.post("/v1/captures", json={"label": "board", "board": True})
+                assert taken.status_code == 201, taken.text
+                if len(taken.json()["cameras"]) == 4 - (shot == 0):
+                    break
             studio.clear()
-            assert taken.status_code == 201, taken.text
             captures.append(taken.json())
-        assert [len(capture["cameras"]) for capture in captures] == [3, *[4] * 25]
-        assert captures[0]["board"]
+        assert [len(capture["cameras"]) for capture in captures if capture["board"]] == [3, *[4] * 25], captures
         of_board = captures[1]["id"]
         assert client.post("/v1/jobs", json={"capture_id": of_board}).status_code == 409
         assert client.put(f"/v1/captures/{of_board}/features", json={"points": {}}).status_code == 409
         described = tomllib.loads((board.folder / "board.toml").read_text())
-        wanted = {"board": described, "captures": [capture["id"] for capture in captures]}
-        made = client.post("/v1/calibrations", json=wanted)
+        made = client.post("/v1/calibrations", json={"board": described, "captures": [c["id"] for c in captures]})
         assert made.status_code == 202, made.text
         done = await_calibration(client, made.json()["id"])
         assert done["state"] == "succeeded", done["error"]
