@@ -136,7 +136,7 @@ def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> 
         assert (state["calibration"], state["ready"]) == (None, False)
         assert client.post("/v1/rig/background").status_code == 200
         refused = client.post("/v1/captures", json={})
-        assert (refused.status_code, refused.json()["type"].split("/")[-1]) == (503, "not-calibrated")
+        assert (refused.status_code, refused.json()["type"].split(":")[-1]) == (503, "not-calibrated")
         captures = []
         for shot in range(26):
             board.hold(studio, shot)
