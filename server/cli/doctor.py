@@ -9,7 +9,7 @@ import sys
 import time
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Protocol, TypedDict
+from typing import Any, Protocol
 from urllib.parse import quote
 
 from pipeline.compute.threads import THREADS, thread_count
@@ -50,21 +50,14 @@ class Connection(Protocol):
         ...
 
 
-class Finding(TypedDict):
-    """Describes the result of one check: whether it passed, and a sentence that says what was found or what to do."""
-
-    ok: bool
-    detail: str
-
-
-def examine(settings: ServiceSettings) -> dict[str, Finding]:
-    """Runs every check of this machine and returns the findings by name. Only reads: it makes neither folders nor
-    tables."""
+def examine(settings: ServiceSettings) -> dict[str, dict[str, Any]]:
+    """Runs every check of this machine. Returns by name whether it passed (``ok``) and what was found or what to do
+    (``detail``). Only reads: it makes neither folders nor tables."""
     checks = (
         *(_python, _egl, _gpu, _model, _cores, _memory, _data, _models, _cache, _database, _retention, _results),
         *(_variables, _rig, _stores, _port),
     )
-    findings: dict[str, Finding] = {}
+    findings = {}
     for check in checks:
         try:
             ok, detail = check(settings)

@@ -5,7 +5,6 @@ from contextlib import suppress
 from dataclasses import asdict
 from typing import cast
 
-from rig.acquisition.shot import CameraSyncDocument, SyncDocument
 from rig.messages.message import compose, documents_of
 from server.console.page import shared
 from server.console.removal import removals
@@ -13,7 +12,6 @@ from server.errors import NotFound
 from server.services.records import SessionOut
 from server.services.service import Service
 from server.storage.records import CaptureRecord, JsonObject
-from server.tasks.simulate import SimulatedCertificate, SimulatedSync
 
 OF_RECORD = (
     *("id", "created", "source", "label", "expression", "front"),
@@ -59,18 +57,17 @@ def sync_line(shot: Mapping[str, object]) -> JsonObject:
     late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
     if late:
         return {"message": compose("not-in-sync", cameras=late).document(), "good": False}
-    spread_ms = cast(SyncDocument, shot["sync"])["spread_ms"] if "sync" in shot else None
+    spread_ms = cast(JsonObject, shot["sync"])["spread_ms"] if "sync" in shot else None
     if spread_ms is None:
         return {"message": compose("cameras-in-sync", count=len(lines)).document(), "good": True}
     within = compose("cameras-in-sync-within", count=len(lines), spread_ms=spread_ms)
     return {"message": within.document(), "good": True}
 
 
-def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:
+def sync_of(shot: Mapping[str, object]) -> JsonObject:
     """Returns the sync status and skew of each camera from the certificate of a shot, of a real rig or of the simulated
     studio."""
-    certificate = cast(SyncDocument | SimulatedCertificate, shot.get("sync", shot))
-    return certificate.get("cameras", {})
+    return cast(JsonObject, shot.get("sync", shot)).get("cameras", {})
 
 
 def sessions_list(service: Service, chosen: str | None = None) -> list[JsonObject]:

@@ -12,10 +12,11 @@ import structlog
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 from rig.progress import Progress
-from server.console.live_frame import LiveFrame, measured_frame
+from server.console.live_frame import measured_frame
 from server.services.live.live import document_of
 from server.services.rigs import PREVIEW_WIDTH, RigBackend, jpeg, reduced
 from server.services.service import Service
+from server.storage.records import JsonObject
 from server.tasks.child import Child, WorkerContext
 from server.wire.problems import problem_from
 
@@ -34,7 +35,7 @@ class StudioSource:
     def __init__(self) -> None:
         self._child, self._looks = Child(), 0
 
-    def frames(self) -> list[LiveFrame]:
+    def frames(self) -> list[JsonObject]:
         """Returns the present picture of each simulated camera, with its measurements."""
         self._looks += 1
         return self._child.remote(frames)(look=self._looks)
@@ -51,7 +52,7 @@ class RigSource:
     def __init__(self, rig: RigBackend) -> None:
         self._rig, self._looks = rig, 0
 
-    def frames(self) -> list[LiveFrame]:
+    def frames(self) -> list[JsonObject]:
         """Returns the present picture of each camera, with its measurements. Raises Unavailable if the rig cannot be
         opened."""
         pictures = self._rig.look()
@@ -63,7 +64,7 @@ class RigSource:
         """Does nothing: the rig stays open for shots."""
 
 
-def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
+def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> JsonObject:
     if picture is None:
         return {"name": name, "jpeg": None, "fault": compose("camera-shows-nothing").document()}
     small = reduced(picture, PREVIEW_WIDTH)  # a tile is 320 points wide, twice as many pixels on a dense screen
@@ -145,7 +146,7 @@ class LiveView:
         return look_bytes(frames, None, document_of(shown))
 
 
-def look_bytes(frames: list[LiveFrame], fault: Message | None, head: object = None) -> bytes:
+def look_bytes(frames: list[JsonObject], fault: Message | None, head: object = None) -> bytes:
     """Encodes the pictures of all cameras as one message: 4 bytes with the header's length, 4 with the length of the
     rest (both big-endian), a JSON header, and the JPEG files in the header's order. ``bytes`` in the header is the
     length of each file."""
@@ -155,7 +156,7 @@ def look_bytes(frames: list[LiveFrame], fault: Message | None, head: object = No
     return struct.pack(">II", len(text), len(body)) + text + body
 
 
-def frames(context: WorkerContext, report: Progress, *, look: int) -> list[LiveFrame]:
+def frames(context: WorkerContext, report: Progress, *, look: int) -> list[JsonObject]:
     """Returns the present picture of each camera of the simulated studio, drawn in a child process. ``look`` counts the
     calls."""
     from server.console import studio_drawing

@@ -4,11 +4,10 @@ A preset is a named choice of a job's settings. Whoever needs other settings wri
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NotRequired, cast
+from typing import cast
 
 from pipeline.settings import settings_from_document
 from rig.messages.message import Message, compose
-from server.console.page import Chosen
 from server.services.templates import templates_at_hand
 from server.services.work import ReconstructionRequest
 from server.storage.records import JsonObject
@@ -52,14 +51,6 @@ def settings_of(preset: str | None) -> Mapping[str, object]:
     return next((known.settings for known in PRESETS if known.id == (preset or "")), {})
 
 
-class WorkForm(Chosen):
-    """Holds what a form asks before a job is queued. ``method``: id of a preset."""
-
-    model: NotRequired[str | None]
-    method: NotRequired[str | None]
-    template: NotRequired[str | None]
-
-
 def preset_lines() -> list[JsonObject]:
     """Converts all presets to entries of a form's list."""
     return [{"id": p.id, "title": p.title.document(), "explanation": p.explanation.document()} for p in PRESETS]
@@ -72,9 +63,9 @@ def template_lines() -> list[JsonObject]:
     ]
 
 
-def chosen_work(event: WorkForm) -> ReconstructionRequest:
-    """Returns the request that a form describes: model, preset and template. What is not chosen is left to the
-    service's defaults."""
+def chosen_work(event: JsonObject) -> ReconstructionRequest:
+    """Returns the request that a form describes: model, preset (``method``) and template. What is not chosen is left to
+    the service's defaults."""
     settings, template = dict(settings_of(event.get("method"))), event.get("template")
     if template:
         settings["outputs"] = cast(dict[str, object], settings.get("outputs", {})) | {"template": template}

@@ -32,9 +32,9 @@ from rig.messages.message import Message, compose, message_of
 from rig.rig import Rig
 from server.errors import Conflict, NotFound, Unavailable
 from server.services.records import CameraOut, CameraSettingsOut, CleanPlates, RigOut
-from server.storage.records import RIG_ADJUSTMENT, RigAdjustment
+from server.storage.records import RIG_ADJUSTMENT, JsonObject, RigAdjustment
 from server.tasks.child import Child, WorkFailed
-from server.tasks.simulate import SimulatedCertificate, look, simulated
+from server.tasks.simulate import look, simulated
 
 SHOT_BYTES = 64 << 20  # that a shot may take on the disk
 PREVIEW_WIDTH = 640  # pixels
@@ -263,7 +263,7 @@ class SimulatedRig:
         """Returns the calibration that was put to use, or the studio's own layout."""
         return read_rig(self._calibration) if self._calibration.is_file() else self._rig()
 
-    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> SimulatedCertificate:
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> JsonObject:
         """Takes a shot of a person, also if ``board`` is set, since the studio has no board. Raises Unavailable if the
         child process fails."""
         with self._one_at_a_time:

@@ -1,24 +1,15 @@
 """The page Captures: the list, uploads, outlines over the images, jobs to start, and removal with undo."""
 
 from collections.abc import Mapping
-from typing import NotRequired, TypedDict, cast, get_args
+from typing import cast, get_args
 
 from pipeline.head_model.model_names import list_models
 from rig.messages.message import Message, compose
 from server.console.capture_lines import capture_line, jobs_of, sessions_list
 from server.console.identity import permit
-from server.console.page import (
-    Action,
-    Chosen,
-    Page,
-    remove_all_later,
-    remove_later,
-    said_unless_refused,
-    serve_page,
-    shared,
-)
+from server.console.page import Action, Page, remove_all_later, remove_later, said_unless_refused, serve_page, shared
 from server.console.removal import removals
-from server.console.work_form import WorkForm, chosen_work, preset_lines, template_lines
+from server.console.work_form import chosen_work, preset_lines, template_lines
 from server.services.bulk import each
 from server.services.service import Service
 from server.services.texts import typed_tags
@@ -27,35 +18,6 @@ from server.storage.records import JsonObject
 
 SHOWN = 50  # captures of a page
 ASKED = ("find", "session", "verdict", "tag", "sort", "after", "capture")
-
-
-class EditForm(Chosen):
-    """Holds changes to a capture. Fields that are left out stay; ``tags`` are separated by commas."""
-
-    label: NotRequired[str]
-    expression: NotRequired[str]
-    session: NotRequired[str | None]
-    tags: NotRequired[str]
-
-
-class SessionForm(TypedDict):
-    """Holds the label and the consent note of a session."""
-
-    label: NotRequired[str]
-    consent: NotRequired[str]
-
-
-class SessionEditForm(Chosen, SessionForm):
-    """Holds changes to a session. Fields that are left out stay."""
-
-
-class BulkForm(WorkForm):
-    """Holds one action on all captures ``ids``. ``id``: the session to move them to, empty for none; ``tags``:
-    separated by commas."""
-
-    ids: list[str]
-    action: str
-    tags: NotRequired[str]
 
 
 class CapturesPage(Page, component="captures.js"):
@@ -98,14 +60,14 @@ def captures_state(service: Service, requested: Mapping[str, str | None]) -> Jso
     }
 
 
-def reconstruct(page: Page, event: WorkForm) -> Message:
+def reconstruct(page: Page, event: JsonObject) -> Message:
     """Queues a job for a capture; its head opens when it is ready. Raises what ``Jobs.submit`` raises."""
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
     page.started(job.id, opens=True)
     return compose("job-queued-watch", job=job.id[-6:])
 
 
-def reconstruct_session(page: Page, event: WorkForm) -> Message:
+def reconstruct_session(page: Page, event: JsonObject) -> Message:
     """Queues a job for every capture of a session that shows a head. Raises what ``Jobs.submit_session`` raises."""
     work = chosen_work(event)
     jobs = page.service.jobs.submit_session(event["id"], work, key=page.caller.key, priority=100)
@@ -121,43 +83,44 @@ def sample(page: Page, event: object) -> Message:
     return compose("sample-taken")
 
 
-def edit(page: Page, event: EditForm) -> None:
-    """Changes label, expression, session or tags of a capture. Raises NotFound and InputError."""
+def edit(page: Page, event: JsonObject) -> None:
+    """Changes label, expression, session or tags (with commas between) of a capture; what the form lacks stays. Raises
+    NotFound and InputError."""
     changes: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
     tags = typed_tags(event["tags"]) if "tags" in event else None
     page.service.captures.edit(event["id"], changes, tags=tags)
     forget_captures()
 
 
-def new_session(page: Page, event: SessionForm) -> Message:
+def new_session(page: Page, event: JsonObject) -> Message:
     """Makes a session. Raises InputError for invalid texts."""
     session = page.service.sessions.add(event.get("label", ""), event.get("consent", ""))
     forget_captures()
     return compose("session-begun", name=session.label or session.id[-6:])
 
 
-def edit_consent(page: Page, event: SessionEditForm) -> None:
+def edit_consent(page: Page, event: JsonObject) -> None:
     """Changes the label or the consent note of a session. Raises NotFound and InputError."""
     changes = {name: str(event.get(name) or "") for name in ("label", "consent") if name in event}
     page.service.sessions.edit(event["id"], label=changes.get("label"), consent=changes.get("consent"))
     forget_captures()
 
 
-def erase(page: Page, event: Chosen) -> Message:
+def erase(page: Page, event: JsonObject) -> Message:
     """Erases a session for good, without undo, as ``Sessions.erase`` does. Raises NotFound and Unavailable."""
     page.service.sessions.erase(event["id"])
     shared.clear()  # reports of its heads among them
     return compose("session-erased")
 
 
-def erase_capture(page: Page, event: Chosen) -> Message:
+def erase_capture(page: Page, event: JsonObject) -> Message:
     """Erases a capture for good, without undo, as ``Captures.erase`` does. Raises NotFound and Unavailable."""
     page.service.captures.erase(event["id"])
     shared.clear()
     return compose("capture-erased")
 
 
-def discard(page: Page, event: Chosen) -> None:
+def discard(page: Page, event: JsonObject) -> None:
     """Removes a capture after the time to undo that has passed; the message says how many heads stay. Raises NotFound,
     and Conflict while a queued or running job needs it."""
     service, identity = page.service, event["id"]
@@ -169,9 +132,9 @@ def discard(page: Page, event: Chosen) -> None:
     remove_later(identity, lambda: service.captures.remove(identity), title, "capture")
 
 
-def bulk(page: Page, event: BulkForm) -> Message | None:
-    """Does one action to all ticked captures. Where it is refused for some, the others are done, and InvalidInput is
-    raised with the reasons."""
+def bulk(page: Page, event: JsonObject) -> Message | None:
+    """Does one ``action`` to all ticked captures, ``ids``. ``id``: the session to move them to, empty for none. Where
+    it is refused for some, the others are done, and InvalidInput is raised with the reasons."""
     service, ids, action = page.service, event["ids"], event["action"]
     if action == "reconstruct":
         permit(page.caller, "submit")

@@ -3,14 +3,13 @@
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import NotRequired, TypedDict, cast, get_args
+from typing import cast, get_args
 
 from pipeline.head_model.model_names import list_models
 from rig.errors import InputError
 from rig.messages.message import Message, compose
 from server.console.page import (
     Action,
-    Chosen,
     Page,
     remove_all_later,
     remove_later,
@@ -37,28 +36,6 @@ SOUGHT_MOST = 1000  # queued jobs among which a search looks for the next ones
 ACTIVE = (*STATUSES["running"], *STATUSES["queued"])
 ASKED = ("find", "state", "sort", "batch", "after")
 LOG_LINES = 200
-
-
-class SettingsForm(TypedDict, total=False):
-    """Holds the settings of a form. ``more``: further settings as a JSON object."""
-
-    method: str
-    detail: str
-    front: str
-    more: str | None
-
-
-class BulkForm(TypedDict):
-    """Holds one action (cancel, restart, remove) on all jobs ``ids``."""
-
-    ids: list[str]
-    action: str
-
-
-class RestartForm(Chosen, SettingsForm):
-    """Holds the job to restart, and the settings and model of the new one."""
-
-    model: NotRequired[str | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +150,7 @@ def log_lines(events: list[JobEvent]) -> list[JsonObject]:
     return lines
 
 
-def restart(page: Page, event: RestartForm) -> Message:
+def restart(page: Page, event: JsonObject) -> Message:
     """Queues a new job for the capture of an earlier one, and selects it. Raises what ``Jobs.restart`` raises."""
     wanted = ReconstructionRequest(event.get("model") or None, chosen_settings(event))
     job = page.service.jobs.restart(event["id"], wanted, key=page.caller.key)
@@ -182,9 +159,9 @@ def restart(page: Page, event: RestartForm) -> Message:
     return compose("job-queued", job=job.id[-6:])
 
 
-def chosen_settings(event: SettingsForm) -> Mapping[str, object]:
-    """Reads the settings of a form: method, detail, front, and further ones from a JSON text. Raises InputError if that
-    text is no JSON object."""
+def chosen_settings(event: JsonObject) -> Mapping[str, object]:
+    """Reads the settings of a form: method, detail, front, and further ones from the JSON text ``more``. Raises
+    InputError if that text is no JSON object."""
     try:
         settings = json.loads(event.get("more") or "{}")
     except ValueError as error:
@@ -194,21 +171,22 @@ def chosen_settings(event: SettingsForm) -> Mapping[str, object]:
     return settings | {key: event.get(key) for key in ("method", "detail", "front") if event.get(key)}
 
 
-def cancel(page: Page, event: Chosen) -> None:
+def cancel(page: Page, event: JsonObject) -> None:
     """Cancels a job. A finished one stays as it is. Raises NotFound."""
     page.service.cancel(event["id"])
 
 
-def delete(page: Page, event: Chosen) -> None:
+def delete(page: Page, event: JsonObject) -> None:
     """Removes a job with its result after the time to undo that has passed. Raises NotFound."""
     service, identity = page.service, event["id"]
     service.jobs.get(identity)
     remove_later(identity, lambda: service.jobs.delete(identity), compose("job-named", job=identity[-6:]), "submit")
 
 
-def bulk(page: Page, event: BulkForm) -> Message:
-    """Does one action to all ticked jobs. Where it is refused for some, the others are done, and InvalidInput is raised
-    with the reasons. Raises Conflict if none of those to be removed has ended."""
+def bulk(page: Page, event: JsonObject) -> Message:
+    """Does one ``action`` (cancel, restart, remove) to all ticked jobs, ``ids``. Where it is refused for some, the
+    others are done, and InvalidInput is raised with the reasons. Raises Conflict if none of those to be removed has
+    ended."""
     service, action = page.service, event["action"]
     if action == "remove":
         ended = [job.id for job in service.jobs.of(event["ids"]) if job.state in FINISHED]

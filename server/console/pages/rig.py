@@ -11,10 +11,10 @@ from rig.acquisition.plates import PlatesVersion
 from rig.messages.message import Message, compose, documents_of
 from server.console.capture_lines import capture_line, sessions_list, sync_of
 from server.console.media import live_view
-from server.console.page import Action, Chosen, Page, serve_page, shared, shown_detail
-from server.console.pages.captures import SessionEditForm, SessionForm, discard, edit_consent, new_session
+from server.console.page import Action, Page, serve_page, shared, shown_detail
+from server.console.pages.captures import discard, edit_consent, new_session
 from server.console.removal import removals
-from server.console.work_form import WorkForm, chosen_work
+from server.console.work_form import chosen_work
 from server.errors import Conflict, NotFound
 from server.services.captures import CaptureMetadata
 from server.services.records import CalibrationOut
@@ -144,14 +144,14 @@ def keep(page: Page, event: object) -> None:
     page.choice["shot"] = None
 
 
-def retake(page: Page, event: Chosen) -> None:
+def retake(page: Page, event: JsonObject) -> None:
     """Removes the shot that was shown for a decision, after the time to undo that. The page then counts down to the
     next one."""
     discard(page, event)
     page.choice["shot"] = None
 
 
-def reconstruct_shot(page: Page, event: WorkForm) -> Message:
+def reconstruct_shot(page: Page, event: JsonObject) -> Message:
     """Keeps the shot and queues a job for it, whose head opens when it is ready. Raises what ``Jobs.submit`` raises."""
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
     page.choice |= {"shot": None, "job": job.id}
@@ -174,21 +174,21 @@ def plates(page: Page, event: object) -> Message | None:
     return compose("plates-taken-note", plates=taken.plates, cameras=len(taken.cameras), note=taken.note)
 
 
-def use_plates(page: Page, event: Chosen) -> Message:
+def use_plates(page: Page, event: JsonObject) -> Message:
     """Puts a version of the clean plates to use. Raises NotFound and Unavailable."""
     page.service.rig.use_plates(event["id"])
     shared.forget("rig")
     return compose("plates-taken-into-use")
 
 
-def begin_session(page: Page, event: SessionForm) -> Message:
+def begin_session(page: Page, event: JsonObject) -> Message:
     """Makes a session, which the page selects. Raises InputError for invalid texts."""
     notice = new_session(page, event)
     shared.forget("rig")
     return notice
 
 
-def note_consent(page: Page, event: SessionEditForm) -> None:
+def note_consent(page: Page, event: JsonObject) -> None:
     """Changes the label or the consent note of a session. Raises NotFound and InputError."""
     edit_consent(page, event)
     shared.forget("rig")

@@ -1,13 +1,12 @@
 """The page about the service itself: API keys, what is kept and removed next, and what lies on the disk."""
 
 from datetime import UTC, datetime
-from typing import TypedDict
 
 from nicegui.events import GenericEventArguments
 
 from rig.errors import InputError
 from rig.messages.message import Message, compose
-from server.console.page import Action, Chosen, Page, remove_all_later, serve_page, shared
+from server.console.page import Action, Page, remove_all_later, serve_page, shared
 from server.errors import Conflict
 from server.services.keys import LOCAL, SCOPES, Caller
 from server.services.retention import clear_caches, sweep, upcoming
@@ -29,13 +28,6 @@ MEANINGS = {
     "cache_bytes": compose("means-cache-bytes"),
     "upload_hours": compose("means-upload-hours"),
 }
-
-
-class KeyForm(TypedDict):
-    """Holds the name and the scopes of a new API key."""
-
-    label: str
-    scopes: list[str]
 
 
 class ServicePage(Page, component="service.js"):
@@ -105,7 +97,7 @@ def _days(days: float | None) -> Message:
     return compose("for-ever") if days is None else compose("days", days=days)
 
 
-def add_key(page: ServicePage, event: KeyForm) -> Message:
+def add_key(page: ServicePage, event: JsonObject) -> Message:
     """Makes an API key. Raises InputError naming every fault of the form, and Forbidden where no key exists."""
     name, scopes = event["label"].strip(), [scope for scope in SCOPES if scope in event["scopes"]]
     faults = []
@@ -121,7 +113,7 @@ def add_key(page: ServicePage, event: KeyForm) -> Message:
     return compose("key-made", name=f"{name!r}")
 
 
-def revoke(page: ServicePage, event: Chosen) -> Message:
+def revoke(page: ServicePage, event: JsonObject) -> Message:
     """Removes an API key. Raises NotFound, and Conflict for the key that the caller uses."""
     if event["id"] == page.caller.key:
         raise Conflict("own-key", compose("own-key"))

@@ -5,7 +5,7 @@ from typing import cast, get_args
 
 from rig.messages.message import Message
 from server.console.page import Action, Page, serve_page, shared
-from server.console.pages.captures import SessionForm, new_session
+from server.console.pages.captures import new_session
 from server.services.service import Service
 from server.storage.library import SubjectOrder
 from server.storage.records import JsonObject
@@ -38,7 +38,7 @@ def subjects_state(service: Service, requested: Mapping[str, str | None]) -> Jso
     }
 
 
-def begin(page: Page, event: SessionForm) -> Message:
+def begin(page: Page, event: JsonObject) -> Message:
     """Makes a session of a subject. Raises InputError for invalid texts."""
     notice = new_session(page, event)
     shared.forget("subjects")
