@@ -254,7 +254,7 @@ class Jobs:
 
     def without_result(self) -> list[str]:
         """Lists the ids of succeeded jobs whose result is missing from the data folder, newest first."""
-        if self.results.elsewhere:
+        if self.results.objects is not None:
             return []  # what the data folder lacks is fetched
         there = set(self._store.ids("jobs"))
         done = self.index.newest_first(STATUSES["succeeded"])
@@ -287,7 +287,7 @@ class Jobs:
 
     def _unless_removed(self, job_id: str) -> None:
         """Raises NotFound, and removes what was fetched, where the job was erased meanwhile."""
-        if self.results.elsewhere and self._status(job_id, load=False) is None:
+        if self.results.objects is not None and self._status(job_id, load=False) is None:
             self.results.erase(job_id)
             raise NotFound(compose("thing-job"), job_id)
 
@@ -345,7 +345,7 @@ class Jobs:
 
     def _lost(self, job_id: str, state: str) -> Message | None:
         """Returns the message that the files of a job that succeeded are gone."""
-        lost = state == "succeeded" and not self.results.elsewhere and not self._result(job_id).is_dir()
+        lost = state == "succeeded" and self.results.objects is None and not self._result(job_id).is_dir()
         return compose("result-missing") if lost else None
 
     def queue_notice(self, queue: str | None) -> Message | None:

@@ -25,14 +25,15 @@ from server.services.deliveries import UNDER_WAY
 from server.services.job_rows import DELIVERY, FINISHED, STATUSES
 from server.services.records import moment_now, moment_of
 from server.services.service import CheckOut, Service
-from server.services.stored_captures import collect_unclaimed, tend_captures
+from server.services.stored_captures import tend_captures
+from server.services.unclaimed import COLLECT_S, DAY_S, collect
+from server.storage.capture_blobs import NAME
 from server.storage.database import database_identity
 from server.storage.folders import LAST_SWEEP, STOPPED, folder_bytes, newest
 from server.storage.job_index import JobQuery
 from server.storage.library import CaptureQuery
 
 LEFTOVER_S = 900.0  # a live upload or extraction touches its folder more often than that
-DAY_S = 86400.0
 BOOT = Path("/proc/sys/kernel/random/boot_id")
 MANY = 20  # records: fewer may all be of one day, and due on one
 ENDED = tuple(status for state in FINISHED for status in STATUSES[state])
@@ -62,10 +63,7 @@ def sweep(service: Service) -> dict[str, int]:
     gone["caches"] = _caches(service)
     gone["blobs"] = tend_captures(service.store, service.jobs, service.settings.captures_bytes)
     gone["results"] = service.jobs.results.bound(service.settings.results_bytes, service.jobs.files)
-    unclaimed = service.settings.keep_unclaimed_days
-    owner = database_identity(service.engine)
-    gone["unclaimed"] = service.jobs.results.collect(owner, service.jobs.index.known, unclaimed)
-    gone["unclaimed"] += collect_unclaimed(service.store, owner, unclaimed)
+    gone["unclaimed"] = _unclaimed(service)
     gone["orphans"] = _orphans(service)
     gone["deliveries"] = _deliveries(service)
     _find_missing(service)
@@ -213,6 +211,20 @@ def _caches(service: Service) -> int:
         store.remove(folder)
         total -= size
         removed += 1
+    return removed
+
+
+def _unclaimed(service: Service) -> int:
+    """Removes from the stores what no job and no capture of this database claims, a few times a day."""
+    days, results, blobs = service.settings.keep_unclaimed_days, service.jobs.results, service.store.blobs
+    if days is None or time.monotonic() - results.collected < min(COLLECT_S, days * DAY_S):
+        return 0
+    results.collected, owner, removed = time.monotonic(), database_identity(service.engine), 0
+    with service.store.incoming() as scratch:
+        if results.objects is not None:
+            removed += collect(results.objects, owner, service.jobs.index.known, days, scratch)
+        if blobs is not None:
+            removed += collect(blobs.objects, owner, blobs.known, days, scratch, NAME.fullmatch)
     return removed
 
 
