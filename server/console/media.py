@@ -309,7 +309,7 @@ def calibration_report(who: Reader, request: Request, calibration_id: str) -> Re
 @pages.get("/console/calibrations/{calibration_id}/cameras.json")
 def cameras_file(who: Reader, calibration_id: str) -> Response:
     """Returns the cameras.json of a calibration."""
-    return FileResponse(who[0].calibrations.cameras_json(calibration_id), media_type="application/json")
+    return FileResponse(who[0].calibrations.result(calibration_id, "cameras.json"), media_type="application/json")
 
 
 def make_thumbnail(source: Path, target: Path) -> None:

@@ -9,13 +9,13 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
-from dbos import DBOSClient, EnqueueOptions, WorkflowStatus
+from dbos import DBOSClient, WorkflowStatus
 
 from rig.messages.message import compose
 from server.errors import Forbidden
 from server.services.answer import State
 from server.services.failures import failure
-from server.services.job_rows import APPLICATION_VERSION, STATES
+from server.services.job_rows import STATES, enqueue_options
 from server.services.records import DeliveryOut
 from server.settings import ServiceSettings
 from server.storage.object_places import locate
@@ -53,13 +53,7 @@ def enqueue_delivery(
     wanted: DeliveryRequest = {"job_id": job_id, "to": to, "until": time.time() + settings.deliver_hours * HOUR_S}
     if webhook is not None:
         wanted["webhook"] = webhook
-    options: EnqueueOptions = {
-        "workflow_name": DELIVER,
-        "queue_name": DELIVERIES_QUEUE,
-        "workflow_id": delivery_id(job_id),
-        "app_version": APPLICATION_VERSION,
-    }
-    enqueue(options, wanted)
+    enqueue(enqueue_options(DELIVER, DELIVERIES_QUEUE, delivery_id(job_id)), wanted)
 
 
 def delivery_id(job_id: str) -> str:

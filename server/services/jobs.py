@@ -138,8 +138,10 @@ class Jobs:
         if first is None:
             self._check_count(key)
             self.index.add(job_id, request, session)
-            attributes = {"capture": request["capture_id"], "session": session, "key": key}
-            self.client.enqueue(enqueue_options(job_id, queue or self._settings.queue, priority, attributes), request)
+            options = enqueue_options(WORKFLOW, queue or self._settings.queue, job_id)
+            options["priority"] = priority
+            options["attributes"] = {"capture": request["capture_id"], "session": session, "key": key}
+            self.client.enqueue(options, request)
             first = self._status(job_id)
             assert first is not None
         if not self._asks_the_same(request_of(first), request):
@@ -154,8 +156,9 @@ class Jobs:
         job. It does not count towards the limit of jobs of an API key."""
         job_id = new_id()
         self.index.add_within(connection, job_id, request, session)
-        attributes = {"capture": request["capture_id"], "session": session, "batch": batch.id}
-        options = enqueue_options(job_id, batch.queue, batch.priority, attributes)
+        options = enqueue_options(WORKFLOW, batch.queue, job_id)
+        options["priority"] = batch.priority
+        options["attributes"] = {"capture": request["capture_id"], "session": session, "batch": batch.id}
         self.client.enqueue_in_transaction(connection, options, request)
         return job_id
 

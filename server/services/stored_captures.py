@@ -14,6 +14,7 @@ import structlog
 from rig.errors import EigenheadError
 from server.errors import Refused
 from server.services.jobs import Jobs
+from server.storage.folders import folder_bytes
 from server.storage.records import CaptureRecord
 from server.storage.store import Store
 
@@ -51,7 +52,7 @@ def bound_captures(store: Store, most: int, is_used: Callable[[str], bool]) -> i
     for identity in store.ids("captures"):
         folder = store.folder("captures", identity) / "files"
         with suppress(FileNotFoundError):
-            size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+            size = folder_bytes(folder)
             found.append((folder.stat().st_mtime, size, identity))
             total += size
     for used, size, identity in sorted(found):

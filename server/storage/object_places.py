@@ -19,7 +19,7 @@ from urllib.parse import quote
 
 from rig.digest import sha256_of
 from rig.messages.message import Message, compose
-from server.errors import InvalidInput
+from server.errors import UrlRefused
 from server.settings import OBJECT_PREFIX, ServiceSettings
 from server.storage.objects import (
     BLOCK_BYTES,
@@ -275,14 +275,14 @@ def key_faults(key: str) -> list[Message]:
 def locate(url: str, prefixes: Collection[str]) -> tuple[str, str]:
     """Returns the allowed prefix that ``url`` lies below, and its key there. Raises InvalidInput ("url-refused")."""
     if not OBJECT_PREFIX.match(f"{url}/"):
-        raise _refused(compose("object-url-none"))
+        raise UrlRefused(compose("object-url-none"))
     for prefix in sorted(prefixes, key=len, reverse=True):
         if url.startswith(prefix):
             key = url.removeprefix(prefix)
             if key and (faults := key_faults(key)):
-                raise _refused(faults[0])
+                raise UrlRefused(faults[0])
             return prefix, key
-    raise _refused(compose("object-url-not-allowed", prefixes=sorted(prefixes)))
+    raise UrlRefused(compose("object-url-not-allowed", prefixes=sorted(prefixes)))
 
 
 def is_object_url(url: str) -> bool:
@@ -296,7 +296,3 @@ def open_objects(prefix: str, settings: ServiceSettings) -> ObjectStore:
     if prefix.startswith("file://"):
         return FolderObjects(Path(prefix.removeprefix("file://")))
     return open_bucket(prefix, settings)
-
-
-def _refused(why: Message) -> InvalidInput:
-    return InvalidInput("url-refused", compose("url-refused", why=why), [compose("field-url-refused", why=why)])

@@ -34,11 +34,8 @@ async def make_calibration(service: ServiceOf, caller: Taker, request: Request, 
     if request.headers.get("content-type", "").partition(";")[0].strip() == "application/json":
         await service.threads.disk(check_length, request, service.store, service.settings)
         wanted = _parsed(await _small_body(request))
-        known, shots, label = service.calibrations, wanted.captures, wanted.label
-        if wanted.source == "scene":
-            made = await service.threads.check(known.add_scene, shots, wanted.scale, label, key=caller.key)
-        else:
-            made = await service.threads.check(known.add_shots, wanted.board or {}, shots, label, key=caller.key)
+        shots = (wanted.board, wanted.captures, wanted.label, wanted.scale)
+        made = await service.threads.check(service.calibrations.add_shots, *shots, key=caller.key)
     else:
         made = await receive_calibration_pictures(service, request, caller.key)
     response.headers["Location"] = f"/v1/calibrations/{made.id}"
