@@ -76,12 +76,8 @@ class Observer(Protocol):
         """Receives how many captures are to be made, once, before the first."""
         ...
 
-    def start(self, name: str) -> None:
-        """Receives that work on a capture begins."""
-        ...
-
     def report(self, name: str, share: float) -> None:
-        """Receives which share of a capture is done, 0 to 1."""
+        """Receives which share of a capture is done, 0 to 1; with 0 work on it begins."""
         ...
 
     def end(self, outcome: Outcome) -> None:
@@ -166,7 +162,7 @@ class BatchRun:
                     if not self._pending:
                         return
                     task = self._pending.popleft()
-                    self._observer.start(task.capture.name)
+                    self._observer.report(task.capture.name, 0.0)
                 try:
                     outcome = self._outcome(task, child)
                 except Cancelled:

@@ -204,14 +204,10 @@ class BatchProgress:
         self._took: list[float] = []
         self.ended = self.failed = 0
 
-    def start(self, name: str) -> None:
-        """Records that work on a capture begins."""
-        self._running[name] = self._clock(), 0.0
-
     def report(self, name: str, share: float) -> None:
-        """Records which share of a capture is done, from 0 to 1."""
-        if name in self._running:
-            self._running[name] = self._running[name][0], min(1.0, max(0.0, share))
+        """Records which share of a capture is done, from 0, with which work on it begins, to 1."""
+        since, _ = self._running.get(name, (self._clock(), 0.0))
+        self._running[name] = since, min(1.0, max(0.0, share))
 
     def end(self, name: str, *, failed: bool) -> None:
         """Records that a capture has ended. The duration of one that failed does not count for the estimate."""
@@ -282,10 +278,6 @@ class BatchDisplay:
         """Begins to show progress of ``pending`` captures."""
         self._count, self._progress = pending, BatchProgress(pending, self._workers, self._expected_s)
         self._show()
-
-    def start(self, name: str) -> None:
-        """Notes that work on a capture begins."""
-        self._progress.start(name)
 
     def report(self, name: str, share: float) -> None:
         """Shows that ``share`` (0 to 1) of a capture is done."""

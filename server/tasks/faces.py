@@ -10,6 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.faces.matching import EYE_DISTANCE_MM
+from pipeline.faces.networks import load_networks
+from pipeline.faces.sighting import file_pixels, reduce_picture
+from pipeline.faces.subject import find_subject
 from rig.camera import Camera
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, read_rig_file
@@ -33,11 +37,6 @@ def find_capture_faces(
 ) -> FacesDocument:
     """Finds the faces in a capture's pictures, and which of them is the subject's. ``images``: file of each camera's
     picture, below the folder ``capture``. Raises InputError, and DamagedNetwork if a network's file is damaged."""
-    from pipeline.faces.matching import EYE_DISTANCE_MM
-    from pipeline.faces.networks import load_networks
-    from pipeline.faces.sighting import reduce_picture
-    from pipeline.faces.subject import find_subject
-
     root = Path(capture)
     rig_file = find_rig_file(root)
     if rig_file is None:
@@ -77,7 +76,7 @@ def describe(
 
 
 def _face_of(face: "FaceDetection", camera: Camera, recorded: Camera, best: "FaceDetection | None") -> FoundFace:
-    points = _file_pixels(face.landmarks_px, camera, recorded)
+    points = file_pixels(face.landmarks_px, camera, recorded)
     return {
         "box_px": _plain(np.concatenate([points.min(axis=0), points.max(axis=0)])),
         "roll_deg": round(face.roll_deg, 1),
@@ -101,15 +100,9 @@ def _suggested(context: WorkerContext, face: "MatchedFaces", rig: Rig, recorded:
         return {}
     suggested = suggest_points(face, rig, model, places, SEVEN_POINTS)
     return {
-        name: {c: _plain(_file_pixels(pixel[None], rig[c], recorded[c])[0]) for c, pixel in views.items()}
+        name: {c: _plain(file_pixels(pixel[None], rig[c], recorded[c])[0]) for c, pixel in views.items()}
         for name, views in suggested.items()
     }
-
-
-def _file_pixels(pixels: Float[np.ndarray, "n 2"], camera: Camera, recorded: Camera) -> Float[np.ndarray, "n 2"]:
-    from pipeline.faces.sighting import file_pixels
-
-    return file_pixels(pixels, camera, recorded)
 
 
 def _plain(values: Float[np.ndarray, " n"]) -> list[float]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from rig.messages.message import compose
 from rig.progress import Progress
 from server.processes import share_one_heap, tidied
-from server.tasks.child import Report, WorkerContext
+from server.tasks.child import WorkerContext
 
 if TYPE_CHECKING:
     from pipeline.settings import Settings
@@ -31,7 +31,7 @@ SURE_SCALE = 0.02  # relative: 3 mm of a head; above it the warning says that le
 
 def reconstruct_capture(
     context: WorkerContext,
-    report: Report,
+    report: Progress,
     *,
     capture: str,
     result: str,
@@ -67,7 +67,7 @@ def reconstruct_capture(
 
 def run_job(
     context: WorkerContext,
-    report: Report,
+    report: Progress,
     prepared: "Prepared",
     out: Path,
     *,
