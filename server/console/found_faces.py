@@ -12,7 +12,8 @@ from rig.messages.message import compose
 from server.errors import Unavailable
 from server.services.service import Service
 from server.services.work import refuse_board
-from server.storage.face_cache import FacesDocument, faces_once
+from server.storage.face_cache import faces_once
+from server.storage.records import JsonObject
 from server.tasks.faces import find_capture_faces
 
 PATIENCE_S = 50.0  # eleven pictures of 12 Mpx take 4 s, forty 15
@@ -20,7 +21,7 @@ PATIENCE_S = 50.0  # eleven pictures of 12 Mpx take 4 s, forty 15
 _finding: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
 
-def found_faces(service: Service, identity: str) -> FacesDocument:
+def found_faces(service: Service, identity: str) -> JsonObject:
     """Returns the faces in a capture's pictures. The first call finds them; later ones read the cache. Blocks.
 
     Raises NotFound, Conflict for a shot of the board, InputError and WorkFailed if the pictures cannot be searched, and
@@ -32,7 +33,7 @@ def found_faces(service: Service, identity: str) -> FacesDocument:
     images = {Path(name).stem: name for name in record.inputs if Path(name).parent.name == "images"}
     files = service.store.capture_files(identity)
 
-    def find() -> FacesDocument:
+    def find() -> JsonObject:
         with service.children.one(max(0.0, deadline - time.monotonic())) as child:
             work = child.remote(find_capture_faces, cancelled=lambda: time.monotonic() > deadline)
             return work(capture=str(files), images=images)

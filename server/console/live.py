@@ -29,46 +29,22 @@ AGAIN_S = 1.0  # after an error
 log = structlog.get_logger()
 
 
-class StudioSource:
-    """Draws the cameras' pictures of the simulated studio, in a child process of its own."""
-
-    def __init__(self) -> None:
-        self._child, self._looks = Child(), 0
-
-    def frames(self) -> list[JsonObject]:
-        """Returns the present picture of each simulated camera, with its measurements."""
-        self._looks += 1
-        return self._child.remote(frames)(look=self._looks)
-
-    def close(self) -> None:
-        """Ends the child process."""
-        self._child.close()
-
-
-class RigSource:
-    """Takes pictures of real cameras, all at once. Each time the sharpness of one camera's picture is measured, in
-    turn, since that needs the full size."""
-
-    def __init__(self, rig: RigBackend) -> None:
-        self._rig, self._looks = rig, 0
-
-    def frames(self) -> list[JsonObject]:
-        """Returns the present picture of each camera, with its measurements. Raises Unavailable if the rig cannot be
-        opened."""
-        pictures = self._rig.look()
-        names = [camera.name for camera in self._rig.describe().cameras]
-        self._looks += 1
-        return [_frame(name, pictures.get(name), self._looks % len(names) == i) for i, name in enumerate(names)]
-
-    def close(self) -> None:
-        """Does nothing: the rig stays open for shots."""
-
-
 def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> JsonObject:
     if picture is None:
         return {"name": name, "jpeg": None, "fault": compose("camera-shows-nothing").document()}
     small = reduced(picture, PREVIEW_WIDTH)  # a tile is 320 points wide, twice as many pixels on a dense screen
     return measured_frame(name, small, jpeg(small), picture if sharp else None)
+
+
+def rig_frames(rig: RigBackend, child: Child, look: int) -> list[JsonObject]:
+    """Returns the present picture of each camera, with its measurements. The simulated studio is drawn in ``child``;
+    real cameras are looked at all at once, and the sharpness of one's picture is measured, in turn, since that needs
+    the full size. ``look`` counts the calls. Raises Unavailable if the rig cannot be opened."""
+    described = rig.describe()
+    if described.kind == "simulated":
+        return child.remote(frames)(look=look)
+    pictures, names = rig.look(), [camera.name for camera in described.cameras]
+    return [_frame(name, pictures.get(name), look % len(names) == i) for i, name in enumerate(names)]
 
 
 class LiveView:
@@ -103,7 +79,7 @@ class LiveView:
                 self._thread.start()
 
     def _look_around(self) -> None:
-        source: StudioSource | RigSource | None = None
+        child, looks = Child(), 0
         blur: dict[str, float | None] = {}
         try:
             while True:
@@ -117,8 +93,8 @@ class LiveView:
                     time.sleep(LOOK_S)
                     continue
                 try:
-                    source = source or self._opened()
-                    message = self._look(source, blur)
+                    looks += 1
+                    message = self._look(child, looks, blur)
                 except Exception as error:  # the rig may come back
                     problem = problem_from(error)
                     log.warning("no live view", error=problem.detail.text)
@@ -127,16 +103,11 @@ class LiveView:
                 self._latest = (self._latest[0] + 1, message)
                 time.sleep(max(0.0, EVERY_S - (time.monotonic() - began)))
         finally:
-            if source is not None:
-                source.close()
+            child.close()
 
-    def _opened(self) -> StudioSource | RigSource:
-        rig = self._service.rig
-        return StudioSource() if rig.describe().kind == "simulated" else RigSource(rig)
-
-    def _look(self, source: StudioSource | RigSource, blur: dict[str, float | None]) -> bytes:
+    def _look(self, child: Child, look: int, blur: dict[str, float | None]) -> bytes:
         began = time.monotonic()
-        frames = source.frames()
+        frames = rig_frames(self._service.rig, child, look)
         for frame in frames:
             if "blur_px" in frame:
                 blur[frame["name"]] = frame["blur_px"]

@@ -46,7 +46,6 @@ from server.errors import NotFound
 from server.services.keys import Caller
 from server.services.service import Service
 from server.services.truth import surface_distance
-from server.storage.face_cache import FoundFace
 from server.storage.records import CaptureRecord, JsonObject
 from server.tasks.child import WorkerContext
 from server.wire.batch_files import SheetFormat, TableFormat, send_sheet, send_table
@@ -400,7 +399,7 @@ def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
     return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_AREA), np.uint8)
 
 
-def straightened_face(face: FoundFace, camera: Camera) -> FoundFace:
+def straightened_face(face: JsonObject, camera: Camera) -> JsonObject:
     """Converts a face to the pixels of the photograph without distortion, at full size. Points outside the lens are
     left out."""
     lens, pixels = camera.intrinsics, np.array(face["points"])

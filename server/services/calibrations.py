@@ -13,7 +13,6 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import cast
 
 from dbos import DBOSClient, WorkflowStatus
 
@@ -28,13 +27,12 @@ from server.services.records import CalibrationOut, moment_now
 from server.services.texts import check_texts
 from server.storage.events import EventLog
 from server.storage.folders import move_durably
-from server.storage.records import CALIBRATION, CalibrationOutcome, CalibrationRecord, EventDocument
+from server.storage.records import CALIBRATION, CalibrationRecord, EventDocument, JsonObject
 from server.storage.store import Store, StoredFile, new_id
 from server.tasks.calibrate import BOARD, check_scale, is_of_board
 from server.tasks.photographs import SCALE
 
 WORKFLOW = "calibrate"
-NO_OUTCOME: CalibrationOutcome = {"figures": {}, "checks": [], "warnings": [], "front": None, "sha256": ""}
 
 
 class Calibrations:
@@ -89,7 +87,7 @@ class Calibrations:
         state = STATES[row.status] if row else "queued"
         if row is None:  # the service was killed between accepting and queueing
             self._enqueue(identity)
-        outcome = NO_OUTCOME if row is None or state != "succeeded" else cast(CalibrationOutcome, row.output)
+        outcome: JsonObject = (row.output or {}) if row is not None and state == "succeeded" else {}
         latest = self._events.latest([identity]).get(identity) if state == "running" else None
         document: EventDocument = {} if latest is None else latest.document
         return CalibrationOut(
@@ -101,11 +99,11 @@ class Calibrations:
             error=failure(row) if row is not None and state == "failed" else None,
             verdict=outcome.get("verdict"),
             missing=_messages(outcome.get("missing_messages") or outcome.get("missing", [])),
-            figures=dict(outcome["figures"]),
-            checks=tuple(map(dict, outcome["checks"])),
-            warnings=_messages(outcome.get("warning_messages") or outcome["warnings"]),
+            figures=outcome.get("figures", {}),
+            checks=tuple(outcome.get("checks", ())),
+            warnings=_messages(outcome.get("warning_messages") or outcome.get("warnings", [])),
             front=outcome.get("front"),
-            in_use=self.in_use() == outcome["sha256"],
+            in_use=self.in_use() == outcome.get("sha256", ""),
         )
 
     def find(self) -> list[CalibrationOut]:

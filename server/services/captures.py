@@ -12,7 +12,7 @@ from typing import cast
 from pydantic import TypeAdapter
 
 from rig.acquisition.face_sighting import face_remarks
-from rig.acquisition.shot import Fault, ShotDocument, read_fault
+from rig.acquisition.shot import ShotDocument, read_fault
 from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
@@ -282,8 +282,13 @@ class Captures:
     ) -> CaptureRecord:
         if needs_consent:
             self._check_consent(about.session, board=content.board)
-        faults = tuple(without_consequences([*shot_faults(shot), *content.faults]))
-        self._store.put_checks(folder, all_checks(shot, content))
+        # Pictures of the simulated studio, whose shots have no checks, are judged like those of an upload.
+        taken = cast(ShotDocument, shot) if shot is not None and "checks" in shot else None
+        at_shot = [] if taken is None else [read_fault(document) for document in taken["faults"]]
+        faults = tuple(without_consequences([*at_shot, *content.faults]))
+        checks = {} if taken is None else taken["checks"]
+        of_views = {name: {**checks.get(name, {}), **view} for name, view in content.checks.items()}
+        self._store.put_checks(folder, cast(dict[str, ViewDocument], of_views))
         record = CaptureRecord(
             id=new_id(),
             created=moment_now(),
@@ -311,18 +316,3 @@ class Captures:
             self._store.remove_capture(record.id, later=True)
             raise
         return record
-
-
-def shot_faults(shot: Mapping[str, object] | None) -> tuple[Fault, ...]:
-    """Returns the faults in the certificate of a real rig's shot. It returns none for the simulated studio, whose
-    pictures are judged like those of an upload."""
-    if shot is None or "checks" not in shot:
-        return ()
-    return tuple(read_fault(document) for document in cast(ShotDocument, shot)["faults"])
-
-
-def all_checks(shot: Mapping[str, object] | None, content: CaptureContent) -> dict[str, ViewDocument]:
-    """Merges what was measured of each camera's picture at the shot (``shot``) and when the files were checked
-    (``content``). The latter counts where both measured the same."""
-    taken = cast(Mapping[str, ViewDocument], {} if shot is None else shot.get("checks", {}))
-    return {name: {**taken.get(name, {}), **view} for name, view in content.checks.items()}

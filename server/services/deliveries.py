@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
-from dbos import DBOSClient, WorkflowStatus
+from dbos import DBOSClient
 
 from rig.messages.message import compose
 from server.errors import Forbidden
@@ -77,7 +77,14 @@ class Deliveries:
         ids = [delivery_id(job_id) for job_id in jobs]
         rows = self.client.list_workflows(name=DELIVER, workflow_ids=ids, load_output=True) if ids else []
         found = [(cast(DeliveryRequest, row.input["args"][0]), row) for row in rows if row.input]
-        return {wanted["job_id"]: _delivery(wanted, row) for wanted, row in found}
+        return {
+            wanted["job_id"]: DeliveryOut(
+                to=place_of(wanted),
+                state=STATE_OF[STATES[row.status]],
+                error=failure(row) if STATES[row.status] == "failed" else None,
+            )
+            for wanted, row in found
+        }
 
     def forget(self, job_id: str) -> None:
         """Ends the delivery of a job, if any, and removes its row; what was delivered stays where it is."""
@@ -94,9 +101,3 @@ def delivery_of(
     place = f"{request['deliver_to']}{job_id}/"
     ended = state in ("failed", "cancelled")
     return DeliveryOut(to=place, state="cancelled" if ended else "waiting", error=None)
-
-
-def _delivery(wanted: DeliveryRequest, row: WorkflowStatus) -> DeliveryOut:
-    state = STATES[row.status]
-    error = failure(row) if state == "failed" else None
-    return DeliveryOut(to=place_of(wanted), state=STATE_OF[state], error=error)

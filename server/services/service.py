@@ -141,11 +141,6 @@ class Service:
                 raise
             return archive.read_bytes()
 
-    def result_address(self, job_id: str, name: str) -> str | None:
-        """Returns a signed address of a file of a job's result, as in ``Results.link``; None where the service sends it
-        itself. Raises NotFound, Conflict and Unavailable."""
-        return self.jobs.results.link(job_id, name) if name in self.jobs.files(job_id) else None
-
 
 def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
     """Opens the data folder, the database and the rig's description, brings the database's index up to date and returns

@@ -17,7 +17,7 @@ from rig.formats.captures.archive import ArchiveLimits, extract_archive
 from rig.formats.captures.capture_folder import capture_root
 from rig.messages.message import compose, documents_of, texts_of
 from rig.progress import Progress
-from server.storage.records import CalibrationOutcome
+from server.storage.records import JsonObject
 from server.tasks.child import WorkerContext
 from server.tasks.photographs import SCALE, check_sizes
 
@@ -115,7 +115,7 @@ def calibrate_folder(
     previous: str | None,
     cache: str,
     front: str | None,
-) -> CalibrationOutcome:
+) -> JsonObject:
     """Calibrates from the board pictures or photographs in ``folder`` and writes cameras.json, calibration.json and
     report.html to ``result``.
 
@@ -148,7 +148,7 @@ def calibrate_folder(
     return _outcome(found.document(), Path(result))
 
 
-def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | None) -> CalibrationOutcome:
+def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | None) -> JsonObject:
     from calibration.result import CalibrationRefused
     from calibration.scene.result import judge_scene, write_scene_report
     from calibration.scene.scene import calibrate_scene
@@ -166,17 +166,9 @@ def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | 
     return _outcome({"verdict": verdict.word, **missing, **found.document()}, result)
 
 
-def _outcome(document: Mapping[str, Any], result: Path) -> CalibrationOutcome:
+def _outcome(document: Mapping[str, Any], result: Path) -> JsonObject:
     """Writes calibration.json beside cameras.json in ``result``. Returns what the calibration's record holds of it."""
     write_atomically(result / "calibration.json", json.dumps(document, indent=1).encode())
-    return {
-        "verdict": document["verdict"],
-        "missing": document["missing"],
-        "missing_messages": document["missing_messages"],
-        "figures": document["figures"],
-        "checks": [*document.get("checks", ())],
-        "warnings": document["warnings"],
-        "warning_messages": document["warning_messages"],
-        "front": document["front"],
-        "sha256": sha256_of(result / "cameras.json"),
-    }
+    kept = ("verdict", "missing", "missing_messages", "figures", "warnings", "warning_messages", "front")
+    beside = {"checks": [*document.get("checks", ())], "sha256": sha256_of(result / "cameras.json")}
+    return {name: document[name] for name in kept} | beside

@@ -21,7 +21,8 @@ from rig.formats.captures.capture_folder import has_known_length
 from rig.formats.pictures.images import read_image
 from rig.progress import Progress
 from rig.rig import Rig
-from server.storage.face_cache import FacesDocument, FoundFace, PixelsOfPoints
+from server.storage.face_cache import PixelsOfPoints
+from server.storage.records import JsonObject
 from server.tasks.child import WorkerContext
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ PICTURE_PX = 1600  # longer side: a face of an eighth of it has the networks' 19
 
 def find_capture_faces(
     context: WorkerContext, report: Progress, *, capture: str, images: Mapping[str, str]
-) -> FacesDocument:
+) -> JsonObject:
     """Finds the faces in a capture's pictures, and which of them is the subject's. ``images``: file of each camera's
     picture, below the folder ``capture``. Raises InputError, and DamagedNetwork if a network's file is damaged."""
     root = Path(capture)
@@ -63,11 +64,12 @@ def find_capture_faces(
 
 def describe(
     subject: "SubjectFaces", rig: Rig, recorded: Rig, suggest: "Callable[[MatchedFaces], PixelsOfPoints]"
-) -> FacesDocument:
+) -> JsonObject:
     """Converts the faces found with the reduced cameras ``rig`` to pixels of the picture files, whose cameras are
-    ``recorded``. In each picture the subject's face comes first."""
+    ``recorded``: ``faces`` of every picture, the subject's first, and the pixels ``suggested`` for the seven feature
+    points (none where no face is certain)."""
     matched = subject.matched
-    faces: dict[str, list[FoundFace]] = {}
+    faces: dict[str, list[JsonObject]] = {}
     for name, seen in subject.found.items():
         best = None if matched is None else matched.detections.get(name)
         found = [_face_of(face, rig[name], recorded[name], best) for face in seen]
@@ -75,7 +77,9 @@ def describe(
     return {"faces": faces, "suggested": {} if matched is None else suggest(matched)}
 
 
-def _face_of(face: "FaceDetection", camera: Camera, recorded: Camera, best: "FaceDetection | None") -> FoundFace:
+def _face_of(face: "FaceDetection", camera: Camera, recorded: Camera, best: "FaceDetection | None") -> JsonObject:
+    """Describes one face in pixels of the picture's file. ``is_subject``: the views agree that it is the subject's;
+    ``roll_deg``: how far it is turned clockwise in the picture."""
     points = file_pixels(face.landmarks_px, camera, recorded)
     return {
         "box_px": _plain(np.concatenate([points.min(axis=0), points.max(axis=0)])),

@@ -57,7 +57,7 @@ from server.storage.database import AWAY, events, now_sql, open_database, worker
 from server.storage.events import END, EventLog
 from server.storage.folders import move_durably
 from server.storage.job_index import RUNNING, engine_jobs
-from server.storage.records import CalibrationOutcome, EventDocument, FileEntry, JobRequest, JobWebhook, WebhookMessage
+from server.storage.records import EventDocument, FileEntry, JobRequest, JobWebhook, JsonObject, WebhookMessage
 from server.storage.store import Store
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import DISK_FULL, ChildProcessPool, WorkerContext, WorkFailed, function_at
@@ -189,12 +189,12 @@ class Worker:
             return post(message)
 
         @DBOS.step(name="calibrate")
-        def calibrate(identity: str) -> CalibrationOutcome:
+        def calibrate(identity: str) -> JsonObject:
             return worker.calibrate(identity)
 
         @DBOS.workflow(name=calibrations.WORKFLOW, max_recovery_attempts=self.settings.attempts)
         @self._noted()
-        def calibrate_rig(identity: str) -> CalibrationOutcome:
+        def calibrate_rig(identity: str) -> JsonObject:
             return calibrate(identity)
 
         del reconstruct_job, deliver, calibrate_rig  # known to the engine by name
@@ -285,7 +285,7 @@ class Worker:
         if self._work is reconstruct_capture:  # how long another work takes says nothing of this one
             self._durations.learn(chosen, progress.finish(), megapixels)
 
-    def calibrate(self, identity: str) -> CalibrationOutcome:
+    def calibrate(self, identity: str) -> JsonObject:
         """Computes one calibration in a child process and returns its outcome. The result is written under a temporary
         name and renamed at the end. Pictures of a scene are removed then, and also after a failure that no repetition
         would mend (JobFailed)."""

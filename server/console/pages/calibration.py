@@ -75,7 +75,11 @@ def calibration_state(service: Service) -> JsonObject:
     names = [camera.name for camera in rig.cameras]
     lines = summary(names, [corners for _, corners in shots.taken])
     return {
-        "calibrations": [calibration_line(c) for c in known_calibrations(service, 1.0) if c.id not in removals],
+        "calibrations": [
+            c.model_dump() | {"error": shown_failure(c.error)}
+            for c in known_calibrations(service, 1.0)
+            if c.id not in removals
+        ],
         "rig": {
             "kind": rig.kind,
             "calibration": rig.calibration,
@@ -86,11 +90,6 @@ def calibration_state(service: Service) -> JsonObject:
         "coverage": lines,
         "advice": (NO_BOARD if rig.kind == "simulated" and not shots.taken else advice(lines)).document(),
     }
-
-
-def calibration_line(calibration: CalibrationOut) -> Mapping[str, object]:
-    """Returns a calibration as JSON types, its failure as pages show it."""
-    return calibration.model_dump() | {"error": shown_failure(calibration.error)}
 
 
 def board_of(event: JsonObject) -> Mapping[str, object]:

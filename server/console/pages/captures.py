@@ -177,8 +177,8 @@ def said_of(action: str, count: int) -> Message:
 
 
 def forget_captures() -> None:
-    """Drops the cached lists that show captures, sessions, tags or subjects."""
-    shared.forget("captures", "sessions", "tags", "subjects")
+    """Drops what is cached of captures, sessions, tags and subjects."""
+    shared.forget("captures", "sessions", "tags", "subjects", "rig")
 
 
 CapturesPage.actions = {

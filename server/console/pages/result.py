@@ -8,7 +8,7 @@ from nicegui.elements import scene
 
 from pipeline.results.report_types import Report
 from server.console.page import Page, serve_page, shared
-from server.console.pages.jobs import ListedJob, listed_jobs
+from server.console.pages.jobs import listed_jobs
 from server.console.pages.rig import read_report
 from server.console.removal import removals
 from server.errors import NotFound
@@ -76,23 +76,18 @@ def heads_of_subject(service: Service, head: JsonObject) -> list[JsonObject]:
 
 
 def result_lines(service: Service, jobs: Iterable[JobOut]) -> list[JsonObject]:
-    """Converts jobs that have a result to entries of the page's list, with the capture and the subject of each."""
-    files = []
+    """Converts jobs that have a result to entries of the page's list, each with label and time of its capture
+    (``capture``, ``captured``) and the name of its ``subject``."""
+    lines = []
     for listed in listed_jobs(service, jobs):
         subject = ""
         if listed.session:
             with suppress(NotFound):
                 subject = service.store.session(listed.session).label
-        files.append(result_line(listed, subject))
-    return files
-
-
-def result_line(listed: ListedJob, subject: str) -> JsonObject:
-    """Converts a job that has a result to an entry of the page's list. ``capture`` and ``captured``: label and time of
-    its capture; ``subject``: name of the subject."""
-    names = ("id", "capture_id", "created", "finished", "settings", "model")
-    line = {name: getattr(listed.job, name) for name in names}
-    return line | {name: getattr(listed, name) for name in ("capture", "captured", "session")} | {"subject": subject}
+        job = listed.job.model_dump(include={"id", "capture_id", "created", "finished", "settings", "model"})
+        of_capture = {"capture": listed.capture, "captured": listed.captured, "session": listed.session}
+        lines.append(job | of_capture | {"subject": subject})
+    return lines
 
 
 def head_of(service: Service, job: JsonObject) -> JsonObject:

@@ -12,12 +12,12 @@ from rig.messages.message import Message, compose, documents_of
 from server.console.capture_lines import capture_line, sessions_list, sync_of
 from server.console.media import live_view
 from server.console.page import Action, Page, serve_page, shared, shown_detail
+from server.console.pages.calibration import known_calibrations
 from server.console.pages.captures import discard, edit_consent, new_session
 from server.console.removal import removals
 from server.console.work_form import chosen_work
 from server.errors import Conflict, NotFound
 from server.services.captures import CaptureMetadata
-from server.services.records import CalibrationOut
 from server.services.service import Service
 from server.storage.records import JsonObject
 
@@ -101,8 +101,7 @@ def calibration_in_use(service: Service) -> JsonObject | None:
     service did not make it."""
     if service.calibrations.in_use() is None:
         return None
-    known: list[CalibrationOut] = shared.get("calibrations", 2.0, service.calibrations.find)
-    used = next((one for one in known if one.in_use), None)
+    used = next((one for one in known_calibrations(service, 2.0) if one.in_use), None)
     return used and {"label": used.label, "created": used.created, "rms_px": used.figures.get("rms_px")}
 
 
@@ -181,26 +180,13 @@ def use_plates(page: Page, event: JsonObject) -> Message:
     return compose("plates-taken-into-use")
 
 
-def begin_session(page: Page, event: JsonObject) -> Message:
-    """Makes a session, which the page selects. Raises InputError for invalid texts."""
-    notice = new_session(page, event)
-    shared.forget("rig")
-    return notice
-
-
-def note_consent(page: Page, event: JsonObject) -> None:
-    """Changes the label or the consent note of a session. Raises NotFound and InputError."""
-    edit_consent(page, event)
-    shared.forget("rig")
-
-
 RigPage.actions = {
     "capture": Action("capture", capture),
     "plates": Action("capture", plates),
     "use_plates": Action("capture", use_plates),
     "keep": Action("read", keep),
-    "new_session": Action("capture", begin_session),
-    "edit_session": Action("capture", note_consent),
+    "new_session": Action("capture", new_session),
+    "edit_session": Action("capture", edit_consent),
     "retake": Action("capture", retake),
     "reconstruct": Action("submit", reconstruct_shot),
 }

@@ -39,7 +39,7 @@ class ServicePage(Page, component="service.js"):
     def look(self) -> JsonObject:
         """Returns the state of the page. Only callers with the scope admin see the keys. ``open``: there are no API
         keys, so that whoever sits at this machine may do everything."""
-        admin, service = self.caller.may("admin"), self.service
+        admin, service, data = self.caller.may("admin"), self.service, str(self.service.store.data.resolve())
         return {
             "keys": [*key_lines(service, self.caller)] if admin else None,
             "open": self.caller.key == LOCAL,
@@ -47,7 +47,7 @@ class ServicePage(Page, component="service.js"):
             "admin": admin,
             "retention": setting_lines(service.settings),
             "upcoming": shared.get("upcoming", 5.0, lambda: [one.model_dump() for one in upcoming(service)]),
-            "storage": shared.get("storage", 2.0, lambda: storage_shown(service)),
+            "storage": shared.get("storage", 2.0, lambda: service.storage.use().model_dump()) | {"data": data},
         }
 
     async def _act(self, event: GenericEventArguments) -> None:
@@ -55,11 +55,6 @@ class ServicePage(Page, component="service.js"):
         if self.secret is not None:  # over the page's socket alone, and never in the state that a look makes
             self.run_method("show_key", self.secret)
             self.secret = None
-
-
-def storage_shown(service: Service) -> JsonObject:
-    """Returns how the disk is used, with the path of the data folder."""
-    return service.storage.use().model_dump() | {"data": str(service.store.data.resolve())}
 
 
 def key_lines(service: Service, caller: Caller) -> list[JsonObject]:
@@ -148,11 +143,6 @@ def sweep_now(page: ServicePage, event: object) -> Message:
     return compose("swept", gone=removed or compose("nothing-due"))
 
 
-def count_again(page: ServicePage, event: object) -> None:
-    """Starts to count the bytes in the data folder anew."""
-    forget_storage(page.service)
-
-
 def forget_storage(service: Service) -> None:
     """Drops the cached figures of the disk and of what retention removes next, so that they are computed anew."""
     service.storage.forget()
@@ -165,7 +155,7 @@ ServicePage.actions = {
     "clear": Action("admin", clear),
     "remove_failed": Action("admin", remove_failed),
     "sweep": Action("admin", sweep_now),
-    "count": Action("read", count_again),
+    "count": Action("read", lambda page, event: forget_storage(page.service)),
 }
 
 

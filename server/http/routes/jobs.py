@@ -238,7 +238,8 @@ def get_result(
     """Returns a file of the result: head.ply, head.glb, report.json, contact_sheet.png, overlays/<camera>.png and so
     on. ``GET .../result`` lists them. With ``redirect`` a result that an S3 store keeps is answered with 307 and a
     signed address of the store, which holds for five minutes and takes no API key."""
-    if redirect and (address := service.result_address(job_id, name)) is not None:
+    address = service.jobs.results.link(job_id, name) if redirect and name in service.jobs.files(job_id) else None
+    if address is not None:
         return RedirectResponse(address, 307, {"Cache-Control": "no-store"})
     return send_file(request, service.jobs.result_file(job_id, name))
 

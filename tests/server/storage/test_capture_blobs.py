@@ -10,7 +10,7 @@ import sqlalchemy as sa
 
 from rig.digest import sha256_of
 from server.errors import Conflict
-from server.services.unclaimed import collect
+from server.services.retention import collect
 from server.settings import ServiceSettings
 from server.storage.capture_blobs import NAME, SMALL_BYTES, CaptureBlobs, open_capture_blobs
 from server.storage.database import capture_index, open_database
