@@ -22,7 +22,7 @@ from server.batch.captures import WHOLE, Shard, capture_sha256
 from server.batch.folder import BatchFolder, FailureRecord, Origin
 from server.tasks.child import DISK_FULL, Child, WorkerContext, WorkFailed
 from server.tasks.progress import JobProgress
-from server.tasks.reconstruct_folder import reconstruct_beside
+from server.tasks.reconstruct import reconstruct_beside
 
 if TYPE_CHECKING:
     from server.batch.plan import BatchTask

@@ -20,7 +20,7 @@ from server.cli.answers import service_settings
 from server.tasks.child import WorkFailed
 from server.tasks.ingest import check_capture, check_views
 from server.tasks.photographs import photographs_alone, read_scaled_capture
-from server.tasks.reconstruct_folder import folder_of
+from server.tasks.reconstruct import folder_of
 
 
 def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> dict[str, Any]:

@@ -97,7 +97,7 @@ def _export_dataset(
     from pipeline.settings import settings_from_document
     from server.cli.reconstruct_local import check_apart
     from server.tasks.export_dataset import export_folder
-    from server.tasks.reconstruct_folder import folder_of
+    from server.tasks.reconstruct import folder_of
     from server.tasks.settings_file import settings_document
 
     wanted = settings_from_document(settings_document(settings))

@@ -16,7 +16,7 @@ from server.processes import share_one_heap
 from server.storage.result_folder import fresh_folder
 from server.tasks.child import WorkerContext
 from server.tasks.progress import JobProgress
-from server.tasks.reconstruct_folder import folder_of, reconstruct_folder
+from server.tasks.reconstruct import folder_of, reconstruct_folder
 
 if TYPE_CHECKING:
     from pipeline.results.report_types import Report as ReportDocument

@@ -9,10 +9,10 @@ from collections.abc import AsyncIterator
 
 import structlog
 
+from rig.acquisition.image_checks import blur_px, exposure
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 from rig.progress import Progress
-from server.console.live_frame import measured_frame
 from server.services.live.live import document_of
 from server.services.rigs import PREVIEW_WIDTH, RigBackend, jpeg, reduced
 from server.services.service import Service
@@ -45,6 +45,23 @@ def rig_frames(rig: RigBackend, child: Child, look: int) -> list[JsonObject]:
         return child.remote(frames)(look=look)
     pictures, names = rig.look(), [camera.name for camera in described.cameras]
     return [_frame(name, pictures.get(name), look % len(names) == i) for i, name in enumerate(names)]
+
+
+def measured_frame(name: str, picture: ImageRgb, data: bytes, large: ImageRgb | None) -> JsonObject:
+    """Returns a camera's frame: its name, ``data``, which is its ``picture`` as a JPEG file, and the picture's ``mean``
+    (0 to 255) and share of ``clipped`` pixels. In ``large``, the picture in full size, its sharpness is measured
+    (``blur_px``)."""
+    level = exposure(picture)
+    frame: JsonObject = {
+        "name": name,
+        "mean": round(level.mean, 1),
+        "clipped": round(level.clipped_share, 4),
+        "jpeg": data,
+    }
+    if large is not None:
+        blur = blur_px(large)
+        frame["blur_px"] = None if blur is None else round(blur, 2)
+    return frame
 
 
 class LiveView:

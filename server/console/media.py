@@ -10,8 +10,11 @@ distortion, onto which a pinhole camera draws the mesh exactly.
 import asyncio
 import json
 import threading
+import time
+from collections import defaultdict
 from contextlib import suppress
 from pathlib import Path
+from queue import Empty
 from typing import Annotated, Any, Literal
 
 import cv2
@@ -26,7 +29,7 @@ from pipeline.geometry.registration.rigid import rigid_procrustes
 from pipeline.results.report_types import Report
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
-from rig.errors import EigenheadError, InputError
+from rig.errors import Cancelled, EigenheadError, InputError
 from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.formats.meshes.ply import read_vertex_numbers
@@ -37,17 +40,19 @@ from rig.mesh import Mesh
 from rig.messages.message import compose
 from rig.progress import Progress
 from rig.rig import Rig
-from server.console.found_faces import found_faces
 from server.console.head_pictures import head_picture, result_folder
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
 from server.console.page import as_problem
-from server.errors import NotFound
+from server.errors import NotFound, Unavailable
 from server.services.keys import Caller
 from server.services.service import Service
 from server.services.truth import surface_distance
+from server.services.work import refuse_board
+from server.storage.face_cache import faces_once
 from server.storage.records import CaptureRecord, JsonObject
 from server.tasks.child import WorkerContext
+from server.tasks.faces import find_capture_faces
 from server.wire.batch_files import SheetFormat, TableFormat, send_sheet, send_table
 from server.wire.multipart import receive_calibration_pictures, receive_capture
 from server.wire.send_file import send_archive, send_file, send_zip
@@ -64,10 +69,12 @@ THUMBNAIL_QUALITY = 82
 STRAIGHTENED_QUALITY = 88
 ROUNDS = 12  # of nearest points, where two heads do not share their vertices
 TRIMMED = 0.8  # share of the nearest pairs that a round uses: necks end at different heights
+PATIENCE_S = 50.0  # for faces: eleven pictures of 12 Mpx take 4 s, forty 15
 FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 
 _live: dict[int, LiveView] = {}
 _drawing = threading.Lock()
+_finding: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)  # faces, by capture
 
 
 def session(scope: str) -> Any:
@@ -452,3 +459,35 @@ def moved_onto(mine: Mesh, theirs: Mesh) -> Float[np.ndarray, "v 3"]:
         near = distance <= np.quantile(distance, TRIMMED)
         points = rigid_procrustes(points[near], theirs.vertices[nearest[near]]).apply(points)
     return points
+
+
+def found_faces(service: Service, identity: str) -> JsonObject:
+    """Returns the faces in a capture's pictures. The first call finds them; later ones read the cache. Blocks.
+
+    Raises NotFound, Conflict for a shot of the board, InputError and WorkFailed if the pictures cannot be searched, and
+    Unavailable after ``PATIENCE_S`` seconds.
+    """
+    deadline = time.monotonic() + PATIENCE_S
+    record = service.store.capture(identity)
+    refuse_board(record)
+    images = {Path(name).stem: name for name in record.inputs if Path(name).parent.name == "images"}
+    files = service.store.capture_files(identity)
+
+    def find() -> JsonObject:
+        with service.children.one(max(0.0, deadline - time.monotonic())) as child:
+            work = child.remote(find_capture_faces, cancelled=lambda: time.monotonic() > deadline)
+            return work(capture=str(files), images=images)
+
+    lock = _finding[identity]
+    if not lock.acquire(timeout=PATIENCE_S):
+        raise _slow()
+    try:
+        return faces_once(service.store.cache_of(identity) / "faces", record.inputs, find)
+    except (Cancelled, Empty):
+        raise _slow() from None
+    finally:
+        lock.release()
+
+
+def _slow() -> Unavailable:
+    return Unavailable("service-unavailable", compose("faces-slow", seconds=PATIENCE_S))

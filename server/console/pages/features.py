@@ -12,9 +12,8 @@ import numpy as np
 
 from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS
 from rig.messages.message import Message, MessageDocument, compose
-from server.console.found_faces import found_faces
 from server.console.guides import Guides, mean_landmarks, nearest_views
-from server.console.media import rig_of
+from server.console.media import found_faces, rig_of
 from server.console.page import Action, Page, serve_page, shared
 from server.console.removal import removals
 from server.errors import Conflict, InvalidInput

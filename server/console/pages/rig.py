@@ -9,13 +9,19 @@ from typing import cast
 from pipeline.results.report_types import Report
 from rig.acquisition.plates import PlatesVersion
 from rig.messages.message import Message, compose, documents_of
-from server.console.capture_lines import capture_line, sessions_list, sync_of
 from server.console.media import live_view
 from server.console.page import Action, Page, serve_page, shared, shown_detail
 from server.console.pages.calibration import known_calibrations
-from server.console.pages.captures import discard, edit_consent, new_session
+from server.console.pages.captures import (
+    capture_line,
+    chosen_work,
+    discard,
+    edit_consent,
+    new_session,
+    sessions_list,
+    sync_of,
+)
 from server.console.removal import removals
-from server.console.work_form import chosen_work
 from server.errors import Conflict, NotFound
 from server.services.captures import CaptureMetadata
 from server.services.service import Service

@@ -31,14 +31,13 @@ from server.http.schemas import (
 from server.services.bulk import BulkOut, each
 from server.services.captures import CaptureMetadata
 from server.services.erasure import HoldingsOut
-from server.services.imports import fetch_stored_capture
 from server.services.records import JobOut
 from server.services.texts import PLAIN, TEXT_MOST, checked_tags
 from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.object_places import is_object_url
 from server.storage.records import CaptureRecord
-from server.wire.fetch import fetch_archive
+from server.wire.fetch import fetch_archive, fetch_stored_capture
 from server.wire.multipart import ABOUT, ARCHIVE, described_form, receive_capture
 from server.wire.problems import Responses, documented
 from server.wire.send_file import send_file

@@ -25,9 +25,9 @@ from server.console import coverage, guides, live, media
 from server.console.identity import cookie_secret, is_foreign, is_rebound
 from server.console.live import look_bytes
 from server.console.mount import path_below
+from server.console.pages.captures import chosen_work, settings_of
 from server.console.pages.jobs import chosen_settings, log_lines
 from server.console.removal import Removals
-from server.console.work_form import chosen_work, settings_of
 from server.errors import Conflict, Forbidden, NotFound, Unauthenticated, Unavailable
 from server.services.keys import Keys
 from server.services.live.live import nothing
