@@ -269,29 +269,15 @@ def subject_of(record: SessionRecord) -> str:
 
 
 def _row_of(record: Record, changed: int) -> dict[str, object]:
-    return _capture_row(record, changed) if isinstance(record, CaptureRecord) else _session_row(record, changed)
-
-
-def _capture_row(record: CaptureRecord, changed: int) -> dict[str, object]:
-    verdict = record.verdict or UNJUDGED
-    return {
-        "id": record.id,
+    row: dict[str, object] = {"id": record.id, "label": storable(record.label), "changed": changed}
+    if isinstance(record, SessionRecord):
+        return row | {"subject": subject_of(record), "words": folded(record.label, record.consent)}
+    words = folded(record.label, record.expression, record.verdict, record.source, *record.tags)
+    return row | {
         "session": None if record.session is None else storable(record.session),
-        "label": storable(record.label),
-        "verdict": verdict,
+        "verdict": record.verdict or UNJUDGED,
         "source": record.source,
         "board": record.board,
         "bytes": record.bytes,
-        "words": folded(record.label, record.expression, record.verdict, record.source, *record.tags),
-        "changed": changed,
-    }
-
-
-def _session_row(record: SessionRecord, changed: int) -> dict[str, object]:
-    return {
-        "id": record.id,
-        "subject": subject_of(record),
-        "label": storable(record.label),
-        "words": folded(record.label, record.consent),
-        "changed": changed,
+        "words": words,
     }

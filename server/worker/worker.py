@@ -101,7 +101,17 @@ class Worker:
     def start(self) -> None:
         """Writes the first heartbeat, starts the job engine and takes jobs. Returns at once; jobs run in threads."""
         DBOS.migrate(system_database_url=self.settings.url)
-        DBOS(config=engine_config(self.settings, self.id))
+        config: DBOSConfig = {
+            "name": APPLICATION,
+            "system_database_url": self.settings.url,
+            "application_version": APPLICATION_VERSION,
+            "executor_id": self.id,
+            "enable_otlp": False,
+            "log_level": "WARNING",
+            "notification_listener_polling_interval_sec": 1.0,
+            "serializer": SERIALIZER,
+        }
+        DBOS(config=config)
         self._register()
         self._deliverer.register()
         DBOS.listen_queues([self.settings.queue, WEBHOOKS_QUEUE, DELIVERIES_QUEUE])
@@ -134,12 +144,6 @@ class Worker:
     def stop(self) -> None:
         """Makes ``run_until_stopped`` end the process, within half a second."""
         self._stop.set()
-
-    def enqueue_delivery_of(self, job_id: str, request: JobRequest) -> None:
-        """Enqueues the delivery of a job's result, if the request asks for one."""
-        if "deliver_to" in request:
-            place, hook = request["deliver_to"], request.get("webhook")
-            enqueue_delivery(DBOS.enqueue_workflow_with_options, job_id, place, self.settings, hook)
 
     def _register(self) -> None:
         worker = self
@@ -176,7 +180,9 @@ class Worker:
                     raise
                 worker.outcomes.publish(job_id, "succeeded", request.get("webhook"))
                 worker._captures.leave(job_id, request["capture_id"])
-                worker.enqueue_delivery_of(job_id, request)
+                if "deliver_to" in request:
+                    place, hook = request["deliver_to"], request.get("webhook")
+                    enqueue_delivery(DBOS.enqueue_workflow_with_options, job_id, place, worker.settings, hook)
                 return files
 
         @DBOS.step(name="post", retries_allowed=True, interval_seconds=2.0, backoff_rate=2.0, max_attempts=9)
@@ -434,20 +440,6 @@ def _stop_at_eof(stop: Callable[[], None]) -> None:
     while sys.stdin.buffer.read(4096):
         pass
     stop()
-
-
-def engine_config(settings: ServiceSettings, executor_id: str) -> DBOSConfig:
-    """Returns the job engine's configuration for the worker ``executor_id``."""
-    return {
-        "name": APPLICATION,
-        "system_database_url": settings.url,
-        "application_version": APPLICATION_VERSION,
-        "executor_id": executor_id,
-        "enable_otlp": False,
-        "log_level": "WARNING",
-        "notification_listener_polling_interval_sec": 1.0,
-        "serializer": SERIALIZER,
-    }
 
 
 def dead_workers(engine: sa.Engine, silent_s: float, except_id: str = "") -> list[str]:

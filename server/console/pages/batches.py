@@ -8,7 +8,7 @@ from rig.messages.message import Message, compose, documents_of
 from server.batch.table import has_parquet
 from server.console.page import Action, Page, serve_page, shared
 from server.console.pages.jobs import listed_jobs
-from server.services.batches import BatchRequest, Selection
+from server.services.batches import BatchRequest
 from server.services.job_rows import STATUSES
 from server.services.service import Service
 from server.services.work import ReconstructionRequest
@@ -68,7 +68,7 @@ def begin(page: Page, event: JsonObject) -> Message:
     """Begins a batch of the captures whose labels begin with ``prefix``, and selects it. ``detail`` is empty for the
     default. Raises what ``Batches.submit`` raises."""
     settings = {"detail": event["detail"]} if event["detail"] else {}
-    wanted = BatchRequest(Selection(prefix=event["prefix"]), ReconstructionRequest(None, settings), event["label"])
+    wanted = BatchRequest(ReconstructionRequest(None, settings), prefix=event["prefix"], label=event["label"])
     batch = page.service.batches.submit(wanted, key=page.caller.key)
     shared.forget("batches")
     page.choice["batch"] = batch.id
