@@ -10,7 +10,6 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import structlog
@@ -32,14 +31,6 @@ UNUSED_S = 900.0  # a file that is being sent is not that old
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 
 log = structlog.get_logger()
-
-
-@dataclass(frozen=True, slots=True)
-class _LargeFile:
-    used: float
-    bytes: int
-    job_id: str
-    path: Path
 
 
 class Results:
@@ -131,20 +122,19 @@ class Results:
         Each is compared with its object before, and stored where it lacks one. Returns how many went."""
         if self.objects is None:
             return 0
-        found, removed = sorted(self._large(), key=lambda file: file.used), 0
-        total = sum(file.bytes for file in found)
-        for file in found:
-            if total <= most or time.time() - file.used < UNUSED_S:
+        found, removed = sorted(self._large()), 0
+        total = sum(size for _, size, *_ in found)
+        for used, size, job_id, path in found:
+            if total <= most or time.time() - used < UNUSED_S:
                 break
-            name = file.path.relative_to(self._store.folder("jobs", file.job_id) / "result").as_posix()
+            name = path.relative_to(self._store.folder("jobs", job_id) / "result").as_posix()
             try:
-                entry = files_of(file.job_id)[name]
-                self.objects.put(f"{file.job_id}/{name}", file.path, entry["sha256"])
+                self.objects.put(f"{job_id}/{name}", path, files_of(job_id)[name]["sha256"])
             except (EigenheadError, LookupError, OSError) as error:  # it runs, is being removed, or the store is away
-                log.info("a result stays in the data folder", job_id=file.job_id, reason=str(error)[:200])
+                log.info("a result stays in the data folder", job_id=job_id, reason=str(error)[:200])
                 continue
-            file.path.unlink(missing_ok=True)
-            total, removed = total - file.bytes, removed + 1
+            path.unlink(missing_ok=True)
+            total, removed = total - size, removed + 1
         return removed
 
     def _path(self, job_id: str, name: str) -> Path:
@@ -165,10 +155,11 @@ class Results:
             path.parent.mkdir(parents=True, exist_ok=True)
             part.replace(path)
 
-    def _large(self) -> Iterator[_LargeFile]:
+    def _large(self) -> Iterator[tuple[float, int, str, Path]]:
+        """Yields when each large file was used, its size, job and path."""
         for job_id in self._store.ids("jobs"):
             for path in (self._store.folder("jobs", job_id) / "result").rglob("*"):
                 with suppress(FileNotFoundError):
                     said = path.stat()
                     if path.is_file() and said.st_size >= LARGE_BYTES:
-                        yield _LargeFile(said.st_mtime, said.st_size, job_id, path)
+                        yield said.st_mtime, said.st_size, job_id, path

@@ -156,8 +156,8 @@ class CaptureBlobs:
         with self._engine.connect() as connection:
             return int(connection.scalar(sa.select(sa.func.sum(capture_index.c.bytes))) or 0)
 
-    def release_abandoned(self) -> int:
-        """Releases the files of captures that were being received when their service was killed. Returns how many."""
+    def release_abandoned(self) -> None:
+        """Releases the files of captures that were being received when their service was killed."""
         known = sa.select(capture_index.c.id)
         query = sa.select(capture_files.c.capture_id).distinct()
         query = query.where(~capture_files.c.arrived, capture_files.c.capture_id.not_in(known))
@@ -165,7 +165,6 @@ class CaptureBlobs:
             found = [c for c in connection.scalars(query) if time.time() - int(c[:12], 16) / 1e3 > ARRIVING_S]
         for capture in found:
             self.release(capture)
-        return len(found)
 
     def known(self, ids: Collection[str]) -> set[str]:
         """Returns those of the ids that are blobs of this database."""

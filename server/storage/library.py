@@ -11,10 +11,9 @@ from typing import Literal
 
 import sqlalchemy as sa
 import structlog
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DataError
 
-from server.storage.database import capture_index, capture_tags, portions, scrub, session_index
+from server.storage.database import capture_index, capture_tags, insert_into, portions, scrub, session_index
 from server.storage.pages import Order, Page, contains, folded, is_or_ends, page_of, storable, words_of
 from server.storage.records import CaptureRecord, SessionRecord
 
@@ -219,10 +218,9 @@ class Library:
 
     def _put(self, table: sa.Table, records: Sequence[Record], changes: Mapping[str, int]) -> None:
         rows = [_row_of(record, changes[record.id]) for record in records]
-        insert = sqlite.insert if self._engine.dialect.name == "sqlite" else postgresql.insert
         with self._engine.begin() as connection:
             for some in portions(rows):
-                statement = insert(table)
+                statement = insert_into(self._engine, table)
                 new = {column.name: statement.excluded[column.name] for column in table.c if not column.primary_key}
                 connection.execute(statement.on_conflict_do_update(index_elements=["id"], set_=new), some)
         self._put_tags([record for record in records if isinstance(record, CaptureRecord)])

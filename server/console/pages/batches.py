@@ -7,7 +7,7 @@ from typing import cast, get_args
 from rig.messages.message import Message, compose, documents_of
 from server.batch.table import has_parquet
 from server.console.page import Action, Page, serve_page, shared
-from server.console.pages.jobs import listed_jobs
+from server.console.pages.jobs import capture_of
 from server.services.batches import BatchRequest
 from server.services.job_rows import STATUSES
 from server.services.service import Service
@@ -54,11 +54,14 @@ def failed_jobs(service: Service, batch: str) -> list[JsonObject]:
 
     def make() -> list[JsonObject]:
         failed = service.jobs.page(JobQuery("", STATUSES["failed"], batch=batch), FAILED_SHOWN).items
-        listed = listed_jobs(service, failed)
         return [
-            {"id": one.job.id, "capture": one.capture, "why": documents_of(error.errors or (error.detail,))}
-            for one in listed
-            if (error := one.job.error) is not None
+            {
+                "id": job.id,
+                "capture": capture_of(service, job)["capture"],
+                "why": documents_of(error.errors or (error.detail,)),
+            }
+            for job in failed
+            if (error := job.error) is not None
         ]
 
     return shared.get(("failed of batch", batch), 1.0, make)

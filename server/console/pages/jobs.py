@@ -1,8 +1,7 @@
 """The page Jobs: the queue, progress, log, cancel, restart with other settings, and the figures of a finished job."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import cast, get_args
 
 from pipeline.head_model.model_names import list_models
@@ -38,16 +37,6 @@ ASKED = ("find", "state", "sort", "batch", "after")
 LOG_LINES = 200
 
 
-@dataclass(frozen=True, slots=True)
-class ListedJob:
-    """Holds a job with the label, time and session of its capture."""
-
-    job: JobOut
-    capture: str
-    captured: str | None
-    session: str | None = None
-
-
 class JobsPage(Page, component="jobs.js"):
     """Shows the list of jobs, and the selected one with its log and, once it has finished, its figures."""
 
@@ -60,9 +49,7 @@ class JobsPage(Page, component="jobs.js"):
         chosen = self.choice.get("job")
         known = next((job for job in state["jobs"] if job["id"] == chosen), None)
         if known is None and chosen and chosen not in removals:
-            known = next(
-                (job_line(listed) for listed in listed_jobs(self.service, self.service.jobs.of([chosen]))), None
-            )
+            known = next((job_line(self.service, job) for job in self.service.jobs.of([chosen])), None)
         job = known or first
         return {**state, "job": job, "detail": None if job is None else job_detail(self.service, job["id"])}
 
@@ -81,7 +68,7 @@ def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JsonObj
     page = service.jobs.page(JobQuery(sought, statuses, batch=batch, order=order), SHOWN, after)
     jobs = [job for job in (*before, *page.items) if job.id not in removals]
     return {
-        "jobs": [job_line(listed) for listed in listed_jobs(service, jobs)],
+        "jobs": [job_line(service, job) for job in jobs],
         "counts": shared.get("job counts", 1.0, service.jobs.counts),
         "waiting": waiting,
         "next": page.next,
@@ -99,22 +86,17 @@ def active_jobs(service: Service, sought: str, batch: str | None, *, running: bo
     return jobs[:SHOWN], matching.total - min(SHOWN, len(jobs))
 
 
-def listed_jobs(service: Service, jobs: Iterable[JobOut]) -> list[ListedJob]:
-    """Adds to each job the label, time and session of its capture, as far as the capture exists."""
-    found = []
-    for job in jobs:
-        capture = next(iter(service.captures.of([job.capture_id or ""])), None)
-        if capture is None:
-            found.append(ListedJob(job, "", None, job.session))
-        else:
-            found.append(ListedJob(job, capture.label, capture.created, capture.session))
-    return found
+def capture_of(service: Service, job: JobOut) -> JsonObject:
+    """Returns label (``capture``), time (``captured``) and session of a job's capture, as far as that exists."""
+    for record in service.captures.of([job.capture_id or ""]):
+        return {"capture": record.label, "captured": record.created, "session": record.session}
+    return {"capture": "", "captured": None, "session": job.session}
 
 
-def job_line(listed: ListedJob) -> JsonObject:
+def job_line(service: Service, job: JobOut) -> JsonObject:
     """Converts a job to an entry of the page's list: its fields, with the label and time of its capture."""
-    line = listed.job.model_dump(exclude={"files"}) | {"error": shown_failure(listed.job.error)}
-    return {**line, "capture": listed.capture, "captured": listed.captured}
+    line = job.model_dump(exclude={"files"}) | {"error": shown_failure(job.error)}
+    return capture_of(service, job) | line
 
 
 def job_detail(service: Service, job_id: str) -> JsonObject:

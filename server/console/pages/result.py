@@ -8,7 +8,7 @@ from nicegui.elements import scene
 
 from pipeline.results.report_types import Report
 from server.console.page import Page, serve_page, shared
-from server.console.pages.jobs import listed_jobs
+from server.console.pages.jobs import capture_of
 from server.console.pages.rig import read_report
 from server.console.removal import removals
 from server.errors import NotFound
@@ -22,6 +22,7 @@ THREE_JS = Path(scene.__file__).with_name("dist")  # NiceGUI's own bundle of thr
 MOSTLY = 0.25  # of a contour, as on the page Jobs
 SHOWN = 60  # heads to choose from; the search finds the others
 SUBJECTS_HEADS = 100
+OF_JOB = {"id", "capture_id", "created", "finished", "settings", "model"}
 
 
 class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS)}):
@@ -79,14 +80,13 @@ def result_lines(service: Service, jobs: Iterable[JobOut]) -> list[JsonObject]:
     """Converts jobs that have a result to entries of the page's list, each with label and time of its capture
     (``capture``, ``captured``) and the name of its ``subject``."""
     lines = []
-    for listed in listed_jobs(service, jobs):
+    for job in jobs:
+        line, of_capture = job.model_dump(include=OF_JOB), capture_of(service, job)
         subject = ""
-        if listed.session:
+        if of_capture["session"]:
             with suppress(NotFound):
-                subject = service.store.session(listed.session).label
-        job = listed.job.model_dump(include={"id", "capture_id", "created", "finished", "settings", "model"})
-        of_capture = {"capture": listed.capture, "captured": listed.captured, "session": listed.session}
-        lines.append(job | of_capture | {"subject": subject})
+                subject = service.store.session(of_capture["session"]).label
+        lines.append(line | of_capture | {"subject": subject})
     return lines
 
 
