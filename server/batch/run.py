@@ -125,8 +125,9 @@ class BatchRun:
         """Separates the captures whose results exist from those to be made."""
 
         def kept(task: "BatchTask") -> bool:
+            origin = self._folder.origin(task.capture.name)
             try:
-                return self._is_done(task)
+                return origin is not None and origin.is_of(self._origin(task, capture_sha256(task.capture.path)))
             except OSError:  # reported when the capture's turn comes
                 return False
 
@@ -136,10 +137,6 @@ class BatchRun:
                     self._outcomes[task.capture.name] = Outcome(task.capture.name, "kept")
                 else:
                     self._pending.append(task)
-
-    def _is_done(self, task: "BatchTask") -> bool:
-        origin = self._folder.origin(task.capture.name)
-        return origin is not None and origin.is_of(self._origin(task, capture_sha256(task.capture.path)))
 
     def _origin(self, task: "BatchTask", input_sha256: str) -> Origin:
         return Origin(input_sha256, task.settings_sha256, task.model_sha256, task.version)

@@ -19,13 +19,15 @@ from rig.errors import InputError
 from rig.formats.captures.archive import ArchiveLimits
 from rig.messages.message import compose
 from server.errors import Conflict, NotFound
-from server.services.erasure import HoldingsOut, erase_captures, holdings
+from server.services.erasure import HoldingsOut, erase_captures
+from server.services.job_rows import FINISHED
 from server.services.jobs import Jobs
 from server.services.records import moment_now
 from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
 from server.services.texts import check_texts, checked_tags, typed_tags
 from server.services.work import refuse_board
 from server.settings import ServiceSettings
+from server.storage.folders import folder_bytes
 from server.storage.library import CaptureQuery, Library
 from server.storage.pages import Page
 from server.storage.records import CaptureContent, CaptureRecord
@@ -250,7 +252,19 @@ class Captures:
 
     def holdings(self, identity: str) -> HoldingsOut:
         """Returns what removing a capture would take away and what would stay. Raises NotFound."""
-        return holdings(self._store, self._jobs, identity)
+        record = self._store.capture(identity)
+        of_capture = self._jobs.find(capture=identity, limit=100_000)
+        held = max(
+            record.bytes, folder_bytes(self._store.folder("captures", identity))
+        )  # some may be in the store alone
+        return HoldingsOut(
+            pictures=len(record.cameras),
+            bytes=held + folder_bytes(self._store.cache_of(identity)),
+            heads=[job.id for job in of_capture if job.state == "succeeded"],
+            head_bytes=sum(file.bytes for job in of_capture for file in job.files.values()),
+            jobs=[job.id for job in of_capture if job.state != "succeeded"],
+            active=[job.id for job in of_capture if job.state not in FINISHED],
+        )
 
     def erase(self, identity: str) -> None:
         """Cancels the jobs of a capture, then removes every trace of it: pictures, heads, caches and rows of the job

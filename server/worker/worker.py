@@ -389,19 +389,24 @@ class Worker:
         """Puts the jobs of dead workers, and lost ones of this one, back. Idempotent, and safe for any number of
         workers at once."""
         dead = dead_workers(self.engine, self.settings.silent_s, except_id=self.id)
-        for job_id in [*take_over(self.engine, dead), *take_back(self.engine, self.id, self._find_lost())]:
+        for job_id in [*take_over(self.engine, dead), *self._take_back_lost()]:
             log.warning("job taken over", job=job_id)
             self.events.append(job_id, {"state": "queued", "stage": "queued", "progress": 0.0, "eta_s": None})
         with self.engine.begin() as connection:
             old = sa.and_(workers.c.id.in_(dead), workers.c.seen < now_sql(connection) - FORGET_S)
             connection.execute(sa.delete(workers).where(old))
 
-    def _find_lost(self) -> list[str]:
-        """Lists the workflows that the engine gave to this worker and in which nothing runs for ``LOST_S`` seconds: how
-        they ended could not be written, as on a disk that was full."""
-        now, held = time.monotonic(), held_by(self.engine, self.id, (WORKFLOW, DELIVERY, calibrations.WORKFLOW))
-        self._idle = {job: self._idle.get(job, now) for job in held if job not in self._here}
-        return [job for job, since in self._idle.items() if now - since >= LOST_S]
+    def _take_back_lost(self) -> list[str]:
+        """Puts the workflows that the engine gave to this worker, and in which nothing runs for ``LOST_S`` seconds,
+        back into their queues: how they ended could not be written, as on a disk that was full. Returns their ids."""
+        job = engine_jobs(self.engine)
+        names = job.c.name.in_((WORKFLOW, DELIVERY, calibrations.WORKFLOW))
+        mine = sa.and_(job.c.status == RUNNING, job.c.executor_id == self.id, names)
+        with self.engine.connect() as connection:
+            held, now = [*connection.scalars(sa.select(job.c.workflow_uuid).where(mine))], time.monotonic()
+        self._idle = {each: self._idle.get(each, now) for each in held if each not in self._here}
+        lost = [each for each, since in self._idle.items() if now - since >= LOST_S]
+        return _put_back(self.engine, job, sa.and_(mine, job.c.workflow_uuid.in_(lost))) if lost else []
 
 
 class _StateWatch:
@@ -467,21 +472,6 @@ def take_over(engine: sa.Engine, dead: Collection[str]) -> list[str]:
         known = {*connection.scalars(sa.select(workers.c.id))}  # asked second: a worker that begins now is no stray
     gone = {*dead, *holders - known} & holders
     return _put_back(engine, job, job.c.executor_id.in_(gone)) if gone else []
-
-
-def take_back(engine: sa.Engine, executor_id: str, lost: Collection[str]) -> list[str]:
-    """Puts workflows of a living worker, in which nothing runs any more, back into their queues, as ``take_over``."""
-    job = engine_jobs(engine)
-    which = sa.and_(job.c.executor_id == executor_id, job.c.workflow_uuid.in_(lost))
-    return _put_back(engine, job, which) if lost else []
-
-
-def held_by(engine: sa.Engine, executor_id: str, names: Collection[str]) -> list[str]:
-    """Lists the ids of the running workflows of these names that a worker holds."""
-    job = engine_jobs(engine).c
-    query = sa.select(job.workflow_uuid).where(job.status == RUNNING, job.executor_id == executor_id)
-    with engine.connect() as connection:
-        return [*connection.scalars(query.where(job.name.in_(names)))]
 
 
 def _put_back(engine: sa.Engine, job: sa.TableClause, which: sa.ColumnElement[bool]) -> list[str]:
