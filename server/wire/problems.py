@@ -200,6 +200,13 @@ def _methods_of(routes: Sequence[APIRoute], path: str) -> list[str]:
     return sorted({method for route in fitting if route.path == fitting[0].path for method in route.methods or ()})
 
 
+def sent_file(*media_types: str) -> Responses:
+    """Returns the OpenAPI ``responses`` of a route that sends a file: whole, in part, or not again."""
+    content = {media_type: {} for media_type in media_types}
+    partial = {"description": "Partial Content", "content": content}
+    return {200: {"content": content}, 206: partial, 304: {"description": "Not Modified"}}
+
+
 def documented(*statuses: int) -> Responses:
     """Returns the OpenAPI ``responses`` of a route that may refuse with these statuses, and with those that every route
     may refuse with."""

@@ -13,7 +13,7 @@ from server.http.schemas import CalibrationList, NewCalibration
 from server.services.records import CalibrationOut
 from server.wire.multipart import check_length, described_form, receive_calibration_pictures
 from server.wire.patience import IDLE_TIMEOUT_S, with_idle_timeout
-from server.wire.problems import Problem, Responses, documented
+from server.wire.problems import Problem, Responses, documented, sent_file
 from server.wire.send_file import send_file
 
 router = APIRouter(prefix="/v1/calibrations", tags=["calibrations"])
@@ -54,12 +54,7 @@ def get_calibration(service: ServiceOf, caller: Reader, calibration_id: str) -> 
     return service.calibrations.get(calibration_id)
 
 
-FILE: Responses = {
-    200: {"content": {"application/json": {}}},
-    206: {"description": "Partial Content", "content": {"application/json": {}}},
-    304: {"description": "Not Modified"},
-    **documented(404, 409, 416),
-}
+FILE: Responses = {**sent_file("application/json"), **documented(404, 409, 416)}
 
 
 @router.head("/{calibration_id}/cameras.json", include_in_schema=False)

@@ -39,7 +39,7 @@ from server.services.work import ReconstructionRequest
 from server.storage.job_index import JobOrder, JobQuery
 from server.storage.records import JobWebhook
 from server.wire.patience import await_hang_up
-from server.wire.problems import Responses, documented
+from server.wire.problems import Responses, documented, sent_file
 from server.wire.send_file import media_type, send_archive, send_file, send_zip
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
@@ -202,11 +202,8 @@ ARCHIVE: Responses = {
     304: {"description": "Not Modified"},
     **documented(404, 409),
 }
-FILES = {kind: {} for kind in ("application/octet-stream", "model/gltf-binary", "application/json", "image/png")}
 RESULT: Responses = {
-    200: {"content": FILES},
-    206: {"description": "Partial Content", "content": FILES},
-    304: {"description": "Not Modified"},
+    **sent_file("application/octet-stream", "model/gltf-binary", "application/json", "image/png"),
     307: {"description": "Temporary Redirect"},
     **documented(404, 409, 416),
 }
