@@ -9,6 +9,7 @@ from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, file_i
 from server.cli.heads import Albedo, Morphs, TemplateName
 
 if TYPE_CHECKING:
+    from pipeline.settings import OutputSettings
     from rig.formats.cameras.dataset_json import DatasetFormat
     from rig.formats.meshes.markups import Axes
 
@@ -76,18 +77,23 @@ def export(
     if (head and out.resolve() == source.resolve()) or (sign.exists() and not overwrite):
         raise Overwrites(sign)
     if form in FORMATS:
-        from server.tasks.export_result import export_result
-
         outputs = OutputSettings(formats=(form,), template=template, morphs=morphs, albedo="file" if albedo else "none")
-        prepare_folder(out)
-        files = export_result(source, out, outputs)
-        answer({"out": str(out), "files": files}, json_out, [f"{out}  {', '.join(files)}"])
+        _export_head(source, out, outputs, json_out=json_out)
     elif form in ("slicer", "dicom", "nifti"):
         if not (patient.isascii() and patient.isalnum() and len(patient) <= LONGEST_PSEUDONYM):
             raise typer.BadParameter(f"at most {LONGEST_PSEUDONYM} letters and digits", param_hint="--patient")
         _export_patient(source, out, form, axes, plane, marked=marked, patient=patient, json_out=json_out)
     else:
         _export_dataset(source, out, form, result=result, settings=settings, json_out=json_out)
+
+
+def _export_head(result: Path, out: Path, outputs: "OutputSettings", *, json_out: bool) -> None:
+    """Writes a result's head in another format."""
+    from server.tasks.export_result import export_result
+
+    prepare_folder(out)
+    files = export_result(result, out, outputs)
+    answer({"out": str(out), "files": files}, json_out, [f"{out}  {', '.join(files)}"])
 
 
 def _export_dataset(
