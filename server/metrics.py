@@ -27,8 +27,8 @@ class Metrics:
         self.oldest = self._gauge("queue_oldest_seconds", "How long the oldest job of a queue has waited", "queue")
         self.slots = self._gauge("worker_slots", "Jobs that the live workers of a queue run at once", "queue")
         self.failures = self._gauge("failures", "Jobs that failed, by kind", "kind")
-        asked = "What the service asked of the store of results"
-        self.store_operations = self._gauge("store_operations", asked, "operation", "outcome")
+        operations = "What the service asked of the store of results"
+        self.store_operations = self._gauge("store_operations", operations, "operation", "outcome")
         self.store_seconds = self._gauge("store_seconds", "How long that took, in all", "operation")
         self.store_up = self._gauge("store_up", "Whether the store of results answers", "store")
         self.captures = self._gauge("captures", "Captures kept")

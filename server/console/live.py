@@ -9,10 +9,10 @@ from collections.abc import AsyncIterator
 
 import structlog
 
-from rig.acquisition.image_checks import blur_px, exposure
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 from rig.progress import Progress
+from server.console.live_frame import measured_frame
 from server.services.live.live import document_of
 from server.services.rigs import PREVIEW_WIDTH, RigBackend, jpeg, reduced
 from server.services.service import Service
@@ -47,23 +47,6 @@ def rig_frames(rig: RigBackend, child: Child, look: int) -> list[JsonObject]:
     return [_frame(name, pictures.get(name), look % len(names) == i) for i, name in enumerate(names)]
 
 
-def measured_frame(name: str, picture: ImageRgb, data: bytes, large: ImageRgb | None) -> JsonObject:
-    """Returns a camera's frame: its name, ``data``, which is its ``picture`` as a JPEG file, and the picture's ``mean``
-    (0 to 255) and share of ``clipped`` pixels. In ``large``, the picture in full size, its sharpness is measured
-    (``blur_px``)."""
-    level = exposure(picture)
-    frame: JsonObject = {
-        "name": name,
-        "mean": round(level.mean, 1),
-        "clipped": round(level.clipped_share, 4),
-        "jpeg": data,
-    }
-    if large is not None:
-        blur = blur_px(large)
-        frame["blur_px"] = None if blur is None else round(blur, 2)
-    return frame
-
-
 class LiveView:
     """Holds the newest pictures of all cameras, numbered. Its thread takes pictures while somebody watches, and ends
     ``KEEP_S`` seconds after the last viewer has left."""
@@ -96,7 +79,7 @@ class LiveView:
                 self._thread.start()
 
     def _look_around(self) -> None:
-        child, looks = Child(), 0
+        child, number = Child(), 0
         blur: dict[str, float | None] = {}
         try:
             while True:
@@ -110,8 +93,8 @@ class LiveView:
                     time.sleep(LOOK_S)
                     continue
                 try:
-                    looks += 1
-                    message = self._look(child, looks, blur)
+                    number += 1
+                    message = self._look(child, number, blur)
                 except Exception as error:  # the rig may come back
                     problem = problem_from(error)
                     log.warning("no live view", error=problem.detail.text)

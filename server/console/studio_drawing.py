@@ -15,7 +15,7 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import Scene, build_scene, view_light
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.sensor import Sensor, expose
-from server.console.live import measured_frame
+from server.console.live_frame import measured_frame
 from server.storage.records import JsonObject
 from server.tasks.child import WorkerContext
 from server.tasks.subjects import drawn_subject
