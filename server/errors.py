@@ -65,6 +65,13 @@ class InvalidInput(Refused):
     """Refuses an input that can be read but not used."""
 
 
+class UrlRefused(InvalidInput):
+    """Refuses an address that a caller names, on the web or in an object store."""
+
+    def __init__(self, why: Message) -> None:
+        super().__init__("url-refused", compose("url-refused", why=why), [compose("field-url-refused", why=why)])
+
+
 class TooMany(Refused):
     """Refuses a caller who has as many jobs or batches at once as the settings allow."""
 

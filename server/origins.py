@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import httpx
 
-from rig.messages.message import Message, compose
-from server.errors import InvalidInput
+from rig.messages.message import compose
+from server.errors import UrlRefused
 
 ANY_PUBLIC = "https://*"
 PORTS = {"http": 80, "https": 443}
@@ -43,14 +43,14 @@ def target(url: str, origins: Collection[str]) -> Target:
     """
     wanted = parsed(url)
     if wanted.userinfo:
-        raise _refused(compose("url-with-user"))
+        raise UrlRefused(compose("url-with-user"))
     named = origin_of(wanted) in {origin_of(httpx.URL(origin)) for origin in origins if origin != ANY_PUBLIC}
     if not named and not (ANY_PUBLIC in origins and wanted.scheme == "https" and wanted.port in (None, 443)):
-        raise _refused(compose("url-not-allowed", origin=origin_of(wanted)))
+        raise UrlRefused(compose("url-not-allowed", origin=origin_of(wanted)))
     host = wanted.raw_host.decode("ascii")
     addresses = _addresses(host, wanted.port or PORTS[wanted.scheme])
     if not named and not all(is_public(address) for address in addresses):
-        raise _refused(compose("url-not-public", origin=origin_of(wanted)))
+        raise UrlRefused(compose("url-not-public", origin=origin_of(wanted)))
     return Target(
         wanted.copy_with(host=str(addresses[0]), fragment=None),
         {"Host": wanted.netloc.decode("ascii")},
@@ -66,11 +66,11 @@ def parsed(url: str) -> httpx.URL:
         shown, host = wanted.host, wanted.raw_host.decode("ascii")  # httpx decodes a host no sooner than it is asked
         host.encode("idna")  # as getaddrinfo will
     except (httpx.InvalidURL, ValueError, TypeError) as error:  # UnicodeError, of what IDNA refuses, is a ValueError
-        raise _refused(compose("url-none")) from error
+        raise UrlRefused(compose("url-none")) from error
     if wanted.scheme not in PORTS or not shown:
-        raise _refused(compose("url-not-web"))
+        raise UrlRefused(compose("url-not-web"))
     if not HOST.fullmatch(host):
-        raise _refused(compose("url-host-impossible", host=f"{host!r:.80}"))
+        raise UrlRefused(compose("url-host-impossible", host=f"{host!r:.80}"))
     return wanted
 
 
@@ -98,9 +98,5 @@ def _addresses(host: str, port: int) -> list[Address]:
     try:
         addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except OSError as error:
-        raise _refused(compose("url-host-unknown", host=host, reason=str(error.strerror))) from error
+        raise UrlRefused(compose("url-host-unknown", host=host, reason=str(error.strerror))) from error
     return [ipaddress.ip_address(str(address[0]).partition("%")[0]) for *_, address in addresses]
-
-
-def _refused(why: Message) -> InvalidInput:
-    return InvalidInput("url-refused", compose("url-refused", why=why), [compose("field-url-refused", why=why)])

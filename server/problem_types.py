@@ -2,7 +2,8 @@
 rely.
 
 Types are written out here, and a title is its type's words. They are not derived from names of classes or from
-messages, since those may change. On the wire ``urn:eigenhead:problem:`` stands before a type.
+messages, since those may change: a class that is renamed keeps its type by an entry in ``FAILURE_TYPES``. On the wire
+``urn:eigenhead:problem:`` stands before a type.
 """
 
 URN = "urn:eigenhead:problem:"
@@ -30,87 +31,31 @@ invalid-captures invalid-cleanplates invalid-cursor invalid-expression invalid-f
 invalid-frontcamera invalid-input invalid-key invalid-model invalid-photographs invalid-picture invalid-plates
 invalid-queue invalid-rig invalid-scale invalid-settings invalid-tags
 """  # input that cannot be used
-FAILED = """
+FAILED_BY_ERROR = """
 bad-model bad-template calibration-refused cannot-fetch cannot-import compute-unavailable damaged-network
 egl-unavailable eigenhead-error exchanged-pictures image-too-large implausible-result no-clinic no-landmark-map
-no-layout no-point no-subject no-surface no-usd not-a-manifold other-model out-of-memory pose-graph-error
-same-pictures shipped-model too-few-captures too-few-features too-few-views unexplained-outlines unknown-model
-unknown-template work-crashed worker-died wrong-board wrong-features wrong-name wrong-rig wrong-scale wrong-thread
-"""  # why a job failed
+no-layout no-point no-subject no-surface no-usd not-a-manifold other-model pose-graph-error same-pictures
+shipped-model too-few-captures too-few-features too-few-views unexplained-outlines unknown-model unknown-template
+wrong-board wrong-features wrong-name wrong-rig wrong-scale wrong-thread
+"""  # why a job failed: each is the name of an error's class, in words
+FAILED = "out-of-memory work-crashed worker-died"  # how its work ended otherwise
 PROBLEM_TYPES = {
     kind: kind.replace("-", " ").capitalize()
-    for kinds in (REFUSED, REFUSED_BY_HTTP, UNUSABLE, FAILED)
+    for kinds in (REFUSED, REFUSED_BY_HTTP, UNUSABLE, FAILED_BY_ERROR, FAILED)
     for kind in kinds.split()
 }
 
-INPUT_TYPES = {
-    "archive": "invalid-archive",
-    "board": "invalid-board",
-    "board.toml": "invalid-board",
-    "calibration": "invalid-calibration",
-    "cameras.json": "invalid-cameras",
-    "capture": "invalid-capture",
-    "captures": "invalid-captures",
-    "clean plates": "invalid-cleanplates",
-    "cursor": "invalid-cursor",
-    "expression": "invalid-expression",
-    "features.json": "invalid-features",
-    "form": "invalid-form",
-    "front camera": "invalid-frontcamera",
-    "key": "invalid-key",
-    "model": "invalid-model",
-    "photographs": "invalid-photographs",
-    "picture": "invalid-picture",
-    "plates.json": "invalid-plates",
-    "queue": "invalid-queue",
-    "request": "invalid-request",
-    "rig": "invalid-rig",
-    "rig.toml": "invalid-rig",
-    "scale.json": "invalid-scale",
-    "settings": "invalid-settings",
-    "tags": "invalid-tags",
-}
+SUBJECTS = (
+    "archive, board, board.toml, calibration, cameras.json, capture, captures, clean plates, cursor, expression, "
+    "features.json, form, front camera, key, model, photographs, picture, plates.json, queue, request, rig, rig.toml, "
+    "scale.json, settings, tags"
+)
+INPUT_TYPES = {subject: "invalid-" + subject.partition(".")[0].replace(" ", "") for subject in SUBJECTS.split(", ")}
 """The type of an ``InputError`` by its subject; of any other, a file that somebody sent, it is ``invalid-input``."""
 
-FAILURE_TYPES = {
-    "BadModel": "bad-model",
-    "BadTemplate": "bad-template",
-    "CalibrationRefused": "calibration-refused",
-    "CannotFetch": "cannot-fetch",
-    "CannotImport": "cannot-import",
+FAILURE_TYPES = {kind.title().replace("-", ""): kind for kind in FAILED_BY_ERROR.split()} | {
     "Damaged": "bad-model",
-    "ComputeUnavailable": "compute-unavailable",
-    "DamagedNetwork": "damaged-network",
-    "EglUnavailable": "egl-unavailable",
-    "EigenheadError": "eigenhead-error",
-    "ExchangedPictures": "exchanged-pictures",
-    "ImageTooLarge": "image-too-large",
-    "ImplausibleResult": "implausible-result",
-    "NoClinic": "no-clinic",
-    "NoLandmarkMap": "no-landmark-map",
-    "NoLayout": "no-layout",
-    "NoPoint": "no-point",
-    "NoSubject": "no-subject",
-    "NoSurface": "no-surface",
-    "NoUsd": "no-usd",
-    "NotAManifold": "not-a-manifold",
-    "OtherModel": "other-model",
-    "PoseGraphError": "pose-graph-error",
-    "SamePictures": "same-pictures",
-    "ShippedModel": "shipped-model",
     "ShotFailed": "shot-failed",
-    "TooFewCaptures": "too-few-captures",
-    "TooFewFeatures": "too-few-features",
-    "TooFewViews": "too-few-views",
-    "UnexplainedOutlines": "unexplained-outlines",
-    "UnknownModel": "unknown-model",
-    "UnknownTemplate": "unknown-template",
-    "WrongBoard": "wrong-board",
-    "WrongFeatures": "wrong-features",
-    "WrongName": "wrong-name",
-    "WrongRig": "wrong-rig",
-    "WrongScale": "wrong-scale",
-    "WrongThread": "wrong-thread",
     "bug": "internal-error",
     "crash": "work-crashed",
     "disk-full": "disk-full",

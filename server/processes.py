@@ -53,24 +53,18 @@ def share_one_heap() -> None:
         ctypes.CDLL(None).mallopt(M_ARENA_MAX, 1)
 
 
-def give_freed_memory_back() -> None:
-    """Gives the system the pages of this process's heap that nothing uses any more, if the C library is glibc, in
-    milliseconds.
+def tidied(report: Progress) -> Progress:
+    """Returns ``report`` as a job takes it that gives the system, whenever a stage begins, the pages of this process's
+    heap that nothing uses any more, if the C library is glibc, in milliseconds.
 
     By itself glibc keeps what arrays have freed below others that still live: 110 MB after a default job's depth maps.
     """
     import ctypes
 
-    with suppress(AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
-
-
-def tidied(report: Progress) -> Progress:
-    """Returns ``report`` as a job takes it that gives freed memory back whenever a stage begins."""
-
     def tell(stage: str, fraction: float) -> None:
         if not fraction:
-            give_freed_memory_back()
+            with suppress(AttributeError):
+                ctypes.CDLL(None).malloc_trim(0)
         report(stage, fraction)
 
     return tell

@@ -2,7 +2,7 @@
 
 NAME/             a result as ``eigenhead reconstruct`` writes it, and batch.json: what it was made from
 heads.csv heads.parquet sheet.html sheet.pdf
-.batch/           K-of-N.lock (a share at work), attempts/K-of-N.0 (a result in the making), failures/: gone when
+.batch/           K-of-N.lock (a share at work), attempts/K-of-N.* (a result in the making), failures/: gone when
                   nothing is at work and none failed
 """
 
@@ -11,10 +11,11 @@ import hashlib
 import json
 import os
 import re
+import secrets
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -56,11 +57,7 @@ class Origin:
 
     def is_of(self, other: "Origin") -> bool:
         """Returns whether two results were made from the same input, settings and model, whatever the version."""
-        return (self.input_sha256, self.settings_sha256, self.model_sha256) == (
-            other.input_sha256,
-            other.settings_sha256,
-            other.model_sha256,
-        )
+        return replace(self, version=other.version) == other
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +88,8 @@ class BatchFolder:
             with self._lock(_lock_name(shard), wait=False) as held:
                 if not held:
                     raise ShareTaken(str(shard))
-                self._remove_attempts(_lock_name(shard))
+                for path in self.attempts.glob(f"{_lock_name(shard)}.*"):
+                    shutil.rmtree(path, ignore_errors=True)
                 yield
         finally:
             self._tidy()
@@ -150,17 +148,10 @@ class BatchFolder:
     def new_attempt(self, shard: Shard) -> Path:
         """Makes a folder for one attempt at a result of a share, with the empty folders ``result`` and ``scratch`` in
         it."""
-        number = 0
-        while True:
-            attempt = self.attempts / f"{_lock_name(shard)}.{number}"
-            try:
-                attempt.mkdir(parents=True)  # a process that ends may remove the empty parent folder meanwhile
-            except FileExistsError:
-                number += 1
-                continue
-            for part in ("result", "scratch"):
-                (attempt / part).mkdir()
-            return attempt
+        attempt = self.attempts / f"{_lock_name(shard)}.{secrets.token_hex(4)}"
+        for part in ("result", "scratch"):
+            (attempt / part).mkdir(parents=True)
+        return attempt
 
     def publish(self, name: str, attempt: Path, origin: Origin) -> None:
         """Renames the finished result of an attempt to its final place, replacing an earlier result of that name, and
@@ -223,10 +214,6 @@ class BatchFolder:
             for path in (self.work / "failures").iterdir():
                 if path.name not in retained:
                     path.unlink(missing_ok=True)
-
-    def _remove_attempts(self, lock_name: str) -> None:
-        for path in self.attempts.glob(f"{lock_name}.*"):
-            shutil.rmtree(path, ignore_errors=True)
 
 
 def _locked(path: Path, *, wait: bool) -> IO[bytes] | None:

@@ -6,7 +6,7 @@ from importlib.metadata import version
 
 from pipeline.applications.templates.header import check_template
 from pipeline.head_model.model_names import model_path, model_sha256
-from pipeline.settings import Settings, document_from_settings, settings_from_document
+from pipeline.settings import document_from_settings, settings_from_document
 from rig.digest import document_sha256
 from rig.errors import EigenheadError, InputError
 from rig.messages.message import Message, compose
@@ -52,16 +52,9 @@ def plan_batch(
         except EigenheadError as error:
             faults.append(compose("located", where=capture.name, fault=error.message))
             continue
-        expected_s = durations.of(chosen, megapixels_of(capture.path))
-        tasks.append(_task(capture, chosen, model, digest, expected_s))
+        document, expected_s = document_from_settings(chosen), durations.of(chosen, megapixels_of(capture.path))
+        wanted = (document, document_sha256(document), model, digest)
+        tasks.append(BatchTask(capture, *wanted, version("eigenhead"), expected_s))
     if faults:
         raise InputError("settings", faults)
     return tuple(tasks)
-
-
-def _task(
-    capture: BatchCapture, chosen: Settings, model: str | None, model_digest: str, expected_s: Mapping[str, float]
-) -> BatchTask:
-    document = document_from_settings(chosen)
-    digest = document_sha256(document)
-    return BatchTask(capture, document, digest, model, model_digest, version("eigenhead"), expected_s)

@@ -22,7 +22,7 @@ from server.batch.captures import WHOLE, Shard, capture_sha256
 from server.batch.folder import BatchFolder, FailureRecord, Origin
 from server.tasks.child import DISK_FULL, Child, WorkerContext, WorkFailed
 from server.tasks.progress import JobProgress
-from server.tasks.reconstruct_folder import reconstruct_beside
+from server.tasks.reconstruct import reconstruct_beside
 
 if TYPE_CHECKING:
     from server.batch.plan import BatchTask
@@ -76,12 +76,8 @@ class Observer(Protocol):
         """Receives how many captures are to be made, once, before the first."""
         ...
 
-    def start(self, name: str) -> None:
-        """Receives that work on a capture begins."""
-        ...
-
     def report(self, name: str, share: float) -> None:
-        """Receives which share of a capture is done, 0 to 1."""
+        """Receives which share of a capture is done, 0 to 1; with 0 work on it begins."""
         ...
 
     def end(self, outcome: Outcome) -> None:
@@ -129,8 +125,9 @@ class BatchRun:
         """Separates the captures whose results exist from those to be made."""
 
         def kept(task: "BatchTask") -> bool:
+            origin = self._folder.origin(task.capture.name)
             try:
-                return self._is_done(task)
+                return origin is not None and origin.is_of(self._origin(task, capture_sha256(task.capture.path)))
             except OSError:  # reported when the capture's turn comes
                 return False
 
@@ -140,10 +137,6 @@ class BatchRun:
                     self._outcomes[task.capture.name] = Outcome(task.capture.name, "kept")
                 else:
                     self._pending.append(task)
-
-    def _is_done(self, task: "BatchTask") -> bool:
-        origin = self._folder.origin(task.capture.name)
-        return origin is not None and origin.is_of(self._origin(task, capture_sha256(task.capture.path)))
 
     def _origin(self, task: "BatchTask", input_sha256: str) -> Origin:
         return Origin(input_sha256, task.settings_sha256, task.model_sha256, task.version)
@@ -166,7 +159,7 @@ class BatchRun:
                     if not self._pending:
                         return
                     task = self._pending.popleft()
-                    self._observer.start(task.capture.name)
+                    self._observer.report(task.capture.name, 0.0)
                 try:
                     outcome = self._outcome(task, child)
                 except Cancelled:

@@ -1,7 +1,6 @@
 """Writes the table and the contact sheet of all results in a batch's folder, whichever process made them."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,26 +8,12 @@ from pipeline.head_model.model_file import expression_names
 from pipeline.head_model.model_names import model_path
 from rig.atomic_write import write_atomically
 from rig.messages.message import MessageDocument, documents_of
-from server.batch.captures import BatchCapture
 from server.batch.folder import BatchFolder, FailureRecord, Origin
 from server.batch.plan import BatchTask
 from server.batch.sheet import Card, figures_of, sheet_html
-from server.batch.table import Column, Row, columns_of, row_of, write_table
+from server.batch.table import Outcome, Row, columns_of, row_of, write_table
 
 SHEET, SHEET_PDF = "sheet.html", "sheet.pdf"
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """Holds what became of a capture: ``report`` and ``origin`` if it is done, ``failure`` if it failed, neither if it
-    is not made yet. ``link``: address of its result on the sheet."""
-
-    capture: BatchCapture
-    result: Path
-    link: str
-    report: dict[str, Any] | None = None
-    origin: Origin | None = None
-    failure: FailureRecord | None = None
 
 
 def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]:
@@ -37,7 +22,7 @@ def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]
     folder.forget_failures_but_of({task.capture.name for task in tasks})
     columns = columns_of(expressions_of(task.model for task in tasks))
     outcomes = [_outcome(folder, task) for task in tasks]
-    rows = [table_row(outcome, columns) for outcome in outcomes]
+    rows = [row_of(outcome, columns) for outcome in outcomes]
     cards = [sheet_card(outcome, row) for outcome, row in zip(outcomes, rows, strict=True)]
     files = write_table(folder.out, columns, rows)
     from server.batch.sheet_pdf import sheet_pdf  # its library takes a while to load; the service's table does without
@@ -46,11 +31,6 @@ def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]
     write_atomically(folder.out / SHEET, sheet_html(title, cards).encode("utf-8", "replace"))
     write_atomically(folder.out / SHEET_PDF, sheet_pdf(title, cards))
     return [*files, folder.out / SHEET, folder.out / SHEET_PDF]
-
-
-def table_row(outcome: Outcome, columns: Sequence[Column]) -> Row:
-    """Returns the row of the batch's table that describes a capture. ``columns``: all columns of the table."""
-    return row_of(outcome.capture, columns, report=outcome.report, origin=outcome.origin, failure=outcome.failure)
 
 
 def sheet_card(outcome: Outcome, row: Row) -> Card:

@@ -39,6 +39,19 @@ class Column:
     words: str
 
 
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Holds what became of a capture: ``report`` and ``origin`` if it is done, ``failure`` if it failed, neither if it
+    is not made yet. ``link``: address of its result on the sheet."""
+
+    capture: BatchCapture
+    result: Path
+    link: str
+    report: dict[str, Any] | None = None
+    origin: Origin | None = None
+    failure: FailureRecord | None = None
+
+
 WHOSE = (
     Column("capture", "text", "", "name of the capture, and of its folder below OUT"),
     Column("subject", "text", "", "of the list; empty without one"),
@@ -120,27 +133,17 @@ def columns_of(expressions: Iterable[str]) -> tuple[Column, ...]:
     return (*WHOSE, *QUALITY, *measurement_columns(), *shown, *ORIGIN, *landmark_columns())
 
 
-def row_of(
-    capture: BatchCapture,
-    columns: Sequence[Column],
-    *,
-    report: Mapping[str, Any] | None = None,
-    origin: Origin | None = None,
-    failure: FailureRecord | None = None,
-) -> Row:
-    """Returns the table's row of a capture. One that is done has ``report`` and ``origin``; one that failed has
-    ``failure``; one that is missing has neither."""
-    row: Row = {column.name: None for column in columns}
-    row |= {"capture": capture.name, "subject": capture.subject or None, "session": capture.session or None}
-    row["state"] = "missing"
+def row_of(outcome: Outcome, columns: Sequence[Column]) -> Row:
+    """Returns the table's row of a capture. ``columns``: all columns of the table."""
+    capture, report, origin, failure = outcome.capture, outcome.report, outcome.origin, outcome.failure
+    said: Row = {"capture": capture.name, "subject": capture.subject or None, "session": capture.session or None}
+    said["state"] = "missing"
     if report is not None and origin is not None:
-        row |= {"state": "done"} | _of_report(report)
-        row |= {key: value for key, value in _expression(report, columns).items() if key in row}
-        row |= {"input_sha256": origin.input_sha256, "settings_sha256": document_sha256(report["settings"])}
+        said |= {"state": "done"} | _of_report(report) | _expression(report, columns)
+        said |= {"input_sha256": origin.input_sha256, "settings_sha256": document_sha256(report["settings"])}
     elif failure is not None:
-        row |= {"state": "failed", "failure_kind": failure.kind, "failure": failure.message.text}
-    strange = row.keys() - {column.name for column in columns}
-    return {name: value for name, value in row.items() if name not in strange}
+        said |= {"state": "failed", "failure_kind": failure.kind, "failure": failure.message.text}
+    return {column.name: said.get(column.name) for column in columns}
 
 
 def _of_report(report: Mapping[str, Any]) -> Row:

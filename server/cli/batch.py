@@ -2,6 +2,7 @@
 
 Progress is a bar on a terminal, otherwise one line for each capture, for a scheduler's log."""
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -124,6 +125,7 @@ def _captures_in(captures: Path, out: Path) -> "tuple[BatchCapture, ...]":
 
 
 def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "Shard", json_out: bool) -> None:
+    from pipeline.compute.threads import THREADS
     from server.batch.folder import BatchFolder
     from server.batch.run import BatchRun, free_memory, threads_of_worker, usable_cores, worker_count
     from server.batch.summary import write_summary
@@ -135,11 +137,13 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
     files: list[Path] = []
     with terminated_like_interrupted(), BatchDisplay.opened(count, share_tasks) as display:
         display.prepare(share_tasks)
-        variables = {"EIGENHEAD_THREADS": str(threads_of_worker(cores, count))} | _threads_variable()
-        run = BatchRun(folder, share_tasks, workers=count, variables=variables, observer=display, shard=share)
+        threads = os.environ.get(THREADS) or str(threads_of_worker(cores, count))  # the user's choice goes before ours
+        run = BatchRun(folder, share_tasks, workers=count, variables={THREADS: threads}, observer=display, shard=share)
         outcomes = run.run(lambda: files.extend(write_summary(folder, tasks)))
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
-    _warn_of_versions(folder, share_tasks)
+    origins = [(folder.origin(task.capture.name), task.version) for task in share_tasks]
+    if others := sum(origin is not None and origin.version != version for origin, version in origins):
+        warn(compose("batch-other-version", count=others).text)
     if not has_parquet():
         warn(compose("batch-no-parquet", install=how_to_install("parquet")).text)
     document = _document(outcomes, out, files, share, count, display.seconds())
@@ -147,22 +151,6 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
     answer(document, json_out, [*map(str, files), counts])
     if failed:
         fail(str(CapturesFailed([outcome.name for outcome in failed], len(share_tasks))))
-
-
-def _threads_variable() -> dict[str, str]:
-    """Returns EIGENHEAD_THREADS if it is set in the environment: the user's choice goes before our own."""
-    import os
-
-    from pipeline.compute.threads import THREADS
-
-    return {THREADS: os.environ[THREADS]} if os.environ.get(THREADS) else {}
-
-
-def _warn_of_versions(folder: Any, tasks: "Sequence[BatchTask]") -> None:
-    origins = [(folder.origin(task.capture.name), task.version) for task in tasks]
-    others = sum(origin is not None and origin.version != version for origin, version in origins)
-    if others:
-        warn(compose("batch-other-version", count=others).text)
 
 
 def _document(
@@ -204,14 +192,10 @@ class BatchProgress:
         self._took: list[float] = []
         self.ended = self.failed = 0
 
-    def start(self, name: str) -> None:
-        """Records that work on a capture begins."""
-        self._running[name] = self._clock(), 0.0
-
     def report(self, name: str, share: float) -> None:
-        """Records which share of a capture is done, from 0 to 1."""
-        if name in self._running:
-            self._running[name] = self._running[name][0], min(1.0, max(0.0, share))
+        """Records which share of a capture is done, from 0, with which work on it begins, to 1."""
+        since, _ = self._running.get(name, (self._clock(), 0.0))
+        self._running[name] = since, min(1.0, max(0.0, share))
 
     def end(self, name: str, *, failed: bool) -> None:
         """Records that a capture has ended. The duration of one that failed does not count for the estimate."""
@@ -282,10 +266,6 @@ class BatchDisplay:
         """Begins to show progress of ``pending`` captures."""
         self._count, self._progress = pending, BatchProgress(pending, self._workers, self._expected_s)
         self._show()
-
-    def start(self, name: str) -> None:
-        """Notes that work on a capture begins."""
-        self._progress.start(name)
 
     def report(self, name: str, share: float) -> None:
         """Shows that ``share`` (0 to 1) of a capture is done."""

@@ -4,8 +4,9 @@ Files, cameras, clean plates and feature points are checked as the service check
 if these checks find no fault, the outlines are extracted and used to check pictures and cameras. A fault of this
 machine is no fault of the capture and is raised as an error."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TypedDict
+from typing import Any
 
 from pipeline.faces.networks import DamagedNetwork, load_networks
 from rig.errors import EigenheadError, InputError, WrongVariable
@@ -13,30 +14,18 @@ from rig.formats.captures.capture_folder import SCALE, capture_root, unread_file
 from rig.formats.captures.shot_files import BESIDE_PICTURES, listed_pictures
 from rig.formats.pictures.images import decode_image_file
 from rig.formats.pictures.picture_names import entry
-from rig.messages.message import MessageDocument, compose, documents_of, texts_of
+from rig.messages.message import compose, documents_of, texts_of
 from rig.progress import Progress
 from server.cli.answers import service_settings
 from server.tasks.child import WorkFailed
 from server.tasks.ingest import check_capture, check_views
 from server.tasks.photographs import photographs_alone, read_scaled_capture
-from server.tasks.reconstruct_folder import folder_of
+from server.tasks.reconstruct import folder_of
 
 
-class Checked(TypedDict):
-    """Describes what `eigenhead check --json` prints. ``faults`` make a reconstruction fail, ``warnings`` do not.
-    ``will`` lists in English what a reconstruction does with photographs that have no cameras."""
-
-    capture: str
-    cameras: list[str]
-    front: str | None
-    faults: list[str]
-    fault_messages: list[MessageDocument]
-    warnings: list[MessageDocument]
-    will: list[str]
-
-
-def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> Checked:
-    """Returns every fault and warning of a capture folder or archive that can be found without fitting a head.
+def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> dict[str, Any]:
+    """Returns what `eigenhead check --json` prints: the ``faults`` of a capture folder or archive that make a
+    reconstruction fail, its ``warnings``, and in English what one does with photographs alone (``will``).
 
     Raises InputError for wrong settings, and WrongVariable or WorkFailed if this machine, not the capture, is at fault.
     """
@@ -44,7 +33,8 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
     from pipeline.settings import settings_from_document
 
     chosen = settings_from_document(settings)
-    document = Checked(capture=str(capture), cameras=[], front=None, faults=[], fault_messages=[], warnings=[], will=[])
+    document: dict[str, Any] = {"capture": str(capture), "cameras": [], "front": None}
+    document |= {"faults": [], "fault_messages": [], "warnings": [], "will": []}
     try:
         with folder_of(capture) as folder:
             if photographs_alone(folder):
@@ -108,7 +98,7 @@ def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
         raise InputError("photographs", faults)
 
 
-def lines(document: Checked) -> list[str]:
+def lines(document: Mapping[str, Any]) -> list[str]:
     """Returns the findings of a check as lines for people."""
     findings = [f"fault    {fault}" for fault in document["faults"]]
     findings += [f"warning  {warning['code']}: {warning['message']}" for warning in document["warnings"]]

@@ -13,7 +13,6 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,15 +57,6 @@ class JobEnded(EigenheadError):
         detail = "no reason given" if error is None else error["detail"]
         super().__init__(f"the job {job['state']}: {detail}{faults}")
         self.job = job
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """Holds one event of a job's stream: its progress, or at the end the document of the whole job."""
-
-    kind: str
-    id: str
-    document: "JsonObject"
 
 
 class Client:
@@ -146,10 +136,10 @@ class Client:
             try:
                 with self._stream(job_id, last) as events:
                     try:
-                        for event in events:
-                            last = event.id
-                            yield event.kind, event.document
-                            if event.kind == "end":
+                        for kind, identity, document in events:
+                            last = identity
+                            yield kind, document
+                            if kind == "end":
                                 return
                     finally:
                         deadline = time.monotonic() + self._patience_s
@@ -221,8 +211,9 @@ class Client:
         return int(head.headers["upload-offset"]), head.headers.get("location")
 
     @contextmanager
-    def _stream(self, job_id: str, last: str) -> Iterator[Iterator[Event]]:
-        """Opens one connection and yields its events. Raises httpx.TransportError if it cannot be opened."""
+    def _stream(self, job_id: str, last: str) -> Iterator[Iterator[tuple[str, str, Any]]]:
+        """Opens one connection and yields its events: kind, id and document. Raises httpx.TransportError if it cannot
+        be opened."""
         headers = {"Last-Event-ID": last, "Accept": "text/event-stream"}
         timeout = httpx.Timeout(10.0, read=30.0)  # the service sends a comment every 15 s
         with self._http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:
@@ -250,14 +241,14 @@ class Client:
             wait = min(2.0, wait * 2)
 
 
-def _events(response: httpx.Response, last: str) -> Iterator[Event]:
+def _events(response: httpx.Response, last: str) -> Iterator[tuple[str, str, Any]]:
     fields: dict[str, str] = {}
     for line in response.iter_lines():
         if line:
             name, _, value = line.partition(":")
             fields[name] = value.strip()
         elif "data" in fields:
-            yield Event(fields.get("event", ""), fields.get("id", last), json.loads(fields["data"]))
+            yield fields.get("event", ""), fields.get("id", last), json.loads(fields["data"])
             fields = {}
 
 

@@ -9,7 +9,7 @@ import sys
 import time
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Protocol, TypedDict
+from typing import Any
 from urllib.parse import quote
 
 from pipeline.compute.threads import THREADS, thread_count
@@ -38,33 +38,14 @@ COMPARE_S = 30.0  # how long doctor compares files of results
 MEMORY_LEAST = 2 << 30  # a job takes up to 1.5 GB
 
 
-class Connection(Protocol):
-    """Declares the methods that connections to SQLite and to PostgreSQL have in common (PEP 249)."""
-
-    def cursor(self) -> Any:
-        """Returns a new cursor."""
-        ...
-
-    def close(self) -> None:
-        """Closes the connection."""
-        ...
-
-
-class Finding(TypedDict):
-    """Describes the result of one check: whether it passed, and a sentence that says what was found or what to do."""
-
-    ok: bool
-    detail: str
-
-
-def examine(settings: ServiceSettings) -> dict[str, Finding]:
-    """Runs every check of this machine and returns the findings by name. Only reads: it makes neither folders nor
-    tables."""
+def examine(settings: ServiceSettings) -> dict[str, dict[str, Any]]:
+    """Runs every check of this machine. Returns by name whether it passed (``ok``) and what was found or what to do
+    (``detail``). Only reads: it makes neither folders nor tables."""
     checks = (
         *(_python, _egl, _gpu, _model, _cores, _memory, _data, _models, _cache, _database, _retention, _results),
         *(_variables, _rig, _stores, _port),
     )
-    findings: dict[str, Finding] = {}
+    findings = {}
     for check in checks:
         try:
             ok, detail = check(settings)
@@ -208,8 +189,8 @@ def _kind(settings: ServiceSettings) -> str:
     return "sqlite" if settings.url.startswith("sqlite:") else "postgresql"
 
 
-def _connected(settings: ServiceSettings) -> Connection | None:
-    """Opens the database for reading; returns None if SQLite's file does not exist."""
+def _connected(settings: ServiceSettings) -> Any:
+    """Opens the database for reading (a connection of PEP 249); returns None if SQLite's file does not exist."""
     if _kind(settings) == "sqlite":
         return _read_only(_sqlite(settings)) if _sqlite(settings).is_file() else None
     import psycopg
@@ -221,7 +202,7 @@ def _sqlite(settings: ServiceSettings) -> Path:
     return Path(settings.url.removeprefix("sqlite:///"))
 
 
-def _rows(connection: Connection, query: str) -> list[tuple[Any, ...]]:
+def _rows(connection: Any, query: str) -> list[tuple[Any, ...]]:
     cursor = connection.cursor()
     cursor.execute(query)
     return cursor.fetchall()

@@ -103,21 +103,20 @@ def _export_dataset(
     from pipeline.settings import settings_from_document
     from server.cli.reconstruct_local import check_apart
     from server.tasks.export_dataset import export_folder
-    from server.tasks.reconstruct_folder import folder_of
+    from server.tasks.reconstruct import folder_of
     from server.tasks.settings_file import settings_document
 
     wanted = settings_from_document(settings_document(settings))
     check_apart(out, capture)
     prepare_folder(out)
     with progress_bar() as report, folder_of(capture) as folder:
-        exported = export_folder(folder, out, form, result=result, chosen=wanted, report=report)
-    for warning in exported.warnings:
+        figures, warnings = export_folder(folder, out, form, result=result, chosen=wanted, report=report)
+    for warning in warnings:
         warn(f"{warning.code}: {warning}")
-    figures = {name: getattr(exported, name) for name in ("cameras", "left_out", "points", "flame")}
     summary = (
-        f"{len(exported.cameras)} views"
-        + (", FLAME parameters" if exported.flame else "")
-        + (f", without {', '.join(exported.left_out)}" if exported.left_out else "")
+        f"{len(figures['cameras'])} views"
+        + (", FLAME parameters" if figures["flame"] else "")
+        + (f", without {', '.join(figures['left_out'])}" if figures["left_out"] else "")
     )
     answer({"out": str(out), "as": form, **figures}, json_out, [f"{out}  {summary}"])
 

@@ -54,7 +54,7 @@ def take(
     from server.cli.reconstruct_local import check_apart
     from server.tasks.photographs import keep_masks, read_or_calibrate
     from server.tasks.prepare import prepare_kernels
-    from server.tasks.reconstruct_folder import folder_of
+    from server.tasks.reconstruct import folder_of
     from server.tasks.settings_file import settings_document
 
     with wrong_usage("CAPTURES"):

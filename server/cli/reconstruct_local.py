@@ -16,11 +16,10 @@ from server.processes import share_one_heap
 from server.storage.result_folder import fresh_folder
 from server.tasks.child import WorkerContext
 from server.tasks.progress import JobProgress
-from server.tasks.reconstruct_folder import folder_of, reconstruct_folder
+from server.tasks.reconstruct import folder_of, reconstruct_folder
 
 if TYPE_CHECKING:
     from pipeline.results.report_types import Report as ReportDocument
-    from pipeline.settings import Settings
 
 
 def reconstruct_locally(
@@ -40,6 +39,7 @@ def reconstruct_locally(
     """
     from pipeline.applications.templates.header import check_template
     from pipeline.settings import settings_from_document
+    from server.tasks.stage_durations import StageDurations, megapixels_of
 
     share_one_heap()
     chosen = settings_from_document(settings)
@@ -48,29 +48,26 @@ def reconstruct_locally(
     if trace is not None:
         check_apart(trace.parent, capture, "--trace")
         prepare_file(trace, option="--trace")
-    with terminated_like_interrupted(), _traced(trace), _result_folder(out) as fresh, folder_of(capture) as folder:
-        _reconstruct_folder(folder, fresh, kept=out, model=model, chosen=chosen, report=report)
-        document = json.loads((fresh / "report.json").read_text(encoding="utf-8"))
-    return document
+    with ExitStack() as stack:
+        stack.enter_context(terminated_like_interrupted())
+        stack.enter_context(_traced(trace))
+        try:
+            fresh = stack.enter_context(fresh_folder(out))
+        except OSError as error:
+            raise CannotWrite(out, error) from error
+        folder, context = stack.enter_context(folder_of(capture)), stack.enter_context(closing(WorkerContext()))
+        durations, megapixels = StageDurations(), megapixels_of(folder)
+        progress = JobProgress(durations.of(chosen, megapixels))
 
+        def tell(stage: str, fraction: float) -> None:
+            progress.report(stage, fraction)
+            report(stage, progress.progress())
 
-def _reconstruct_folder(
-    folder: Path, out: Path, *, kept: Path, model: str | None, chosen: "Settings", report: Progress
-) -> None:
-    from server.tasks.stage_durations import StageDurations, megapixels_of
-
-    durations, megapixels = StageDurations(), megapixels_of(folder)
-    progress = JobProgress(durations.of(chosen, megapixels))
-
-    def tell(stage: str, fraction: float) -> None:
-        progress.report(stage, fraction)
-        report(stage, progress.progress())
-
-    with closing(WorkerContext()) as context:
         reconstruct_folder(
-            context, tell, folder=folder, out=out, kept=kept, model=model, chosen=chosen, preparation=report
-        )  # fmt: skip
-    durations.learn(chosen, progress.finish(), megapixels)
+            context, tell, folder=folder, out=fresh, kept=out, model=model, chosen=chosen, preparation=report
+        )
+        durations.learn(chosen, progress.finish(), megapixels)
+        return json.loads((fresh / "report.json").read_text(encoding="utf-8"))
 
 
 def flame_lines(document: "ReportDocument", out: Path) -> list[str]:
@@ -114,13 +111,3 @@ def _traced(path: Path | None) -> Iterator[None]:
             yield
     finally:
         write_atomically(path, trace.encoded(threads=thread_count()))
-
-
-@contextmanager
-def _result_folder(out: Path) -> Iterator[Path]:
-    with ExitStack() as stack:
-        try:
-            fresh = stack.enter_context(fresh_folder(out))
-        except OSError as error:
-            raise CannotWrite(out, error) from error
-        yield fresh

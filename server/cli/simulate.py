@@ -185,14 +185,14 @@ def _serve_studio(folder: Path, json_out: bool, **options: Any) -> None:
     """Serves the simulated studio until Ctrl-C, which ends it with status 0."""
     from contextlib import ExitStack, suppress
 
-    from server.cli.studio import OpenStudio, serve_studio
+    from server.cli.studio import serve_studio, studio_lines
 
     with ExitStack() as bar, suppress(KeyboardInterrupt):
         report = bar.enter_context(progress_bar())
 
-        def ready(studio: OpenStudio) -> None:
+        def ready(studio: dict[str, Any]) -> None:
             bar.close()
-            answer(studio.document(), json_out, studio.lines())
+            answer(studio, json_out, studio_lines(studio))
             sys.stdout.flush()
 
         serve_studio(folder, ready=ready, report=report, **options)

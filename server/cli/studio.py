@@ -2,9 +2,9 @@
 
 import signal
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,56 +23,41 @@ from rig.studio.sensor.preset import Preset
 from server.tasks.subjects import SubjectChoice
 
 
-@dataclass(frozen=True, slots=True)
-class OpenStudio:
-    """Holds the addresses and files through which an operator uses the devices of a served studio."""
+def describe_studio(devices: StudioDevices, truth: Path) -> dict[str, Any]:
+    """Returns the JSON object that ``simulate --serve --json`` prints: addresses of running devices, and files.
+    ``truth`` is the folder with the subject's true head."""
+    link = devices.port_link
+    return {
+        "url": devices.streams.address,
+        "cameras": {name: devices.streams.url(name) for name in devices.names},
+        "trigger": {"port": str(link), "terminal": str(link.readlink())},
+        "rig": str(devices.folder / "rig.toml"),
+        "truth": str(truth),
+    }
 
-    url: str
-    cameras: dict[str, str]
-    box: Path
-    terminal: str
-    rig: Path
-    truth: Path
 
-    @classmethod
-    def of(cls, devices: StudioDevices, truth: Path) -> "OpenStudio":
-        """Collects the addresses of running devices. ``truth`` is the folder with the subject's true head."""
-        link = devices.port_link
-        cameras = {name: devices.streams.url(name) for name in devices.names}
-        return cls(devices.streams.address, cameras, link, str(link.readlink()), devices.folder / "rig.toml", truth)
-
-    def document(self) -> dict[str, object]:
-        """Returns the JSON object that ``simulate --serve --json`` prints."""
-        return {
-            "url": self.url,
-            "cameras": self.cameras,
-            "trigger": {"port": str(self.box), "terminal": self.terminal},
-            "rig": str(self.rig),
-            "truth": str(self.truth),
-        }
-
-    def lines(self) -> list[str]:
-        """Returns lines for people: the devices, and commands to try on them."""
-        first = next(iter(self.cameras))
-        return [
-            "The simulated studio is open; Ctrl-C closes it.",
-            "",
-            f"  page         {self.url}/",
-            f"  cameras      {len(self.cameras)}, {self.cameras[first]} and so on",
-            f"  trigger box  {self.box} ({self.terminal})",
-            f"  rig.toml     {self.rig}",
-            f"  truth        {self.truth}",
-            "",
-            "Clean plates are taken and the subject is seated. In another terminal:",
-            "",
-            f"  eigenhead rig check --rig {self.rig}",
-            f"  eigenhead rig capture --rig {self.rig} --out shots/one",
-            "  eigenhead reconstruct shots/one --out heads/one",
-            f"  eigenhead serve --rig {self.rig}",
-            f"  curl -X POST '{self.url}/subject?present=0'",
-            f"  curl -X POST '{self.url}/faults?kind=bumped&camera={first}'",
-            f"  curl -X DELETE {self.url}/faults",
-        ]
+def studio_lines(studio: Mapping[str, Any]) -> list[str]:
+    """Returns lines for people: the devices, and commands to try on them."""
+    url, rig, first = studio["url"], studio["rig"], next(iter(studio["cameras"]))
+    return [
+        "The simulated studio is open; Ctrl-C closes it.",
+        "",
+        f"  page         {url}/",
+        f"  cameras      {len(studio['cameras'])}, {studio['cameras'][first]} and so on",
+        f"  trigger box  {studio['trigger']['port']} ({studio['trigger']['terminal']})",
+        f"  rig.toml     {rig}",
+        f"  truth        {studio['truth']}",
+        "",
+        "Clean plates are taken and the subject is seated. In another terminal:",
+        "",
+        f"  eigenhead rig check --rig {rig}",
+        f"  eigenhead rig capture --rig {rig} --out shots/one",
+        "  eigenhead reconstruct shots/one --out heads/one",
+        f"  eigenhead serve --rig {rig}",
+        f"  curl -X POST '{url}/subject?present=0'",
+        f"  curl -X POST '{url}/faults?kind=bumped&camera={first}'",
+        f"  curl -X DELETE {url}/faults",
+    ]
 
 
 def serve_studio(
@@ -84,14 +69,14 @@ def serve_studio(
     faults: Sequence[str],
     fps: float,
     port: int,
-    ready: Callable[[OpenStudio], None],
+    ready: Callable[[dict[str, Any]], None],
     report: Progress,
 ) -> None:
     """Serves the subject that ``eigenhead simulate`` draws for the same ``seed``, until SIGINT or SIGTERM.
 
     Writes rig.toml, cameras.json and clean plates into ``folder``, and the true head into ``<folder>.truth``. ``ready``
-    is called once all devices can be used. Afterwards no thread, port or pseudo-terminal is left. Raises InputError for
-    a folder of another rig, a wrong fault, or a port in use.
+    is called with ``describe_studio`` once all devices can be used. Afterwards no thread, port or pseudo-terminal is
+    left. Raises InputError for a folder of another rig, a wrong fault, or a port in use.
     """
     planted = [device_fault_from_text(text) for text in faults]
     _check_folder(folder)
@@ -113,7 +98,7 @@ def serve_studio(
         for fault in planted:
             devices.inject(fault)
         report("ready", 1.0)
-        ready(OpenStudio.of(devices, truth))
+        ready(describe_studio(devices, truth))
         threading.Event().wait()
 
 

@@ -3,7 +3,6 @@ shot."""
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TypedDict
 
 import cv2
 import numpy as np
@@ -13,6 +12,7 @@ from calibration.board.board import board_from_document
 from calibration.board.corners import detect
 from rig.messages.message import Message, compose
 from rig.progress import Progress
+from server.storage.records import JsonObject
 from server.tasks.child import WorkerContext
 
 CELLS = (4, 3)  # of an image, across and down, that corners should fall into
@@ -21,21 +21,6 @@ CELLS_ENOUGH = 0.75
 VIEWS_ENOUGH = 6  # per camera: Zhang's method has nothing more to gain from the count of views than that
 
 Corners = dict[str, list[list[float]]]  # of a shot, by camera: shares of the image's width and height
-
-
-class Coverage(TypedDict):
-    """Holds how much of one camera's picture the board has covered so far.
-
-    ``views``: pictures that show the board; ``covered``: share of the picture; ``corners`` and ``last``: corners of
-    earlier shots and of the last one, as shares of width and height.
-    """
-
-    name: str
-    views: int
-    covered: float
-    enough: bool
-    corners: list[list[float]]
-    last: list[list[float]]
 
 
 def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: Mapping[str, object]) -> Corners:
@@ -63,10 +48,11 @@ def covered(corners: Float[np.ndarray, "n 2"]) -> float:
     return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
 
 
-def summary(cameras: list[str], shots: list[Corners]) -> list[Coverage]:
-    """Computes the coverage of each camera by the shots so far: pictures that show the board, covered share, corners,
-    and whether that is enough."""
-    lines: list[Coverage] = []
+def summary(cameras: list[str], shots: list[Corners]) -> list[JsonObject]:
+    """Computes the coverage of each camera by the shots so far: pictures that show the board (``views``), ``covered``
+    share, whether that is enough, and ``corners`` of earlier shots and of the ``last`` as shares of width and
+    height."""
+    lines: list[JsonObject] = []
     for name in cameras:
         seen = [shot[name] for shot in shots if shot.get(name)]
         corners = np.array([corner for shot in seen for corner in shot]).reshape(-1, 2)
@@ -87,7 +73,7 @@ def summary(cameras: list[str], shots: list[Corners]) -> list[Coverage]:
     return lines
 
 
-def advice(lines: list[Coverage]) -> Message:
+def advice(lines: list[JsonObject]) -> Message:
     """Returns a message that says what the person with the board should do next."""
     if not lines or not any(line["views"] for line in lines):
         return compose("board-hold")

@@ -7,7 +7,6 @@ Everything is a function of a rig and pixels. Lens distortion is kept, so that a
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TypedDict
 
 import numpy as np
 from jaxtyping import Float
@@ -16,9 +15,10 @@ from pipeline.alignment.feature_points import locate_features
 from pipeline.geometry.registration.rigid import procrustes
 from pipeline.multiview.triangulation import CLICK_NOISE_PX, NoPoint, triangulate
 from rig.camera import Camera
-from rig.messages.message import Message, MessageDocument, compose
+from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig
+from server.storage.records import JsonObject
 from server.tasks.child import WorkerContext
 
 Pixels = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]  # point, camera
@@ -40,21 +40,6 @@ def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) ->
     depths = np.linspace(max(middle - REACH_MM, 50.0), middle + REACH_MM, SAMPLES)
     projected = rig[target].project(camera.centre_world + depths[:, None] * ray)
     return projected[_near_image(rig[target], projected)]
-
-
-class Helps(TypedDict):
-    """Holds the aids for picking feature points, by point and then by camera, in pixels.
-
-    ``guides``: the other views' lines of sight as curves; ``reprojected``: where the triangulated point is seen;
-    ``off_px``: distance of the picked pixel from there; ``predicted``: where the model's landmarks would be.
-    ``contradictions``: for a point whose pixels do not fit together, what a job would leave out.
-    """
-
-    guides: dict[str, dict[str, list[list[list[float]]]]]
-    reprojected: dict[str, dict[str, list[float]]]
-    off_px: dict[str, dict[str, float]]
-    predicted: dict[str, dict[str, list[float]]]
-    contradictions: dict[str, MessageDocument]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +65,14 @@ class Guides:
 
     def helps(
         self, points: Pixels, landmarks: Landmarks, shown: Collection[str], views: Collection[str] | None = None
-    ) -> Helps:
-        """Computes the aids for picking feature points. ``points``: the pixels picked so far, by point and camera.
+    ) -> JsonObject:
+        """Computes the aids for picking feature points, by point and then by camera, in pixels.
 
-        ``landmarks``: the model's (head frame, mm); ``shown``: points whose guides are needed; ``views``: cameras in
-        which guides are needed (None: all).
+        ``points``: the pixels picked so far; ``landmarks``: the model's (head frame, mm); ``shown``: points whose
+        guides are needed; ``views``: cameras in which guides are needed (None: all). Returns ``guides``, the other
+        views' lines of sight as curves; ``reprojected``, where the triangulated point is seen; ``off_px``, distance of
+        the picked pixel from there; ``predicted``, where the model's landmarks would be; ``contradictions``, what a job
+        would leave out of points whose pixels do not fit together.
         """
         targets = self._rig.names if views is None else [name for name in self._rig.names if name in views]
         located = {name: self._of(name, views) for name, views in points.items()}

@@ -54,7 +54,7 @@ def result_folder(service: Service, job_id: str) -> Path:
     """Returns the folder of a job's result, with all its files. Raises NotFound, and Conflict if the job has not
     succeeded."""
     local = _local_folder(service, job_id)
-    return service.jobs.result_folder(job_id) if service.jobs.results.elsewhere else local
+    return service.jobs.result_folder(job_id) if service.jobs.results.objects is not None else local
 
 
 def _local_folder(service: Service, job_id: str) -> Path:

@@ -29,11 +29,6 @@ def service_of_pages() -> Service:
     return pages.state.eigenhead.state.service
 
 
-def sign_in(service: Service, token: str) -> Caller | None:
-    """Returns the caller whose API key is ``token``; None for an unknown key. Blocks."""
-    return service.keys.caller(token.strip())
-
-
 def caller_of(service: Service, stored: Mapping[str, object]) -> Caller | None:
     """Identifies the caller by ``stored``, the user storage of the browser's session. Returns None if an API key must
     be given first. Blocks."""

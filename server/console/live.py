@@ -12,10 +12,11 @@ import structlog
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 from rig.progress import Progress
-from server.console.live_frame import LiveFrame, measured_frame
+from server.console.live_frame import measured_frame
 from server.services.live.live import document_of
 from server.services.rigs import PREVIEW_WIDTH, RigBackend, jpeg, reduced
 from server.services.service import Service
+from server.storage.records import JsonObject
 from server.tasks.child import Child, WorkerContext
 from server.wire.problems import problem_from
 
@@ -28,46 +29,22 @@ AGAIN_S = 1.0  # after an error
 log = structlog.get_logger()
 
 
-class StudioSource:
-    """Draws the cameras' pictures of the simulated studio, in a child process of its own."""
-
-    def __init__(self) -> None:
-        self._child, self._looks = Child(), 0
-
-    def frames(self) -> list[LiveFrame]:
-        """Returns the present picture of each simulated camera, with its measurements."""
-        self._looks += 1
-        return self._child.remote(frames)(look=self._looks)
-
-    def close(self) -> None:
-        """Ends the child process."""
-        self._child.close()
-
-
-class RigSource:
-    """Takes pictures of real cameras, all at once. Each time the sharpness of one camera's picture is measured, in
-    turn, since that needs the full size."""
-
-    def __init__(self, rig: RigBackend) -> None:
-        self._rig, self._looks = rig, 0
-
-    def frames(self) -> list[LiveFrame]:
-        """Returns the present picture of each camera, with its measurements. Raises Unavailable if the rig cannot be
-        opened."""
-        pictures = self._rig.look()
-        names = [camera.name for camera in self._rig.describe().cameras]
-        self._looks += 1
-        return [_frame(name, pictures.get(name), self._looks % len(names) == i) for i, name in enumerate(names)]
-
-    def close(self) -> None:
-        """Does nothing: the rig stays open for shots."""
-
-
-def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
+def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> JsonObject:
     if picture is None:
         return {"name": name, "jpeg": None, "fault": compose("camera-shows-nothing").document()}
     small = reduced(picture, PREVIEW_WIDTH)  # a tile is 320 points wide, twice as many pixels on a dense screen
     return measured_frame(name, small, jpeg(small), picture if sharp else None)
+
+
+def rig_frames(rig: RigBackend, child: Child, look: int) -> list[JsonObject]:
+    """Returns the present picture of each camera, with its measurements. The simulated studio is drawn in ``child``;
+    real cameras are looked at all at once, and the sharpness of one's picture is measured, in turn, since that needs
+    the full size. ``look`` counts the calls. Raises Unavailable if the rig cannot be opened."""
+    described = rig.describe()
+    if described.kind == "simulated":
+        return child.remote(frames)(look=look)
+    pictures, names = rig.look(), [camera.name for camera in described.cameras]
+    return [_frame(name, pictures.get(name), look % len(names) == i) for i, name in enumerate(names)]
 
 
 class LiveView:
@@ -102,7 +79,7 @@ class LiveView:
                 self._thread.start()
 
     def _look_around(self) -> None:
-        source: StudioSource | RigSource | None = None
+        child, number = Child(), 0
         blur: dict[str, float | None] = {}
         try:
             while True:
@@ -116,8 +93,8 @@ class LiveView:
                     time.sleep(LOOK_S)
                     continue
                 try:
-                    source = source or self._opened()
-                    message = self._look(source, blur)
+                    number += 1
+                    message = self._look(child, number, blur)
                 except Exception as error:  # the rig may come back
                     problem = problem_from(error)
                     log.warning("no live view", error=problem.detail.text)
@@ -126,16 +103,11 @@ class LiveView:
                 self._latest = (self._latest[0] + 1, message)
                 time.sleep(max(0.0, EVERY_S - (time.monotonic() - began)))
         finally:
-            if source is not None:
-                source.close()
+            child.close()
 
-    def _opened(self) -> StudioSource | RigSource:
-        rig = self._service.rig
-        return StudioSource() if rig.describe().kind == "simulated" else RigSource(rig)
-
-    def _look(self, source: StudioSource | RigSource, blur: dict[str, float | None]) -> bytes:
+    def _look(self, child: Child, look: int, blur: dict[str, float | None]) -> bytes:
         began = time.monotonic()
-        frames = source.frames()
+        frames = rig_frames(self._service.rig, child, look)
         for frame in frames:
             if "blur_px" in frame:
                 blur[frame["name"]] = frame["blur_px"]
@@ -145,7 +117,7 @@ class LiveView:
         return look_bytes(frames, None, document_of(shown))
 
 
-def look_bytes(frames: list[LiveFrame], fault: Message | None, head: object = None) -> bytes:
+def look_bytes(frames: list[JsonObject], fault: Message | None, head: object = None) -> bytes:
     """Encodes the pictures of all cameras as one message: 4 bytes with the header's length, 4 with the length of the
     rest (both big-endian), a JSON header, and the JPEG files in the header's order. ``bytes`` in the header is the
     length of each file."""
@@ -155,7 +127,7 @@ def look_bytes(frames: list[LiveFrame], fault: Message | None, head: object = No
     return struct.pack(">II", len(text), len(body)) + text + body
 
 
-def frames(context: WorkerContext, report: Progress, *, look: int) -> list[LiveFrame]:
+def frames(context: WorkerContext, report: Progress, *, look: int) -> list[JsonObject]:
     """Returns the present picture of each camera of the simulated studio, drawn in a child process. ``look`` counts the
     calls."""
     from server.console import studio_drawing

@@ -1,29 +1,16 @@
 """Measures a camera's picture for the live view."""
 
-from typing import NotRequired, TypedDict
-
 from rig.acquisition.image_checks import blur_px, exposure
 from rig.image import ImageRgb
-from rig.messages.message import MessageDocument
+from server.storage.records import JsonObject
 
 
-class LiveFrame(TypedDict):
-    """Holds a camera's picture as a JPEG file (None: it delivers none) and what was measured on it: ``mean`` (0 to
-    255), share of ``clipped`` pixels, ``blur_px``."""
-
-    name: str
-    jpeg: bytes | None
-    mean: NotRequired[float]
-    clipped: NotRequired[float]
-    blur_px: NotRequired[float | None]
-    fault: NotRequired[MessageDocument]
-
-
-def measured_frame(name: str, picture: ImageRgb, data: bytes, large: ImageRgb | None) -> LiveFrame:
-    """Returns a camera's frame: ``data`` is its ``picture`` as a JPEG file, and in ``large``, the picture in full size,
-    its sharpness is measured."""
+def measured_frame(name: str, picture: ImageRgb, data: bytes, large: ImageRgb | None) -> JsonObject:
+    """Returns a camera's frame: its name, ``data``, which is its ``picture`` as a JPEG file, and the picture's ``mean``
+    (0 to 255) and share of ``clipped`` pixels. In ``large``, the picture in full size, its sharpness is measured
+    (``blur_px``)."""
     level = exposure(picture)
-    frame: LiveFrame = {
+    frame: JsonObject = {
         "name": name,
         "mean": round(level.mean, 1),
         "clipped": round(level.clipped_share, 4),

@@ -10,40 +10,49 @@ distortion, onto which a pinhole camera draws the mesh exactly.
 import asyncio
 import json
 import threading
+import time
+from collections import defaultdict
 from contextlib import suppress
 from pathlib import Path
+from queue import Empty
 from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
 from fastapi import Depends, Request, Response
 from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 from nicegui import app as pages
+from scipy.spatial import KDTree
 
+from pipeline.geometry.registration.rigid import rigid_procrustes
 from pipeline.results.report_types import Report
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
-from rig.errors import EigenheadError, InputError
+from rig.errors import Cancelled, EigenheadError, InputError
 from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
+from rig.formats.meshes.mesh_file import read_mesh
+from rig.formats.meshes.ply import read_vertex_numbers
 from rig.formats.pictures.images import open_picture, read_image, write_image
 from rig.geometry import RigidTransform
 from rig.image import ImageRgb
+from rig.mesh import Mesh
 from rig.messages.message import compose
 from rig.progress import Progress
 from rig.rig import Rig
-from server.console import comparison
-from server.console.found_faces import found_faces
 from server.console.head_pictures import head_picture, result_folder
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
 from server.console.page import as_problem
-from server.errors import NotFound
+from server.errors import NotFound, Unavailable
 from server.services.keys import Caller
 from server.services.service import Service
-from server.storage.face_cache import FoundFace
+from server.services.truth import surface_distance
+from server.services.work import refuse_board
+from server.storage.face_cache import faces_once
 from server.storage.records import CaptureRecord, JsonObject
 from server.tasks.child import WorkerContext
+from server.tasks.faces import find_capture_faces
 from server.wire.batch_files import SheetFormat, TableFormat, send_sheet, send_table
 from server.wire.multipart import receive_calibration_pictures, receive_capture
 from server.wire.send_file import send_archive, send_file, send_zip
@@ -58,10 +67,14 @@ LINE_PX = 3
 THUMBNAIL_WIDTH = 480
 THUMBNAIL_QUALITY = 82
 STRAIGHTENED_QUALITY = 88
+ROUNDS = 12  # of nearest points, where two heads do not share their vertices
+TRIMMED = 0.8  # share of the nearest pairs that a round uses: necks end at different heights
+PATIENCE_S = 50.0  # for faces: eleven pictures of 12 Mpx take 4 s, forty 15
 FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 
 _live: dict[int, LiveView] = {}
 _drawing = threading.Lock()
+_finding: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)  # faces, by capture
 
 
 def session(scope: str) -> Any:
@@ -187,7 +200,7 @@ def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Li
     path = result_folder(who[0], job_id) / f"{surface}.ply"
     if not path.is_file():
         raise NotFound(compose("thing-surface"), surface)
-    return _floats(comparison.vertex_numbers(path, name))
+    return _floats(vertex_numbers(path, name))
 
 
 @pages.get("/console/jobs/{job_id}/portrait.jpg")
@@ -253,10 +266,10 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
         theirs = service.store.folder("captures", job.capture_id or "") / "truth" / "head.ply"
         if not theirs.is_file():
             raise NotFound(compose("thing-truth"), job.capture_id or "")
-        return _floats(comparison.to_surface(mine, theirs))
+        return _floats(to_surface(mine, theirs))
     other_job = service.jobs.get(other)
     same = other_job.capture_id == job.capture_id
-    return _floats(comparison.to_surface(mine, result_folder(service, other) / "head.ply", align=not same))
+    return _floats(to_surface(mine, result_folder(service, other) / "head.ply", align=not same))
 
 
 @pages.get("/console/jobs/{job_id}/all.zip")
@@ -302,7 +315,7 @@ def calibration_report(who: Reader, request: Request, calibration_id: str) -> Re
 @pages.get("/console/calibrations/{calibration_id}/cameras.json")
 def cameras_file(who: Reader, calibration_id: str) -> Response:
     """Returns the cameras.json of a calibration."""
-    return FileResponse(who[0].calibrations.cameras_json(calibration_id), media_type="application/json")
+    return FileResponse(who[0].calibrations.result(calibration_id, "cameras.json"), media_type="application/json")
 
 
 def make_thumbnail(source: Path, target: Path) -> None:
@@ -393,7 +406,7 @@ def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
     return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_AREA), np.uint8)
 
 
-def straightened_face(face: FoundFace, camera: Camera) -> FoundFace:
+def straightened_face(face: JsonObject, camera: Camera) -> JsonObject:
     """Converts a face to the pixels of the photograph without distortion, at full size. Points outside the lens are
     left out."""
     lens, pixels = camera.intrinsics, np.array(face["points"])
@@ -411,3 +424,70 @@ def _view(camera: Camera, camera_from_head: RigidTransform) -> JsonObject:
     matrix[:3, :3], matrix[:3, 3] = camera_from_head.rotation, camera_from_head.translation / MM
     pinhole = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
     return {"name": camera.name, **pinhole, "camera_from_head": matrix.tolist()}
+
+
+def vertex_numbers(path: Path, name: str) -> Float[np.ndarray, " v"]:
+    """Reads one number for each vertex of a result's surface. Raises NotFound if the file has no such number, and
+    InputError for another program's file."""
+    values = read_vertex_numbers(path, name)
+    if values is None:
+        raise NotFound(compose("thing-vertex-number"), name, compose("hint-other-numbers", file=path.name))
+    return values
+
+
+def to_surface(result: Path, other: Path, *, align: bool = False) -> Float[np.ndarray, " v"]:
+    """Computes the distance (mm) of every vertex of a result's head to the surface of the mesh ``other``.
+
+    With ``align`` the result's head is first moved rigidly onto the other one, since heads of different captures stand
+    in different places. Raises FileNotFoundError.
+    """
+    mine, theirs = read_mesh(result / "head.ply"), read_mesh(other)
+    points = moved_onto(mine, theirs) if align else mine.vertices
+    return surface_distance(points, theirs)
+
+
+def moved_onto(mine: Mesh, theirs: Mesh) -> Float[np.ndarray, "v 3"]:
+    """Returns the vertices of ``mine`` after the rigid motion that brings them closest to ``theirs``. Heads with
+    equally many vertices are compared vertex by vertex. Others are compared by nearest points, without the farthest
+    fifth."""
+    if len(mine.vertices) == len(theirs.vertices):
+        return rigid_procrustes(mine.vertices, theirs.vertices).apply(mine.vertices)
+    points = mine.vertices - mine.vertices.mean(0) + theirs.vertices.mean(0)
+    tree = KDTree(theirs.vertices)
+    for _ in range(ROUNDS):
+        distance, nearest = (np.asarray(part) for part in tree.query(points))
+        near = distance <= np.quantile(distance, TRIMMED)
+        points = rigid_procrustes(points[near], theirs.vertices[nearest[near]]).apply(points)
+    return points
+
+
+def found_faces(service: Service, identity: str) -> JsonObject:
+    """Returns the faces in a capture's pictures. The first call finds them; later ones read the cache. Blocks.
+
+    Raises NotFound, Conflict for a shot of the board, InputError and WorkFailed if the pictures cannot be searched, and
+    Unavailable after ``PATIENCE_S`` seconds.
+    """
+    deadline = time.monotonic() + PATIENCE_S
+    record = service.store.capture(identity)
+    refuse_board(record)
+    images = {Path(name).stem: name for name in record.inputs if Path(name).parent.name == "images"}
+    files = service.store.capture_files(identity)
+
+    def find() -> JsonObject:
+        with service.children.one(max(0.0, deadline - time.monotonic())) as child:
+            work = child.remote(find_capture_faces, cancelled=lambda: time.monotonic() > deadline)
+            return work(capture=str(files), images=images)
+
+    lock = _finding[identity]
+    if not lock.acquire(timeout=PATIENCE_S):
+        raise _slow()
+    try:
+        return faces_once(service.store.cache_of(identity) / "faces", record.inputs, find)
+    except (Cancelled, Empty):
+        raise _slow() from None
+    finally:
+        lock.release()
+
+
+def _slow() -> Unavailable:
+    return Unavailable("service-unavailable", compose("faces-slow", seconds=PATIENCE_S))

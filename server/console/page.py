@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from threading import Lock
-from typing import Any, TypedDict
+from typing import Any
 
 import anyio
 import anyio.to_thread
@@ -54,7 +54,8 @@ _threads = anyio.CapacityLimiter(16)  # actions and looks of all pages; a captur
 @dataclass(frozen=True, slots=True)
 class Action:
     """Describes what an event of a page does. ``function(page, event)`` runs in a thread, for callers with ``scope``.
-    ``page`` is the page on which the event happened, ``event`` what its component sent.
+    ``page`` is the page on which the event happened, ``event`` what its component sent: an ``id``, or the fields of a
+    form.
 
     A message that the function returns is shown in the corner; an error is shown there with its faults.
     """
@@ -239,13 +240,7 @@ class Page(Element):
         return action.function(self, event)
 
 
-class Chosen(TypedDict):
-    """Holds the event of an action on one thing: the thing's id."""
-
-    id: str
-
-
-def undo(page: Page, event: Chosen) -> Message:
+def undo(page: Page, event: JsonObject) -> Message:
     """Takes back a removal that is still waiting, whichever page began it. Raises Gone if it is too late, and Forbidden
     for a caller who could not have removed the thing."""
     removal = removals.waiting().get(event["id"])

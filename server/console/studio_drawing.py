@@ -15,7 +15,8 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import Scene, build_scene, view_light
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.sensor import Sensor, expose
-from server.console.live_frame import LiveFrame, measured_frame
+from server.console.live_frame import measured_frame
+from server.storage.records import JsonObject
 from server.tasks.child import WorkerContext
 from server.tasks.subjects import drawn_subject
 
@@ -26,7 +27,7 @@ QUICK = replace(PRESET, samples=1)  # the pictures are shown at a third of their
 SUBJECT_SEED = 1  # the same person as in the rig's own previews
 
 
-def frames(context: WorkerContext, look: int) -> list[LiveFrame]:
+def frames(context: WorkerContext, look: int) -> list[JsonObject]:
     """Returns the present picture of each camera of the simulated studio. ``look`` counts the calls: every
     ``SHARP_EVERY``-th measures one camera's blur, too."""
     views = context.keep("live", _draw)
@@ -52,7 +53,7 @@ def _draw() -> dict[str, tuple[Sensor, np.ndarray, np.ndarray]]:
 
 def _frame(
     name: str, lit: tuple[Sensor, np.ndarray, np.ndarray], rng: np.random.Generator, *, sharp: bool
-) -> LiveFrame:
+) -> JsonObject:
     sensor, light, small = lit
     picture = expose(small, sensor, rng)
     done, data = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])

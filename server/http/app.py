@@ -1,31 +1,36 @@
-"""Composes the API as an ASGI app: routers, middleware, and the tasks that run beside the requests."""
+"""Composes the API as an ASGI app: routers, middleware, the tasks that run beside the requests, and its description."""
 
 import asyncio
 import hashlib
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from functools import partial
 from importlib.metadata import version
+from typing import Any
 from weakref import WeakValueDictionary
 
 import structlog
 from fastapi import FastAPI, Request
 from fastapi.middleware.cors import CORSMiddleware
 from fastapi.routing import APIRoute
+from pydantic import TypeAdapter
 from starlette.datastructures import Headers
 from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from pipeline.settings import SPACING_RANGE_MM, Settings
+from pipeline.warnings import WARNING_CODES
 from rig.messages.message import compose
 from server.http.auth import FairShares, check_caller
-from server.http.openapi import CHANGES, describe, operation_name
 from server.http.routes import batches, calibrations, captures, jobs, live, operations, rig, sessions, uploads
 from server.metrics import Metrics
+from server.services.answer import SETTINGS
 from server.services.health import check_egl, check_store, store_places
 from server.services.retention import sweep
 from server.services.service import Service, open_service
 from server.settings import ServiceSettings
+from server.storage.records import JsonObject
 from server.storage.store import new_id
 from server.wire import problems
 from server.wire.patience import IDLE_TIMEOUT_S, within
@@ -36,6 +41,9 @@ BATCHES_AGAIN_S = 5.0
 STORE_AGAIN_S = 10.0
 EXPOSED = ("Location", "ETag", "Upload-Offset", "Upload-Length", "Upload-Expires", "Tus-Resumable", "X-Request-Id")
 
+REFERENCE = "#/components/schemas/{model}"
+CHANGES = frozenset({"PUT", "PATCH", "DELETE"})  # methods that If-Match makes conditional
+TEXTUAL = ("application/json", problems.MEDIA_TYPE, "text/")
 POLICY = (  # NiceGUI writes scripts and styles into its pages, and Vue compiles their templates by eval
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob: ws: wss:; "
@@ -59,9 +67,16 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.service = service = await asyncio.to_thread(open_service, settings, metrics)
-        tasks = [asyncio.create_task(_look_around(service))]
-        tasks += [asyncio.create_task(_sweep_forever(service)), asyncio.create_task(_measure_lag(metrics))]
-        tasks += [asyncio.create_task(_serve_batches(service)), asyncio.create_task(_watch_store(service))]
+        looked = min(STORE_AGAIN_S, settings.sweep_s)
+        beside = [
+            service.threads.disk(check_egl, service),
+            _measure_lag(metrics),
+            _repeat(service, partial(sweep, service), settings.sweep_s, "sweep failed"),
+            _repeat(service, service.batches.serve, settings.poll_s, "batches not served", BATCHES_AGAIN_S),
+        ]
+        if store_places(service):
+            beside.append(_repeat(service, partial(check_store, service), looked, "stores not looked at"))
+        tasks = [asyncio.create_task(each) for each in beside]
         try:
             yield
         finally:
@@ -79,7 +94,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
-        generate_unique_id_function=operation_name,
+        generate_unique_id_function=lambda route: route.name,  # generated clients name their methods so
     )
     routers = [module.router for module in MODULES]
     for router in routers:
@@ -198,37 +213,18 @@ async def _send_start(send: Send, message: Message) -> None:
         await send({"type": "http.response.body"})
 
 
-async def _look_around(service: Service) -> None:
-    await service.threads.disk(check_egl, service)
-
-
-async def _watch_store(service: Service) -> None:
-    """Asks the stores every ``STORE_AGAIN_S`` seconds whether they answer, where there are any."""
-    while store_places(service):
-        await service.threads.disk(check_store, service)
-        await asyncio.sleep(min(STORE_AGAIN_S, service.settings.sweep_s))
-
-
-async def _sweep_forever(service: Service) -> None:
-    """Removes expired data at once and then every ``sweep_s`` seconds. A sweep that fails is logged; the next one
-    runs."""
+async def _repeat(
+    service: Service, action: Callable[[], object], every_s: float, fault: str, again_s: float = 0.0
+) -> None:
+    """Does an action in a thread at once, and then every ``every_s`` seconds. One that fails, as of a full disk or a
+    database that is away, is logged as ``fault``, and done again after ``again_s`` seconds at least."""
     while True:
+        pause_s = every_s
         try:
-            await service.threads.disk(sweep, service)
-        except Exception as error:  # a full or missing disk, an unreachable database
-            log.error("sweep failed", error=str(error)[:300])
-        await asyncio.sleep(service.settings.sweep_s)
-
-
-async def _serve_batches(service: Service) -> None:
-    """Queues jobs of batches every ``poll_s`` seconds. A call that fails is logged, and the next one tries again."""
-    while True:
-        pause_s = service.settings.poll_s
-        try:
-            await service.threads.disk(service.batches.serve)
-        except Exception as error:  # a database that is away
-            log.error("batches not served", error=str(error)[:300])
-            pause_s = max(pause_s, BATCHES_AGAIN_S)
+            await service.threads.disk(action)
+        except Exception as error:
+            log.error(fault, error=str(error)[:300])
+            pause_s = max(pause_s, again_s)
         await asyncio.sleep(pause_s)
 
 
@@ -357,3 +353,84 @@ def _closes(scope: Scope) -> bool:
 def _has_body(scope: Scope) -> bool:
     names = {name: value for name, value in scope["headers"]}
     return b"transfer-encoding" in names or names.get(b"content-length", b"0") != b"0"
+
+
+def describe(app: FastAPI, address: str | None) -> None:
+    """Replaces ``app.openapi`` by a function that returns the completed document, which is made once: the pipeline's
+    settings get schemas of their own, files are marked as bytes, and problem documents replace the framework's errors.
+    ``address``: what the service is known as; None where it is that of the request."""
+    original = app.openapi
+
+    def openapi() -> JsonObject:
+        if app.openapi_schema is None:
+            document = original()
+            _name_problems(document)
+            _name_settings(document)
+            _mark_files(document)
+            _name_conditions(document)
+            document["servers"] = [{"url": address or "/"}]
+        return app.openapi_schema or {}
+
+    app.openapi = openapi
+
+
+def _responses(document: JsonObject) -> Iterator[tuple[str, dict[str, Any]]]:
+    for path in document["paths"].values():
+        for call in path.values():
+            yield from call.get("responses", {}).items()
+
+
+def _name_problems(document: JsonObject) -> None:
+    """Replaces the framework's error schemas by that of the problem document."""
+    schemas = document.setdefault("components", {}).setdefault("schemas", {})
+    schemas["Problem"] = problems.PROBLEM_SCHEMA
+    for unused in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(unused, None)
+    for status, answer in _responses(document):
+        if status[0] in "45" and problems.MEDIA_TYPE in answer.get("content", {}):
+            answer["content"] = {problems.MEDIA_TYPE: answer["content"][problems.MEDIA_TYPE]}
+
+
+def _name_conditions(document: JsonObject) -> None:
+    """Adds ``If-Match`` to what changes or removes something that can be got, and ``ETag`` to what gets it."""
+    text = {"schema": {"type": "string"}}
+    tag = {"description": "of this state; If-Match takes it", **text}
+    for path in document["paths"].values():
+        changes = [call for method, call in path.items() if method.upper() in CHANGES]
+        if not changes or "get" not in path:
+            continue
+        path["get"]["responses"]["200"]["headers"] = {"ETag": tag}
+        for call in changes:
+            meaning = "the ETag of the state that is meant to be changed: 412 if it is another by now"
+            parameters = call.setdefault("parameters", [])
+            parameters.append({"name": "If-Match", "in": "header", "required": False, "description": meaning, **text})
+            call["responses"] |= {"412": {**call["responses"]["422"], "description": "Precondition Failed"}}
+
+
+def _name_settings(document: JsonObject) -> None:
+    """Adds the pipeline's settings as named schemas: every key is optional, unknown keys are refused."""
+    described = TypeAdapter(Settings).json_schema(ref_template=REFERENCE)
+    named = described.pop("$defs") | {"Settings": described}
+    del described["properties"]["warnings"]  # of the reader
+    for schema in named.values():
+        schema["additionalProperties"] = False
+    named["Settings"]["properties"]["fail_on"]["items"] = {"type": "string", "enum": list(WARNING_CODES)}
+    least, most = SPACING_RANGE_MM
+    named["BustSettings"]["properties"]["spacing_mm"] |= {"minimum": least, "maximum": most}
+    _replace(document, SETTINGS, {"$ref": REFERENCE.format(model="Settings")})
+    document["components"]["schemas"] |= named
+
+
+def _replace(node: Any, old: JsonObject, new: JsonObject) -> None:
+    for key, value in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
+        if isinstance(value, dict) and old.items() <= value.items():
+            node[key] = {**{k: v for k, v in value.items() if k not in old}, **new}
+        else:
+            _replace(value, old, new)
+
+
+def _mark_files(document: JsonObject) -> None:
+    for _, answer in _responses(document):
+        for media, content in answer.get("content", {}).items():
+            if not media.startswith(TEXTUAL):
+                content["schema"] = {"type": "string", "format": "binary"}

@@ -12,9 +12,9 @@ from pathlib import Path
 from pipeline.head_model.model_names import UnknownModel
 from server.batch.captures import BatchCapture, files_sha256
 from server.batch.folder import REPORT, FailureRecord, Origin
-from server.batch.sheet import Card, sheet_lines
-from server.batch.summary import Outcome, expressions_of, sheet_card, table_row
-from server.batch.table import Column, Row, columns_of
+from server.batch.sheet import Card
+from server.batch.summary import expressions_of, sheet_card
+from server.batch.table import Column, Outcome, Row, columns_of, row_of
 from server.problem_types import URN
 from server.services.batches import Batches
 from server.services.records import BatchOut, JobOut
@@ -34,25 +34,14 @@ def batch_columns(batch: BatchOut) -> tuple[Column, ...]:
 def batch_rows(batches: Batches, store: Store, batch: BatchOut, columns: Sequence[Column]) -> Iterator[Row]:
     """Yields the rows of a batch's table, in the order of its captures. A capture that was erased, or whose head is not
     made yet, has a row, too."""
-    return (table_row(outcome, columns) for outcome in _outcomes(batches, store, batch))
+    return (row_of(outcome, columns) for outcome in _outcomes(batches, store, batch))
 
 
-def batch_sheet(batches: Batches, store: Store, batch: BatchOut) -> Iterator[str]:
-    """Yields the lines of a batch's contact sheet, a self-contained HTML page with one card for each capture. A card
-    links to the console's page of the result."""
-    return sheet_lines(batch.label or batch.id, _cards(batches, store, batch))
-
-
-def batch_sheet_pdf(batches: Batches, store: Store, batch: BatchOut) -> bytes:
-    """Returns a batch's contact sheet as PDF."""
-    from server.batch.sheet_pdf import sheet_pdf  # its library takes a while to load
-
-    return sheet_pdf(batch.label or batch.id, _cards(batches, store, batch))
-
-
-def _cards(batches: Batches, store: Store, batch: BatchOut) -> list[Card]:
+def batch_cards(batches: Batches, store: Store, batch: BatchOut) -> list[Card]:
+    """Returns the cards of a batch's contact sheet, one for each capture. A card links to the console's page of the
+    result."""
     columns = batch_columns(batch)
-    return [sheet_card(outcome, table_row(outcome, columns)) for outcome in _outcomes(batches, store, batch)]
+    return [sheet_card(outcome, row_of(outcome, columns)) for outcome in _outcomes(batches, store, batch)]
 
 
 def _outcomes(batches: Batches, store: Store, batch: BatchOut) -> Iterator[Outcome]:

@@ -46,22 +46,15 @@ log = structlog.get_logger()
 
 
 @dataclass(frozen=True, slots=True)
-class Selection:
-    """Describes which captures a batch is made of. Exactly one field is set: the captures' ids, the id of a session, or
-    the text that their labels begin with."""
+class BatchRequest:
+    """Holds a request for a batch: what is done with each of which captures, and in which queue (None: the service's
+    own). Exactly one is set of ``captures``, their ids, ``session``, its id, and ``prefix``, the text that their labels
+    begin with. Of two jobs the one with the lower ``priority`` runs first."""
 
+    work: ReconstructionRequest
     captures: Sequence[str] | None = None
     session: str | None = None
     prefix: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class BatchRequest:
-    """Holds a request for a batch: which captures, what is done with each, and in which queue (None: the service's
-    own). Of two jobs the one with the lower ``priority`` runs first."""
-
-    selection: Selection
-    work: ReconstructionRequest
     label: str = ""
     queue: str | None = None
     priority: int = PRIORITY
@@ -69,9 +62,8 @@ class BatchRequest:
     def digest(self) -> str:
         """Returns the SHA-256 of everything that was requested. A repeated request with the same idempotency key must
         have the same digest."""
-        chosen = self.selection
-        captures = None if chosen.captures is None else list(chosen.captures)
-        wanted = [captures, chosen.session, chosen.prefix, self.work.model, self.work.settings]
+        captures = None if self.captures is None else list(self.captures)
+        wanted = [captures, self.session, self.prefix, self.work.model, self.work.settings]
         wanted += [self.label, self.queue, self.priority]
         wanted += [] if self.work.deliver_to is None else [self.work.deliver_to]  # digests of earlier versions lack it
         return document_sha256({"wanted": json.dumps(wanted, sort_keys=True)})
@@ -107,7 +99,7 @@ class Batches:
         identity = new_id() if idempotency_key is None else repeatable_id(key, f"batch {idempotency_key}")
         digest = wanted.digest()
         if idempotency_key is None or self._index.get(identity) is None:
-            captures = self._chosen(wanted.selection)
+            captures = self._chosen(wanted)
             self._store.reserve(0, self._settings.free_bytes)
             if len(self._index.unfinished(key)) >= self._settings.batches_per_key:
                 most = self._settings.batches_per_key
@@ -228,17 +220,17 @@ class Batches:
             raise Conflict("batch-ended", compose("batch-ended"))
         return self.get(identity)
 
-    def _chosen(self, selection: Selection) -> Sequence[str]:
-        ways = (selection.captures, selection.session, selection.prefix)
+    def _chosen(self, wanted: BatchRequest) -> Sequence[str]:
+        ways = (wanted.captures, wanted.session, wanted.prefix)
         if sum(way is not None for way in ways) != 1:
             raise InputError("request", [compose("batch-selection")])
-        if selection.captures is not None:
-            chosen, faults = selection.captures, self._faults_of(selection.captures)
-        elif selection.session is not None:
-            self._store.session(selection.session)
-            chosen, faults = self._library.heads_of(selection.session)[::-1], []
+        if wanted.captures is not None:
+            chosen, faults = wanted.captures, self._faults_of(wanted.captures)
+        elif wanted.session is not None:
+            self._store.session(wanted.session)
+            chosen, faults = self._library.heads_of(wanted.session)[::-1], []
         else:
-            chosen, faults = self._library.heads_labelled(selection.prefix or ""), []
+            chosen, faults = self._library.heads_labelled(wanted.prefix or ""), []
         if not chosen:
             faults = [compose("batch-none-chosen")]
         if len(chosen) > (most := self._settings.batch_captures):

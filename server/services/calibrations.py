@@ -13,9 +13,8 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import cast
 
-from dbos import DBOSClient, EnqueueOptions, WorkflowStatus
+from dbos import DBOSClient, WorkflowStatus
 
 from rig.atomic_write import write_atomically
 from rig.digest import sha256_of
@@ -23,18 +22,17 @@ from rig.errors import InputError
 from rig.messages.message import Message, compose, read_message
 from server.errors import Conflict, NotFound
 from server.services.failures import failure
-from server.services.job_rows import APPLICATION_VERSION, FINISHED, STATES
+from server.services.job_rows import FINISHED, STATES, enqueue_options
 from server.services.records import CalibrationOut, moment_now
 from server.services.texts import check_texts
 from server.storage.events import EventLog
 from server.storage.folders import move_durably
-from server.storage.records import CALIBRATION, CalibrationOutcome, CalibrationRecord, EventDocument
+from server.storage.records import CALIBRATION, CalibrationRecord, EventDocument, JsonObject
 from server.storage.store import Store, StoredFile, new_id
 from server.tasks.calibrate import BOARD, check_scale, is_of_board
 from server.tasks.photographs import SCALE
 
 WORKFLOW = "calibrate"
-NO_OUTCOME: CalibrationOutcome = {"figures": {}, "checks": [], "warnings": [], "front": None, "sha256": ""}
 
 
 class Calibrations:
@@ -54,29 +52,28 @@ class Calibrations:
         record = CALIBRATION.document(CalibrationRecord(identity, moment_now(), source, label, cameras, kind))
         write_atomically(folder / "record.json", json.dumps(record, indent=1).encode())
         move_durably(folder, self._store.folder("calibrations", identity))
-        self._client.enqueue(self._options(identity), identity)
+        self._enqueue(identity)
         return self.get(identity)
 
-    def add_shots(self, board: Mapping[str, object], captures: list[str], label: str) -> CalibrationOut:
-        """Queues a calibration from captures that show the board. ``board``: the content of a ``board.toml``. Raises
-        NotFound for an unknown capture, and InputError for a wrong board or captures without images."""
+    def add_shots(
+        self,
+        board: Mapping[str, object] | None,
+        captures: list[str],
+        label: str,
+        scale: Mapping[str, object] | None = None,
+    ) -> CalibrationOut:
+        """Queues a calibration from captures. ``board``: the content of a ``board.toml``, None for captures of any
+        scene; ``scale``: of the scene, the content of a ``scale.json``. Raises NotFound for an unknown capture, and
+        InputError for a wrong board or scale, or captures without images."""
         from calibration.board.board import board_from_document, write_board
 
-        described = board_from_document(board)
+        described = None if board is None else board_from_document(board)
         with self._store.incoming() as folder:
             target = folder / "calibration"
             target.mkdir()
             link_shots(self._store, target, captures)
-            write_board(described, target / BOARD)
-            return self.add(target, "rig", label)
-
-    def add_scene(self, captures: list[str], scale: Mapping[str, object] | None, label: str) -> CalibrationOut:
-        """Queues a calibration from captures of any scene. ``scale``: the content of a ``scale.json``. Raises NotFound
-        for an unknown capture, and InputError for a wrong scale or captures without images."""
-        with self._store.incoming() as folder:
-            target = folder / "calibration"
-            target.mkdir()
-            link_shots(self._store, target, captures)
+            if described is not None:
+                write_board(described, target / BOARD)
             if scale is not None:
                 write_atomically(target / SCALE, json.dumps(scale).encode())
             check_scale(target)
@@ -89,8 +86,8 @@ class Calibrations:
         row = self._row(identity)
         state = STATES[row.status] if row else "queued"
         if row is None:  # the service was killed between accepting and queueing
-            self._client.enqueue(self._options(identity), identity)
-        outcome = NO_OUTCOME if row is None or state != "succeeded" else cast(CalibrationOutcome, row.output)
+            self._enqueue(identity)
+        outcome: JsonObject = (row.output or {}) if row is not None and state == "succeeded" else {}
         latest = self._events.latest([identity]).get(identity) if state == "running" else None
         document: EventDocument = {} if latest is None else latest.document
         return CalibrationOut(
@@ -102,11 +99,11 @@ class Calibrations:
             error=failure(row) if row is not None and state == "failed" else None,
             verdict=outcome.get("verdict"),
             missing=_messages(outcome.get("missing_messages") or outcome.get("missing", [])),
-            figures=dict(outcome["figures"]),
-            checks=tuple(map(dict, outcome["checks"])),
-            warnings=_messages(outcome.get("warning_messages") or outcome["warnings"]),
+            figures=outcome.get("figures", {}),
+            checks=tuple(outcome.get("checks", ())),
+            warnings=_messages(outcome.get("warning_messages") or outcome.get("warnings", [])),
             front=outcome.get("front"),
-            in_use=self.in_use() == outcome["sha256"],
+            in_use=self.in_use() == outcome.get("sha256", ""),
         )
 
     def find(self) -> list[CalibrationOut]:
@@ -116,11 +113,6 @@ class Calibrations:
             with suppress(NotFound):  # removed since they were listed, or damaged
                 found.append(self.get(identity))
         return found
-
-    def cameras_json(self, identity: str) -> Path:
-        """Returns the path of a calibration's cameras.json. Raises NotFound, and Conflict if the calibration has not
-        succeeded."""
-        return self.result(identity, "cameras.json")
 
     def result(self, identity: str, name: str) -> Path:
         """Returns the path of a file in the result folder of a calibration. Raises NotFound, and Conflict if the
@@ -161,21 +153,17 @@ class Calibrations:
     def mark_in_use(self, identity: str) -> None:
         """Notes, in one atomic write, that the rig uses this calibration. Raises NotFound, and Conflict if the
         calibration has not succeeded."""
-        digest = sha256_of(self.cameras_json(identity))
+        digest = sha256_of(self.result(identity, "cameras.json"))
         write_atomically(self._store.data / "rig" / "in_use", digest.encode())
+
+    def _enqueue(self, identity: str) -> None:
+        options = enqueue_options(WORKFLOW, self._queue, identity)
+        options["priority"] = 1
+        self._client.enqueue(options, identity)
 
     def _row(self, identity: str) -> WorkflowStatus | None:
         rows = self._client.list_workflows(workflow_ids=[identity], name=WORKFLOW)
         return rows[0] if rows else None
-
-    def _options(self, identity: str) -> EnqueueOptions:
-        return {
-            "workflow_name": WORKFLOW,
-            "queue_name": self._queue,
-            "workflow_id": identity,
-            "app_version": APPLICATION_VERSION,
-            "priority": 1,
-        }
 
 
 def link_shots(store: Store, folder: Path, captures: list[str]) -> None:

@@ -12,20 +12,22 @@ from typing import cast
 from pydantic import TypeAdapter
 
 from rig.acquisition.face_sighting import face_remarks
-from rig.acquisition.shot import Fault, ShotDocument, read_fault
+from rig.acquisition.shot import ShotDocument, read_fault
 from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.captures.archive import ArchiveLimits
 from rig.messages.message import compose
 from server.errors import Conflict, NotFound
-from server.services.erasure import HoldingsOut, erase_captures, holdings
+from server.services.erasure import HoldingsOut, erase_captures
+from server.services.job_rows import FINISHED
 from server.services.jobs import Jobs
 from server.services.records import moment_now
 from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
 from server.services.texts import check_texts, checked_tags, typed_tags
 from server.services.work import refuse_board
 from server.settings import ServiceSettings
+from server.storage.folders import folder_bytes
 from server.storage.library import CaptureQuery, Library
 from server.storage.pages import Page
 from server.storage.records import CaptureContent, CaptureRecord
@@ -250,7 +252,19 @@ class Captures:
 
     def holdings(self, identity: str) -> HoldingsOut:
         """Returns what removing a capture would take away and what would stay. Raises NotFound."""
-        return holdings(self._store, self._jobs, identity)
+        record = self._store.capture(identity)
+        of_capture = self._jobs.find(capture=identity, limit=100_000)
+        held = max(
+            record.bytes, folder_bytes(self._store.folder("captures", identity))
+        )  # some may be in the store alone
+        return HoldingsOut(
+            pictures=len(record.cameras),
+            bytes=held + folder_bytes(self._store.cache_of(identity)),
+            heads=[job.id for job in of_capture if job.state == "succeeded"],
+            head_bytes=sum(file.bytes for job in of_capture for file in job.files.values()),
+            jobs=[job.id for job in of_capture if job.state != "succeeded"],
+            active=[job.id for job in of_capture if job.state not in FINISHED],
+        )
 
     def erase(self, identity: str) -> None:
         """Cancels the jobs of a capture, then removes every trace of it: pictures, heads, caches and rows of the job
@@ -282,8 +296,13 @@ class Captures:
     ) -> CaptureRecord:
         if needs_consent:
             self._check_consent(about.session, board=content.board)
-        faults = tuple(without_consequences([*shot_faults(shot), *content.faults]))
-        self._store.put_checks(folder, all_checks(shot, content))
+        # Pictures of the simulated studio, whose shots have no checks, are judged like those of an upload.
+        taken = cast(ShotDocument, shot) if shot is not None and "checks" in shot else None
+        at_shot = [] if taken is None else [read_fault(document) for document in taken["faults"]]
+        faults = tuple(without_consequences([*at_shot, *content.faults]))
+        checks = {} if taken is None else taken["checks"]
+        of_views = {name: {**checks.get(name, {}), **view} for name, view in content.checks.items()}
+        self._store.put_checks(folder, cast(dict[str, ViewDocument], of_views))
         record = CaptureRecord(
             id=new_id(),
             created=moment_now(),
@@ -311,18 +330,3 @@ class Captures:
             self._store.remove_capture(record.id, later=True)
             raise
         return record
-
-
-def shot_faults(shot: Mapping[str, object] | None) -> tuple[Fault, ...]:
-    """Returns the faults in the certificate of a real rig's shot. It returns none for the simulated studio, whose
-    pictures are judged like those of an upload."""
-    if shot is None or "checks" not in shot:
-        return ()
-    return tuple(read_fault(document) for document in cast(ShotDocument, shot)["faults"])
-
-
-def all_checks(shot: Mapping[str, object] | None, content: CaptureContent) -> dict[str, ViewDocument]:
-    """Merges what was measured of each camera's picture at the shot (``shot``) and when the files were checked
-    (``content``). The latter counts where both measured the same."""
-    taken = cast(Mapping[str, ViewDocument], {} if shot is None else shot.get("checks", {}))
-    return {name: {**taken.get(name, {}), **view} for name, view in content.checks.items()}

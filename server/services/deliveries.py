@@ -9,13 +9,13 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
-from dbos import DBOSClient, EnqueueOptions, WorkflowStatus
+from dbos import DBOSClient
 
 from rig.messages.message import compose
 from server.errors import Forbidden
 from server.services.answer import State
 from server.services.failures import failure
-from server.services.job_rows import APPLICATION_VERSION, STATES
+from server.services.job_rows import STATES, enqueue_options
 from server.services.records import DeliveryOut
 from server.settings import ServiceSettings
 from server.storage.object_places import locate
@@ -53,13 +53,7 @@ def enqueue_delivery(
     wanted: DeliveryRequest = {"job_id": job_id, "to": to, "until": time.time() + settings.deliver_hours * HOUR_S}
     if webhook is not None:
         wanted["webhook"] = webhook
-    options: EnqueueOptions = {
-        "workflow_name": DELIVER,
-        "queue_name": DELIVERIES_QUEUE,
-        "workflow_id": delivery_id(job_id),
-        "app_version": APPLICATION_VERSION,
-    }
-    enqueue(options, wanted)
+    enqueue(enqueue_options(DELIVER, DELIVERIES_QUEUE, delivery_id(job_id)), wanted)
 
 
 def delivery_id(job_id: str) -> str:
@@ -83,7 +77,14 @@ class Deliveries:
         ids = [delivery_id(job_id) for job_id in jobs]
         rows = self.client.list_workflows(name=DELIVER, workflow_ids=ids, load_output=True) if ids else []
         found = [(cast(DeliveryRequest, row.input["args"][0]), row) for row in rows if row.input]
-        return {wanted["job_id"]: _delivery(wanted, row) for wanted, row in found}
+        return {
+            wanted["job_id"]: DeliveryOut(
+                to=place_of(wanted),
+                state=STATE_OF[STATES[row.status]],
+                error=failure(row) if STATES[row.status] == "failed" else None,
+            )
+            for wanted, row in found
+        }
 
     def forget(self, job_id: str) -> None:
         """Ends the delivery of a job, if any, and removes its row; what was delivered stays where it is."""
@@ -100,9 +101,3 @@ def delivery_of(
     place = f"{request['deliver_to']}{job_id}/"
     ended = state in ("failed", "cancelled")
     return DeliveryOut(to=place, state="cancelled" if ended else "waiting", error=None)
-
-
-def _delivery(wanted: DeliveryRequest, row: WorkflowStatus) -> DeliveryOut:
-    state = STATES[row.status]
-    error = failure(row) if state == "failed" else None
-    return DeliveryOut(to=place_of(wanted), state=STATE_OF[state], error=error)

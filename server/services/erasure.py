@@ -11,7 +11,6 @@ from server.errors import Unavailable
 from server.services.answer import Answer
 from server.services.job_rows import FINISHED
 from server.services.jobs import Jobs
-from server.storage.folders import folder_bytes
 from server.storage.store import Store
 
 CANCEL_S = 5.0  # a cancelled job lets go of its files within one second
@@ -26,22 +25,6 @@ class HoldingsOut(Answer):
     head_bytes: int
     jobs: list[str] = Field(description="the other jobs")
     active: list[str] = Field(description="jobs that are queued or running: a removal is refused, an erasure ends them")
-
-
-def holdings(store: Store, jobs: Jobs, capture: str) -> HoldingsOut:
-    """Counts what is stored of a capture. Raises NotFound."""
-    record = store.capture(capture)
-    of_capture = jobs.find(capture=capture, limit=100_000)
-    held = max(record.bytes, folder_bytes(store.folder("captures", capture)))  # some may be in the store alone
-    heads = [job.id for job in of_capture if job.state == "succeeded"]
-    return HoldingsOut(
-        pictures=len(record.cameras),
-        bytes=held + folder_bytes(store.cache_of(capture)),
-        heads=heads,
-        head_bytes=sum(file.bytes for job in of_capture for file in job.files.values()),
-        jobs=[job.id for job in of_capture if job.state != "succeeded"],
-        active=[job.id for job in of_capture if job.state not in FINISHED],
-    )
 
 
 def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: Collection[str] = ()) -> None:

@@ -1,12 +1,14 @@
 """Checks whether the service can do its work, and says what to do where it cannot."""
 
 import os
+import resource
 import time
 from collections import Counter
 from importlib.metadata import version
 
 import sqlalchemy as sa
 import structlog
+from prometheus_client import generate_latest
 from pydantic import Field
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -14,13 +16,13 @@ from pipeline.settings import Settings, document_from_settings
 from rig.formats.cameras.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
 from rig.messages.message import compose, verbatim
 from server.errors import Refused
-from server.metrics import QueueFigures, StoreFigures
 from server.services.answer import Answer, JobSettings
 from server.services.service import CheckOut, Service
 from server.storage.database import alive_workers, slots_by_queue
 from server.storage.events import failure_counts
 from server.storage.folders import STOPPED
 from server.storage.job_index import Queued
+from server.storage.watched_objects import WatchedObjects
 from server.tasks.child import WorkFailed
 from server.tasks.egl import try_egl
 
@@ -126,9 +128,8 @@ def check_store(service: Service) -> None:
     if not places:
         return
     try:
-        service.jobs.results.probe()
-        if service.store.blobs is not None:
-            service.store.blobs.probe()
+        for store in _watched(service):
+            store.probe()
     except Refused as error:
         if service.known.get("store", STORE_UNKNOWN).detail.code == "store-answers":
             log.warning("the store is away", reason=error.detail.text)
@@ -149,39 +150,47 @@ def _store(service: Service) -> CheckOut:
     return service.known.get("store", STORE_UNKNOWN)
 
 
-def _store_figures(service: Service) -> StoreFigures | None:
+def _watched(service: Service) -> list[WatchedObjects]:
     blobs = service.store.blobs
-    tallies = [service.jobs.results.tally, None if blobs is None else blobs.objects.tally]
-    found = [tally for tally in tallies if tally is not None]
-    if not found:
-        return None
-    answers = _store(service).detail.code == "store-answers"
-    operations, seconds = Counter[tuple[str, str]](), Counter[str]()
-    for tally in found:
-        operations.update(tally.operations())
-        seconds.update(tally.seconds())  # pyright: ignore[reportCallIssue, reportArgumentType]
-    return StoreFigures(answers, operations, seconds)
+    stores = (service.jobs.results.objects, None if blobs is None else blobs.objects)
+    return [store for store in stores if store is not None]
 
 
 def exposition(service: Service) -> bytes:
-    """Returns the current metrics in Prometheus' text format."""
-    captures, damaged = len(service.store.ids("captures")), len(service.store.list_quarantined())
-    queued, slots = service.jobs.index.queued(), slots_by_queue(service.engine, service.settings.silent_s)
-    queues = {
-        name: QueueFigures(found.jobs, max(0.0, time.time() - found.since), slots.get(name, 0))
-        for name in {*queued, *slots}
-        for found in (queued.get(name) or Queued(0, time.time()),)
-    }
-    died = service.jobs.index.counts().get("MAX_RECOVERY_ATTEMPTS_EXCEEDED", 0)
-    return service.metrics.exposition(
-        service.jobs.counts(),
-        captures=captures,
-        free=service.store.free_bytes(),
-        damaged=damaged,
-        queues=queues,
-        failures=failure_counts(service.engine) | {"worker-died": died},
-        store=_store_figures(service),
-    )
+    """Measures what is not counted as it happens. Returns all metrics in Prometheus' text format."""
+    metrics, index = service.metrics, service.jobs.index
+    queued, slots = index.queued(), slots_by_queue(service.engine, service.settings.silent_s)
+    for gauge in (metrics.queued, metrics.oldest, metrics.slots):
+        gauge.clear()  # of queues that nobody uses any more
+    for name in {*queued, *slots}:
+        found = queued.get(name) or Queued(0, time.time())
+        metrics.queued.labels(name).set(found.jobs)
+        metrics.oldest.labels(name).set(max(0.0, time.time() - found.since))
+        metrics.slots.labels(name).set(slots.get(name, 0))
+    died = index.counts().get("MAX_RECOVERY_ATTEMPTS_EXCEEDED", 0)
+    for kind, count in (failure_counts(service.engine) | {"worker-died": died}).items():
+        metrics.failures.labels(kind).set(count)
+    for state, count in service.jobs.counts().items():
+        metrics.jobs.labels(state).set(count)
+    _measure_stores(service)
+    metrics.captures.set(len(service.store.ids("captures")))
+    metrics.free.set(service.store.free_bytes())
+    metrics.memory.set(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+    metrics.quarantined.set(len(service.store.list_quarantined()))
+    return generate_latest(metrics.registry)
+
+
+def _measure_stores(service: Service) -> None:
+    """Sets what this process asked of its object stores, if it has any, and whether they answered last."""
+    operations, seconds = Counter[tuple[str, str]](), Counter[str]()
+    for store in _watched(service):
+        service.metrics.store_up.labels("results").set(_store(service).detail.code == "store-answers")
+        operations.update(store.operations())
+        seconds.update(store.seconds())  # pyright: ignore[reportCallIssue, reportArgumentType]
+    for labels, count in operations.items():
+        service.metrics.store_operations.labels(*labels).set(count)
+    for operation, took_s in seconds.items():
+        service.metrics.store_seconds.labels(operation).set(took_s)
 
 
 class InfoOut(Answer):

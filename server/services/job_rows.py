@@ -30,16 +30,9 @@ STATUSES: Mapping[str, list[str]] = {
 FINISHED = ("succeeded", "failed", "cancelled")
 
 
-def enqueue_options(job_id: str, queue: str, priority: int, attributes: dict[str, str | None]) -> EnqueueOptions:
-    """Returns how the job engine is to queue a job."""
-    return {
-        "workflow_name": WORKFLOW,
-        "queue_name": queue,
-        "workflow_id": job_id,
-        "app_version": APPLICATION_VERSION,
-        "priority": priority,
-        "attributes": attributes,
-    }
+def enqueue_options(workflow: str, queue: str, identity: str) -> EnqueueOptions:
+    """Returns how the job engine is to queue a workflow under an id."""
+    return {"workflow_name": workflow, "queue_name": queue, "workflow_id": identity, "app_version": APPLICATION_VERSION}
 
 
 def by_state(query: JobQuery) -> JobQuery:

@@ -138,8 +138,10 @@ class Jobs:
         if first is None:
             self._check_count(key)
             self.index.add(job_id, request, session)
-            attributes = {"capture": request["capture_id"], "session": session, "key": key}
-            self.client.enqueue(enqueue_options(job_id, queue or self._settings.queue, priority, attributes), request)
+            options = enqueue_options(WORKFLOW, queue or self._settings.queue, job_id)
+            options["priority"] = priority
+            options["attributes"] = {"capture": request["capture_id"], "session": session, "key": key}
+            self.client.enqueue(options, request)
             first = self._status(job_id)
             assert first is not None
         if not self._asks_the_same(request_of(first), request):
@@ -154,8 +156,9 @@ class Jobs:
         job. It does not count towards the limit of jobs of an API key."""
         job_id = new_id()
         self.index.add_within(connection, job_id, request, session)
-        attributes = {"capture": request["capture_id"], "session": session, "batch": batch.id}
-        options = enqueue_options(job_id, batch.queue, batch.priority, attributes)
+        options = enqueue_options(WORKFLOW, batch.queue, job_id)
+        options["priority"] = batch.priority
+        options["attributes"] = {"capture": request["capture_id"], "session": session, "batch": batch.id}
         self.client.enqueue_in_transaction(connection, options, request)
         return job_id
 
@@ -215,9 +218,9 @@ class Jobs:
         found = self.index.of_captures(captures)
         return {capture: [(job, STATES[status]) for job, status in jobs] for capture, jobs in found.items()}
 
-    def active(self, *, capture: str | None = None, session: str | None = None, key: str | None = None) -> list[str]:
-        """Lists the ids of queued and running jobs. They can be restricted to one capture, session or API key."""
-        wanted = {k: v for k, v in {"capture": capture, "session": session, "key": key}.items() if v is not None}
+    def active(self, *, capture: str | None = None, key: str | None = None) -> list[str]:
+        """Lists the ids of queued and running jobs. They can be restricted to one capture or API key."""
+        wanted = {k: v for k, v in {"capture": capture, "key": key}.items() if v is not None}
         rows = self.client.list_workflows(
             name=WORKFLOW, status=STATUSES["queued"] + STATUSES["running"], load_input=False, load_output=False
         )
@@ -254,7 +257,7 @@ class Jobs:
 
     def without_result(self) -> list[str]:
         """Lists the ids of succeeded jobs whose result is missing from the data folder, newest first."""
-        if self.results.elsewhere:
+        if self.results.objects is not None:
             return []  # what the data folder lacks is fetched
         there = set(self._store.ids("jobs"))
         done = self.index.newest_first(STATUSES["succeeded"])
@@ -287,7 +290,7 @@ class Jobs:
 
     def _unless_removed(self, job_id: str) -> None:
         """Raises NotFound, and removes what was fetched, where the job was erased meanwhile."""
-        if self.results.elsewhere and self._status(job_id, load=False) is None:
+        if self.results.objects is not None and self._status(job_id, load=False) is None:
             self.results.erase(job_id)
             raise NotFound(compose("thing-job"), job_id)
 
@@ -343,11 +346,6 @@ class Jobs:
             detail = compose("too-many-jobs", count=active)
             raise TooMany("too-many-jobs", detail, retry_after_s=10)
 
-    def _lost(self, job_id: str, state: str) -> Message | None:
-        """Returns the message that the files of a job that succeeded are gone."""
-        lost = state == "succeeded" and not self.results.elsewhere and not self._result(job_id).is_dir()
-        return compose("result-missing") if lost else None
-
     def queue_notice(self, queue: str | None) -> Message | None:
         """Returns a message if no live worker serves a queue, so that its jobs cannot begin. Returns None if one
         does."""
@@ -385,6 +383,8 @@ class Jobs:
         state = STATES[row.status]
         progress: EventDocument = event.document if event is not None and state == "running" else {}
         request = request_of(row)
+        here = state == "succeeded" and self.results.objects is None
+        lost = here and not self._result(row.workflow_id).is_dir()
         return JobOut(
             id=row.workflow_id,
             name="" if request is None else request.get("name", ""),
@@ -393,7 +393,7 @@ class Jobs:
             progress=1.0 if state == "succeeded" else progress.get("progress", 0.0),
             eta_s=progress.get("eta_s"),
             error=failure(row) if state == "failed" else None,
-            notice=idle[row.queue_name] if state == "queued" else self._lost(row.workflow_id, state),
+            notice=idle[row.queue_name] if state == "queued" else compose("result-missing") if lost else None,
             capture_id=None if request is None else request["capture_id"],
             session=(row.attributes or {}).get("session"),
             model=None if request is None else request.get("model"),

@@ -8,9 +8,8 @@ tables and sheets) stay. Without a store everything lies in the data folder, as 
 import os
 import shutil
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import structlog
@@ -19,13 +18,12 @@ from rig.digest import sha256_of
 from rig.errors import Cancelled, EigenheadError
 from rig.messages.message import compose
 from server.errors import Conflict, Refused
-from server.services.unclaimed import COLLECT_S, DAY_S, collect
 from server.settings import ServiceSettings
 from server.storage.object_places import open_objects
 from server.storage.objects import ObjectMissing, StoreDenied, StoreUnavailable
 from server.storage.records import FileEntry
 from server.storage.store import Store, StoredFile
-from server.storage.watched_objects import StoreTally, WatchedObjects
+from server.storage.watched_objects import WatchedObjects
 
 LARGE_BYTES = 1 << 20
 LINK_S = 300
@@ -35,38 +33,16 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 log = structlog.get_logger()
 
 
-@dataclass(frozen=True, slots=True)
-class _LargeFile:
-    used: float
-    bytes: int
-    job_id: str
-    path: Path
-
-
 class Results:
-    """Keeps the results of jobs. Methods block."""
+    """Keeps the results of jobs. ``objects``: the store where they lie, None for the data folder alone. Methods
+    block."""
 
     def __init__(self, store: Store, settings: ServiceSettings) -> None:
         place = settings.results_store
         self._store, self._spare = store, settings.free_bytes
-        self._objects = None if place is None else WatchedObjects(open_objects(place, settings))
-        self._collected = float("-inf")
+        self.objects = None if place is None else WatchedObjects(open_objects(place, settings))
+        self.collected = float("-inf")  # when this process last looked for unclaimed objects (s, monotonic)
         self.damaged = set[str]()
-
-    @property
-    def elsewhere(self) -> bool:
-        """Tells whether results lie in a store, whatever lies in the data folder."""
-        return self._objects is not None
-
-    @property
-    def tally(self) -> StoreTally | None:
-        """Returns what this process asked of the store; None without one."""
-        return None if self._objects is None else self._objects.tally
-
-    def probe(self) -> None:
-        """Asks the store for a list of nothing. Raises StoreUnavailable and StoreDenied."""
-        if self._objects is not None:
-            next(self._objects.entries("none/"), None)
 
     def keep(
         self,
@@ -77,7 +53,7 @@ class Results:
     ) -> None:
         """Stores a result, and waits for a store that is away. Raises Cancelled once the job is not ``wanted``,
         and what ``pause`` raises."""
-        if self._objects is None:
+        if self.objects is None:
             return
         pause_s = FIRST_PAUSE_S
         for name, file in files.items():
@@ -85,7 +61,7 @@ class Results:
                 if not wanted():
                     raise Cancelled
                 try:
-                    self._objects.put(f"{job_id}/{name}", self._path(job_id, name), file["sha256"])
+                    self.objects.put(f"{job_id}/{name}", self._path(job_id, name), file["sha256"])
                     break
                 except (StoreUnavailable, StoreDenied) as error:  # the head is made: it waits for its operator, too
                     log.warning("a result waits for the store", reason=error.detail.text)
@@ -100,7 +76,7 @@ class Results:
             if time.time() - path.stat().st_mtime > UNUSED_S:
                 os.utime(path)  # it is used
         except FileNotFoundError:
-            if self._objects is not None:
+            if self.objects is not None:
                 self._fetch(job_id, name, entry, path)
         return StoredFile(path, entry["sha256"])
 
@@ -117,10 +93,10 @@ class Results:
     def link(self, job_id: str, name: str) -> str | None:
         """Returns a signed address of a file of a result, for ``LINK_S`` seconds; None where the store has no such
         addresses, or does not have the file yet. Raises Unavailable."""
-        if self._objects is None:
+        if self.objects is None:
             return None
         with suppress(ObjectMissing):
-            return self._objects.link(f"{job_id}/{name}", Path(name).name, LINK_S)
+            return self.objects.link(f"{job_id}/{name}", Path(name).name, LINK_S)
 
     def folder(self, job_id: str, files: Mapping[str, FileEntry]) -> Path:
         """Returns the folder of a result with all its files. Raises what ``file`` raises."""
@@ -130,54 +106,42 @@ class Results:
 
     def erase(self, job_id: str) -> None:
         """Removes a result, in the store with every version. Raises Unavailable where the store does not do it."""
-        if self._objects is not None:
-            self._objects.erase(f"{job_id}/")
+        if self.objects is not None:
+            self.objects.erase(f"{job_id}/")
         self._store.remove(self._store.folder("jobs", job_id))
 
     def discard(self, job_id: str) -> None:
         """Removes what a cancelled job has made; a store that is away keeps it until the job is removed."""
-        if self._objects is not None:
+        if self.objects is not None:
             with suppress(Refused):
-                self._objects.erase(f"{job_id}/")
+                self.objects.erase(f"{job_id}/")
         shutil.rmtree(self._store.folder("jobs", job_id), ignore_errors=True)
 
     def bound(self, most: int, files_of: Callable[[str], Mapping[str, FileEntry]]) -> int:
         """Removes large files from the data folder that were not used for long, until all of them take ``most`` bytes.
         Each is compared with its object before, and stored where it lacks one. Returns how many went."""
-        if self._objects is None:
+        if self.objects is None:
             return 0
-        found, removed = sorted(self._large(), key=lambda file: file.used), 0
-        total = sum(file.bytes for file in found)
-        for file in found:
-            if total <= most or time.time() - file.used < UNUSED_S:
+        found, removed = sorted(self._large()), 0
+        total = sum(size for _, size, *_ in found)
+        for used, size, job_id, path in found:
+            if total <= most or time.time() - used < UNUSED_S:
                 break
-            name = file.path.relative_to(self._store.folder("jobs", file.job_id) / "result").as_posix()
+            name = path.relative_to(self._store.folder("jobs", job_id) / "result").as_posix()
             try:
-                entry = files_of(file.job_id)[name]
-                self._objects.put(f"{file.job_id}/{name}", file.path, entry["sha256"])
+                self.objects.put(f"{job_id}/{name}", path, files_of(job_id)[name]["sha256"])
             except (EigenheadError, LookupError, OSError) as error:  # it runs, is being removed, or the store is away
-                log.info("a result stays in the data folder", job_id=file.job_id, reason=str(error)[:200])
+                log.info("a result stays in the data folder", job_id=job_id, reason=str(error)[:200])
                 continue
-            file.path.unlink(missing_ok=True)
-            total, removed = total - file.bytes, removed + 1
+            path.unlink(missing_ok=True)
+            total, removed = total - size, removed + 1
         return removed
-
-    def collect(self, owner: str, known: Callable[[Collection[str]], set[str]], days: float | None) -> int:
-        """Removes results from the store that no job claims, as in ``unclaimed``, a few times a day. Returns of
-        how many jobs."""
-        if self._objects is None or days is None:
-            return 0
-        if time.monotonic() - self._collected < min(COLLECT_S, days * DAY_S):
-            return 0
-        self._collected = time.monotonic()
-        with self._store.incoming() as scratch:
-            return collect(self._objects, owner, known, days, scratch)
 
     def _path(self, job_id: str, name: str) -> Path:
         return self._store.folder("jobs", job_id) / "result" / name
 
     def _fetch(self, job_id: str, name: str, entry: FileEntry, path: Path) -> None:
-        assert self._objects is not None
+        assert self.objects is not None
 
         def admit(size: int) -> None:
             self._store.reserve(size, self._spare)
@@ -185,16 +149,17 @@ class Results:
         with self._store.incoming() as folder:
             part = folder / "file"
             try:
-                self._objects.fetch(f"{job_id}/{name}", part, entry["sha256"], admit)
+                self.objects.fetch(f"{job_id}/{name}", part, entry["sha256"], admit)
             except ObjectMissing as error:
                 raise Conflict("result-missing", compose("result-missing")) from error
             path.parent.mkdir(parents=True, exist_ok=True)
             part.replace(path)
 
-    def _large(self) -> Iterator[_LargeFile]:
+    def _large(self) -> Iterator[tuple[float, int, str, Path]]:
+        """Yields when each large file was used, its size, job and path."""
         for job_id in self._store.ids("jobs"):
             for path in (self._store.folder("jobs", job_id) / "result").rglob("*"):
                 with suppress(FileNotFoundError):
                     said = path.stat()
                     if path.is_file() and said.st_size >= LARGE_BYTES:
-                        yield _LargeFile(said.st_mtime, said.st_size, job_id, path)
+                        yield said.st_mtime, said.st_size, job_id, path

@@ -3,36 +3,48 @@
 It never touches what a queued or running job needs, nor files that the service did not make itself. It trusts the clock
 only as far as the last sweep and the machine's uptime bear it out: where the clock seems to have jumped, nothing is
 removed until somebody has looked (``STOPPED``).
+
+From object stores goes what nothing claims: results of jobs that were removed while a worker still wrote, and results
+and captures' files that a restored database lacks. Several services may do this at once. The row of a job is written
+before its result, and the store is listed before the rows are read, so that a result is never taken for one without a
+job. A database collects only where its own results lie.
 """
 
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import structlog
 from pydantic import Field
 
 from rig.atomic_write import write_atomically
+from rig.digest import sha256_of
 from rig.errors import EigenheadError
 from rig.messages.message import compose
-from server.errors import NotFound
+from server.errors import NotFound, Refused
 from server.services.answer import Answer, Moment
 from server.services.deliveries import UNDER_WAY
 from server.services.job_rows import DELIVERY, FINISHED, STATUSES
 from server.services.records import moment_now, moment_of
 from server.services.service import CheckOut, Service
-from server.services.stored_captures import collect_unclaimed, tend_captures
-from server.storage.database import database_identity
+from server.services.stored_captures import tend_captures
+from server.storage.capture_blobs import NAME
+from server.storage.database import database_identity, portions
 from server.storage.folders import LAST_SWEEP, STOPPED, folder_bytes, newest
 from server.storage.job_index import JobQuery
 from server.storage.library import CaptureQuery
+from server.storage.objects import ObjectMissing, ObjectStore
+from server.storage.store import is_id
 
-LEFTOVER_S = 900.0  # a live upload or extraction touches its folder more often than that
+OWNER = "owner"  # the object that names the database whose results lie in a store
 DAY_S = 86400.0
+COLLECT_S = 6 * 3600.0  # between two looks at a whole store
+LEFTOVER_S = 900.0  # a live upload or extraction touches its folder more often than that
 BOOT = Path("/proc/sys/kernel/random/boot_id")
 MANY = 20  # records: fewer may all be of one day, and due on one
 ENDED = tuple(status for state in FINISHED for status in STATUSES[state])
@@ -62,10 +74,7 @@ def sweep(service: Service) -> dict[str, int]:
     gone["caches"] = _caches(service)
     gone["blobs"] = tend_captures(service.store, service.jobs, service.settings.captures_bytes)
     gone["results"] = service.jobs.results.bound(service.settings.results_bytes, service.jobs.files)
-    unclaimed = service.settings.keep_unclaimed_days
-    owner = database_identity(service.engine)
-    gone["unclaimed"] = service.jobs.results.collect(owner, service.jobs.index.known, unclaimed)
-    gone["unclaimed"] += collect_unclaimed(service.store, owner, unclaimed)
+    gone["unclaimed"] = _unclaimed(service)
     gone["orphans"] = _orphans(service)
     gone["deliveries"] = _deliveries(service)
     _find_missing(service)
@@ -216,6 +225,20 @@ def _caches(service: Service) -> int:
     return removed
 
 
+def _unclaimed(service: Service) -> int:
+    """Removes from the stores what no job and no capture of this database claims, a few times a day."""
+    days, results, blobs = service.settings.keep_unclaimed_days, service.jobs.results, service.store.blobs
+    if days is None or time.monotonic() - results.collected < min(COLLECT_S, days * DAY_S):
+        return 0
+    results.collected, owner, removed = time.monotonic(), database_identity(service.engine), 0
+    with service.store.incoming() as scratch:
+        if results.objects is not None:
+            removed += collect(results.objects, owner, service.jobs.index.known, days, scratch)
+        if blobs is not None:
+            removed += collect(blobs.objects, owner, blobs.known, days, scratch, NAME.fullmatch)
+    return removed
+
+
 def _orphans(service: Service) -> int:
     """Removes attempts that a killed worker left in ended jobs, and folders of jobs that are not known any more."""
     removed = 0
@@ -272,3 +295,43 @@ def _find_missing(service: Service) -> None:
 
 def _age_s(moment: str | None) -> float:
     return time.time() - datetime.fromisoformat(moment).timestamp() if moment else 0.0
+
+
+def collect(
+    objects: ObjectStore,
+    owner: str,
+    known: Callable[[Collection[str]], set[str]],
+    days: float,
+    scratch: Path,
+    is_name: Callable[[str], object] = is_id,
+) -> int:
+    """Removes the results of jobs that are not known and were written more than ``days`` ago. ``owner`` names the
+    database, ``known`` returns those of the ids that are jobs of it, ``is_name`` tells what may be an id. Returns of
+    how many jobs. A store that is away ends it; the next call goes on."""
+    removed = 0
+    try:
+        if not _owns(objects, owner, scratch):
+            return 0
+        listed = [name for name in objects.folders() if is_name(name)]
+        for some in portions(listed):
+            for job_id in sorted({*some} - known(some)):
+                written = max((entry.written for entry in objects.entries(f"{job_id}/")), default=0.0)
+                if time.time() - written > days * DAY_S and not known([job_id]):  # submitted again under its id
+                    removed += objects.erase(f"{job_id}/") > 0  # some stores go on listing empty folders
+    except Refused as error:
+        log.info("objects that nothing claims stay", reason=error.detail.text)
+    return removed
+
+
+def _owns(objects: ObjectStore, owner: str, scratch: Path) -> bool:
+    """Tells whether the store's results are this database's; the first database that looks becomes their owner."""
+    with TemporaryDirectory(dir=scratch) as folder:
+        path = Path(folder) / OWNER
+        try:
+            objects.fetch(OWNER, path)
+        except ObjectMissing:
+            path.write_text(owner, encoding="utf-8")
+            objects.put(OWNER, path, sha256_of(path))
+        if (found := path.read_text(encoding="utf-8")) != owner:
+            log.warning("this store is another database's; nothing is collected in it", owner=found[:64])
+        return found == owner

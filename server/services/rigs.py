@@ -32,9 +32,9 @@ from rig.messages.message import Message, compose, message_of
 from rig.rig import Rig
 from server.errors import Conflict, NotFound, Unavailable
 from server.services.records import CameraOut, CameraSettingsOut, CleanPlates, RigOut
-from server.storage.records import RIG_ADJUSTMENT, RigAdjustment
+from server.storage.records import RIG_ADJUSTMENT, JsonObject, RigAdjustment
 from server.tasks.child import Child, WorkFailed
-from server.tasks.simulate import SimulatedCertificate, look, simulated
+from server.tasks.simulate import look, simulated
 
 SHOT_BYTES = 64 << 20  # that a shot may take on the disk
 PREVIEW_WIDTH = 640  # pixels
@@ -118,8 +118,7 @@ class RealRig:
     def preview(self, camera: str) -> bytes:
         """Takes one picture with one camera and returns it as a JPEG file. Raises NotFound for an unknown camera, and
         Unavailable if it delivers none."""
-        if camera not in self._config.names:
-            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
+        check_camera(camera, self._config.names)
         with self._lock:
             image = self._opened().look([camera]).get(camera)
         if image is None:
@@ -129,9 +128,8 @@ class RealRig:
     def camera_settings(self, camera: str) -> CameraSettingsOut:
         """Returns the settings requested of a camera, by rig.toml or by the operator, and those that the driver did not
         take. Raises NotFound for an unknown camera."""
-        wanted = next((found for found in self._config.cameras if found.name == camera), None)
-        if wanted is None:
-            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
+        check_camera(camera, self._config.names)
+        wanted = next(found for found in self._config.cameras if found.name == camera)
         with self._lock:
             state = None if self._session is None else self._session.states().get(camera)
         unmet = () if state is None else tuple(message_of(line) for line in state.unmet)
@@ -263,7 +261,7 @@ class SimulatedRig:
         """Returns the calibration that was put to use, or the studio's own layout."""
         return read_rig(self._calibration) if self._calibration.is_file() else self._rig()
 
-    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> SimulatedCertificate:
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> JsonObject:
         """Takes a shot of a person, also if ``board`` is set, since the studio has no board. Raises Unavailable if the
         child process fails."""
         with self._one_at_a_time:
@@ -282,21 +280,19 @@ class SimulatedRig:
 
     def preview(self, camera: str) -> bytes:
         """Renders what one camera sees, as a JPEG file. Raises NotFound for an unknown camera."""
-        if camera not in self._rig():
-            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
+        check_camera(camera, self._rig().names)
         with self._one_at_a_time:
             return jpeg(self._child.remote(look)(cameras=[camera])[camera])
 
     def camera_settings(self, camera: str) -> CameraSettingsOut:
         """Returns settings without values, since simulated cameras have none. Raises NotFound for an unknown camera."""
-        if camera not in self._rig():
-            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
+        check_camera(camera, self._rig().names)
         return CameraSettingsOut(exposure_ms=None, gain_db=None, white_balance_k=None, unmet=())
 
     def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettingsOut:
         """Raises Conflict, since simulated cameras cannot be set; NotFound for an unknown camera."""
         self.camera_settings(camera)
-        raise _fixed_studio()
+        raise Conflict("simulated-rig", compose("simulated-rig-fixed"))
 
     def lights(self) -> tuple[int, ...]:
         """Returns no outputs: the studio's lights are fixed."""
@@ -304,7 +300,7 @@ class SimulatedRig:
 
     def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
         """Raises Conflict, since the studio's lights are fixed."""
-        raise _fixed_studio()
+        raise Conflict("simulated-rig", compose("simulated-rig-fixed"))
 
     def take_background(self) -> CleanPlates:
         """Takes no pictures, since the studio takes clean plates with every shot. Returns its cameras and a note that
@@ -337,11 +333,13 @@ class SimulatedRig:
         return default_layout()
 
 
-def _fixed_studio() -> Conflict:
-    return Conflict("simulated-rig", compose("simulated-rig-fixed"))
-
-
 RigBackend = RealRig | SimulatedRig
+
+
+def check_camera(camera: str, names: tuple[str, ...]) -> None:
+    """Raises NotFound for a camera that is none of the rig's."""
+    if camera not in names:
+        raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
 
 
 def check_names(rig: Rig, names: tuple[str, ...]) -> None:
@@ -365,9 +363,9 @@ def rig_state(
     return RigOut(id=identity, kind=kind, ready=ready, cameras=cameras, faults=tuple(faults), calibration=calibration)
 
 
-def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:
-    """Encodes an RGB image as a JPEG file. An image wider than ``width`` pixels is reduced to that width."""
-    small = reduced(image, width)
+def jpeg(image: ImageRgb) -> bytes:
+    """Encodes an RGB image as a JPEG file. One wider than ``PREVIEW_WIDTH`` pixels is reduced to that width."""
+    small = reduced(image, PREVIEW_WIDTH)
     done, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])
     assert done
     return data.tobytes()

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import sqlalchemy as sa
@@ -32,7 +31,7 @@ from server.storage.capture_blobs import open_capture_blobs
 from server.storage.database import open_database
 from server.storage.library import Library
 from server.storage.store import Store
-from server.tasks.calibrate import ingest_board_pictures, ingest_photographs
+from server.tasks.calibrate import ingest_pictures
 from server.tasks.child import ChildProcessPool, WorkFailed
 from server.tasks.export_archive import export_archive
 
@@ -85,11 +84,13 @@ class Service:
         limits, target = self.captures.archive_limits(archive), folder / "calibration" / "pictures"
         target.mkdir(parents=True)
         with self.children.one() as child:
-            if source == "scene":
-                unpack = partial(child.remote(ingest_photographs), image_pixels=self.settings.image_pixels)
-            else:
-                unpack = child.remote(ingest_board_pictures)
-            unpack(archive=str(archive), folder=str(target), limits=limits)
+            child.remote(ingest_pictures)(
+                archive=str(archive),
+                folder=str(target),
+                limits=limits,
+                image_pixels=self.settings.image_pixels,
+                scene=source == "scene",
+            )
         return self.calibrations.add(target, "upload", label)
 
     def use_calibration(self, identity: str, *, poor: bool = False) -> RigOut:
@@ -97,7 +98,7 @@ class Service:
         calibration has not succeeded, is of other cameras, or has the verdict poor and ``poor`` does not allow that."""
         if not poor:
             self.calibrations.check_usable(identity)
-        self.rig.use(self.calibrations.cameras_json(identity))
+        self.rig.use(self.calibrations.result(identity, "cameras.json"))
         self.calibrations.mark_in_use(identity)
         return self.rig.describe()
 
@@ -139,11 +140,6 @@ class Service:
                 self.jobs.files(job_id)  # erased while it was read
                 raise
             return archive.read_bytes()
-
-    def result_address(self, job_id: str, name: str) -> str | None:
-        """Returns a signed address of a file of a job's result, as in ``Results.link``; None where the service sends it
-        itself. Raises NotFound, Conflict and Unavailable."""
-        return self.jobs.results.link(job_id, name) if name in self.jobs.files(job_id) else None
 
 
 def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:

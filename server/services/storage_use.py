@@ -4,7 +4,6 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 from pydantic import Field
@@ -13,6 +12,7 @@ from server.services.answer import Answer
 from server.services.job_rows import STATUSES
 from server.services.jobs import Jobs
 from server.settings import ServiceSettings
+from server.storage.folders import folder_bytes
 from server.storage.job_index import JobQuery
 from server.storage.store import Store
 
@@ -107,21 +107,4 @@ def _names(folder: Path) -> list[str]:
 
 
 def _bytes(path: Path) -> int:
-    return path.lstat().st_size if path.is_file() else sum(_sizes(path))
-
-
-def _sizes(folder: Path) -> Iterator[int]:
-    """Yields the sizes of all files below a folder but those removed meanwhile; links are not followed."""
-    try:
-        entries = os.scandir(folder)
-    except (FileNotFoundError, NotADirectoryError):
-        return
-    with entries:
-        for entry in entries:
-            try:
-                if entry.is_dir(follow_symlinks=False):
-                    yield from _sizes(Path(entry.path))
-                else:
-                    yield entry.stat(follow_symlinks=False).st_size
-            except FileNotFoundError:
-                continue
+    return path.lstat().st_size if path.is_file() else folder_bytes(path)

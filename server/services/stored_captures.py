@@ -1,5 +1,5 @@
-"""Looks after the store of captures: what waits for it goes there, what is dead or unclaimed is removed, and what it
-has goes from the data folder where that holds too much.
+"""Looks after the store of captures: what waits for it goes there, what is dead is removed, and what it has goes from
+the data folder where that holds too much.
 
 A data folder whose captures have no records is a worker's own. It is a cache as a whole: what was erased goes from it,
 too.
@@ -14,8 +14,7 @@ import structlog
 from rig.errors import EigenheadError
 from server.errors import Refused
 from server.services.jobs import Jobs
-from server.services.unclaimed import COLLECT_S, DAY_S, collect
-from server.storage.capture_blobs import NAME
+from server.storage.folders import folder_bytes
 from server.storage.records import CaptureRecord
 from server.storage.store import Store
 
@@ -45,18 +44,6 @@ def tend_captures(store: Store, jobs: Jobs, most: int) -> int:
     return removed
 
 
-def collect_unclaimed(store: Store, owner: str, days: float | None) -> int:
-    """Removes blobs from the store that this database, ``owner``, does not have, as in ``collect``, a few times a day.
-    Returns how many."""
-    if store.blobs is None or days is None:
-        return 0
-    if time.monotonic() - store.blobs.collected < min(COLLECT_S, days * DAY_S):
-        return 0
-    store.blobs.collected = time.monotonic()
-    with store.incoming() as scratch:
-        return collect(store.blobs.objects, owner, store.blobs.known, days, scratch, NAME.fullmatch)
-
-
 def bound_captures(store: Store, most: int, is_used: Callable[[str], bool]) -> int:
     """Removes large files of captures that were not used for long from the data folder, until all of them take
     ``most`` bytes. Each is compared with its object before. Returns of how many captures."""
@@ -65,7 +52,7 @@ def bound_captures(store: Store, most: int, is_used: Callable[[str], bool]) -> i
     for identity in store.ids("captures"):
         folder = store.folder("captures", identity) / "files"
         with suppress(FileNotFoundError):
-            size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+            size = folder_bytes(folder)
             found.append((folder.stat().st_mtime, size, identity))
             total += size
     for used, size, identity in sorted(found):

@@ -17,12 +17,11 @@ from typing import Any
 import httpx
 import sqlalchemy as sa
 import structlog
-from dbos import EnqueueOptions
 
 from rig.messages.message import compose
 from server.errors import NotFound
 from server.origins import parsed, target
-from server.services.job_rows import APPLICATION_VERSION, DELIVERY
+from server.services.job_rows import DELIVERY, enqueue_options
 from server.services.records import NewWebhookOut, WebhookOut
 from server.storage.database import now_sql, webhooks
 from server.storage.records import JobWebhook, WebhookMessage
@@ -82,7 +81,7 @@ class Webhooks:
                 message["delivered_to"] = delivered_to
             if job_webhook is not None and hook_id == OWN:
                 message["own"] = job_webhook
-            enqueue(_delivery(identity), message)
+            enqueue(enqueue_options(DELIVERY, WEBHOOKS_QUEUE, identity), message)
 
     def announce_batch(self, batch_id: str, round_number: int, enqueue: Callable[..., Any]) -> None:
         """Queues a message for each webhook that a batch has finished. A retry of failed jobs begins the batch's next
@@ -90,7 +89,7 @@ class Webhooks:
         for hook in self.all():
             identity = f"hook-{hook.id}-{batch_id}-{round_number}"
             what: WebhookMessage = {"webhook": hook.id, "type": "batch.finished", "batch_id": batch_id, "id": identity}
-            enqueue(_delivery(identity), what)
+            enqueue(enqueue_options(DELIVERY, WEBHOOKS_QUEUE, identity), what)
 
     def post(self, message: WebhookMessage) -> int:
         """Tries once to deliver a message and returns the HTTP status of the answer. Returns 0 without sending if the
@@ -131,15 +130,6 @@ class Webhooks:
 def messages_of(job_id: str) -> str:
     """Returns what the ids of all messages about a job begin with."""
     return f"hook-{job_id}-"
-
-
-def _delivery(identity: str) -> EnqueueOptions:
-    return {
-        "workflow_name": DELIVERY,
-        "queue_name": WEBHOOKS_QUEUE,
-        "workflow_id": identity,
-        "app_version": APPLICATION_VERSION,
-    }
 
 
 def _signed(message: WebhookMessage, secret: str | None) -> tuple[bytes, dict[str, str]]:

@@ -6,6 +6,7 @@ join the job engine's own row, so that counts agree with the jobs at any moment.
 
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
@@ -71,18 +72,14 @@ class BatchIndex:
     def __init__(self, engine: sa.Engine) -> None:
         self._engine, self._status = engine, engine_jobs(engine)
 
-    def add(self, row: BatchRow, captures: Sequence[str]) -> bool:
-        """Adds a batch with its captures in one transaction. Returns False, without any change, if the id is taken."""
+    def add(self, row: BatchRow, captures: Sequence[str]) -> None:
+        """Adds a batch with its captures in one transaction. Changes nothing if the id is taken."""
         columns = {name: getattr(row, name) for name in BatchRow.__dataclass_fields__}
         columns |= {"label": storable(row.label), "words": folded(row.label), "settings": json.dumps(row.settings)}
         items = [{"batch_id": row.id, "position": place, "capture_id": one} for place, one in enumerate(captures)]
-        try:
-            with self._engine.begin() as connection:
-                connection.execute(sa.insert(batches).values(**columns))
-                connection.execute(sa.insert(batch_items), items)
-        except IntegrityError:
-            return False
-        return True
+        with suppress(IntegrityError), self._engine.begin() as connection:
+            connection.execute(sa.insert(batches).values(**columns))
+            connection.execute(sa.insert(batch_items), items)
 
     def get(self, identity: str) -> BatchRow | None:
         """Returns the batch with this id; None if there is none."""

@@ -54,17 +54,7 @@ class CaptureBlobs:
     raises StoreUnavailable if the store fails, and StoreDenied if it refuses."""
 
     def __init__(self, objects: WatchedObjects, engine: sa.Engine) -> None:
-        self._objects, self._engine = objects, engine
-        self.collected = float("-inf")  # when this process last looked for unclaimed blobs (s, monotonic)
-
-    @property
-    def objects(self) -> WatchedObjects:
-        """Returns the store, with what was asked of it."""
-        return self._objects
-
-    def probe(self) -> None:
-        """Asks the store for a list of nothing."""
-        next(self._objects.entries("none/"), None)
+        self.objects, self._engine = objects, engine
 
     def keep(self, capture: str, folder: Path, inputs: Mapping[str, str]) -> None:
         """Stores the files of a capture that lie in ``folder``; ``inputs`` is their SHA-256 by name. Once all are
@@ -76,7 +66,7 @@ class CaptureBlobs:
             for name, blob in used.values():
                 if not blob.stored:
                     sent.append(blob.id)
-                    self._objects.put(blob.key, folder / name, blob.sha256)
+                    self.objects.put(blob.key, folder / name, blob.sha256)
         finally:
             self._take_back(sent)
         mine = sa.and_(capture_files.c.capture_id == capture, capture_files.c.blob_id.in_(used))
@@ -133,7 +123,7 @@ class CaptureBlobs:
         for name, blob in self.files(capture).items():
             path = folder / name
             if blob.bytes > SMALL_BYTES and path.is_file():
-                self._objects.put(blob.key, path, blob.sha256)
+                self.objects.put(blob.key, path, blob.sha256)
                 same[name] = path
         return same
 
@@ -149,7 +139,7 @@ class CaptureBlobs:
         with self._engine.connect() as connection:
             dead = connection.scalars(sa.select(blobs.c.id).where(blobs.c.dead)).all()
         for blob in dead:
-            self._objects.erase(f"{blob}/")
+            self.objects.erase(f"{blob}/")
             with self._engine.begin() as connection:
                 connection.execute(sa.delete(blobs).where(blobs.c.id == blob))
         return len(dead)
@@ -166,8 +156,8 @@ class CaptureBlobs:
         with self._engine.connect() as connection:
             return int(connection.scalar(sa.select(sa.func.sum(capture_index.c.bytes))) or 0)
 
-    def release_abandoned(self) -> int:
-        """Releases the files of captures that were being received when their service was killed. Returns how many."""
+    def release_abandoned(self) -> None:
+        """Releases the files of captures that were being received when their service was killed."""
         known = sa.select(capture_index.c.id)
         query = sa.select(capture_files.c.capture_id).distinct()
         query = query.where(~capture_files.c.arrived, capture_files.c.capture_id.not_in(known))
@@ -175,7 +165,6 @@ class CaptureBlobs:
             found = [c for c in connection.scalars(query) if time.time() - int(c[:12], 16) / 1e3 > ARRIVING_S]
         for capture in found:
             self.release(capture)
-        return len(found)
 
     def known(self, ids: Collection[str]) -> set[str]:
         """Returns those of the ids that are blobs of this database."""
@@ -223,7 +212,7 @@ class CaptureBlobs:
             alive = {*connection.scalars(sa.select(blobs.c.id).where(blobs.c.id.in_(sent), ~blobs.c.dead))}
         for blob in sent:
             if blob not in alive:
-                self._objects.erase(f"{blob}/")
+                self.objects.erase(f"{blob}/")
 
     def _fetch(self, blob: Blob, path: Path, admit: Admission) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -231,7 +220,7 @@ class CaptureBlobs:
         part = Path(name)
         try:
             os.close(handle)
-            self._objects.fetch(blob.key, part, blob.sha256, admit)
+            self.objects.fetch(blob.key, part, blob.sha256, admit)
             part.chmod(0o644)
             part.replace(path)
         except ObjectMissing as error:

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy import event
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import IntegrityError, InterfaceError, InternalError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
@@ -307,3 +308,8 @@ def now_sql(engine: sa.Engine | sa.Connection) -> sa.ColumnElement[float]:
     if engine.dialect.name == "sqlite":
         return sa.literal_column("((julianday('now') - 2440587.5) * 86400.0)", sa.Float)
     return sa.literal_column("extract(epoch from clock_timestamp())", sa.Float)
+
+
+def insert_into(engine: sa.Engine | sa.Connection, table: sa.Table) -> "sqlite.Insert | postgresql.Insert":
+    """Returns an insertion that may say what happens on a conflict."""
+    return sqlite.insert(table) if engine.dialect.name == "sqlite" else postgresql.insert(table)

@@ -11,7 +11,7 @@ import structlog
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import IntegrityError
 
-from server.storage.database import AWAY, events, failures, now_sql
+from server.storage.database import AWAY, events, failures, insert_into, now_sql
 from server.storage.records import EventDocument
 
 END = 2**31 - 1  # the number of a job's end, the largest of the column: the table's key holds that a job has one
@@ -103,15 +103,13 @@ class EventLog:
             connection.execute(sa.delete(events).where(events.c.job_id.in_(job_ids)))
 
     def _end(self, job_id: str, document: EventDocument) -> "sqlite.Insert | postgresql.Insert":
-        insert = sqlite.insert if self._engine.dialect.name == "sqlite" else postgresql.insert
         row = {"job_id": job_id, "seq": END, "document": json.dumps(document), "at": now_sql(self._engine)}
-        return insert(events).values(**row)
+        return insert_into(self._engine, events).values(**row)
 
 
 def note_failure(connection: sa.Connection, kind: str) -> None:
     """Adds one to the count of a kind of failure in the caller's transaction."""
-    insert = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
-    first = insert(failures).values(kind=kind, count=1)
+    first = insert_into(connection, failures).values(kind=kind, count=1)
     more = {"count": failures.c["count"] + 1}
     connection.execute(first.on_conflict_do_update(index_elements=["kind"], set_=more))
 

@@ -12,11 +12,11 @@ from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TypedDict, cast
 
 import cv2
 
 from rig.atomic_write import write_atomically
+from server.storage.records import JsonObject
 
 PIPELINE = Path(__file__).resolve().parents[2] / "pipeline"
 ROOMS = ("alignment", "faces", "geometry", "head_model", "multiview")
@@ -25,26 +25,7 @@ SUFFIX = ".faces.json"
 PixelsOfPoints = dict[str, dict[str, list[float]]]  # by landmark and camera, as features.json has them
 
 
-class FoundFace(TypedDict):
-    """Holds one face, in pixels of the picture's file. ``is_subject``: the views agree that it is the subject's;
-    ``roll_deg``: how far the face is turned clockwise in the picture."""
-
-    box_px: list[float]
-    roll_deg: float
-    score: float
-    is_subject: bool
-    points: list[list[float]]
-
-
-class FacesDocument(TypedDict):
-    """Holds the faces of every picture that was searched, and the pixels suggested for the seven feature points (none
-    where no face is certain)."""
-
-    faces: dict[str, list[FoundFace]]
-    suggested: PixelsOfPoints
-
-
-def faces_once(folder: Path, inputs: Mapping[str, str], find: Callable[[], FacesDocument]) -> FacesDocument:
+def faces_once(folder: Path, inputs: Mapping[str, str], find: Callable[[], JsonObject]) -> JsonObject:
     """Returns the faces of a capture. If ``folder`` has them from an earlier call, ``find`` is not called; otherwise
     its result is stored there. ``inputs``: SHA-256 of the capture's files by name."""
     with suppress(OSError):
@@ -53,7 +34,7 @@ def faces_once(folder: Path, inputs: Mapping[str, str], find: Callable[[], Faces
     with suppress(OSError, ValueError):
         document = json.loads(path.read_bytes())
         if isinstance(document, dict) and document.keys() == {"faces", "suggested"}:
-            return cast(FacesDocument, document)
+            return document
     found = find()
     with suppress(OSError):
         write_atomically(path, json.dumps(found, separators=(",", ":")).encode(), parents=False)

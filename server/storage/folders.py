@@ -1,6 +1,7 @@
 """Folders: moved so that it lasts, and measured."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 LAST_SWEEP, STOPPED = "last-sweep.json", "retention-stopped.txt"  # in the data folder: see server.services.retention
@@ -17,8 +18,13 @@ def move_durably(folder: Path, target: Path) -> None:
 
 
 def folder_bytes(folder: Path) -> int:
-    """Returns the size in bytes of all files below a folder."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    """Returns the size in bytes of all files below a folder but those removed meanwhile; links are not followed."""
+    total = 0
+    for path, _, names in os.walk(folder):
+        for name in names:
+            with suppress(FileNotFoundError):
+                total += Path(path, name).lstat().st_size
+    return total
 
 
 def newest(path: Path) -> float:

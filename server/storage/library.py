@@ -11,10 +11,9 @@ from typing import Literal
 
 import sqlalchemy as sa
 import structlog
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DataError
 
-from server.storage.database import capture_index, capture_tags, portions, scrub, session_index
+from server.storage.database import capture_index, capture_tags, insert_into, portions, scrub, session_index
 from server.storage.pages import Order, Page, contains, folded, is_or_ends, page_of, storable, words_of
 from server.storage.records import CaptureRecord, SessionRecord
 
@@ -25,6 +24,7 @@ SubjectOrder = Literal["-created", "created", "label", "-label"]
 log = structlog.get_logger()
 UNFIT = (DataError, OverflowError)  # of one row's values, not of the database
 Record = CaptureRecord | SessionRecord
+TABLES = {"captures": capture_index, "sessions": session_index}
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,24 +48,15 @@ class Library:
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
 
-    def put_capture(self, record: CaptureRecord, changed: int) -> None:
-        """Writes a capture, with its tags, to the index, replacing earlier ones. ``changed``: time of the record's file
-        (ns)."""
-        self._put(capture_index, [_capture_row(record, changed)])
-        self._put_tags([record])
+    def put(self, record: Record, changed: int) -> None:
+        """Writes a capture, with its tags, or a session to the index, replacing earlier rows. ``changed``: time of the
+        record's file (ns)."""
+        table = capture_index if isinstance(record, CaptureRecord) else session_index
+        self._put(table, [record], {record.id: changed})
 
-    def drop_capture(self, identity: str) -> None:
-        """Removes a capture, with its tags, from the index."""
-        self._drop(capture_index, [identity])
-        self._drop_tags([identity])
-
-    def put_session(self, record: SessionRecord, changed: int) -> None:
-        """Writes a session to the index, replacing an earlier one. ``changed``: time of the record's file (ns)."""
-        self._put(session_index, [_session_row(record, changed)])
-
-    def drop_session(self, identity: str) -> None:
-        """Removes a session from the index."""
-        self._drop(session_index, [identity])
+    def drop(self, kind: str, identity: str) -> None:
+        """Removes a capture, with its tags, or a session (``kind``: "captures", "sessions") from the index."""
+        self._drop(TABLES[kind], [identity])
 
     def scrub(self) -> None:
         """Overwrites what deleted rows left in the database's files, names of people included."""
@@ -200,15 +191,13 @@ class Library:
         """Makes the index agree with the records in the data folder. Returns how many rows differed. A record that no
         row can hold is left out and logged. ``changes`` and ``found`` are those of the ``Store``."""
         mended = 0
-        for table, kind in ((capture_index, "captures"), (session_index, "sessions")):
+        for kind, table in TABLES.items():
             with self._engine.connect() as connection:
                 known = {row.id: row.changed for row in connection.execute(sa.select(table.c.id, table.c.changed))}
             there = changes(kind)  # asked second: what is added in between is no stray row
             self._drop(table, gone := [identity for identity in known if identity not in there])
             differing = [identity for identity, changed in there.items() if known.get(identity) != changed]
             records = [record for identity in differing if (record := found(kind, identity)) is not None]
-            if table is capture_index:
-                self._drop_tags(gone)
             mended += len(gone) + self._put_fitting(table, records, there)
         if mended:
             log.info("index mended", rows=mended)
@@ -218,8 +207,7 @@ class Library:
         """Writes the rows of records and returns how many. One whose values no column takes is left out and named in
         the log: it must not keep the service from starting."""
         try:
-            self._put(table, [_row_of(record, changes[record.id]) for record in records])
-            self._put_tags([record for record in records if isinstance(record, CaptureRecord)])
+            self._put(table, records, changes)
         except UNFIT as error:
             if len(records) == 1:
                 log.error("record left out of the index", table=table.name, id=records[0].id, error=str(error)[:300])
@@ -228,31 +216,30 @@ class Library:
             return sum(self._put_fitting(table, some, changes) for some in (records[:half], records[half:]))
         return len(records)
 
-    def _put(self, table: sa.Table, rows: list[dict[str, object]]) -> None:
-        insert = sqlite.insert if self._engine.dialect.name == "sqlite" else postgresql.insert
+    def _put(self, table: sa.Table, records: Sequence[Record], changes: Mapping[str, int]) -> None:
+        rows = [_row_of(record, changes[record.id]) for record in records]
         with self._engine.begin() as connection:
             for some in portions(rows):
-                statement = insert(table)
+                statement = insert_into(self._engine, table)
                 new = {column.name: statement.excluded[column.name] for column in table.c if not column.primary_key}
                 connection.execute(statement.on_conflict_do_update(index_elements=["id"], set_=new), some)
+        self._put_tags([record for record in records if isinstance(record, CaptureRecord)])
 
     def _put_tags(self, records: Collection[CaptureRecord]) -> None:
         names = {(record.id, folded(tag)): storable(tag) for record in records for tag in record.tags}
         rows = [{"capture_id": capture, "folded": tag, "name": name} for (capture, tag), name in names.items()]
-        self._drop_tags([record.id for record in records])
         with self._engine.begin() as connection:
+            for some in portions([record.id for record in records]):
+                connection.execute(sa.delete(capture_tags).where(capture_tags.c.capture_id.in_(some)))
             for some in portions(rows):
                 connection.execute(sa.insert(capture_tags), some)
-
-    def _drop_tags(self, captures: Collection[str]) -> None:
-        with self._engine.begin() as connection:
-            for some in portions(captures):
-                connection.execute(sa.delete(capture_tags).where(capture_tags.c.capture_id.in_(some)))
 
     def _drop(self, table: sa.Table, ids: Collection[str]) -> None:
         with self._engine.begin() as connection:
             for some in portions(ids):
                 connection.execute(sa.delete(table).where(table.c.id.in_(some)))
+                if table is capture_index:
+                    connection.execute(sa.delete(capture_tags).where(capture_tags.c.capture_id.in_(some)))
 
 
 def captures_with(word: str) -> sa.ColumnElement[bool]:
@@ -280,29 +267,15 @@ def subject_of(record: SessionRecord) -> str:
 
 
 def _row_of(record: Record, changed: int) -> dict[str, object]:
-    return _capture_row(record, changed) if isinstance(record, CaptureRecord) else _session_row(record, changed)
-
-
-def _capture_row(record: CaptureRecord, changed: int) -> dict[str, object]:
-    verdict = record.verdict or UNJUDGED
-    return {
-        "id": record.id,
+    row: dict[str, object] = {"id": record.id, "label": storable(record.label), "changed": changed}
+    if isinstance(record, SessionRecord):
+        return row | {"subject": subject_of(record), "words": folded(record.label, record.consent)}
+    words = folded(record.label, record.expression, record.verdict, record.source, *record.tags)
+    return row | {
         "session": None if record.session is None else storable(record.session),
-        "label": storable(record.label),
-        "verdict": verdict,
+        "verdict": record.verdict or UNJUDGED,
         "source": record.source,
         "board": record.board,
         "bytes": record.bytes,
-        "words": folded(record.label, record.expression, record.verdict, record.source, *record.tags),
-        "changed": changed,
-    }
-
-
-def _session_row(record: SessionRecord, changed: int) -> dict[str, object]:
-    return {
-        "id": record.id,
-        "subject": subject_of(record),
-        "label": storable(record.label),
-        "words": folded(record.label, record.consent),
-        "changed": changed,
+        "words": words,
     }

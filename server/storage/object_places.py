@@ -10,16 +10,16 @@ import base64
 import hashlib
 import mimetypes
 import unicodedata
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import closing, contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import quote
 
 from rig.digest import sha256_of
 from rig.messages.message import Message, compose
-from server.errors import InvalidInput
+from server.errors import UrlRefused
 from server.settings import OBJECT_PREFIX, ServiceSettings
 from server.storage.objects import (
     BLOCK_BYTES,
@@ -41,16 +41,7 @@ SHA256 = "sha256"  # in an object's metadata
 DAMAGED = ("BadDigest", "InvalidDigest", "XAmzContentSHA256Mismatch", "XAmzContentChecksumMismatch", "IncompleteBody")
 PASSING = ("SlowDown", "RequestTimeout", "OperationAborted", "NoSuchUpload", "InvalidPart")
 MISSING = ("NoSuchKey", "404", "NotFound")
-
-
-def open_bucket(prefix: str, settings: ServiceSettings) -> "S3Objects":
-    """Opens ``s3://bucket/prefix/``. Raises StoreDenied where botocore is not installed."""
-    bucket, _, below = prefix.removeprefix("s3://").partition("/")
-    try:
-        client = _client(settings.store_endpoint, settings.store_region, settings.store_timeout_s)
-    except ImportError as error:
-        raise StoreDenied(prefix, compose("store-extra-missing")) from error
-    return S3Objects(client, bucket, below)
+T = TypeVar("T")
 
 
 @lru_cache
@@ -87,18 +78,12 @@ class S3Objects:
 
     def put(self, key: str, path: Path, sha256: str) -> None:
         """Stores a file, as in ``ObjectStore``."""
-        for _ in range(TRIES - 1):
-            with suppress(DamagedTransfer):
-                return self._put(key, path, sha256)
-        self._put(key, path, sha256)
+        _repeated(lambda: self._put(key, path, sha256))
 
     def fetch(self, key: str, path: Path, sha256: str | None = None, admit: Admission = any_size) -> str:
         """Writes an object to a file, as in ``ObjectStore``."""
         try:
-            for _ in range(TRIES - 1):
-                with suppress(DamagedTransfer):
-                    return self._fetch(key, path, sha256, admit)
-            return self._fetch(key, path, sha256, admit)
+            return _repeated(lambda: self._fetch(key, path, sha256, admit))
         except BaseException:
             path.unlink(missing_ok=True)
             raise
@@ -257,6 +242,13 @@ class S3Objects:
             raise StoreUnavailable(self._place(key), f"{type(error).__name__}: {error}") from error
 
 
+def _repeated(transfer: Callable[[], T]) -> T:
+    for _ in range(TRIES - 1):
+        with suppress(DamagedTransfer):
+            return transfer()
+    return transfer()
+
+
 def _base64(data: bytes) -> str:
     return base64.b64encode(hashlib.sha256(data).digest()).decode()
 
@@ -275,14 +267,14 @@ def key_faults(key: str) -> list[Message]:
 def locate(url: str, prefixes: Collection[str]) -> tuple[str, str]:
     """Returns the allowed prefix that ``url`` lies below, and its key there. Raises InvalidInput ("url-refused")."""
     if not OBJECT_PREFIX.match(f"{url}/"):
-        raise _refused(compose("object-url-none"))
+        raise UrlRefused(compose("object-url-none"))
     for prefix in sorted(prefixes, key=len, reverse=True):
         if url.startswith(prefix):
             key = url.removeprefix(prefix)
             if key and (faults := key_faults(key)):
-                raise _refused(faults[0])
+                raise UrlRefused(faults[0])
             return prefix, key
-    raise _refused(compose("object-url-not-allowed", prefixes=sorted(prefixes)))
+    raise UrlRefused(compose("object-url-not-allowed", prefixes=sorted(prefixes)))
 
 
 def is_object_url(url: str) -> bool:
@@ -295,8 +287,9 @@ def open_objects(prefix: str, settings: ServiceSettings) -> ObjectStore:
     where the extra for S3 is not installed."""
     if prefix.startswith("file://"):
         return FolderObjects(Path(prefix.removeprefix("file://")))
-    return open_bucket(prefix, settings)
-
-
-def _refused(why: Message) -> InvalidInput:
-    return InvalidInput("url-refused", compose("url-refused", why=why), [compose("field-url-refused", why=why)])
+    bucket, _, below = prefix.removeprefix("s3://").partition("/")
+    try:
+        client = _client(settings.store_endpoint, settings.store_region, settings.store_timeout_s)
+    except ImportError as error:
+        raise StoreDenied(prefix, compose("store-extra-missing")) from error
+    return S3Objects(client, bucket, below)

@@ -53,35 +53,23 @@ class Order:
     def after(self, cursor: str) -> sa.ColumnElement[bool]:
         """Returns the SQL condition for rows that come after a cursor. Raises InputError for a cursor of a list that is
         sorted by another type."""
-        place = place_of(cursor)
-        if isinstance(place.value, str) != isinstance(self.column.type, sa.String):
+        value, identity, _ = place_of(cursor)
+        if isinstance(value, str) != isinstance(self.column.type, sa.String):
             raise no_cursor()
         if self.column is self.identity:
-            return self.identity < place.identity if self.descending else self.identity > place.identity
-        ended, row = (
-            sa.tuple_(sa.literal(place.value), sa.literal(place.identity)),
-            sa.tuple_(self.column, self.identity),
-        )
+            return self.identity < identity if self.descending else self.identity > identity
+        ended, row = (sa.tuple_(sa.literal(value), sa.literal(identity)), sa.tuple_(self.column, self.identity))
         return row < ended if self.descending else row > ended
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Holds where a page ended: the value and the id of its last row, and how many rows the list had at its first
-    page."""
-
-    value: str | int
-    identity: str
-    total: int
-
-
 def cursor_of(value: Value, identity: str, total: int) -> str:
-    """Encodes a place as a cursor: text that clients send back and need not understand."""
+    """Encodes where a page ended as a cursor: the value and the id of its last row, and how many rows the list had at
+    its first page. Clients send it back and need not understand it."""
     return base64.urlsafe_b64encode(json.dumps([value, identity, total]).encode()).decode().rstrip("=")
 
 
-def place_of(cursor: str) -> Place:
-    """Decodes a cursor. Raises InputError for a text that is none."""
+def place_of(cursor: str) -> tuple[str | int, str, int]:
+    """Decodes a cursor to what ``cursor_of`` encoded. Raises InputError for a text that is none."""
     try:
         value, identity, total = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
         text = f"{value}{identity}".encode()  # half of a surrogate pair is JSON and nothing that a database takes
@@ -91,7 +79,7 @@ def place_of(cursor: str) -> Place:
         raise no_cursor()
     if not isinstance(identity, str) or b"\0" in text:
         raise no_cursor()
-    return Place(value, identity, total)
+    return value, identity, total
 
 
 def _is_whole(part: object) -> bool:
@@ -113,7 +101,7 @@ def page_of(
     """
     wanted = rows.with_only_columns(order.identity.label("id"), order.column.label("value"))
     if cursor is not None:
-        total, wanted = place_of(cursor).total, wanted.where(order.after(cursor))
+        total, wanted = place_of(cursor)[2], wanted.where(order.after(cursor))
     elif searched:
         total, wanted = 0, wanted.add_columns(sa.func.count().over().label("total"))
     else:

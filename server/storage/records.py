@@ -12,8 +12,8 @@ from pydantic import BaseModel, Field, PlainSerializer, PlainValidator, TypeAdap
 
 from rig.acquisition.face_sighting import FaceSighting
 from rig.acquisition.shot import Fault, read_fault
-from rig.acquisition.verdict import Verdict, ViewDocument
-from rig.messages.message import Message, MessageDocument, read_message
+from rig.acquisition.verdict import ViewDocument
+from rig.messages.message import Message, read_message
 
 JsonObject = dict[str, Any]  # what HTTP takes and gives without a shape of its own
 T = TypeVar("T")
@@ -230,21 +230,6 @@ class FileEntry(TypedDict):
     """Holds size and SHA-256 of a result's file, as the job engine stores them."""
 
     bytes: int
-    sha256: str
-
-
-class CalibrationOutcome(TypedDict):
-    """Holds the result of a calibration, as the job engine stores it. ``sha256`` is that of cameras.json. Outcomes of
-    earlier versions have no verdict."""
-
-    verdict: NotRequired[Verdict]
-    missing: NotRequired[list[str]]
-    missing_messages: NotRequired[list[MessageDocument]]
-    figures: Mapping[str, object]
-    checks: list[Mapping[str, object]]
-    warnings: list[str]
-    warning_messages: NotRequired[list[MessageDocument]]
-    front: str | None
     sha256: str
 
 

@@ -36,7 +36,7 @@ import structlog
 from rig.acquisition.verdict import ViewDocument
 from rig.atomic_write import unfinished, write_atomically
 from rig.digest import sha256_of
-from rig.messages.message import Message, compose
+from rig.messages.message import compose
 from server.errors import DiskFull, NotFound
 from server.storage.capture_blobs import CaptureBlobs
 from server.storage.folders import move_durably, newest, sync_folder
@@ -195,32 +195,20 @@ class Store:
 
     def _record_path(self, kind: str, identity: str) -> Path:
         folder = self.folder(kind, identity)
-        return folder / "record.json" if kind == "captures" else folder.with_suffix(".json")
+        return folder.with_suffix(".json") if kind == "sessions" else folder / "record.json"
 
     def _tell(self, record: CaptureRecord | SessionRecord) -> None:
-        if self._index is None:
-            return
-        if isinstance(record, CaptureRecord):
-            changed = self._record_path("captures", record.id).stat().st_mtime_ns
-            self._index.put_capture(record, changed)
-        else:
-            self._index.put_session(record, self._record_path("sessions", record.id).stat().st_mtime_ns)
+        if self._index is not None:
+            kind = "captures" if isinstance(record, CaptureRecord) else "sessions"
+            self._index.put(record, self._record_path(kind, record.id).stat().st_mtime_ns)
 
     def capture(self, identity: str) -> CaptureRecord:
         """Returns the record of a capture. Raises NotFound."""
-        path = self.folder("captures", identity) / "record.json"
-        record = self._read(path, CAPTURE, path.parent)
-        if record is None:
-            raise NotFound(compose("thing-capture"), identity)
-        return record
+        return self._read("captures", identity, CAPTURE)
 
     def calibration(self, identity: str) -> CalibrationRecord:
         """Returns the record of a calibration. Raises NotFound."""
-        path = self.folder("calibrations", identity) / "record.json"
-        record = self._read(path, CALIBRATION, path.parent)
-        if record is None:
-            raise NotFound(compose("thing-calibration"), identity)
-        return record
+        return self._read("calibrations", identity, CALIBRATION)
 
     def put_checks(self, folder: Path, checks: Mapping[str, ViewDocument]) -> None:
         """Writes the measurements of a capture's pictures into the capture's folder before it is moved to its final
@@ -244,25 +232,25 @@ class Store:
     def change_capture(self, identity: str, change: Callable[[CaptureRecord], CaptureRecord]) -> CaptureRecord:
         """Replaces the record of a capture by what ``change`` returns for it, and returns the new record. Changes wait
         for each other, and the file is replaced atomically. Raises NotFound."""
-        with self._change(compose("thing-capture"), identity):
+        with self._change("captures", identity):
             before = self.capture(identity)
             record = change(before)
-            path = self.folder("captures", identity) / "record.json"
-            write_atomically(path, _encoded(CAPTURE.document(record)), parents=False)
+            data = _encoded(CAPTURE.document(record))
+            write_atomically(self._record_path("captures", identity), data, parents=False)
             self._tell(record)
         if record.inputs != before.inputs:
             self.share(record)
         return record
 
     @contextmanager
-    def _change(self, what: Message, identity: str) -> Iterator[None]:
+    def _change(self, kind: str, identity: str) -> Iterator[None]:
         """Allows one change or removal at a time, so that no change is lost and no removed thing comes back. Raises
         NotFound, also for what another process removed meanwhile."""
         with self._changing:
             try:
                 yield
             except FileNotFoundError as error:
-                raise NotFound(what, identity) from error
+                raise NotFound(_THINGS[kind], identity) from error
 
     def remove_capture(self, identity: str, *, later: bool = False) -> None:
         """Removes a capture and everything cached of it, which shows the face as well; first what the store of captures
@@ -270,7 +258,7 @@ class Store:
         removes that part."""
         if self.blobs is not None:
             self.blobs.release(identity, later=later)
-        with self._change(compose("thing-capture"), identity):
+        with self._change("captures", identity):
             self.remove(self.folder("captures", identity))
             self.remove(self.cache_of(identity))
             for path in (self.data / "set-aside").glob(f"captures-{identity}-*"):
@@ -279,7 +267,7 @@ class Store:
                 if identity in self._upload_text(upload):
                     self.remove(self.folder("uploads", upload))
             if self._index is not None:
-                self._index.drop_capture(identity)
+                self._index.drop("captures", identity)
         if self.blobs is not None:  # it may have been stored again since
             self.blobs.release(identity, later=later)
 
@@ -294,7 +282,7 @@ class Store:
 
     def add_session(self, record: SessionRecord) -> None:
         """Writes the record of a session, replacing an earlier one atomically."""
-        path = self.folder("sessions", record.id).with_suffix(".json")
+        path = self._record_path("sessions", record.id)
         write_atomically(path, _encoded(SESSION.document(record)))
         sync_folder(path.parent)
         self._tell(record)
@@ -302,7 +290,7 @@ class Store:
     def change_session(self, identity: str, change: Callable[[SessionRecord], SessionRecord]) -> SessionRecord:
         """Replaces the record of a session by what ``change`` returns for it, and returns the new record. Changes wait
         for each other, and the file is replaced atomically. Raises NotFound."""
-        with self._change(compose("thing-session"), identity):
+        with self._change("sessions", identity):
             record = change(self.session(identity))
             self.add_session(record)
         return record
@@ -310,21 +298,17 @@ class Store:
     def remove_session(self, identity: str) -> None:
         """Removes the record of a session, and copies of it that a kill left half written. The session's captures
         stay."""
-        with self._change(compose("thing-session"), identity):
-            path = self.folder("sessions", identity).with_suffix(".json")
+        with self._change("sessions", identity):
+            path = self._record_path("sessions", identity)
             for part in [*unfinished(path.parent, path.name)]:
                 self.remove(part)
             self.remove(path)
             if self._index is not None:
-                self._index.drop_session(identity)
+                self._index.drop("sessions", identity)
 
     def session(self, identity: str) -> SessionRecord:
         """Returns the record of a session. Raises NotFound."""
-        path = self.folder("sessions", identity).with_suffix(".json")
-        record = self._read(path, SESSION, path)
-        if record is None:
-            raise NotFound(compose("thing-session"), identity)
-        return record
+        return self._read("sessions", identity, SESSION)
 
     def remove(self, path: Path) -> None:
         """Deletes a file or folder. It is first renamed into ``trash``, so that it is gone from sight even if the
@@ -368,11 +352,14 @@ class Store:
         """Lists the names of damaged records that were moved to the folder ``set-aside``."""
         return sorted(entry.name for entry in (self.data / "set-aside").iterdir())
 
-    def _read(self, path: Path, wanted: RecordFormat[T], whole: Path) -> T | None:
+    def _read(self, kind: str, identity: str, wanted: RecordFormat[T]) -> T:
+        """Reads a record. Raises NotFound where there is none, and for a damaged one, which is set aside."""
+        path = self._record_path(kind, identity)
+        whole = path if kind == "sessions" else path.parent
         try:
             data = path.read_bytes()
-        except (FileNotFoundError, NotADirectoryError):
-            return None
+        except (FileNotFoundError, NotADirectoryError) as error:
+            raise NotFound(_THINGS[kind], identity) from error
         with suppress(ValueError, RecursionError):
             document = json.loads(data)
             record = wanted.read(document)
@@ -382,7 +369,7 @@ class Store:
         log.error("damaged record set aside", record=str(path), to=name)
         with suppress(OSError):
             whole.rename(self.data / "set-aside" / name)
-        return None
+        raise NotFound(_THINGS[kind], identity)
 
 
 def _encoded(document: Mapping[str, object]) -> bytes:

@@ -20,11 +20,12 @@ from server.storage.objects import (
 OUTCOMES = {ObjectMissing: "missing", StoreUnavailable: "unavailable", StoreDenied: "denied"}
 
 
-class StoreTally:
-    """Holds the number of operations by name and outcome, and the seconds that they took by name."""
+class WatchedObjects:
+    """Passes everything on to an object store, and counts it: operations by name and outcome, and their seconds by
+    name."""
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
+    def __init__(self, objects: ObjectStore) -> None:
+        self._objects, self._lock = objects, threading.Lock()
         self._operations, self._seconds = Counter[tuple[str, str]](), Counter[str]()
 
     def operations(self) -> dict[tuple[str, str], int]:
@@ -38,8 +39,42 @@ class StoreTally:
         with self._lock:
             return dict(self._seconds)
 
+    def probe(self) -> None:
+        """Asks the store for a list of nothing. Raises StoreUnavailable and StoreDenied."""
+        next(self.entries("none/"), None)
+
+    def put(self, key: str, path: Path, sha256: str) -> None:
+        """Stores a file, as in ``ObjectStore``."""
+        with self._counting("put"):
+            self._objects.put(key, path, sha256)
+
+    def fetch(self, key: str, path: Path, sha256: str | None = None, admit: Admission = any_size) -> str:
+        """Writes an object to a file, as in ``ObjectStore``."""
+        with self._counting("fetch"):
+            return self._objects.fetch(key, path, sha256, admit)
+
+    def entries(self, prefix: str) -> Iterator[StoredObject]:
+        """Yields the objects below a key, as in ``ObjectStore``."""
+        with self._counting("list"):
+            yield from self._objects.entries(prefix)
+
+    def folders(self) -> Iterator[str]:
+        """Yields the first parts of keys, as in ``ObjectStore``."""
+        with self._counting("list"):
+            yield from self._objects.folders()
+
+    def erase(self, prefix: str) -> int:
+        """Removes all objects below a key, as in ``ObjectStore``."""
+        with self._counting("erase"):
+            return self._objects.erase(prefix)
+
+    def link(self, key: str, name: str, seconds: int) -> str | None:
+        """Returns an address of an object, as in ``ObjectStore``."""
+        with self._counting("link"):
+            return self._objects.link(key, name, seconds)
+
     @contextmanager
-    def counting(self, operation: str) -> Iterator[None]:
+    def _counting(self, operation: str) -> Iterator[None]:
         """Counts what happens in its block as one operation."""
         began, outcome = time.monotonic(), "refused"
         try:
@@ -55,40 +90,3 @@ class StoreTally:
             with self._lock:
                 self._operations[operation, outcome] += 1
                 self._seconds[operation] += time.monotonic() - began  # pyright: ignore[reportArgumentType]
-
-
-class WatchedObjects:
-    """Passes everything on to an object store, and counts it."""
-
-    def __init__(self, objects: ObjectStore) -> None:
-        self._objects, self.tally = objects, StoreTally()
-
-    def put(self, key: str, path: Path, sha256: str) -> None:
-        """Stores a file, as in ``ObjectStore``."""
-        with self.tally.counting("put"):
-            self._objects.put(key, path, sha256)
-
-    def fetch(self, key: str, path: Path, sha256: str | None = None, admit: Admission = any_size) -> str:
-        """Writes an object to a file, as in ``ObjectStore``."""
-        with self.tally.counting("fetch"):
-            return self._objects.fetch(key, path, sha256, admit)
-
-    def entries(self, prefix: str) -> Iterator[StoredObject]:
-        """Yields the objects below a key, as in ``ObjectStore``."""
-        with self.tally.counting("list"):
-            yield from self._objects.entries(prefix)
-
-    def folders(self) -> Iterator[str]:
-        """Yields the first parts of keys, as in ``ObjectStore``."""
-        with self.tally.counting("list"):
-            yield from self._objects.folders()
-
-    def erase(self, prefix: str) -> int:
-        """Removes all objects below a key, as in ``ObjectStore``."""
-        with self.tally.counting("erase"):
-            return self._objects.erase(prefix)
-
-    def link(self, key: str, name: str, seconds: int) -> str | None:
-        """Returns an address of an object, as in ``ObjectStore``."""
-        with self.tally.counting("link"):
-            return self._objects.link(key, name, seconds)

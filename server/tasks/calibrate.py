@@ -17,7 +17,7 @@ from rig.formats.captures.archive import ArchiveLimits, extract_archive
 from rig.formats.captures.capture_folder import capture_root
 from rig.messages.message import compose, documents_of, texts_of
 from rig.progress import Progress
-from server.storage.records import CalibrationOutcome
+from server.storage.records import JsonObject
 from server.tasks.child import WorkerContext
 from server.tasks.photographs import SCALE, check_sizes
 
@@ -43,24 +43,52 @@ def is_of_board(folder: Path) -> bool:
     return (folder / BOARD).is_file()
 
 
-def ingest_photographs(
-    context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
+def ingest_pictures(
+    context: WorkerContext,
+    report: Progress,
+    *,
+    archive: str,
+    folder: str,
+    limits: ArchiveLimits,
+    image_pixels: int,
+    scene: bool,
 ) -> None:
-    """Unpacks an archive of photographs of a scene into ``folder``, with scale.json if there is one, and checks both.
-    Raises InputError naming every fault."""
-    from calibration.scene.photographs import find_photographs
-
+    """Unpacks an archive of board.toml and IMAGES/ into ``folder``, or of photographs of a ``scene``, with scale.json
+    if there is one, and checks them. Raises InputError naming every fault."""
     target = Path(folder)
     unpacked = target.with_name(target.name + ".unpacked")
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
-    found = find_photographs(root)
-    check_sizes((path for shots in found.files.values() for path in shots.values()), image_pixels)
-    _file_pictures(found.files, target)
-    if (root / SCALE).is_file():
-        (root / SCALE).rename(target / SCALE)
+    files = _scene_pictures(root, image_pixels) if scene else _board_pictures(root)
+    for camera, shots in files.items():
+        (target / "images" / camera).mkdir(parents=True)
+        for shot, path in shots.items():
+            path.rename(target / "images" / camera / f"{shot}{path.suffix}")
+    beside = SCALE if scene else BOARD
+    if (root / beside).is_file():
+        (root / beside).rename(target / beside)
     check_scale(target)
     shutil.rmtree(unpacked)
+
+
+def _scene_pictures(root: Path, image_pixels: int) -> Mapping[str, Mapping[str, Path]]:
+    """Returns the photographs of a scene by camera and shot. Raises InputError."""
+    from calibration.scene.photographs import find_photographs
+
+    found = find_photographs(root)
+    check_sizes((path for shots in found.files.values() for path in shots.values()), image_pixels)
+    return found.files
+
+
+def _board_pictures(root: Path) -> Mapping[str, Mapping[str, Path]]:
+    """Returns the pictures of a board by camera and shot. Raises InputError, also for a wrong board.toml."""
+    from calibration.board.board import read_board
+    from calibration.board.picture_files import list_pictures
+
+    if not (root / BOARD).is_file():
+        raise InputError("archive", [compose("no-board-toml")])
+    read_board(root / BOARD)
+    return list_pictures(next((root / name for name in ("IMAGES", "images") if (root / name).is_dir()), root))
 
 
 def forget_scene(folder: Path) -> None:
@@ -78,35 +106,6 @@ def check_scale(folder: Path) -> None:
         read_scale(folder / SCALE, [path.name for path in (folder / "images").iterdir()])
 
 
-def ingest_board_pictures(
-    context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits
-) -> None:
-    """Unpacks an archive of board.toml and IMAGES/ into ``folder`` and checks both. Raises InputError naming every
-    fault."""
-    from calibration.board.board import read_board
-    from calibration.board.picture_files import list_pictures
-
-    target = Path(folder)
-    unpacked = target.with_name(target.name + ".unpacked")
-    extract_archive(Path(archive), unpacked, limits)
-    root = capture_root(unpacked)
-    if not (root / BOARD).is_file():
-        raise InputError("archive", [compose("no-board-toml")])
-    read_board(root / BOARD)
-    pictures = next((root / name for name in ("IMAGES", "images") if (root / name).is_dir()), root)
-    _file_pictures(list_pictures(pictures), target)
-    (root / BOARD).rename(target / BOARD)
-    shutil.rmtree(unpacked)
-
-
-def _file_pictures(files: Mapping[str, Mapping[str, Path]], target: Path) -> None:
-    """Moves pictures, by camera and shot, to ``target/images/<camera>/<shot>``."""
-    for camera, shots in files.items():
-        (target / "images" / camera).mkdir(parents=True)
-        for shot, path in shots.items():
-            path.rename(target / "images" / camera / f"{shot}{path.suffix}")
-
-
 def calibrate_folder(
     context: WorkerContext,
     report: Progress,
@@ -116,7 +115,7 @@ def calibrate_folder(
     previous: str | None,
     cache: str,
     front: str | None,
-) -> CalibrationOutcome:
+) -> JsonObject:
     """Calibrates from the board pictures or photographs in ``folder`` and writes cameras.json, calibration.json and
     report.html to ``result``.
 
@@ -149,7 +148,7 @@ def calibrate_folder(
     return _outcome(found.document(), Path(result))
 
 
-def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | None) -> CalibrationOutcome:
+def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | None) -> JsonObject:
     from calibration.result import CalibrationRefused
     from calibration.scene.result import judge_scene, write_scene_report
     from calibration.scene.scene import calibrate_scene
@@ -167,17 +166,9 @@ def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | 
     return _outcome({"verdict": verdict.word, **missing, **found.document()}, result)
 
 
-def _outcome(document: Mapping[str, Any], result: Path) -> CalibrationOutcome:
+def _outcome(document: Mapping[str, Any], result: Path) -> JsonObject:
     """Writes calibration.json beside cameras.json in ``result``. Returns what the calibration's record holds of it."""
     write_atomically(result / "calibration.json", json.dumps(document, indent=1).encode())
-    return {
-        "verdict": document["verdict"],
-        "missing": document["missing"],
-        "missing_messages": document["missing_messages"],
-        "figures": document["figures"],
-        "checks": [*document.get("checks", ())],
-        "warnings": document["warnings"],
-        "warning_messages": document["warning_messages"],
-        "front": document["front"],
-        "sha256": sha256_of(result / "cameras.json"),
-    }
+    kept = ("verdict", "missing", "missing_messages", "figures", "warnings", "warning_messages", "front")
+    beside = {"checks": [*document.get("checks", ())], "sha256": sha256_of(result / "cameras.json")}
+    return {name: document[name] for name in kept} | beside

@@ -44,7 +44,6 @@ CANCELLED: ContextVar[Callable[[], bool]] = ContextVar(
 )  # asked where no other is named
 CALLER: ContextVar[str] = ContextVar("caller", default="")  # for whom a child of a pool works
 STOP = b""
-Report = Progress  # as the task of a reconstruction calls it
 
 
 class WorkFailed(EigenheadError):

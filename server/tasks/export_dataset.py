@@ -7,10 +7,10 @@ estimated and kept beside the data set, or copied from the result that it is exp
 import json
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rig.errors import InputError
 from rig.formats.cameras.dataset_json import DatasetFormat
@@ -30,23 +30,12 @@ DATASET_FILES = ("images", "masks", "fg_masks", "sparse_pc.ply", "points3d.ply",
 NOT_OF_CAMERAS = ("masks/", "background/", "features.json")  # inputs that may differ where cameras and pictures do not
 
 
-@dataclass(frozen=True, slots=True)
-class Exported:
-    """Holds what a data set contains: its cameras, those left out, the number of points, whether there are FLAME
-    parameters, and the warnings about the capture."""
-
-    cameras: tuple[str, ...]
-    left_out: tuple[str, ...]
-    points: int
-    flame: bool
-    warnings: "tuple[ReportWarning, ...]"
-
-
 def export_folder(
     folder: Path, out: Path, form: DatasetFormat, *, result: Path | None, chosen: "Settings", report: Progress
-) -> Exported:
+) -> "tuple[dict[str, Any], tuple[ReportWarning, ...]]":
     """Writes the capture in ``folder`` to ``out`` as a data set, replacing an earlier one. With ``result``, the folder
-    of its reconstruction, the head is written as a point cloud too.
+    of its reconstruction, the head is written as a point cloud too. Returns the cameras of the data set, those left
+    out, the number of points and whether there are FLAME parameters; and the warnings about the capture.
 
     Raises InputError naming every fault, also if ``result`` was made from other pictures, and the errors of
     calibration, segmentation and the choice of views.
@@ -82,7 +71,8 @@ def export_folder(
     used = dataset.rig_used.names
     left_out = tuple(name for name in rig.names if name not in used)
     points = 0 if head is None else len(head.vertices)
-    return Exported(used, left_out, points, flame is not None, (*prepared.warnings, *views.warnings))
+    figures = {"cameras": used, "left_out": left_out, "points": points, "flame": flame is not None}
+    return figures, (*prepared.warnings, *views.warnings)
 
 
 def _read_result(result: Path) -> tuple[Mapping[str, str], Mesh]:

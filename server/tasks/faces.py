@@ -10,6 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.faces.matching import EYE_DISTANCE_MM
+from pipeline.faces.networks import load_networks
+from pipeline.faces.sighting import file_pixels, reduce_picture
+from pipeline.faces.subject import find_subject
 from rig.camera import Camera
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, read_rig_file
@@ -17,7 +21,8 @@ from rig.formats.captures.capture_folder import has_known_length
 from rig.formats.pictures.images import read_image
 from rig.progress import Progress
 from rig.rig import Rig
-from server.storage.face_cache import FacesDocument, FoundFace, PixelsOfPoints
+from server.storage.face_cache import PixelsOfPoints
+from server.storage.records import JsonObject
 from server.tasks.child import WorkerContext
 
 if TYPE_CHECKING:
@@ -30,14 +35,9 @@ PICTURE_PX = 1600  # longer side: a face of an eighth of it has the networks' 19
 
 def find_capture_faces(
     context: WorkerContext, report: Progress, *, capture: str, images: Mapping[str, str]
-) -> FacesDocument:
+) -> JsonObject:
     """Finds the faces in a capture's pictures, and which of them is the subject's. ``images``: file of each camera's
     picture, below the folder ``capture``. Raises InputError, and DamagedNetwork if a network's file is damaged."""
-    from pipeline.faces.matching import EYE_DISTANCE_MM
-    from pipeline.faces.networks import load_networks
-    from pipeline.faces.sighting import reduce_picture
-    from pipeline.faces.subject import find_subject
-
     root = Path(capture)
     rig_file = find_rig_file(root)
     if rig_file is None:
@@ -64,11 +64,12 @@ def find_capture_faces(
 
 def describe(
     subject: "SubjectFaces", rig: Rig, recorded: Rig, suggest: "Callable[[MatchedFaces], PixelsOfPoints]"
-) -> FacesDocument:
+) -> JsonObject:
     """Converts the faces found with the reduced cameras ``rig`` to pixels of the picture files, whose cameras are
-    ``recorded``. In each picture the subject's face comes first."""
+    ``recorded``: ``faces`` of every picture, the subject's first, and the pixels ``suggested`` for the seven feature
+    points (none where no face is certain)."""
     matched = subject.matched
-    faces: dict[str, list[FoundFace]] = {}
+    faces: dict[str, list[JsonObject]] = {}
     for name, seen in subject.found.items():
         best = None if matched is None else matched.detections.get(name)
         found = [_face_of(face, rig[name], recorded[name], best) for face in seen]
@@ -76,8 +77,10 @@ def describe(
     return {"faces": faces, "suggested": {} if matched is None else suggest(matched)}
 
 
-def _face_of(face: "FaceDetection", camera: Camera, recorded: Camera, best: "FaceDetection | None") -> FoundFace:
-    points = _file_pixels(face.landmarks_px, camera, recorded)
+def _face_of(face: "FaceDetection", camera: Camera, recorded: Camera, best: "FaceDetection | None") -> JsonObject:
+    """Describes one face in pixels of the picture's file. ``is_subject``: the views agree that it is the subject's;
+    ``roll_deg``: how far it is turned clockwise in the picture."""
+    points = file_pixels(face.landmarks_px, camera, recorded)
     return {
         "box_px": _plain(np.concatenate([points.min(axis=0), points.max(axis=0)])),
         "roll_deg": round(face.roll_deg, 1),
@@ -101,15 +104,9 @@ def _suggested(context: WorkerContext, face: "MatchedFaces", rig: Rig, recorded:
         return {}
     suggested = suggest_points(face, rig, model, places, SEVEN_POINTS)
     return {
-        name: {c: _plain(_file_pixels(pixel[None], rig[c], recorded[c])[0]) for c, pixel in views.items()}
+        name: {c: _plain(file_pixels(pixel[None], rig[c], recorded[c])[0]) for c, pixel in views.items()}
         for name, views in suggested.items()
     }
-
-
-def _file_pixels(pixels: Float[np.ndarray, "n 2"], camera: Camera, recorded: Camera) -> Float[np.ndarray, "n 2"]:
-    from pipeline.faces.sighting import file_pixels
-
-    return file_pixels(pixels, camera, recorded)
 
 
 def _plain(values: Float[np.ndarray, " n"]) -> list[float]:

@@ -1,20 +1,24 @@
-"""The task of a job, which runs in a worker's child process: it reads files, calls ``reconstruct()`` and writes
-files.
+"""The task of a job: it reads files, calls ``reconstruct()`` and writes files.
 
-Both kinds of job end in ``run_job``: a service's, whose capture was checked and stored before, and the command line's
-(``server.tasks.reconstruct_folder``), whose cameras and masks may have to be estimated first.
+Both kinds of job end in ``run_job``: a service's, in a worker's child process, whose capture was checked and stored
+before, and the command line's, of a capture on a user's disk: archives are unpacked; cameras and masks that are missing
+are estimated and kept.
 """
 
-from collections.abc import Mapping
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rig.formats.captures.archive import extract_archive
 from rig.messages.message import compose
 from rig.progress import Progress
-from server.processes import share_one_heap, tidied
-from server.tasks.child import Report, WorkerContext
+from server.processes import end_with_parent, share_one_heap, tidied
+from server.tasks.child import WorkerContext
 
 if TYPE_CHECKING:
     from pipeline.settings import Settings
@@ -31,7 +35,7 @@ SURE_SCALE = 0.02  # relative: 3 mm of a head; above it the warning says that le
 
 def reconstruct_capture(
     context: WorkerContext,
-    report: Report,
+    report: Progress,
     *,
     capture: str,
     result: str,
@@ -65,9 +69,81 @@ def reconstruct_capture(
     )
 
 
+@contextmanager
+def folder_of(capture: Path) -> Iterator[Path]:
+    """Yields the folder of a capture. An archive is unpacked to a temporary folder, which is removed after the block.
+    Raises InputError."""
+    if capture.is_dir():
+        yield capture
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        extract_archive(capture, Path(scratch) / "capture")
+        yield Path(scratch) / "capture"
+
+
+def reconstruct_folder(
+    context: WorkerContext,
+    report: Progress,
+    *,
+    folder: Path,
+    out: Path,
+    kept: Path,
+    model: str | None,
+    chosen: "Settings",
+    preparation: Progress,
+) -> None:
+    """Reconstructs the capture in ``folder`` and writes the result to ``out``. Cameras and masks that had to be
+    estimated are written to ``kept``, even if the reconstruction fails.
+
+    ``preparation`` receives the progress before the first stage: estimating cameras, compiling loops. Raises the errors
+    of the pipeline, and OSError for a full disk.
+    """
+    from pipeline.compute.trace import span
+    from server.tasks.photographs import keep_masks, read_or_calibrate
+
+    with span("stage", "read"):
+        prepared = read_or_calibrate(folder, kept, front=chosen.front, report=preparation)
+    run_job(
+        context,
+        report,
+        prepared,
+        out,
+        folders=(folder, kept),
+        model=model,
+        chosen=chosen,
+        segment=partial(keep_masks, kept),
+        preparation=preparation,
+    )
+
+
+def reconstruct_beside(
+    context: WorkerContext,
+    report: Progress,
+    *,
+    parent: int,
+    capture: str,
+    result: str,
+    scratch: str,
+    model: str | None,
+    settings: Mapping[str, object],
+) -> None:
+    """Reconstructs a capture folder or archive into the new folder ``result``. It runs in a child process and ends with
+    the process ``parent``. All its temporary files lie in the folder ``scratch``."""
+    end_with_parent(parent)
+    share_one_heap()
+    from pipeline.settings import settings_from_document
+
+    os.environ["TMPDIR"] = tempfile.tempdir = scratch
+    chosen, out = settings_from_document(settings), Path(result)
+    with folder_of(Path(capture)) as folder:
+        reconstruct_folder(
+            context, report, folder=folder, out=out, kept=out, model=model, chosen=chosen, preparation=report
+        )  # fmt: skip
+
+
 def run_job(
     context: WorkerContext,
-    report: Report,
+    report: Progress,
     prepared: "Prepared",
     out: Path,
     *,

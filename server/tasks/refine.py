@@ -21,7 +21,7 @@ from rig.messages.message import compose
 from rig.progress import Progress, discard_progress
 from rig.rig import Rig
 from server.tasks.photographs import read_scaled_capture
-from server.tasks.reconstruct_folder import folder_of
+from server.tasks.reconstruct import folder_of
 
 
 def refine_locally(

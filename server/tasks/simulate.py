@@ -2,35 +2,19 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rig.progress import Progress
+from server.storage.records import JsonObject
 from server.tasks.child import WorkerContext
 
 if TYPE_CHECKING:
     from rig.studio.scene.simulate import SimulatedCapture
 
 
-class SimulatedSync(TypedDict):
-    """Holds a camera's entry in the sync certificate of a simulated shot: its delay is always 0 ms."""
-
-    status: str
-    skew_ms: float
-
-
-class SimulatedCertificate(TypedDict):
-    """Holds the sync certificate of a simulated shot: the subject, when each camera took its picture, and planted
-    faults."""
-
-    kind: str
-    subject: str
-    cameras: dict[str, SimulatedSync]
-    faults: list[str]
-
-
-def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: int | None) -> SimulatedCertificate:
+def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: int | None) -> JsonObject:
     """Takes a shot of the simulated studio: writes the capture to ``folder/files`` and the true head to
     ``folder/truth``. Returns the shot's certificate.
 
@@ -54,9 +38,9 @@ def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: in
     return describe(taken)
 
 
-def describe(taken: "SimulatedCapture") -> SimulatedCertificate:
+def describe(taken: "SimulatedCapture") -> JsonObject:
     """Returns the sync certificate of a simulated shot, all of whose pictures show the same moment."""
-    cameras: dict[str, SimulatedSync] = {name: {"status": "in sync", "skew_ms": 0.0} for name in taken.rig.names}
+    cameras = {name: {"status": "in sync", "skew_ms": 0.0} for name in taken.rig.names}
     faults = [f.kind if f.camera is None else f"{f.kind} in {f.camera}" for f in taken.faults]
     return {"kind": "simulated", "subject": taken.scene.name, "cameras": cameras, "faults": faults}
 

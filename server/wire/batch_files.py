@@ -35,13 +35,17 @@ def send_table(service: Service, batch_id: str, form: TableFormat) -> Response:
 def send_sheet(service: Service, batch_id: str, form: SheetFormat) -> Response:
     """Returns the response that carries the contact sheet of a batch. The HTML page's headers forbid scripts, since
     people's labels stand on it. Raises NotFound."""
-    from server.services.batch_table import batch_sheet, batch_sheet_pdf
+    from server.batch.sheet import sheet_lines
+    from server.services.batch_table import batch_cards
 
     batch, headers = service.batches.get(batch_id), {"Content-Disposition": f'inline; filename="sheet.{form}"'}
+    title, cards = batch.label or batch.id, batch_cards(service.batches, service.store, batch)
     if form == "pdf":
-        return Response(batch_sheet_pdf(service.batches, service.store, batch), media_type=PDF_TYPE, headers=headers)
+        from server.batch.sheet_pdf import sheet_pdf  # its library takes a while to load
+
+        return Response(sheet_pdf(title, cards), media_type=PDF_TYPE, headers=headers)
     headers["Content-Security-Policy"] = CLOSED
-    lines = (f"{line}\n".encode("utf-8", "replace") for line in batch_sheet(service.batches, service.store, batch))
+    lines = (f"{line}\n".encode("utf-8", "replace") for line in sheet_lines(title, cards))
     return StreamingResponse(lines, media_type="text/html", headers=headers)
 
 

@@ -1,19 +1,27 @@
-"""Fetches an archive from another server whose address a caller names.
+"""Fetches a capture whose address a caller names: an archive from another server, or from an object store an archive
+under one key or the files below a prefix.
 
-The address is checked (server.origins), bytes and seconds are limited, and the data are written straight to the data
-folder.
+The address is checked (server.origins, server.storage.object_places), bytes and seconds are limited, and the data are
+written straight to the data folder.
 """
 
+import tarfile
+import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import anyio
 import httpx
 
 from rig.messages.message import Message, compose
-from server.errors import InvalidInput
+from server.errors import InvalidInput, TooLarge
 from server.origins import target
 from server.services.service import Service
 from server.services.uploads import too_large
+from server.settings import ServiceSettings
+from server.storage.object_places import locate, open_objects
+from server.storage.objects import Admission, ObjectMissing, ObjectStore, StoredObject
+from server.storage.store import Store
 from server.wire.multipart import BLOCK_BYTES
 from server.wire.patience import IDLE_TIMEOUT_S
 
@@ -81,3 +89,53 @@ async def _receive(service: Service, answer: httpx.Response, path: Path) -> None
 
 def _failed(why: Message) -> InvalidInput:
     return InvalidInput("import-failed", compose("import-failed", why=why), [why])
+
+
+def fetch_stored_capture(url: str, folder: Path, store: Store, settings: ServiceSettings) -> Path:
+    """Fetches the capture at an object store's ``url`` into ``folder`` and returns its archive: the object itself, or
+    where the URL ends with a slash one of all objects below it.
+
+    Raises InvalidInput for a place that is not allowed ("url-refused"), where there is nothing ("object-missing") and
+    for a store that is slow ("import-failed"), TooLarge, DiskFull, and Unavailable where the store does not do its
+    part."""
+    prefix, key = locate(url, settings.import_prefixes)
+    objects, archive = open_objects(prefix, settings), folder / "upload"
+
+    def admit(size: int) -> None:
+        if size > settings.body_bytes:
+            raise too_large(settings)
+        store.reserve(2 * size, settings.free_bytes)  # packed and unpacked
+
+    if key and not key.endswith("/"):
+        objects.fetch(key, archive, admit=admit)
+    else:
+        _pack(objects, _listed(url, objects, key, settings), archive, admit, settings.import_s)
+    return archive
+
+
+def _listed(url: str, objects: ObjectStore, prefix: str, settings: ServiceSettings) -> dict[str, StoredObject]:
+    """Lists the objects below a prefix, by their names there."""
+    found, total = dict[str, StoredObject](), 0
+    for entry in objects.entries(prefix):
+        found[entry.key.removeprefix(prefix)] = entry
+        total += entry.bytes
+        if total > settings.body_bytes:
+            raise too_large(settings)
+        if len(found) > settings.archive_members:
+            raise TooLarge("upload-too-large", compose("objects-many", place=url, most=settings.archive_members))
+    if not found:
+        raise ObjectMissing(url)
+    return found
+
+
+def _pack(
+    objects: ObjectStore, entries: Mapping[str, StoredObject], archive: Path, admit: Admission, most_s: float
+) -> None:
+    """Packs objects as an archive. Their names are judged when it is unpacked, as those of any upload."""
+    ends, part = time.monotonic() + most_s, archive.with_suffix(".part")
+    with tarfile.open(archive, "w") as packed:
+        for name, entry in entries.items():
+            objects.fetch(entry.key, part, admit=admit)
+            packed.add(part, name)
+            if time.monotonic() > ends:
+                raise _failed(compose("import-too-slow", seconds=most_s))

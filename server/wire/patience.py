@@ -17,13 +17,12 @@ IDLE_TIMEOUT_S = 30.0  # between two pieces: longer than a change of networks ta
 async def with_idle_timeout(stream: AsyncIterator[bytes], silent_s: float) -> AsyncIterator[bytes]:
     """Yields the pieces of ``stream``. Raises a 408 problem if one does not arrive within ``silent_s`` seconds. The
     total time is not limited."""
-    while (piece := await _next(stream, silent_s)) is not None:
+    while True:
+        async with within(silent_s):
+            piece = await anext(stream, None)
+        if piece is None:
+            return
         yield piece
-
-
-async def _next(stream: AsyncIterator[bytes], silent_s: float) -> bytes | None:
-    async with within(silent_s):
-        return await anext(stream, None)
 
 
 @asynccontextmanager

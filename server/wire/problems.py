@@ -4,7 +4,7 @@ in ``errors``."""
 import errno
 from collections.abc import Iterable, Mapping, Sequence
 from http import HTTPStatus
-from typing import Any, TypedDict
+from typing import Any
 
 import structlog
 from fastapi import FastAPI, Request
@@ -16,7 +16,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from rig.errors import EigenheadError, InputError
-from rig.messages.message import Message, MessageDocument, compose, documents_of, message_of
+from rig.messages.message import Message, compose, documents_of, message_of
 from rig.text import printable
 from server.errors import (
     UNWRITABLE,
@@ -68,18 +68,6 @@ PROBLEM_SCHEMA = {
 Responses = dict[int | str, dict[str, Any]]  # FastAPI's type of a route's ``responses``
 
 
-class ProblemDocument(TypedDict):
-    """Holds the JSON of a problem: the members of RFC 9457, the faults as texts and, for translation, as messages."""
-
-    type: str
-    title: str
-    status: int
-    detail: str
-    errors: list[str]
-    detail_message: MessageDocument
-    error_messages: list[MessageDocument]
-
-
 STATUS_OF: dict[type[Refused], int] = {
     Refused: 400,
     Unauthenticated: 401,
@@ -116,8 +104,8 @@ class Problem(EigenheadError):
         self.status, self.kind, self.detail = status, kind, self.message
         self.errors, self.headers = tuple(message_of(error) for error in errors), dict(headers or {})
 
-    def document(self) -> ProblemDocument:
-        """Returns the problem as a JSON document of RFC 9457."""
+    def document(self) -> dict[str, Any]:
+        """Returns the problem as a JSON document of RFC 9457, with the faults as texts and as messages."""
         return {
             "type": URN + self.kind,
             "title": PROBLEM_TYPES.get(self.kind, self.kind),
@@ -210,6 +198,13 @@ def _methods_of(routes: Sequence[APIRoute], path: str) -> list[str]:
     route."""
     fitting = [route for route in routes if route.path_regex.match(path)]
     return sorted({method for route in fitting if route.path == fitting[0].path for method in route.methods or ()})
+
+
+def sent_file(*media_types: str) -> Responses:
+    """Returns the OpenAPI ``responses`` of a route that sends a file: whole, in part, or not again."""
+    content = {media_type: {} for media_type in media_types}
+    partial = {"description": "Partial Content", "content": content}
+    return {200: {"content": content}, 206: partial, 304: {"description": "Not Modified"}}
 
 
 def documented(*statuses: int) -> Responses:

@@ -57,7 +57,7 @@ from server.storage.database import AWAY, events, now_sql, open_database, worker
 from server.storage.events import END, EventLog
 from server.storage.folders import move_durably
 from server.storage.job_index import RUNNING, engine_jobs
-from server.storage.records import CalibrationOutcome, EventDocument, FileEntry, JobRequest, JobWebhook, WebhookMessage
+from server.storage.records import EventDocument, FileEntry, JobRequest, JobWebhook, JsonObject, WebhookMessage
 from server.storage.store import Store
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import DISK_FULL, ChildProcessPool, WorkerContext, WorkFailed, function_at
@@ -101,7 +101,17 @@ class Worker:
     def start(self) -> None:
         """Writes the first heartbeat, starts the job engine and takes jobs. Returns at once; jobs run in threads."""
         DBOS.migrate(system_database_url=self.settings.url)
-        DBOS(config=engine_config(self.settings, self.id))
+        config: DBOSConfig = {
+            "name": APPLICATION,
+            "system_database_url": self.settings.url,
+            "application_version": APPLICATION_VERSION,
+            "executor_id": self.id,
+            "enable_otlp": False,
+            "log_level": "WARNING",
+            "notification_listener_polling_interval_sec": 1.0,
+            "serializer": SERIALIZER,
+        }
+        DBOS(config=config)
         self._register()
         self._deliverer.register()
         DBOS.listen_queues([self.settings.queue, WEBHOOKS_QUEUE, DELIVERIES_QUEUE])
@@ -134,12 +144,6 @@ class Worker:
     def stop(self) -> None:
         """Makes ``run_until_stopped`` end the process, within half a second."""
         self._stop.set()
-
-    def enqueue_delivery_of(self, job_id: str, request: JobRequest) -> None:
-        """Enqueues the delivery of a job's result, if the request asks for one."""
-        if "deliver_to" in request:
-            place, hook = request["deliver_to"], request.get("webhook")
-            enqueue_delivery(DBOS.enqueue_workflow_with_options, job_id, place, self.settings, hook)
 
     def _register(self) -> None:
         worker = self
@@ -176,7 +180,9 @@ class Worker:
                     raise
                 worker.outcomes.publish(job_id, "succeeded", request.get("webhook"))
                 worker._captures.leave(job_id, request["capture_id"])
-                worker.enqueue_delivery_of(job_id, request)
+                if "deliver_to" in request:
+                    place, hook = request["deliver_to"], request.get("webhook")
+                    enqueue_delivery(DBOS.enqueue_workflow_with_options, job_id, place, worker.settings, hook)
                 return files
 
         @DBOS.step(name="post", retries_allowed=True, interval_seconds=2.0, backoff_rate=2.0, max_attempts=9)
@@ -189,12 +195,12 @@ class Worker:
             return post(message)
 
         @DBOS.step(name="calibrate")
-        def calibrate(identity: str) -> CalibrationOutcome:
+        def calibrate(identity: str) -> JsonObject:
             return worker.calibrate(identity)
 
         @DBOS.workflow(name=calibrations.WORKFLOW, max_recovery_attempts=self.settings.attempts)
         @self._noted()
-        def calibrate_rig(identity: str) -> CalibrationOutcome:
+        def calibrate_rig(identity: str) -> JsonObject:
             return calibrate(identity)
 
         del reconstruct_job, deliver, calibrate_rig  # known to the engine by name
@@ -285,7 +291,7 @@ class Worker:
         if self._work is reconstruct_capture:  # how long another work takes says nothing of this one
             self._durations.learn(chosen, progress.finish(), megapixels)
 
-    def calibrate(self, identity: str) -> CalibrationOutcome:
+    def calibrate(self, identity: str) -> JsonObject:
         """Computes one calibration in a child process and returns its outcome. The result is written under a temporary
         name and renamed at the end. Pictures of a scene are removed then, and also after a failure that no repetition
         would mend (JobFailed)."""
@@ -383,19 +389,24 @@ class Worker:
         """Puts the jobs of dead workers, and lost ones of this one, back. Idempotent, and safe for any number of
         workers at once."""
         dead = dead_workers(self.engine, self.settings.silent_s, except_id=self.id)
-        for job_id in [*take_over(self.engine, dead), *take_back(self.engine, self.id, self._find_lost())]:
+        for job_id in [*take_over(self.engine, dead), *self._take_back_lost()]:
             log.warning("job taken over", job=job_id)
             self.events.append(job_id, {"state": "queued", "stage": "queued", "progress": 0.0, "eta_s": None})
         with self.engine.begin() as connection:
             old = sa.and_(workers.c.id.in_(dead), workers.c.seen < now_sql(connection) - FORGET_S)
             connection.execute(sa.delete(workers).where(old))
 
-    def _find_lost(self) -> list[str]:
-        """Lists the workflows that the engine gave to this worker and in which nothing runs for ``LOST_S`` seconds: how
-        they ended could not be written, as on a disk that was full."""
-        now, held = time.monotonic(), held_by(self.engine, self.id, (WORKFLOW, DELIVERY, calibrations.WORKFLOW))
-        self._idle = {job: self._idle.get(job, now) for job in held if job not in self._here}
-        return [job for job, since in self._idle.items() if now - since >= LOST_S]
+    def _take_back_lost(self) -> list[str]:
+        """Puts the workflows that the engine gave to this worker, and in which nothing runs for ``LOST_S`` seconds,
+        back into their queues: how they ended could not be written, as on a disk that was full. Returns their ids."""
+        job = engine_jobs(self.engine)
+        names = job.c.name.in_((WORKFLOW, DELIVERY, calibrations.WORKFLOW))
+        mine = sa.and_(job.c.status == RUNNING, job.c.executor_id == self.id, names)
+        with self.engine.connect() as connection:
+            held, now = [*connection.scalars(sa.select(job.c.workflow_uuid).where(mine))], time.monotonic()
+        self._idle = {each: self._idle.get(each, now) for each in held if each not in self._here}
+        lost = [each for each, since in self._idle.items() if now - since >= LOST_S]
+        return _put_back(self.engine, job, sa.and_(mine, job.c.workflow_uuid.in_(lost))) if lost else []
 
 
 class _StateWatch:
@@ -436,20 +447,6 @@ def _stop_at_eof(stop: Callable[[], None]) -> None:
     stop()
 
 
-def engine_config(settings: ServiceSettings, executor_id: str) -> DBOSConfig:
-    """Returns the job engine's configuration for the worker ``executor_id``."""
-    return {
-        "name": APPLICATION,
-        "system_database_url": settings.url,
-        "application_version": APPLICATION_VERSION,
-        "executor_id": executor_id,
-        "enable_otlp": False,
-        "log_level": "WARNING",
-        "notification_listener_polling_interval_sec": 1.0,
-        "serializer": SERIALIZER,
-    }
-
-
 def dead_workers(engine: sa.Engine, silent_s: float, except_id: str = "") -> list[str]:
     """Lists the ids of dead workers: those that stopped, whose process on this machine is gone, or that sent no
     heartbeat for ``silent_s`` seconds. ``except_id`` is never listed."""
@@ -475,21 +472,6 @@ def take_over(engine: sa.Engine, dead: Collection[str]) -> list[str]:
         known = {*connection.scalars(sa.select(workers.c.id))}  # asked second: a worker that begins now is no stray
     gone = {*dead, *holders - known} & holders
     return _put_back(engine, job, job.c.executor_id.in_(gone)) if gone else []
-
-
-def take_back(engine: sa.Engine, executor_id: str, lost: Collection[str]) -> list[str]:
-    """Puts workflows of a living worker, in which nothing runs any more, back into their queues, as ``take_over``."""
-    job = engine_jobs(engine)
-    which = sa.and_(job.c.executor_id == executor_id, job.c.workflow_uuid.in_(lost))
-    return _put_back(engine, job, which) if lost else []
-
-
-def held_by(engine: sa.Engine, executor_id: str, names: Collection[str]) -> list[str]:
-    """Lists the ids of the running workflows of these names that a worker holds."""
-    job = engine_jobs(engine).c
-    query = sa.select(job.workflow_uuid).where(job.status == RUNNING, job.executor_id == executor_id)
-    with engine.connect() as connection:
-        return [*connection.scalars(query.where(job.name.in_(names)))]
 
 
 def _put_back(engine: sa.Engine, job: sa.TableClause, which: sa.ColumnElement[bool]) -> list[str]:

@@ -43,9 +43,6 @@ class Silent:
     def begin(self, pending: int) -> None:
         self.pending = pending
 
-    def start(self, name: str) -> None:
-        self.events.append(("start", name))
-
     def report(self, name: str, share: float) -> None:
         assert 0 <= share <= 1
 

@@ -2,13 +2,13 @@
 sheet."""
 
 from collections.abc import Callable, Mapping
-from typing import TypedDict, cast, get_args
+from typing import cast, get_args
 
 from rig.messages.message import Message, compose, documents_of
 from server.batch.table import has_parquet
-from server.console.page import Action, Chosen, Page, serve_page, shared
-from server.console.pages.jobs import listed_jobs
-from server.services.batches import BatchRequest, Selection
+from server.console.page import Action, Page, serve_page, shared
+from server.console.pages.jobs import capture_of
+from server.services.batches import BatchRequest
 from server.services.job_rows import STATUSES
 from server.services.service import Service
 from server.services.work import ReconstructionRequest
@@ -19,15 +19,6 @@ from server.storage.records import JsonObject
 SHOWN = 50
 FAILED_SHOWN = 20  # of the batch that is looked at; the page Jobs has all
 ASKED = ("find", "state", "after")
-
-
-class BatchForm(TypedDict):
-    """Holds the form of a new batch: what the captures' labels begin with, the batch's label, and the level of detail
-    (empty: the default)."""
-
-    prefix: str
-    label: str
-    detail: str
 
 
 class BatchesPage(Page, component="batches.js"):
@@ -63,31 +54,35 @@ def failed_jobs(service: Service, batch: str) -> list[JsonObject]:
 
     def make() -> list[JsonObject]:
         failed = service.jobs.page(JobQuery("", STATUSES["failed"], batch=batch), FAILED_SHOWN).items
-        listed = listed_jobs(service, failed)
         return [
-            {"id": one.job.id, "capture": one.capture, "why": documents_of(error.errors or (error.detail,))}
-            for one in listed
-            if (error := one.job.error) is not None
+            {
+                "id": job.id,
+                "capture": capture_of(service, job)["capture"],
+                "why": documents_of(error.errors or (error.detail,)),
+            }
+            for job in failed
+            if (error := job.error) is not None
         ]
 
     return shared.get(("failed of batch", batch), 1.0, make)
 
 
-def begin(page: Page, event: BatchForm) -> Message:
-    """Begins the batch of a form and selects it. Raises what ``Batches.submit`` raises."""
+def begin(page: Page, event: JsonObject) -> Message:
+    """Begins a batch of the captures whose labels begin with ``prefix``, and selects it. ``detail`` is empty for the
+    default. Raises what ``Batches.submit`` raises."""
     settings = {"detail": event["detail"]} if event["detail"] else {}
-    wanted = BatchRequest(Selection(prefix=event["prefix"]), ReconstructionRequest(None, settings), event["label"])
+    wanted = BatchRequest(ReconstructionRequest(None, settings), prefix=event["prefix"], label=event["label"])
     batch = page.service.batches.submit(wanted, key=page.caller.key)
     shared.forget("batches")
     page.choice["batch"] = batch.id
     return compose("batch-begun", count=batch.total)
 
 
-def changes(change: Callable[[Service, str], object]) -> Callable[[Page, Chosen], None]:
+def changes(change: Callable[[Service, str], object]) -> Callable[[Page, JsonObject], None]:
     """Makes the function of an action that changes a batch and refreshes the lists. ``change`` gets the service and the
     batch's id."""
 
-    def act(page: Page, event: Chosen) -> None:
+    def act(page: Page, event: JsonObject) -> None:
         change(page.service, event["id"])
         shared.forget("batches", "failed of batch")
 

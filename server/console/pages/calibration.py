@@ -2,12 +2,11 @@
 
 import threading
 from collections.abc import Mapping
-from typing import NotRequired, TypedDict
 
 from rig.errors import InputError
 from rig.messages.message import Message, compose
 from server.console.coverage import Corners, advice, detect_shot, summary
-from server.console.page import Action, Chosen, Page, remove_later, serve_page, shared, shown_failure
+from server.console.page import Action, Page, remove_later, serve_page, shared, shown_failure
 from server.console.removal import removals
 from server.errors import Conflict, InvalidInput
 from server.services.captures import CaptureMetadata
@@ -56,25 +55,6 @@ class Shots:
 shots = Shots()
 
 
-class BoardForm(TypedDict):
-    """Holds the form that describes the calibration board, with the keys of ``board.toml``."""
-
-    board: NotRequired[Mapping[str, object] | None]
-
-
-class CalibrateForm(TypedDict):
-    """Holds the label of a new calibration."""
-
-    label: NotRequired[str | None]
-
-
-class UseForm(Chosen):
-    """Holds the request to use a calibration. ``poor``: the operator has read what it lacks and uses it
-    nevertheless."""
-
-    poor: NotRequired[bool]
-
-
 class CalibrationPage(Page, component="calibration.js"):
     """Shows the shots of the board so far, and the list of calibrations with their reports."""
 
@@ -95,7 +75,11 @@ def calibration_state(service: Service) -> JsonObject:
     names = [camera.name for camera in rig.cameras]
     lines = summary(names, [corners for _, corners in shots.taken])
     return {
-        "calibrations": [calibration_line(c) for c in known_calibrations(service, 1.0) if c.id not in removals],
+        "calibrations": [
+            c.model_dump() | {"error": shown_failure(c.error)}
+            for c in known_calibrations(service, 1.0)
+            if c.id not in removals
+        ],
         "rig": {
             "kind": rig.kind,
             "calibration": rig.calibration,
@@ -108,12 +92,7 @@ def calibration_state(service: Service) -> JsonObject:
     }
 
 
-def calibration_line(calibration: CalibrationOut) -> Mapping[str, object]:
-    """Returns a calibration as JSON types, its failure as pages show it."""
-    return calibration.model_dump() | {"error": shown_failure(calibration.error)}
-
-
-def board_of(event: BoardForm) -> Mapping[str, object]:
+def board_of(event: JsonObject) -> Mapping[str, object]:
     """Reads the board that a form describes, as the content of a ``board.toml``. Raises InputError naming missing
     keys."""
     form = event.get("board") or {}
@@ -125,7 +104,7 @@ def board_of(event: BoardForm) -> Mapping[str, object]:
     return board
 
 
-def shoot(page: Page, event: BoardForm) -> Message:
+def shoot(page: Page, event: JsonObject) -> Message:
     """Takes a shot of the board and adds it to the collection. A shot in which no camera sees the board is removed.
 
     Raises InputError for an impossible board, Conflict if the collection shows a different one, InvalidInput if no
@@ -162,7 +141,7 @@ def start_over(page: Page, event: object) -> None:
     shared.forget("calibration page")
 
 
-def calibrate(page: Page, event: CalibrateForm) -> Message:
+def calibrate(page: Page, event: JsonObject) -> Message:
     """Queues a calibration from the collected shots and empties the collection. Raises InvalidInput for fewer than
     ``SHOTS_LEAST`` shots."""
     if len(shots.taken) < SHOTS_LEAST:
@@ -175,14 +154,15 @@ def calibrate(page: Page, event: CalibrateForm) -> Message:
     return compose("calibration-queued")
 
 
-def use(page: Page, event: UseForm) -> Message:
-    """Uses a calibration for every later capture. Raises NotFound, and Conflict as ``Service.use_calibration`` does."""
+def use(page: Page, event: JsonObject) -> Message:
+    """Uses a calibration for every later capture; with ``poor`` even one of which the operator has read what it lacks.
+    Raises NotFound, and Conflict as ``Service.use_calibration`` does."""
     page.service.use_calibration(event["id"], poor=event.get("poor", False))
     _forget()
     return compose("calibration-taken-into-use")
 
 
-def remove(page: Page, event: Chosen) -> None:
+def remove(page: Page, event: JsonObject) -> None:
     """Removes a calibration after the time to undo that has passed. Raises NotFound."""
     service, identity = page.service, event["id"]
     calibration = service.calibrations.get(identity)

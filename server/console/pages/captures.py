@@ -1,61 +1,163 @@
-"""The page Captures: the list, uploads, outlines over the images, jobs to start, and removal with undo."""
+"""The page Captures: the list, uploads, outlines over the images, jobs to start, and removal with undo.
 
-from collections.abc import Mapping
-from typing import NotRequired, TypedDict, cast, get_args
+What a form asks before a job is queued becomes a request here. A preset is a named choice of a job's settings; whoever
+needs other settings writes a settings document."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import cast, get_args
 
 from pipeline.head_model.model_names import list_models
-from rig.messages.message import Message, compose
-from server.console.capture_lines import capture_line, jobs_of, sessions_list
+from pipeline.settings import settings_from_document
+from rig.messages.message import Message, compose, documents_of
 from server.console.identity import permit
-from server.console.page import (
-    Action,
-    Chosen,
-    Page,
-    remove_all_later,
-    remove_later,
-    said_unless_refused,
-    serve_page,
-    shared,
-)
+from server.console.page import Action, Page, remove_all_later, remove_later, said_unless_refused, serve_page, shared
 from server.console.removal import removals
-from server.console.work_form import WorkForm, chosen_work, preset_lines, template_lines
+from server.errors import NotFound
 from server.services.bulk import each
+from server.services.records import SessionOut
 from server.services.service import Service
+from server.services.templates import templates_at_hand
 from server.services.texts import typed_tags
+from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureOrder, CaptureQuery
-from server.storage.records import JsonObject
+from server.storage.records import CaptureRecord, JsonObject
 
 SHOWN = 50  # captures of a page
 ASKED = ("find", "session", "verdict", "tag", "sort", "after", "capture")
+OF_RECORD = (
+    *("id", "created", "source", "label", "expression", "front"),
+    *("features", "bytes", "session", "board", "verdict"),
+)
+SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are found on the page Subjects
 
 
-class EditForm(Chosen):
-    """Holds changes to a capture. Fields that are left out stay; ``tags`` are separated by commas."""
-
-    label: NotRequired[str]
-    expression: NotRequired[str]
-    session: NotRequired[str | None]
-    tags: NotRequired[str]
-
-
-class SessionForm(TypedDict):
-    """Holds the label and the consent note of a session."""
-
-    label: NotRequired[str]
-    consent: NotRequired[str]
+def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JsonObject]]:
+    """Returns the jobs of each capture, newest first, with the progress (0 to 1) of those that run. Jobs that are being
+    removed are left out."""
+    found = service.jobs.of_captures(captures)
+    running = [job for jobs in found.values() for job, state in jobs if state == "running"]
+    progress = {job.id: job.progress for job in service.jobs.of(running)}
+    return {
+        capture: [
+            {"id": job, "state": state, "progress": progress.get(job)} for job, state in jobs if job not in removals
+        ]
+        for capture, jobs in found.items()
+    }
 
 
-class SessionEditForm(Chosen, SessionForm):
-    """Holds changes to a session. Fields that are left out stay."""
+def capture_line(record: CaptureRecord, jobs: list[JsonObject]) -> JsonObject:
+    """Converts a capture's record to an entry of a list. ``jobs``: the capture's jobs, as ``jobs_of`` returns them;
+    ``size``: of the first camera's pictures (px); ``sizes``: width and height by camera."""
+    return {
+        **{name: getattr(record, name) for name in OF_RECORD},
+        "cameras": [camera.name for camera in record.cameras],
+        "jobs": jobs,
+        "size": asdict(record.cameras[0]),
+        "sizes": {camera.name: (camera.width, camera.height) for camera in record.cameras},
+        "faults": [fault.document() for fault in record.faults],
+        "warnings": documents_of(record.warnings),
+        "sync": None if record.shot is None else sync_line(record.shot),
+        "tags": [*record.tags],
+    }
 
 
-class BulkForm(WorkForm):
-    """Holds one action on all captures ``ids``. ``id``: the session to move them to, empty for none; ``tags``:
-    separated by commas."""
+def sync_line(shot: Mapping[str, object]) -> JsonObject:
+    """Makes a sentence on how nearly the pictures of a shot show the same moment, and tells whether they do (``good``).
+    ``shot`` is its certificate."""
+    lines = sync_of(shot)
+    late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
+    if late:
+        return {"message": compose("not-in-sync", cameras=late).document(), "good": False}
+    spread_ms = cast(JsonObject, shot["sync"])["spread_ms"] if "sync" in shot else None
+    if spread_ms is None:
+        return {"message": compose("cameras-in-sync", count=len(lines)).document(), "good": True}
+    within = compose("cameras-in-sync-within", count=len(lines), spread_ms=spread_ms)
+    return {"message": within.document(), "good": True}
 
-    ids: list[str]
-    action: str
-    tags: NotRequired[str]
+
+def sync_of(shot: Mapping[str, object]) -> JsonObject:
+    """Returns the sync status and skew of each camera from the certificate of a shot, of a real rig or of the simulated
+    studio."""
+    return cast(JsonObject, shot.get("sync", shot)).get("cameras", {})
+
+
+def sessions_list(service: Service, chosen: str | None = None) -> list[JsonObject]:
+    """Returns the newest ``SESSIONS_SHOWN`` sessions, newest first, and the session ``chosen`` even if it is older."""
+
+    def make() -> list[SessionOut]:
+        return [*service.sessions.page(limit=SESSIONS_SHOWN).items]
+
+    sessions = shared.get("sessions", 0.5, make)
+    if chosen and all(session.id != chosen for session in sessions):
+        with suppress(NotFound):
+            sessions = [*sessions, service.sessions.get(chosen)]
+    return [session_line(session) for session in sessions]
+
+
+def session_line(session: SessionOut) -> JsonObject:
+    """Converts a session to an entry of a list. ``captures`` counts them, without those that are being removed."""
+    return session.model_dump() | {"captures": sum(capture not in removals for capture in session.captures)}
+
+
+@dataclass(frozen=True, slots=True)
+class Preset:
+    """Holds a preset: its title and explanation for people, and the settings document that it stands for. Raises
+    InputError for wrong settings."""
+
+    id: str
+    title: Message
+    explanation: Message
+    settings: Mapping[str, object]
+
+    def __post_init__(self) -> None:
+        settings_from_document(self.settings)
+
+
+PRESETS = (
+    Preset("", compose("preset-standard"), compose("preset-standard-explained"), {}),
+    Preset(
+        "quick",
+        compose("preset-quick"),
+        compose("preset-quick-explained"),
+        {"detail": "span", "outputs": {"surface": "head"}},
+    ),
+    Preset("head", compose("preset-head"), compose("preset-head-explained"), {"outputs": {"surface": "head"}}),
+    Preset(
+        "texture",
+        compose("preset-renderers"),
+        compose("preset-renderers-explained"),
+        {"outputs": {"formats": ["glb", "ply", "obj", "usdz"]}},
+    ),
+    Preset("simplex", compose("preset-paper"), compose("preset-paper-explained"), {"method": "simplex"}),
+)
+
+
+def settings_of(preset: str | None) -> Mapping[str, object]:
+    """Returns the settings of the preset with this id. None and an unknown id give those of the preset Standard."""
+    return next((known.settings for known in PRESETS if known.id == (preset or "")), {})
+
+
+def preset_lines() -> list[JsonObject]:
+    """Converts all presets to entries of a form's list."""
+    return [{"id": p.id, "title": p.title.document(), "explanation": p.explanation.document()} for p in PRESETS]
+
+
+def template_lines() -> list[JsonObject]:
+    """Converts the templates whose model is at hand to entries of a form's list."""
+    return [
+        {"name": template.name, "models": list(template.models)} for template in templates_at_hand() if template.models
+    ]
+
+
+def chosen_work(event: JsonObject) -> ReconstructionRequest:
+    """Returns the request that a form describes: model, preset (``method``) and template. What is not chosen is left to
+    the service's defaults."""
+    settings, template = dict(settings_of(event.get("method"))), event.get("template")
+    if template:
+        settings["outputs"] = cast(dict[str, object], settings.get("outputs", {})) | {"template": template}
+    return ReconstructionRequest(event.get("model") or None, settings)
 
 
 class CapturesPage(Page, component="captures.js"):
@@ -98,14 +200,14 @@ def captures_state(service: Service, requested: Mapping[str, str | None]) -> Jso
     }
 
 
-def reconstruct(page: Page, event: WorkForm) -> Message:
+def reconstruct(page: Page, event: JsonObject) -> Message:
     """Queues a job for a capture; its head opens when it is ready. Raises what ``Jobs.submit`` raises."""
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
     page.started(job.id, opens=True)
     return compose("job-queued-watch", job=job.id[-6:])
 
 
-def reconstruct_session(page: Page, event: WorkForm) -> Message:
+def reconstruct_session(page: Page, event: JsonObject) -> Message:
     """Queues a job for every capture of a session that shows a head. Raises what ``Jobs.submit_session`` raises."""
     work = chosen_work(event)
     jobs = page.service.jobs.submit_session(event["id"], work, key=page.caller.key, priority=100)
@@ -121,43 +223,44 @@ def sample(page: Page, event: object) -> Message:
     return compose("sample-taken")
 
 
-def edit(page: Page, event: EditForm) -> None:
-    """Changes label, expression, session or tags of a capture. Raises NotFound and InputError."""
+def edit(page: Page, event: JsonObject) -> None:
+    """Changes label, expression, session or tags (with commas between) of a capture; what the form lacks stays. Raises
+    NotFound and InputError."""
     changes: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
     tags = typed_tags(event["tags"]) if "tags" in event else None
     page.service.captures.edit(event["id"], changes, tags=tags)
     forget_captures()
 
 
-def new_session(page: Page, event: SessionForm) -> Message:
+def new_session(page: Page, event: JsonObject) -> Message:
     """Makes a session. Raises InputError for invalid texts."""
     session = page.service.sessions.add(event.get("label", ""), event.get("consent", ""))
     forget_captures()
     return compose("session-begun", name=session.label or session.id[-6:])
 
 
-def edit_consent(page: Page, event: SessionEditForm) -> None:
+def edit_consent(page: Page, event: JsonObject) -> None:
     """Changes the label or the consent note of a session. Raises NotFound and InputError."""
     changes = {name: str(event.get(name) or "") for name in ("label", "consent") if name in event}
     page.service.sessions.edit(event["id"], label=changes.get("label"), consent=changes.get("consent"))
     forget_captures()
 
 
-def erase(page: Page, event: Chosen) -> Message:
+def erase(page: Page, event: JsonObject) -> Message:
     """Erases a session for good, without undo, as ``Sessions.erase`` does. Raises NotFound and Unavailable."""
     page.service.sessions.erase(event["id"])
     shared.clear()  # reports of its heads among them
     return compose("session-erased")
 
 
-def erase_capture(page: Page, event: Chosen) -> Message:
+def erase_capture(page: Page, event: JsonObject) -> Message:
     """Erases a capture for good, without undo, as ``Captures.erase`` does. Raises NotFound and Unavailable."""
     page.service.captures.erase(event["id"])
     shared.clear()
     return compose("capture-erased")
 
 
-def discard(page: Page, event: Chosen) -> None:
+def discard(page: Page, event: JsonObject) -> None:
     """Removes a capture after the time to undo that has passed; the message says how many heads stay. Raises NotFound,
     and Conflict while a queued or running job needs it."""
     service, identity = page.service, event["id"]
@@ -169,9 +272,9 @@ def discard(page: Page, event: Chosen) -> None:
     remove_later(identity, lambda: service.captures.remove(identity), title, "capture")
 
 
-def bulk(page: Page, event: BulkForm) -> Message | None:
-    """Does one action to all ticked captures. Where it is refused for some, the others are done, and InvalidInput is
-    raised with the reasons."""
+def bulk(page: Page, event: JsonObject) -> Message | None:
+    """Does one ``action`` to all ticked captures, ``ids``. ``id``: the session to move them to, empty for none. Where
+    it is refused for some, the others are done, and InvalidInput is raised with the reasons."""
     service, ids, action = page.service, event["ids"], event["action"]
     if action == "reconstruct":
         permit(page.caller, "submit")
@@ -214,8 +317,8 @@ def said_of(action: str, count: int) -> Message:
 
 
 def forget_captures() -> None:
-    """Drops the cached lists that show captures, sessions, tags or subjects."""
-    shared.forget("captures", "sessions", "tags", "subjects")
+    """Drops what is cached of captures, sessions, tags and subjects."""
+    shared.forget("captures", "sessions", "tags", "subjects", "rig")
 
 
 CapturesPage.actions = {

@@ -7,15 +7,13 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import NotRequired, TypedDict
 
 import numpy as np
 
 from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS
 from rig.messages.message import Message, MessageDocument, compose
-from server.console.found_faces import found_faces
 from server.console.guides import Guides, mean_landmarks, nearest_views
-from server.console.media import rig_of
+from server.console.media import found_faces, rig_of
 from server.console.page import Action, Page, serve_page, shared
 from server.console.removal import removals
 from server.errors import Conflict, InvalidInput
@@ -28,27 +26,6 @@ from server.tasks.ingest import Points
 
 VIEWS = 4
 CHOICES = 100  # captures to choose from; the page Captures leads to all
-
-
-class Place(TypedDict):
-    """Holds where a point is set in one view. ``at``: its pixel; None removes the point there."""
-
-    point: str
-    camera: str
-    at: list[float] | None
-
-
-class Sure(TypedDict):
-    """Holds whether the operator has confirmed points that contradict each other."""
-
-    sure: NotRequired[bool]
-
-
-class SuggestedPlaces(TypedDict):
-    """Selects suggestions: of one point in one view, of one point in all views, or all."""
-
-    point: NotRequired[str]
-    camera: NotRequired[str]
 
 
 @dataclass(slots=True)
@@ -186,8 +163,8 @@ class Landmarks:
 landmarks = Landmarks()
 
 
-def place(page: FeaturesPage, event: Place) -> None:
-    """Sets one point in one view, or removes it there if ``at`` is None. Nothing is saved yet."""
+def place(page: FeaturesPage, event: JsonObject) -> None:
+    """Sets one ``point`` in the view of one ``camera``, or removes it there if ``at`` is None. Nothing is saved yet."""
     picked = page.of_capture()
     points = {name: dict(views) for name, views in picked.points.items()}
     views = points.setdefault(event["point"], {})
@@ -211,21 +188,22 @@ def suggest(page: FeaturesPage, event: object) -> Message:
     return compose("points-suggested", count=sum(len(views) for views in picked.suggested.values()))
 
 
-def accept(page: FeaturesPage, event: SuggestedPlaces) -> None:
-    """Turns the selected suggestions into points, which are saved like all others."""
+def accept(page: FeaturesPage, event: JsonObject) -> None:
+    """Turns suggestions into points: of one ``point`` in one ``camera``, of one point, or all. They are saved like all
+    others."""
     picked = page.of_capture()
     picked.points = take_suggestions(picked.points, picked.suggested, event.get("point"), event.get("camera"))
     picked.suggested = open_suggestions(picked.suggested, picked.points)
     drafts.keep(page.caller.key, picked)
 
 
-def reject(page: FeaturesPage, event: SuggestedPlaces) -> None:
+def reject(page: FeaturesPage, event: JsonObject) -> None:
     """Drops the selected suggestions without setting points."""
     picked = page.of_capture()
     picked.suggested = drop_suggestions(picked.suggested, event.get("point"), event.get("camera"))
 
 
-def save(page: FeaturesPage, event: Sure) -> Message | None:
+def save(page: FeaturesPage, event: JsonObject) -> Message | None:
     """Stores the points of the page. If views contradict each other, nothing is stored and None is returned until the
     event comes again with ``sure``. Raises what ``Captures.put_features`` raises."""
     picked = page.of_capture()
@@ -246,7 +224,7 @@ def contradictions(page: FeaturesPage) -> Mapping[str, MessageDocument]:
     return picked.guides.helps(pixels, {}, [])["contradictions"]
 
 
-def reconstruct(page: FeaturesPage, event: Sure) -> Message | None:
+def reconstruct(page: FeaturesPage, event: JsonObject) -> Message | None:
     """Saves the points if needed, and queues a job for the capture. Returns None without a job if contradictions must
     be confirmed first."""
     picked = page.of_capture()

@@ -1,16 +1,14 @@
 """The page Jobs: the queue, progress, log, cancel, restart with other settings, and the figures of a finished job."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from typing import NotRequired, TypedDict, cast, get_args
+from collections.abc import Callable, Mapping
+from typing import cast, get_args
 
 from pipeline.head_model.model_names import list_models
 from rig.errors import InputError
 from rig.messages.message import Message, compose
 from server.console.page import (
     Action,
-    Chosen,
     Page,
     remove_all_later,
     remove_later,
@@ -39,38 +37,6 @@ ASKED = ("find", "state", "sort", "batch", "after")
 LOG_LINES = 200
 
 
-class SettingsForm(TypedDict, total=False):
-    """Holds the settings of a form. ``more``: further settings as a JSON object."""
-
-    method: str
-    detail: str
-    front: str
-    more: str | None
-
-
-class BulkForm(TypedDict):
-    """Holds one action (cancel, restart, remove) on all jobs ``ids``."""
-
-    ids: list[str]
-    action: str
-
-
-class RestartForm(Chosen, SettingsForm):
-    """Holds the job to restart, and the settings and model of the new one."""
-
-    model: NotRequired[str | None]
-
-
-@dataclass(frozen=True, slots=True)
-class ListedJob:
-    """Holds a job with the label, time and session of its capture."""
-
-    job: JobOut
-    capture: str
-    captured: str | None
-    session: str | None = None
-
-
 class JobsPage(Page, component="jobs.js"):
     """Shows the list of jobs, and the selected one with its log and, once it has finished, its figures."""
 
@@ -83,9 +49,7 @@ class JobsPage(Page, component="jobs.js"):
         chosen = self.choice.get("job")
         known = next((job for job in state["jobs"] if job["id"] == chosen), None)
         if known is None and chosen and chosen not in removals:
-            known = next(
-                (job_line(listed) for listed in listed_jobs(self.service, self.service.jobs.of([chosen]))), None
-            )
+            known = next((job_line(self.service, job) for job in self.service.jobs.of([chosen])), None)
         job = known or first
         return {**state, "job": job, "detail": None if job is None else job_detail(self.service, job["id"])}
 
@@ -104,7 +68,7 @@ def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JsonObj
     page = service.jobs.page(JobQuery(sought, statuses, batch=batch, order=order), SHOWN, after)
     jobs = [job for job in (*before, *page.items) if job.id not in removals]
     return {
-        "jobs": [job_line(listed) for listed in listed_jobs(service, jobs)],
+        "jobs": [job_line(service, job) for job in jobs],
         "counts": shared.get("job counts", 1.0, service.jobs.counts),
         "waiting": waiting,
         "next": page.next,
@@ -122,22 +86,17 @@ def active_jobs(service: Service, sought: str, batch: str | None, *, running: bo
     return jobs[:SHOWN], matching.total - min(SHOWN, len(jobs))
 
 
-def listed_jobs(service: Service, jobs: Iterable[JobOut]) -> list[ListedJob]:
-    """Adds to each job the label, time and session of its capture, as far as the capture exists."""
-    found = []
-    for job in jobs:
-        capture = next(iter(service.captures.of([job.capture_id or ""])), None)
-        if capture is None:
-            found.append(ListedJob(job, "", None, job.session))
-        else:
-            found.append(ListedJob(job, capture.label, capture.created, capture.session))
-    return found
+def capture_of(service: Service, job: JobOut) -> JsonObject:
+    """Returns label (``capture``), time (``captured``) and session of a job's capture, as far as that exists."""
+    for record in service.captures.of([job.capture_id or ""]):
+        return {"capture": record.label, "captured": record.created, "session": record.session}
+    return {"capture": "", "captured": None, "session": job.session}
 
 
-def job_line(listed: ListedJob) -> JsonObject:
+def job_line(service: Service, job: JobOut) -> JsonObject:
     """Converts a job to an entry of the page's list: its fields, with the label and time of its capture."""
-    line = listed.job.model_dump(exclude={"files"}) | {"error": shown_failure(listed.job.error)}
-    return {**line, "capture": listed.capture, "captured": listed.captured}
+    line = job.model_dump(exclude={"files"}) | {"error": shown_failure(job.error)}
+    return capture_of(service, job) | line
 
 
 def job_detail(service: Service, job_id: str) -> JsonObject:
@@ -173,7 +132,7 @@ def log_lines(events: list[JobEvent]) -> list[JsonObject]:
     return lines
 
 
-def restart(page: Page, event: RestartForm) -> Message:
+def restart(page: Page, event: JsonObject) -> Message:
     """Queues a new job for the capture of an earlier one, and selects it. Raises what ``Jobs.restart`` raises."""
     wanted = ReconstructionRequest(event.get("model") or None, chosen_settings(event))
     job = page.service.jobs.restart(event["id"], wanted, key=page.caller.key)
@@ -182,9 +141,9 @@ def restart(page: Page, event: RestartForm) -> Message:
     return compose("job-queued", job=job.id[-6:])
 
 
-def chosen_settings(event: SettingsForm) -> Mapping[str, object]:
-    """Reads the settings of a form: method, detail, front, and further ones from a JSON text. Raises InputError if that
-    text is no JSON object."""
+def chosen_settings(event: JsonObject) -> Mapping[str, object]:
+    """Reads the settings of a form: method, detail, front, and further ones from the JSON text ``more``. Raises
+    InputError if that text is no JSON object."""
     try:
         settings = json.loads(event.get("more") or "{}")
     except ValueError as error:
@@ -194,21 +153,22 @@ def chosen_settings(event: SettingsForm) -> Mapping[str, object]:
     return settings | {key: event.get(key) for key in ("method", "detail", "front") if event.get(key)}
 
 
-def cancel(page: Page, event: Chosen) -> None:
+def cancel(page: Page, event: JsonObject) -> None:
     """Cancels a job. A finished one stays as it is. Raises NotFound."""
     page.service.cancel(event["id"])
 
 
-def delete(page: Page, event: Chosen) -> None:
+def delete(page: Page, event: JsonObject) -> None:
     """Removes a job with its result after the time to undo that has passed. Raises NotFound."""
     service, identity = page.service, event["id"]
     service.jobs.get(identity)
     remove_later(identity, lambda: service.jobs.delete(identity), compose("job-named", job=identity[-6:]), "submit")
 
 
-def bulk(page: Page, event: BulkForm) -> Message:
-    """Does one action to all ticked jobs. Where it is refused for some, the others are done, and InvalidInput is raised
-    with the reasons. Raises Conflict if none of those to be removed has ended."""
+def bulk(page: Page, event: JsonObject) -> Message:
+    """Does one ``action`` (cancel, restart, remove) to all ticked jobs, ``ids``. Where it is refused for some, the
+    others are done, and InvalidInput is raised with the reasons. Raises Conflict if none of those to be removed has
+    ended."""
     service, action = page.service, event["action"]
     if action == "remove":
         ended = [job.id for job in service.jobs.of(event["ids"]) if job.state in FINISHED]

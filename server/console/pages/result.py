@@ -8,7 +8,7 @@ from nicegui.elements import scene
 
 from pipeline.results.report_types import Report
 from server.console.page import Page, serve_page, shared
-from server.console.pages.jobs import ListedJob, listed_jobs
+from server.console.pages.jobs import capture_of
 from server.console.pages.rig import read_report
 from server.console.removal import removals
 from server.errors import NotFound
@@ -22,6 +22,7 @@ THREE_JS = Path(scene.__file__).with_name("dist")  # NiceGUI's own bundle of thr
 MOSTLY = 0.25  # of a contour, as on the page Jobs
 SHOWN = 60  # heads to choose from; the search finds the others
 SUBJECTS_HEADS = 100
+OF_JOB = {"id", "capture_id", "created", "finished", "settings", "model"}
 
 
 class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS)}):
@@ -76,23 +77,17 @@ def heads_of_subject(service: Service, head: JsonObject) -> list[JsonObject]:
 
 
 def result_lines(service: Service, jobs: Iterable[JobOut]) -> list[JsonObject]:
-    """Converts jobs that have a result to entries of the page's list, with the capture and the subject of each."""
-    files = []
-    for listed in listed_jobs(service, jobs):
+    """Converts jobs that have a result to entries of the page's list, each with label and time of its capture
+    (``capture``, ``captured``) and the name of its ``subject``."""
+    lines = []
+    for job in jobs:
+        line, of_capture = job.model_dump(include=OF_JOB), capture_of(service, job)
         subject = ""
-        if listed.session:
+        if of_capture["session"]:
             with suppress(NotFound):
-                subject = service.store.session(listed.session).label
-        files.append(result_line(listed, subject))
-    return files
-
-
-def result_line(listed: ListedJob, subject: str) -> JsonObject:
-    """Converts a job that has a result to an entry of the page's list. ``capture`` and ``captured``: label and time of
-    its capture; ``subject``: name of the subject."""
-    names = ("id", "capture_id", "created", "finished", "settings", "model")
-    line = {name: getattr(listed.job, name) for name in names}
-    return line | {name: getattr(listed, name) for name in ("capture", "captured", "session")} | {"subject": subject}
+                subject = service.store.session(of_capture["session"]).label
+        lines.append(line | of_capture | {"subject": subject})
+    return lines
 
 
 def head_of(service: Service, job: JsonObject) -> JsonObject:

@@ -9,15 +9,21 @@ from typing import cast
 from pipeline.results.report_types import Report
 from rig.acquisition.plates import PlatesVersion
 from rig.messages.message import Message, compose, documents_of
-from server.console.capture_lines import capture_line, sessions_list, sync_of
 from server.console.media import live_view
-from server.console.page import Action, Chosen, Page, serve_page, shared, shown_detail
-from server.console.pages.captures import SessionEditForm, SessionForm, discard, edit_consent, new_session
+from server.console.page import Action, Page, serve_page, shared, shown_detail
+from server.console.pages.calibration import known_calibrations
+from server.console.pages.captures import (
+    capture_line,
+    chosen_work,
+    discard,
+    edit_consent,
+    new_session,
+    sessions_list,
+    sync_of,
+)
 from server.console.removal import removals
-from server.console.work_form import WorkForm, chosen_work
 from server.errors import Conflict, NotFound
 from server.services.captures import CaptureMetadata
-from server.services.records import CalibrationOut
 from server.services.service import Service
 from server.storage.records import JsonObject
 
@@ -101,8 +107,7 @@ def calibration_in_use(service: Service) -> JsonObject | None:
     service did not make it."""
     if service.calibrations.in_use() is None:
         return None
-    known: list[CalibrationOut] = shared.get("calibrations", 2.0, service.calibrations.find)
-    used = next((one for one in known if one.in_use), None)
+    used = next((one for one in known_calibrations(service, 2.0) if one.in_use), None)
     return used and {"label": used.label, "created": used.created, "rms_px": used.figures.get("rms_px")}
 
 
@@ -144,14 +149,14 @@ def keep(page: Page, event: object) -> None:
     page.choice["shot"] = None
 
 
-def retake(page: Page, event: Chosen) -> None:
+def retake(page: Page, event: JsonObject) -> None:
     """Removes the shot that was shown for a decision, after the time to undo that. The page then counts down to the
     next one."""
     discard(page, event)
     page.choice["shot"] = None
 
 
-def reconstruct_shot(page: Page, event: WorkForm) -> Message:
+def reconstruct_shot(page: Page, event: JsonObject) -> Message:
     """Keeps the shot and queues a job for it, whose head opens when it is ready. Raises what ``Jobs.submit`` raises."""
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
     page.choice |= {"shot": None, "job": job.id}
@@ -174,24 +179,11 @@ def plates(page: Page, event: object) -> Message | None:
     return compose("plates-taken-note", plates=taken.plates, cameras=len(taken.cameras), note=taken.note)
 
 
-def use_plates(page: Page, event: Chosen) -> Message:
+def use_plates(page: Page, event: JsonObject) -> Message:
     """Puts a version of the clean plates to use. Raises NotFound and Unavailable."""
     page.service.rig.use_plates(event["id"])
     shared.forget("rig")
     return compose("plates-taken-into-use")
-
-
-def begin_session(page: Page, event: SessionForm) -> Message:
-    """Makes a session, which the page selects. Raises InputError for invalid texts."""
-    notice = new_session(page, event)
-    shared.forget("rig")
-    return notice
-
-
-def note_consent(page: Page, event: SessionEditForm) -> None:
-    """Changes the label or the consent note of a session. Raises NotFound and InputError."""
-    edit_consent(page, event)
-    shared.forget("rig")
 
 
 RigPage.actions = {
@@ -199,8 +191,8 @@ RigPage.actions = {
     "plates": Action("capture", plates),
     "use_plates": Action("capture", use_plates),
     "keep": Action("read", keep),
-    "new_session": Action("capture", begin_session),
-    "edit_session": Action("capture", note_consent),
+    "new_session": Action("capture", new_session),
+    "edit_session": Action("capture", edit_consent),
     "retake": Action("capture", retake),
     "reconstruct": Action("submit", reconstruct_shot),
 }

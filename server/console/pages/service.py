@@ -1,13 +1,12 @@
 """The page about the service itself: API keys, what is kept and removed next, and what lies on the disk."""
 
 from datetime import UTC, datetime
-from typing import TypedDict
 
 from nicegui.events import GenericEventArguments
 
 from rig.errors import InputError
 from rig.messages.message import Message, compose
-from server.console.page import Action, Chosen, Page, remove_all_later, serve_page, shared
+from server.console.page import Action, Page, remove_all_later, serve_page, shared
 from server.errors import Conflict
 from server.services.keys import LOCAL, SCOPES, Caller
 from server.services.retention import clear_caches, sweep, upcoming
@@ -31,13 +30,6 @@ MEANINGS = {
 }
 
 
-class KeyForm(TypedDict):
-    """Holds the name and the scopes of a new API key."""
-
-    label: str
-    scopes: list[str]
-
-
 class ServicePage(Page, component="service.js"):
     """Shows API keys, retention and the use of the disk. The secret of a new key is sent over the page's socket once
     and is never part of the page's state."""
@@ -47,7 +39,7 @@ class ServicePage(Page, component="service.js"):
     def look(self) -> JsonObject:
         """Returns the state of the page. Only callers with the scope admin see the keys. ``open``: there are no API
         keys, so that whoever sits at this machine may do everything."""
-        admin, service = self.caller.may("admin"), self.service
+        admin, service, data = self.caller.may("admin"), self.service, str(self.service.store.data.resolve())
         return {
             "keys": [*key_lines(service, self.caller)] if admin else None,
             "open": self.caller.key == LOCAL,
@@ -55,7 +47,7 @@ class ServicePage(Page, component="service.js"):
             "admin": admin,
             "retention": setting_lines(service.settings),
             "upcoming": shared.get("upcoming", 5.0, lambda: [one.model_dump() for one in upcoming(service)]),
-            "storage": shared.get("storage", 2.0, lambda: storage_shown(service)),
+            "storage": shared.get("storage", 2.0, lambda: service.storage.use().model_dump()) | {"data": data},
         }
 
     async def _act(self, event: GenericEventArguments) -> None:
@@ -63,11 +55,6 @@ class ServicePage(Page, component="service.js"):
         if self.secret is not None:  # over the page's socket alone, and never in the state that a look makes
             self.run_method("show_key", self.secret)
             self.secret = None
-
-
-def storage_shown(service: Service) -> JsonObject:
-    """Returns how the disk is used, with the path of the data folder."""
-    return service.storage.use().model_dump() | {"data": str(service.store.data.resolve())}
 
 
 def key_lines(service: Service, caller: Caller) -> list[JsonObject]:
@@ -105,7 +92,7 @@ def _days(days: float | None) -> Message:
     return compose("for-ever") if days is None else compose("days", days=days)
 
 
-def add_key(page: ServicePage, event: KeyForm) -> Message:
+def add_key(page: ServicePage, event: JsonObject) -> Message:
     """Makes an API key. Raises InputError naming every fault of the form, and Forbidden where no key exists."""
     name, scopes = event["label"].strip(), [scope for scope in SCOPES if scope in event["scopes"]]
     faults = []
@@ -121,7 +108,7 @@ def add_key(page: ServicePage, event: KeyForm) -> Message:
     return compose("key-made", name=f"{name!r}")
 
 
-def revoke(page: ServicePage, event: Chosen) -> Message:
+def revoke(page: ServicePage, event: JsonObject) -> Message:
     """Removes an API key. Raises NotFound, and Conflict for the key that the caller uses."""
     if event["id"] == page.caller.key:
         raise Conflict("own-key", compose("own-key"))
@@ -156,11 +143,6 @@ def sweep_now(page: ServicePage, event: object) -> Message:
     return compose("swept", gone=removed or compose("nothing-due"))
 
 
-def count_again(page: ServicePage, event: object) -> None:
-    """Starts to count the bytes in the data folder anew."""
-    forget_storage(page.service)
-
-
 def forget_storage(service: Service) -> None:
     """Drops the cached figures of the disk and of what retention removes next, so that they are computed anew."""
     service.storage.forget()
@@ -173,7 +155,7 @@ ServicePage.actions = {
     "clear": Action("admin", clear),
     "remove_failed": Action("admin", remove_failed),
     "sweep": Action("admin", sweep_now),
-    "count": Action("read", count_again),
+    "count": Action("read", lambda page, event: forget_storage(page.service)),
 }
 
 

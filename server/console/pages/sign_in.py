@@ -9,7 +9,7 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
 from rig.messages.message import compose
-from server.console.identity import KEY_ID, service_of_pages, sign_in
+from server.console.identity import KEY_ID, service_of_pages
 from server.console.page import signed_in
 
 WRONG_PAUSE_S = 1.0  # after a key that is nobody's
@@ -24,7 +24,7 @@ class SignIn(Element, component="sign_in.js"):
         self.on("key", self._try)
 
     async def _try(self, event: GenericEventArguments) -> None:
-        caller = await anyio.to_thread.run_sync(sign_in, service_of_pages(), str(event.args)[:200])
+        caller = await anyio.to_thread.run_sync(service_of_pages().keys.caller, str(event.args)[:200].strip())
         if caller is None:
             await asyncio.sleep(WRONG_PAUSE_S)
             self.run_method("refuse", compose("no-such-key").document())

@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from typing import cast, get_args
 
-from rig.messages.message import Message
 from server.console.page import Action, Page, serve_page, shared
-from server.console.pages.captures import SessionForm, new_session
+from server.console.pages.captures import new_session
 from server.services.service import Service
 from server.storage.library import SubjectOrder
 from server.storage.records import JsonObject
@@ -38,14 +37,7 @@ def subjects_state(service: Service, requested: Mapping[str, str | None]) -> Jso
     }
 
 
-def begin(page: Page, event: SessionForm) -> Message:
-    """Makes a session of a subject. Raises InputError for invalid texts."""
-    notice = new_session(page, event)
-    shared.forget("subjects")
-    return notice
-
-
-SubjectsPage.actions = {"new_session": Action("capture", begin)}
+SubjectsPage.actions = {"new_session": Action("capture", new_session)}
 
 
 serve_page("subjects", SubjectsPage, choices=("find", "tag", "sort"), paths=("/subjects",))

@@ -23,7 +23,7 @@ from server.http.schemas import (
     example,
 )
 from server.services.answer import JobSettings
-from server.services.batches import PRIORITY, BatchRequest, Selection
+from server.services.batches import PRIORITY, BatchRequest
 from server.services.records import BatchOut
 from server.services.work import ReconstructionRequest
 from server.storage.batches import BatchState
@@ -69,8 +69,10 @@ def submit_batch(
     """Queues a job for each of many captures, behind the jobs of others. The same Idempotency-Key with the same request
     returns the first batch."""
     request = BatchRequest(
-        Selection(wanted.captures, wanted.session, wanted.prefix),
         ReconstructionRequest(wanted.model, wanted.settings, deliver_to=wanted.deliver_to),
+        wanted.captures,
+        wanted.session,
+        wanted.prefix,
         wanted.label,
         wanted.queue,
         wanted.priority,

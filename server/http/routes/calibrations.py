@@ -13,7 +13,7 @@ from server.http.schemas import CalibrationList, NewCalibration
 from server.services.records import CalibrationOut
 from server.wire.multipart import check_length, described_form, receive_calibration_pictures
 from server.wire.patience import IDLE_TIMEOUT_S, with_idle_timeout
-from server.wire.problems import Problem, Responses, documented
+from server.wire.problems import Problem, Responses, documented, sent_file
 from server.wire.send_file import send_file
 
 router = APIRouter(prefix="/v1/calibrations", tags=["calibrations"])
@@ -34,11 +34,8 @@ async def make_calibration(service: ServiceOf, caller: Taker, request: Request, 
     if request.headers.get("content-type", "").partition(";")[0].strip() == "application/json":
         await service.threads.disk(check_length, request, service.store, service.settings)
         wanted = _parsed(await _small_body(request))
-        known, shots, label = service.calibrations, wanted.captures, wanted.label
-        if wanted.source == "scene":
-            made = await service.threads.check(known.add_scene, shots, wanted.scale, label, key=caller.key)
-        else:
-            made = await service.threads.check(known.add_shots, wanted.board or {}, shots, label, key=caller.key)
+        shots = (wanted.board, wanted.captures, wanted.label, wanted.scale)
+        made = await service.threads.check(service.calibrations.add_shots, *shots, key=caller.key)
     else:
         made = await receive_calibration_pictures(service, request, caller.key)
     response.headers["Location"] = f"/v1/calibrations/{made.id}"
@@ -57,12 +54,7 @@ def get_calibration(service: ServiceOf, caller: Reader, calibration_id: str) -> 
     return service.calibrations.get(calibration_id)
 
 
-FILE: Responses = {
-    200: {"content": {"application/json": {}}},
-    206: {"description": "Partial Content", "content": {"application/json": {}}},
-    304: {"description": "Not Modified"},
-    **documented(404, 409, 416),
-}
+FILE: Responses = {**sent_file("application/json"), **documented(404, 409, 416)}
 
 
 @router.head("/{calibration_id}/cameras.json", include_in_schema=False)

@@ -31,16 +31,15 @@ from server.http.schemas import (
 from server.services.bulk import BulkOut, each
 from server.services.captures import CaptureMetadata
 from server.services.erasure import HoldingsOut
-from server.services.imports import fetch_stored_capture
 from server.services.records import JobOut
 from server.services.texts import PLAIN, TEXT_MOST, checked_tags
 from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.object_places import is_object_url
 from server.storage.records import CaptureRecord
-from server.wire.fetch import fetch_archive
+from server.wire.fetch import fetch_archive, fetch_stored_capture
 from server.wire.multipart import ABOUT, ARCHIVE, described_form, receive_capture
-from server.wire.problems import Responses, documented
+from server.wire.problems import Responses, documented, sent_file
 from server.wire.send_file import send_file
 
 router = APIRouter(prefix="/v1", tags=["captures"])
@@ -154,15 +153,8 @@ def edit_capture(service: ServiceOf, caller: Taker, capture_id: str, wanted: Cap
     return CaptureOut.model_validate(changed)
 
 
-IMAGE_RESPONSES: Responses = {
-    200: {"content": {f"image/{kind}": {} for kind in ("png", "jpeg", "tiff", "webp")}},
-    206: {
-        "description": "Partial Content",
-        "content": {f"image/{kind}": {} for kind in ("png", "jpeg", "tiff", "webp")},
-    },
-    304: {"description": "Not Modified"},
-    **documented(404, 416),
-}
+IMAGES = ("image/png", "image/jpeg", "image/tiff", "image/webp")
+IMAGE_RESPONSES: Responses = {**sent_file(*IMAGES), **documented(404, 416)}
 
 
 @router.head("/captures/{capture_id}/images/{camera}", include_in_schema=False)

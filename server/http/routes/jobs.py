@@ -39,7 +39,7 @@ from server.services.work import ReconstructionRequest
 from server.storage.job_index import JobOrder, JobQuery
 from server.storage.records import JobWebhook
 from server.wire.patience import await_hang_up
-from server.wire.problems import Responses, documented
+from server.wire.problems import Responses, documented, sent_file
 from server.wire.send_file import media_type, send_archive, send_file, send_zip
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
@@ -202,11 +202,8 @@ ARCHIVE: Responses = {
     304: {"description": "Not Modified"},
     **documented(404, 409),
 }
-FILES = {kind: {} for kind in ("application/octet-stream", "model/gltf-binary", "application/json", "image/png")}
 RESULT: Responses = {
-    200: {"content": FILES},
-    206: {"description": "Partial Content", "content": FILES},
-    304: {"description": "Not Modified"},
+    **sent_file("application/octet-stream", "model/gltf-binary", "application/json", "image/png"),
     307: {"description": "Temporary Redirect"},
     **documented(404, 409, 416),
 }
@@ -238,7 +235,8 @@ def get_result(
     """Returns a file of the result: head.ply, head.glb, report.json, contact_sheet.png, overlays/<camera>.png and so
     on. ``GET .../result`` lists them. With ``redirect`` a result that an S3 store keeps is answered with 307 and a
     signed address of the store, which holds for five minutes and takes no API key."""
-    if redirect and (address := service.result_address(job_id, name)) is not None:
+    address = service.jobs.results.link(job_id, name) if redirect and name in service.jobs.files(job_id) else None
+    if address is not None:
         return RedirectResponse(address, 307, {"Cache-Control": "no-store"})
     return send_file(request, service.jobs.result_file(job_id, name))
 

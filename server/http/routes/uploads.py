@@ -26,13 +26,12 @@ from server.services.service import Service
 from server.services.threads import Threads
 from server.services.uploads import ResumableUploads
 from server.storage.records import UploadRecord
-from server.wire.multipart import BLOCK_BYTES
+from server.wire.multipart import ABOUT, BLOCK_BYTES
 from server.wire.patience import IDLE_TIMEOUT_S, with_idle_timeout
 from server.wire.problems import Problem, documented
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 VERSION = "1.0.0"
-FIELDS = ("session", "label", "expression", "tags")
 Resumable = Annotated[str | None, Header(alias="Tus-Resumable", description=VERSION)]
 COMMON = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
 
@@ -108,19 +107,13 @@ async def tus_patch(
     with service.uploads.lock(record.id):
         # read again under the lock: another request may have made the capture meanwhile
         record = await service.threads.disk(_owned_upload, service, caller, upload_id)
-        return await _append(service, record, upload_offset, request.stream(), upload_checksum)
-
-
-async def _append(
-    service: Service, record: UploadRecord, offset: str | None, stream: AsyncIterator[bytes], checksum: str | None
-) -> Response:
-    here = await service.threads.disk(service.uploads.offset, record)
-    if offset != str(here):
-        raise Problem(409, "wrong-offset", compose("upload-offset-wrong", offset=here))
-    if record.capture is None:
-        here = await append(service.uploads, record, stream, checksum, service.threads)
-    if here == record.length and record.capture is None:
-        record = await service.threads.check(_finish, service, record, key=record.key)
+        here = await service.threads.disk(service.uploads.offset, record)
+        if upload_offset != str(here):
+            raise Problem(409, "wrong-offset", compose("upload-offset-wrong", offset=here))
+        if record.capture is None:
+            here = await append(service.uploads, record, request.stream(), upload_checksum, service.threads)
+        if here == record.length and record.capture is None:
+            record = await service.threads.check(_finish, service, record, key=record.key)
     headers = {"Upload-Offset": str(here)}
     return Response(status_code=204, headers=COMMON | headers | _expires(record) | _location(record))
 
@@ -177,7 +170,7 @@ def _metadata(text: str | None) -> dict[str, str]:
             decoded = base64.b64decode(value, validate=True).decode()
         except (binascii.Error, ValueError) as error:
             raise Problem(400, "upload-metadata", compose("upload-metadata-unreadable", key=f"{key!r:.80}")) from error
-        if key in FIELDS:
+        if key in ABOUT:
             fields[key] = decoded
     return fields
 

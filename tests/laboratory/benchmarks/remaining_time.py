@@ -8,7 +8,7 @@ from typing import Any
 from pipeline.settings import settings_from_document
 from server.tasks.child import WorkerContext
 from server.tasks.progress import JobProgress
-from server.tasks.reconstruct_folder import reconstruct_folder
+from server.tasks.reconstruct import reconstruct_folder
 from server.tasks.stage_durations import StageDurations, megapixels_of
 
 JOBS = [("scan-a", "fine both"), ("three-brows", "kernel head"), ("scan-a", "photo head"), ("scan-a", "kernel head")]

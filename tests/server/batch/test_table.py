@@ -16,6 +16,7 @@ from server.batch.table import (
     ORIGIN,
     QUALITY,
     WHOSE,
+    Outcome,
     columns_of,
     expression_columns,
     landmark_columns,
@@ -32,7 +33,7 @@ COLUMNS = columns_of(["jawOpen", "mouthSmileLeft"])
 
 def test_a_head_is_a_row() -> None:
     report = pinned_report(3, {"detail": "span"})
-    row = row_of(CAPTURE, COLUMNS, report=report, origin=FROM)
+    row = row_of(Outcome(CAPTURE, Path(), "", report, FROM), COLUMNS)
     assert list(row) == [column.name for column in COLUMNS]
     assert (row["capture"], row["subject"], row["session"], row["state"]) == ("monday/anna", "S01", "day 1", "done")
     assert (row["warnings"], row["warning_count"], row["cameras"], row["cameras_used"]) == ("view", 1, 3, 2)
@@ -50,17 +51,17 @@ def test_a_head_is_a_row() -> None:
 
 def test_what_failed_and_what_is_missing_have_rows_too() -> None:
     failure = FailureRecord("crash", compose("batch-worker-killed"), (), FROM)
-    failed = row_of(CAPTURE, COLUMNS, failure=failure)
+    failed = row_of(Outcome(CAPTURE, Path(), "", failure=failure), COLUMNS)
     assert (failed["state"], failed["failure_kind"]) == ("failed", "crash")
     assert "fewer --workers" in str(failed["failure"])
-    missing = row_of(BatchCapture("bert", Path()), COLUMNS)
+    missing = row_of(Outcome(BatchCapture("bert", Path()), Path(), ""), COLUMNS)
     assert {name for name, value in missing.items() if value is not None} == {"capture", "state"}
     assert missing["state"] == "missing"
 
 
 def test_each_value_is_of_its_columns_kind() -> None:
     kinds = {"text": str, "number": float, "count": int, "flag": bool}
-    row = row_of(CAPTURE, COLUMNS, report=pinned_report(4, {}), origin=FROM)
+    row = row_of(Outcome(CAPTURE, Path(), "", pinned_report(4, {}), FROM), COLUMNS)
     for column in COLUMNS:
         value = row[column.name]
         assert value is None or type(value) is kinds[column.kind], column.name

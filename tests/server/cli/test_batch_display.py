@@ -21,11 +21,9 @@ class Terminal(io.StringIO):
 def go_through(display: BatchDisplay) -> None:
     display.begin(3)
     for name in ("anna", "bert", "carl"):
-        display.start(name)
         display.report(name, 0.5)
     display.end(Outcome("anna", "made", 21.4))
     display.end(Outcome("bert", "failed", 1.0, FAILURE))
-    display.start("carl")
     display.end(Outcome("carl", "kept"))
 
 
@@ -61,8 +59,6 @@ def test_the_first_guess_then_the_mean_of_those_that_were_made() -> None:
     clock = Clock()
     progress = BatchProgress(6, 2, 30.0, clock)
     assert (progress.share(), progress.remaining_s()) == (0.0, 90.0)  # six of 30 s, two at once
-    progress.start("a")
-    progress.start("b")
     progress.report("a", 0.5)
     progress.report("b", 0.5)
     assert progress.share() == pytest.approx(1 / 6)
@@ -77,7 +73,6 @@ def test_the_first_guess_then_the_mean_of_those_that_were_made() -> None:
 
 def test_the_last_capture_has_one_worker_however_many_there_are() -> None:
     progress = BatchProgress(1, 8, 30.0, Clock())
-    progress.start("a")
     progress.report("a", 0.9)
     assert progress.remaining_s() == pytest.approx(3.0)
     progress.end("a", failed=False)

@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from rig.messages.message import texts_of
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
-from server.cli.check import Checked, checked, lines
+from server.cli.check import checked, lines
 from server.cli.reconstruct_local import reconstruct_locally
 from server.tasks.child import WorkerContext
 from server.tasks.ingest import ingest_archive
@@ -31,7 +32,7 @@ from tests.support.services import small_capture
 from tests.support.silhouette_subjects import dressed_head
 
 
-def found_in(capture: Path, **settings: object) -> Checked:
+def found_in(capture: Path, **settings: object) -> dict[str, Any]:
     return checked(capture, settings, report=lambda stage, share: None)
 
 

@@ -111,13 +111,13 @@ def test_a_result_never_lies_among_the_pictures_of_its_capture(inside: str, encl
 def test_a_trace_is_written_of_every_job_and_may_lie_in_the_result(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fails: bool
 ) -> None:
-    def reconstructed(folder: Path, out: Path, **named: Any) -> None:
+    def reconstructed(*_: Any, out: Path, **named: Any) -> None:
         with span("stage", "fit"):
             if fails:
                 raise OSError("no head")
         (out / "report.json").write_text("{}")
 
-    monkeypatch.setattr(reconstruct_local, "_reconstruct_folder", reconstructed)
+    monkeypatch.setattr(reconstruct_local, "reconstruct_folder", reconstructed)
     capture, out = small_capture(tmp_path / "capture"), tmp_path / "out"
     with pytest.raises(OSError, match="no head") if fails else nullcontext():
         reconstruct_local.reconstruct_locally(
@@ -132,7 +132,7 @@ def test_a_trace_is_written_of_every_job_and_may_lie_in_the_result(
 def test_a_trace_that_cannot_be_written_or_spoils_the_capture_is_refused_before_the_work(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(reconstruct_local, "_reconstruct_folder", lambda *_, **__: pytest.fail("the work began"))
+    monkeypatch.setattr(reconstruct_local, "reconstruct_folder", lambda *_, **__: pytest.fail("the work began"))
     capture = small_capture(tmp_path / "capture")
     (tmp_path / "file").write_text("x")
     for place, why in {

@@ -21,14 +21,13 @@ from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
 from rig.messages.message import compose, verbatim
 from rig.rig import Rig
-from server.console import comparison, coverage, guides, live
+from server.console import coverage, guides, live, media
 from server.console.identity import cookie_secret, is_foreign, is_rebound
 from server.console.live import look_bytes
-from server.console.live_frame import LiveFrame
 from server.console.mount import path_below
-from server.console.pages.jobs import SettingsForm, chosen_settings, log_lines
+from server.console.pages.captures import chosen_work, settings_of
+from server.console.pages.jobs import chosen_settings, log_lines
 from server.console.removal import Removals
-from server.console.work_form import chosen_work, settings_of
 from server.errors import Conflict, Forbidden, NotFound, Unauthenticated, Unavailable
 from server.services.keys import Keys
 from server.services.live.live import nothing
@@ -175,12 +174,12 @@ def test_quality_and_distance_come_in_the_order_of_the_vertices(tmp_path: Path) 
     mesh = grid()
     quality = np.linspace(0.1, 3.0, len(mesh.vertices))
     mine = write_head(tmp_path / "mine", mesh, quality)
-    np.testing.assert_array_equal(comparison.vertex_numbers(mine / "head.ply", "quality"), quality.astype(np.float32))
+    np.testing.assert_array_equal(media.vertex_numbers(mine / "head.ply", "quality"), quality.astype(np.float32))
     with pytest.raises(NotFound):
-        comparison.vertex_numbers(mine / "head.ply", "curvature")
+        media.vertex_numbers(mine / "head.ply", "curvature")
     lifted = Mesh(mesh.vertices + [0, 0, 2.5], mesh.faces)
     theirs = write_head(tmp_path / "theirs", lifted, quality)
-    np.testing.assert_allclose(comparison.to_surface(mine, theirs / "head.ply"), 2.5, atol=1e-5)
+    np.testing.assert_allclose(media.to_surface(mine, theirs / "head.ply"), 2.5, atol=1e-5)
 
 
 @pytest.mark.parametrize("shared_vertices", [True, False])
@@ -194,7 +193,7 @@ def test_heads_of_two_captures_are_compared_after_a_rigid_motion(tmp_path: Path,
         moved = Mesh(np.concatenate([moved.vertices, moved.vertices[:2]]), moved.faces)
     mine = write_head(tmp_path / "mine", bumpy, np.ones(len(bumpy.vertices)))
     theirs = write_head(tmp_path / "theirs", moved, np.ones(len(moved.vertices)))
-    distance = comparison.to_surface(mine, theirs / "head.ply", align=True)
+    distance = media.to_surface(mine, theirs / "head.ply", align=True)
     # the files hold float32: 3e-5 mm at 300 mm; nearest points converge to less than a hundredth of the step
     assert distance.max() < (1e-3 if shared_vertices else 0.1)
 
@@ -266,7 +265,7 @@ def test_a_jobs_log_has_one_line_a_stage() -> None:
 
 
 def test_the_restart_form_becomes_settings() -> None:
-    event: SettingsForm = {"method": "simplex", "detail": "", "front": "cam03", "more": '{"fitting": {"modes": 80}}'}
+    event = {"method": "simplex", "detail": "", "front": "cam03", "more": '{"fitting": {"modes": 80}}'}
     assert chosen_settings(event) == {"method": "simplex", "front": "cam03", "fitting": {"modes": 80}}
     assert chosen_settings({}) == {}
     for wrong in ("{", "[1]"):
@@ -284,7 +283,7 @@ def test_the_captures_form_becomes_work() -> None:
 
 
 def test_a_look_on_the_wire_holds_every_picture() -> None:
-    frames: list[LiveFrame] = [
+    frames = [
         {"name": "a", "jpeg": b"abc", "mean": 1.0},
         {"name": "b", "jpeg": None, "fault": verbatim("unplugged").document()},
     ]

@@ -11,9 +11,9 @@ import pytest
 
 from pipeline.head_model.landmarks import SEVEN_POINTS
 from rig.progress import Progress
-from server.console import found_faces as module
 from server.console import media
-from server.console.found_faces import found_faces
+from server.console import media as module
+from server.console.media import found_faces
 from server.errors import Conflict, Unavailable
 from server.services.keys import LOCAL, Caller
 from server.storage.records import CameraSize, CaptureRecord

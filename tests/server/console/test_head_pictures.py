@@ -21,7 +21,7 @@ def service(tmp_path: Path) -> Any:
     (tmp_path / "jobs" / "j1" / "result").mkdir(parents=True)
     jobs = SimpleNamespace(
         state=lambda job: "succeeded" if job == "j1" else "running",
-        results=SimpleNamespace(elsewhere=False),
+        results=SimpleNamespace(objects=None),
         result_folder=lambda job: tmp_path / "fetched",
     )
     return SimpleNamespace(jobs=jobs, store=SimpleNamespace(folder=lambda kind, name: tmp_path / kind / name))
@@ -49,7 +49,7 @@ def test_a_result_in_a_store_is_fetched_to_be_drawn_and_not_to_be_shown(
     monkeypatch.setitem(
         head_pictures.DRAWN, "portrait.jpg", lambda result: (drawn.append(result), np.zeros((8, 8, 3), np.uint8))[1]
     )
-    service.jobs.results.elsewhere = True
+    service.jobs.results.objects = object()
     for _ in range(2):
         assert head_picture(service, "j1", "portrait.jpg") == tmp_path / "jobs" / "j1" / "portrait.jpg"
     assert drawn == [tmp_path / "fetched"]

@@ -12,7 +12,6 @@ from rig.geometry import RigidTransform, rotation_from_vector
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 from server.console.media import camera_views, straightened, straightened_face
-from server.storage.face_cache import FoundFace
 
 LENS = Distortion(-0.14, 0.04, 0.001, -0.0008, 0.0)
 
@@ -70,7 +69,7 @@ def test_a_face_lies_on_the_straightened_photograph(recorded: bool) -> None:
         fisheye = RecordedLens("kannala-brandt", (0.05, 0.01, 0.0, 0.0))
         lens = replace(lens, recorded=fisheye)
         pixels = fisheye.distorted(wanted, lens.intrinsics.matrix())
-    face: FoundFace = {
+    face = {
         "box_px": [0.0, 0.0, 1.0, 1.0],
         "roll_deg": 3.0,
         "score": 20.0,
@@ -81,5 +80,5 @@ def test_a_face_lies_on_the_straightened_photograph(recorded: bool) -> None:
     np.testing.assert_allclose(straight["points"], wanted, atol=0.06)
     np.testing.assert_allclose(straight["box_px"], [*wanted.min(axis=0), *wanted.max(axis=0)], atol=0.06)
     assert straight["is_subject"]
-    beyond: FoundFace = {**face, "points": [[1e6, 1e6]]}
+    beyond = {**face, "points": [[1e6, 1e6]]}
     assert straightened_face(beyond, camera(LENS))["points"] == [], "no ray of the lens goes there"

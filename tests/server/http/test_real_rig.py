@@ -13,10 +13,11 @@ from rig.acquisition.commands import take_plates
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.rig_toml import read_rig_config
 from rig.studio.devices.serve import DeviceFault, StudioDevices
-from server.console.live import RigSource
+from server.console.live import rig_frames
 from server.console.pages.rig import sync_of
 from server.services.service import open_rig
 from server.settings import ServiceSettings
+from server.tasks.child import Child
 from tests.rig.acquisition.test_session import flat_rig
 from tests.support.board_pictures import BoardPictures
 from tests.support.services import await_calibration, served_client
@@ -171,8 +172,8 @@ def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> 
 def test_the_live_view_takes_all_pictures_in_one_look(studio: StudioDevices, tmp_path: Path) -> None:
     rig = open_rig(ServiceSettings(data=tmp_path / "data", rig=studio.folder / "rig.toml"))
     try:
-        source = RigSource(rig)
-        rounds = [source.frames() for _ in range(2)]
+        child = Child()
+        rounds = [rig_frames(rig, child, look) for look in (1, 2)]
         for frames in rounds:
             assert [frame["name"] for frame in frames] == list(NAMES)
             assert {_decoded(frame["jpeg"] or b"").shape for frame in frames} == {(240, 320, 3)}
@@ -180,7 +181,7 @@ def test_the_live_view_takes_all_pictures_in_one_look(studio: StudioDevices, tmp
         assert judged == [["cam01"], ["cam02"]], "each look judges another camera"
         studio.inject(DeviceFault("hung", "cam04"))
         deadline = time.monotonic() + 20
-        while "fault" not in (lost := {frame["name"]: frame for frame in source.frames()}["cam04"]):
+        while "fault" not in (lost := {frame["name"]: frame for frame in rig_frames(rig, child, 3)}["cam04"]):
             assert time.monotonic() < deadline
         assert lost["jpeg"] is None
     finally:

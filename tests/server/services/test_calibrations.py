@@ -121,7 +121,7 @@ def test_a_board_or_a_shot_that_is_none_queues_nothing(
 def test_a_result_is_there_once_it_succeeded(calibrations: Calibrations, store: Store, engine: Engine) -> None:
     made = calibrations.add_shots(BOARD, [board_shot(store, "one")], "")
     with pytest.raises(Conflict, match="queued"):
-        calibrations.cameras_json(made.id)
+        calibrations.result(made.id, "cameras.json")
     engine.rows[made.id].status = "PENDING"
     with pytest.raises(Conflict, match="wait"):
         calibrations.remove(made.id)

@@ -5,7 +5,7 @@ import pytest
 from pipeline.head_model.model import load_model
 from pipeline.settings import settings_from_document
 from pipeline.texturing.paint import find_layout
-from server.console.work_form import PRESETS, Preset, settings_of
+from server.console.pages.captures import PRESETS, Preset, settings_of
 
 
 @pytest.mark.parametrize("preset", PRESETS, ids=lambda preset: preset.id or "standard")

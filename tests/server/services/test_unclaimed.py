@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from rig.digest import sha256_of
-from server.services.unclaimed import OWNER, collect
+from server.services.retention import OWNER, collect
 from server.settings import ServiceSettings
 from server.storage.database import database_identity, open_database
 from server.storage.objects import FolderObjects

@@ -10,7 +10,7 @@ import sqlalchemy as sa
 
 from rig.digest import sha256_of
 from server.errors import Conflict
-from server.services.unclaimed import collect
+from server.services.retention import collect
 from server.settings import ServiceSettings
 from server.storage.capture_blobs import NAME, SMALL_BYTES, CaptureBlobs, open_capture_blobs
 from server.storage.database import capture_index, open_database
@@ -66,9 +66,9 @@ def test_equal_contents_are_stored_once_and_go_with_the_last_capture(
     second = written(tmp_path / "other", cameras=b"{}", left=PICTURE + b"2", plate=b"plate")
     blobs.keep(one, tmp_path / "one", first)
     assert len(names(bucket)) == 3
-    sent = blobs.objects.tally.operations()["put", "done"]
+    sent = blobs.objects.operations()["put", "done"]
     blobs.keep(other, tmp_path / "other", second)
-    assert blobs.objects.tally.operations()["put", "done"] == sent + 1
+    assert blobs.objects.operations()["put", "done"] == sent + 1
     assert len(names(bucket)) == 4
     blobs.release(one)
     assert blobs.files(one) == {}

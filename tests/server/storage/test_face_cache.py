@@ -1,19 +1,20 @@
 """Faces are found once, and anew only where what they follow from has changed."""
 
 from pathlib import Path
+from typing import Any
 
 from server.storage import face_cache
-from server.storage.face_cache import FacesDocument, faces_once
+from server.storage.face_cache import faces_once
 
 INPUTS = {"images/cam00.png": "a1", "cameras.json": "b2"}
-FOUND: FacesDocument = {"faces": {"cam00": []}, "suggested": {"pronasale": {"cam00": [1.5, 2.0]}}}
+FOUND: dict[str, Any] = {"faces": {"cam00": []}, "suggested": {"pronasale": {"cam00": [1.5, 2.0]}}}
 
 
 def looked(folder: Path, inputs: dict[str, str]) -> bool:
     """Whether the faces had to be looked for."""
     calls: list[int] = []
 
-    def find() -> FacesDocument:
+    def find() -> dict[str, Any]:
         calls.append(1)
         return FOUND
 
@@ -46,7 +47,7 @@ def test_a_damaged_file_is_made_anew(tmp_path: Path) -> None:
 def test_a_capture_that_is_erased_meanwhile_stays_erased(tmp_path: Path) -> None:
     folder = tmp_path / "cache" / "faces"
 
-    def find() -> FacesDocument:
+    def find() -> dict[str, Any]:
         folder.rmdir()
         folder.parent.rmdir()
         return FOUND

@@ -12,7 +12,7 @@ from rig.errors import InputError
 from rig.formats.captures.archive import pack_folder
 from rig.render.renderer import Renderer
 from server.tasks.child import Child, WorkerContext
-from server.tasks.reconstruct_folder import folder_of, reconstruct_beside
+from server.tasks.reconstruct import folder_of, reconstruct_beside
 from tests.support.services import ROOT, packed_capture, small_capture
 from tests.support.small_studio import small_studio_captures
 
