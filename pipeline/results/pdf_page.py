@@ -1,6 +1,7 @@
 """Pages of a PDF: A4, in the fonts that every reader has, with lines, tables and pictures."""
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
 
 import cv2
 import numpy as np
@@ -14,10 +15,13 @@ JPEG_QUALITY = 92
 
 
 class PdfPage(FPDF):
-    """Draws A4 pages with a document's margins and fonts; characters outside Latin-1 become question marks."""
+    """Draws A4 pages with a document's margins and fonts; characters outside Latin-1 become question marks. ``date``
+    (ISO 8601) is that of the document, so that the same content gives the same bytes."""
 
-    def __init__(self) -> None:
+    def __init__(self, title: str, date: str) -> None:
         super().__init__(unit="mm", format="A4")
+        self.set_creation_date(datetime.fromisoformat(date).replace(tzinfo=UTC))
+        self.set_title(title)
         self.set_margins(MARGIN_MM, MARGIN_MM, MARGIN_MM)
         self.set_auto_page_break(False)
 

@@ -4,8 +4,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
+from pipeline.applications.model_building.correspondence.scans import welded
 from rig.errors import InputError
 from rig.formats.meshes.mesh_file import TexturedMesh, read_textured_mesh
 from rig.image import ImageRgb
@@ -76,12 +77,7 @@ def read_raw_scan(path: Path) -> RawScan:
 
 def raw_scan(painted: TexturedMesh, name: str) -> RawScan:
     """Joins the vertices of a mesh that lie at the same position, and drops its degenerate triangles."""
-    mesh = painted.mesh
-    _, first, joined = np.unique(mesh.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
-    corners = joined.ravel()[mesh.faces]
-    proper: Bool[np.ndarray, " f"] = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
-    used, faces = np.unique(corners[proper], return_inverse=True)
-    whole = Mesh(mesh.vertices[first[used]], faces.reshape(-1, 3).astype(np.int32))
+    mesh, (whole, proper) = painted.mesh, welded(painted.mesh)
     return RawScan(name, whole, replace(painted, mesh=Mesh(mesh.vertices, mesh.faces[proper], mesh.colours)))
 
 

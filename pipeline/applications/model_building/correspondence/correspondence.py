@@ -109,14 +109,6 @@ def workers(count: int, items: int) -> Iterator[Workers]:
         yield Workers(pool)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Cast:
-    """Holds where rays meet a surface: radius (mm) and triangle, NaN and -1 where they do not."""
-
-    radii: PerVertex
-    triangles: Int[np.ndarray, " N"]
-
-
 def coordinates(points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, " _"], ...]:
     """Returns angle (-pi to pi), height and radius (mm) of points about the axis x = z = 0."""
     return np.arctan2(points[:, 0], points[:, 2]), points[:, 1], np.hypot(points[:, 0], points[:, 2])
@@ -137,13 +129,13 @@ class CylinderIndex:
         self._rows = int((vertices[:, 1].max() - self._low) / CELL_MM) + 1
         self._start, self._members = bin_triangles(self._vertices, self._faces, self._low, self._rows)
 
-    def cast(self, angles: PerVertex, heights: PerVertex, near: PerVertex | None = None) -> Cast:
-        """Returns each ray's hit whose radius is nearest to ``near`` (mm), or without ``near`` the outermost hit."""
+    def cast(self, angles: PerVertex, heights: PerVertex, near: PerVertex | None = None) -> PerVertex:
+        """Returns the radius (mm) of each ray's hit, NaN without one: the radius nearest to ``near``, or without it the
+        outermost."""
         wanted = np.full(len(angles), np.inf) if near is None else np.asarray(near, float)
-        found, triangles = cast_rays(
+        return cast_rays(
             self._vertices, self._faces, self._low, self._rows, self._start, self._members, angles, heights, wanted
         )
-        return Cast(found, triangles)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -271,9 +263,9 @@ def warp_and_resample(
     warped position."""
     warped = landmark_warp(shape[index], marks, shape, smoothing=MARK_SMOOTHING_MM)
     angles, heights, radii = coordinates(warped)
-    cast = cylinder.cast(angles, heights, radii)
-    void = ~(np.abs(cast.radii - radii) < SAMPLE_REACH_MM)
-    sampled = points_at(angles, heights, np.where(void, radii, cast.radii))
+    hits = cylinder.cast(angles, heights, radii)
+    void = ~(np.abs(hits - radii) < SAMPLE_REACH_MM)
+    sampled = points_at(angles, heights, np.where(void, radii, hits))
     sampled[index], void[index] = marks, False  # landmarks stay fixed
     return warped, sampled, void
 

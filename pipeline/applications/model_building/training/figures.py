@@ -64,8 +64,8 @@ def scan_head(
     """Returns a raw scan of a head (head frame, mm) in the scanner's frame: rotated and shifted slightly."""
     angles, heights = _grid(vertices, scanner, rng)
     columns, rows = np.meshgrid(angles, heights)
-    cast = CylinderIndex(vertices, faces).cast(columns.ravel(), rows.ravel())
-    radii = cast.radii + scanner.noise_mm * rng.standard_normal(len(cast.radii))
+    radii = CylinderIndex(vertices, faces).cast(columns.ravel(), rows.ravel())
+    radii = radii + scanner.noise_mm * rng.standard_normal(len(radii))
     points = points_at(columns.ravel(), rows.ravel(), radii)
     marks = {n: vertices[v] + scanner.landmark_noise_mm * rng.standard_normal(3) for n, v in landmarks.items()}
     valid = np.isfinite(radii) & ~_swallowed(points, {n: vertices[v] for n, v in landmarks.items()}, scanner, rng)
