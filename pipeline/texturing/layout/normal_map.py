@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from pipeline.compute.array_cache import cached_arrays
-from pipeline.compute.threads import in_threads
+from pipeline.compute.threads import map_strips
 from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.head_model.decimation import decimate
 from pipeline.head_model.model import HeadModel
@@ -103,12 +103,10 @@ def normal_mapped(
     coarse = _image(uv, reduced.faces, np.concatenate([reduced_normals, tangents[:, :3]], axis=1), size)
     turned = np.empty_like(fine)
 
-    def work(first: int, last: int) -> None:
-        for start in range(first * BAND_ROWS, min(last * BAND_ROWS, size), BAND_ROWS):
-            band = slice(start, start + BAND_ROWS)
-            turned[band] = _in_frame(_unit(fine[band]), _unit(coarse[band, :, 3:]), _unit(coarse[band, :, :3]), sign)
+    def work(band: slice) -> None:
+        turned[band] = _in_frame(_unit(fine[band]), _unit(coarse[band, :, 3:]), _unit(coarse[band, :, :3]), sign)
 
-    in_threads(-(-size // BAND_ROWS), work)
+    map_strips(work, size, BAND_ROWS)
     inside = np.asarray(np.isfinite(turned[:, :, 0]))
     codes = np.where(inside[:, :, None], np.rint(127.5 + 127.5 * turned), 0.0).astype(np.float32)
     image = np.clip(spread_texels(codes, inside), 0, 255).astype(np.uint8)
