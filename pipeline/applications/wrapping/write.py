@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Int, UInt8
 
@@ -72,9 +71,7 @@ def _write_obj(folder: Path, wrapped: Wrapped) -> None:
     template, textures = wrapped.template, baked_textures(wrapped)
     files = {tile: f"wrapped{tile_suffix(tile)}.jpg" for tile in textures}
     for tile, image in textures.items():
-        quality = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
-        _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[:, :, ::-1]), quality)
-        write_atomically(folder / files[tile], data.tobytes())
+        write_image(folder / files[tile], image, quality=JPEG_QUALITY)
     mesh, library = template.mesh, None
     if textures:
         mesh, materials = template_materials(template, files)

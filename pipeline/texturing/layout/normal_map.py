@@ -11,7 +11,6 @@ A texel shows the same point of the head in the normal map and in the texture, s
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
@@ -158,8 +157,3 @@ def _in_frame(wanted: Picture, tangent: Picture, normal: Picture, sign: np.float
     x, z = (np.einsum("yxc,yxc->yx", wanted, axis) for axis in (tangent, normal))
     y = np.einsum("yxc,yxc->yx", wanted, bitangent)
     return _unit(np.stack([(x - lean * z) / (1 - lean**2), y, (z - lean * x) / (1 - lean**2)], axis=2))
-
-
-def png(image: UInt8[np.ndarray, "s s 3"]) -> bytes:
-    """Returns the normal map as the bytes of a PNG file. Lossy compression would show in highlights."""
-    return cv2.imencode(".png", image[:, :, ::-1])[1].tobytes()

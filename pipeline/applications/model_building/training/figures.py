@@ -31,6 +31,7 @@ from pipeline.geometry.projection import picture
 from pipeline.head_model.landmarks import NAMES
 from pipeline.head_model.model import HeadModel
 from rig.camera import Camera, Intrinsics
+from rig.formats.pictures.images import encode_image
 from rig.geometry import look_at, rotation_from_vector
 from rig.mesh import vertex_normals
 from rig.progress import Progress
@@ -145,8 +146,7 @@ def show_model(model: HeadModel, folder: Path, *, modes: int, report: Progress) 
         pictures["curves.png"] = curves_figure(model, report)
     folder.mkdir(parents=True, exist_ok=True)
     for name, image in pictures.items():
-        _, data = cv2.imencode(".png", image[:, :, ::-1])
-        (folder / name).write_bytes(data.tobytes())
+        (folder / name).write_bytes(encode_image(".png", image))
     return [folder / name for name in pictures]
 
 
