@@ -127,16 +127,13 @@ def assign_images(
     if not assignment.pictures:
         overruled += _check_rig(capture, rig, distinct, guards)
     pictures = {} if masks else assignment.pictures
-    if masks:
-        capture = reassign_images(capture, masks=masks)
+    if assignment.pictures:
+        capture = reassign_images(capture, masks=masks) if masks else _filed_back(capture, pictures, rig)
         silhouettes = segmented(capture)
-    elif pictures:
-        capture = _filed_back(capture, pictures, rig)
-        silhouettes = segmented(capture)
-        plates = _composed(plates, pictures)
-    warnings = (*overruled, *_warnings(pictures, masks, plates, duplicates))
-    if not assignment.pictures and loose_outlines(distinct, rig):
-        warnings = (*warnings, compose("outlines-loose"))
+    plates = _composed(plates, pictures) if pictures else plates
+    loose = not assignment.pictures and loose_outlines(distinct, rig)
+    outlines = [compose("outlines-loose")] if loose else []
+    warnings = (*overruled, *_warnings(pictures, masks, plates, duplicates), *outlines)
     silhouettes = {n: s.judged(usable=False) if n in duplicates else s for n, s in silhouettes.items()}
     return ImageAssignment(capture, silhouettes, pictures, plates, warnings)
 
