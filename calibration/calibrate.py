@@ -25,7 +25,7 @@ from calibration.adjustment.state import (
 )
 from calibration.adjustment.timing import TimeOffsets, board_velocities, estimate_offsets
 from calibration.board.board import Board
-from calibration.board.detection import Detections, View, WrongBoard, detect_folder, ignore_progress
+from calibration.board.detection import Detections, View, WrongBoard, detect_folder
 from calibration.board.picture_files import list_pictures
 from calibration.quality.checks import (
     check_against_previous,
@@ -42,7 +42,7 @@ from calibration.result import Calibration, CalibrationRefused
 from rig.formats.captures.shot_files import with_serials
 from rig.geometry import RigidTransform
 from rig.messages.message import Message, compose
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 from rig.rig import Rig
 
 # Time offsets are used where they explain this share of the residuals; below it they would only follow noise.
@@ -58,7 +58,7 @@ def calibrate(
     previous: Rig | None = None,
     cache: Path | None = None,
     workers: int = 2,
-    report: Progress = ignore_progress,
+    report: Progress = discard_progress,
 ) -> Calibration:
     """Calibrates the cameras of ``IMAGES/<camera>/<shot>.<ext>``. Pictures with the same name of a shot were taken at
     the same moment.
@@ -77,7 +77,11 @@ def calibrate(
 
 
 def calibrate_detections(
-    detections: Detections, *, front: str | None = None, previous: Rig | None = None, report: Progress = ignore_progress
+    detections: Detections,
+    *,
+    front: str | None = None,
+    previous: Rig | None = None,
+    report: Progress = discard_progress,
 ) -> Calibration:
     """Calibrates from detected corners, as ``calibrate`` does from pictures. It reads no file."""
     detected = detections.corner_count

@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -13,13 +13,13 @@ from calibration.adjustment.intrinsics import Lens
 from calibration.adjustment.state import INTRINSICS, rms
 from calibration.adjustment.timing import TimeOffsets
 from calibration.board.board import Board
-from calibration.quality.checks import CameraEvidence, Check, Verdict, Word, judge
+from calibration.quality.checks import CameraEvidence, Check, Verdict, judge
 from calibration.quality.outliers import Dropped
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import EigenheadError
-from rig.formats.cameras.cameras_json import CamerasDocument, document_from_rig
-from rig.messages.message import Message, MessageDocument, compose, documents_of, message_of, texts_of
+from rig.formats.cameras.cameras_json import document_from_rig
+from rig.messages.message import Message, compose, documents_of, message_of, texts_of
 from rig.rig import Rig
 
 CELLS = (4, 3)  # of a picture, across and down
@@ -33,81 +33,6 @@ class CalibrationRefused(EigenheadError):
         self.reasons = tuple(message_of(reason) for reason in reasons)
         self.calibration = calibration
         super().__init__(compose("calibration-refused", reasons=self.reasons))
-
-
-class CameraFigures(TypedDict):
-    """Describes how well one camera is calibrated: reprojection errors in the joint solution and by its own lens alone
-    (RMS, px), its views and corners, the standard deviations of pose and focal length, and the share of the picture
-    with corners."""
-
-    rms_px: float
-    alone_rms_px: float
-    views: int
-    corners: int
-    pose_sigma_px: float
-    focal_sigma_px: float
-    focal_share: float
-    covered: float
-
-
-class Figures(TypedDict):
-    """Describes the numbers of ``calibrate --json``. ``sync_px`` is the part of the corners' noise that all cameras
-    share, a sign that they were not simultaneous."""
-
-    rms_px: float
-    used_share: float
-    corners: int
-    sync_px: float
-    cameras: dict[str, CameraFigures]
-
-
-class CheckDocument(TypedDict):
-    """Describes the result of one check, and a remedy. ``passed`` is null if there was nothing to check against."""
-
-    name: str
-    passed: bool | None
-    detail: str
-    advice: str
-    detail_message: MessageDocument
-    advice_message: MessageDocument | None
-
-
-class DroppedDocument(TypedDict):
-    """Describes a view that was left out, and why; ``camera`` is null for a whole shot."""
-
-    shot: str
-    camera: str | None
-    reason: str
-    reason_message: MessageDocument
-
-
-class OffsetsDocument(TypedDict):
-    """Describes the time offset of each camera with its standard deviation, in units of the time between shots, and
-    whether the offsets were used."""
-
-    used: bool
-    unit: str
-    cameras: dict[str, float]
-    sigma: dict[str, float]
-    rms_without_px: float
-    rms_with_px: float
-
-
-class CalibrationDocument(TypedDict):
-    """Describes ``calibration.json``."""
-
-    verdict: Word
-    missing: list[str]
-    missing_messages: list[MessageDocument]
-    figures: Figures
-    front: str
-    checks: list[CheckDocument]
-    dropped: list[DroppedDocument]
-    warnings: list[str]
-    warning_messages: list[MessageDocument]
-    time_offsets: OffsetsDocument | None
-    intrinsics_sigma: dict[str, dict[str, float]]
-    rig: CamerasDocument
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -136,10 +61,12 @@ class Calibration:
     checks: tuple[Check, ...]
     warnings: tuple[Message, ...]
 
-    def figures(self) -> Figures:
-        """Returns the numbers of ``calibrate --json``."""
+    def figures(self) -> dict[str, Any]:
+        """Returns the numbers of ``calibrate --json``. ``sync_px`` is the part of the corners' noise that all cameras
+        share, a sign that they were not simultaneous. Of each camera: reprojection errors in the joint solution and by
+        its own lens alone (RMS, px), and the share of the picture with corners, among others."""
         everything = np.concatenate([miss for _, _, miss in self.misses.values()])
-        cameras: dict[str, CameraFigures] = {}
+        cameras = {}
         for camera in self.rig:
             residuals = [miss for (name, _), (_, _, miss) in self.misses.items() if name == camera.name]
             cameras[camera.name] = {
@@ -178,10 +105,11 @@ class Calibration:
         }
         return judge(evidence, self.checks)
 
-    def document(self) -> CalibrationDocument:
-        """Returns everything but the residuals as JSON types."""
+    def document(self) -> dict[str, Any]:
+        """Returns ``calibration.json``: everything but the residuals, as JSON types. ``passed`` of a check is null if
+        there was nothing to check against; ``camera`` of a view that was left out is null for a whole shot."""
         names = self.rig.names
-        offsets: OffsetsDocument | None = None
+        offsets = None
         if self.offsets is not None:
             offsets = {
                 "used": self.offsets_used,
@@ -220,7 +148,7 @@ class Calibration:
         }
 
 
-def _check_document(check: Check) -> CheckDocument:
+def _check_document(check: Check) -> dict[str, Any]:
     return {
         "name": check.name,
         "passed": check.passed,

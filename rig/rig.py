@@ -1,12 +1,12 @@
 """Defines a rig: calibrated cameras with names."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
-from rig.camera import Camera
+from rig.camera import Camera, Intrinsics
 from rig.errors import EigenheadError
 from rig.geometry import nearest_to_rays
 from rig.messages.message import compose
@@ -56,6 +56,10 @@ class Rig:
         """Returns the rig of the named cameras only, in the rig's order."""
         retained = set(names)
         return replace(self, cameras=tuple(camera for camera in self.cameras if camera.name in retained))
+
+    def with_intrinsics(self, change: Callable[[Intrinsics], Intrinsics]) -> "Rig":
+        """Returns the rig with each camera's intrinsics as ``change`` returns them."""
+        return replace(self, cameras=tuple(replace(c, intrinsics=change(c.intrinsics)) for c in self.cameras))
 
     def scaled(self, factor: float) -> "Rig":
         """Returns the rig for images scaled by ``factor``."""

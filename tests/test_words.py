@@ -69,7 +69,6 @@ REPLACED = {
     "weight_room": "weight_bounds",
 }
 PUBLIC = {
-    ("calibration/scene/result.py", "told"),  # scale.told of a calibration's document
     ("rig/formats/cameras/foreign.py", "told"),  # a parameter of the message key-not-used
     ("server/storage/records.py", "own"),  # of deliveries that wait in the job engine's queue
 }

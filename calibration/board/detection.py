@@ -27,7 +27,7 @@ from calibration.board.picture_files import filed_by_shot, list_pictures
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
 from rig.messages.message import Message, compose
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 
 VERSION = 2  # of the detector: part of the cache's key
 EXPLAINED = 4  # pictures of a blind camera that are looked at twice
@@ -74,7 +74,6 @@ class Detections:
         sizes: width and height of each camera's pictures, px.
         shots: their names.
         views: the corners that each camera saw in each shot.
-        missed: camera and shot of each picture without the board.
         notes: for cameras that never see the board, what their pictures show instead.
         remarks: how the board differs from its description.
     """
@@ -83,7 +82,6 @@ class Detections:
     sizes: dict[str, tuple[int, int]]
     shots: tuple[str, ...]
     views: tuple[View, ...]
-    missed: tuple[tuple[str, str], ...]
     notes: tuple[PictureNote, ...] = ()
     remarks: tuple[Message, ...] = ()
 
@@ -116,10 +114,6 @@ def _some_pictures(names: list[str]) -> str | Message:
     return compose("picture-and-others", picture=names[0], others=len(names) - 1)
 
 
-def ignore_progress(stage: str, fraction: float) -> None:
-    """Does nothing: the default for callers that need no progress."""
-
-
 def detect_folder(
     folder: Path,
     board: Board,
@@ -127,7 +121,7 @@ def detect_folder(
     cache: Path | None = None,
     workers: int = 2,
     together: bool = True,
-    report: Progress = ignore_progress,
+    report: Progress = discard_progress,
 ) -> Detections:
     """Finds the board in every picture of ``folder``. A ChArUco board is also found if its first square is white, or if
     its markers begin at another number than described.
@@ -159,10 +153,8 @@ def _with_measured_pattern(
     """Returns the board with the pattern that its markers have, if it is not found as described. Raises WrongBoard
     where its markers are not as wide as described: their edges then pass for blur."""
     board = detections.board
-    paths = [path for shots in pictures.values() for path in shots.values()]
-    found_share = len(detections.views) / len(paths)
-    sample = paths[:: max(1, len(paths) // MEASURED)]
-    greys = [grey for path in sample if (grey := _decode(path.read_bytes())) is not None]
+    found_share = len(detections.views) / sum(map(len, pictures.values()))
+    greys = _sample(pictures, MEASURED)
     greys = [255 - grey for grey in greys] if board.inverted else greys
     markers = [find_markers(grey, board.dictionary) for grey in greys[: MEASURED if found_share < FEW_FOUND else 4]]
     if found_share >= FEW_FOUND:
@@ -186,12 +178,16 @@ def _with_measured_pattern(
 def _refuse_markers(pictures: dict[str, dict[str, Path]]) -> None:
     """Raises WrongBoard where pictures that should show a checkerboard show markers. Some squares of a ChArUco board
     pass for a checkerboard, and the markers' edges for blur."""
-    paths = [path for shots in pictures.values() for path in shots.values()]
-    sample = paths[:: max(1, len(paths) // TRIED)][:TRIED]
-    greys = [grey for path in sample if (grey := _decode(path.read_bytes())) is not None]
-    dictionary = other_dictionary(greys, "")
+    dictionary = other_dictionary(_sample(pictures, TRIED)[:TRIED], "")
     if dictionary is not None:
         raise WrongBoard([compose("board-has-markers", dictionary=dictionary)])
+
+
+def _sample(pictures: dict[str, dict[str, Path]], count: int) -> list[UInt8[np.ndarray, "_ _"]]:
+    """Returns about ``count`` pictures, in grey, from all cameras and shots."""
+    paths = [path for shots in pictures.values() for path in shots.values()]
+    every = paths[:: max(1, len(paths) // count)]
+    return [grey for path in every if (grey := _decode(path.read_bytes())) is not None]
 
 
 def _detect_pictures(
@@ -215,7 +211,7 @@ def _detect_pictures(
         if isinstance(result, Message)
     ]
     sizes: dict[str, tuple[int, int]] = {}
-    views, missed = [], []
+    views = []
     for (camera, shot, path), result in zip(tasks, results, strict=True):
         if isinstance(result, Message):
             continue
@@ -229,15 +225,13 @@ def _detect_pictures(
                     first="{} x {}".format(*sizes[camera]),
                 )
             )
-        if detection is None:
-            missed.append((camera, shot))
-        else:
+        if detection is not None:
             views.append(View(camera, shot, detection))
     if faults:
         raise InputError(folder.name, faults)
     shots = tuple(sorted({shot for _, shot, _ in tasks}))
     notes = _explain_missing(pictures, sizes, views, board)
-    return Detections(board, sizes, shots, tuple(views), tuple(missed), tuple(notes))
+    return Detections(board, sizes, shots, tuple(views), tuple(notes))
 
 
 def _detect_file(path: Path, board: Board, cache: Path | None) -> tuple[tuple[int, int], Found | None] | Message:

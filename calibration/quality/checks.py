@@ -5,7 +5,7 @@ The verdict's limits were chosen on simulated sessions of 4 to 30 shots (``tests
 prints them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -65,12 +65,7 @@ def check_cheirality(state: BundleState, observed: Observations, board: Board) -
 
 
 def check_held_out(
-    state: BundleState,
-    observed: Observations,
-    prior: LensPrior,
-    sigma: Float[np.ndarray, " c"],
-    free: Free,
-    tick: Callable[[], None] = lambda: None,
+    state: BundleState, observed: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"], free: Free
 ) -> Check:
     """Checks that cameras estimated without every fifth shot fit the boards of those shots as well as others."""
     several = np.flatnonzero(np.bincount(observed.shot, minlength=len(state.board_rotations)) >= 2)
@@ -78,10 +73,10 @@ def check_held_out(
     if len(held) < 2 or len(several) - len(held) < 4:
         return Check("held-out shots", None, compose("held-out-too-few", shots=len(several)))
     out = np.isin(observed.shot[observed.view_of], held)
-    trained = adjust(state, observed.subset(~out), prior, sigma, free=free, loss=HUBER, tick=tick, steps=25).state
+    trained = adjust(state, observed.subset(~out), prior, sigma, free=free, loss=HUBER, steps=25).state
     boards = replace(free, intrinsics=False, poses=False, offsets=False)
     rest = observed.subset(out)
-    tested = adjust(trained, rest, fixed_prior(trained.intrinsics), sigma, free=boards, loss=HUBER, tick=tick).state
+    tested = adjust(trained, rest, fixed_prior(trained.intrinsics), sigma, free=boards, loss=HUBER).state
     inside, outside = (
         float(np.sqrt((residuals(s, o) ** 2).sum(axis=1).mean())) for s, o in ((state, observed), (tested, rest))
     )

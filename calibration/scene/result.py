@@ -4,7 +4,7 @@ the verdict on it, by the same limits as for a board; and writes its report, one
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TypedDict
+from typing import Any
 
 from calibration.adjustment.state import rms
 from calibration.quality.checks import POSE_GOOD_PX, POSE_POOR_PX, Verdict
@@ -13,57 +13,9 @@ from calibration.scene.covariance import Uncertainty
 from calibration.scene.scale import Scale
 from calibration.scene.structure import Structure
 from rig.atomic_write import write_atomically
-from rig.formats.cameras.cameras_json import CamerasDocument, document_from_rig
-from rig.messages.message import Message, MessageDocument, compose, documents_of, texts_of
+from rig.formats.cameras.cameras_json import document_from_rig
+from rig.messages.message import Message, compose, documents_of, texts_of
 from rig.rig import Rig
-
-
-class SceneCameraFigures(TypedDict):
-    """Describes how well one camera is calibrated: its reprojection error (RMS, px), its keypoints and solved points,
-    its focal length, and the standard deviations of pose and focal length."""
-
-    rms_px: float
-    features: int
-    points: int
-    pose_sigma_px: float
-    focal_px: float
-    focal_sigma_px: float
-
-
-class SceneFigures(TypedDict):
-    """Describes the numbers that ``calibrate --from scene --json`` prints. ``used_share`` is the share of matched
-    keypoints in the solution."""
-
-    rms_px: float
-    used_share: float
-    noise_px: float
-    points: int
-    observations: int
-    cameras: dict[str, SceneCameraFigures]
-
-
-class ScaleDocument(TypedDict):
-    """Describes where the scale comes from, in words too (``told``), whether it is only assumed, and its relative
-    standard deviation."""
-
-    source: str
-    assumed: bool
-    told: str
-    share_sigma: float
-
-
-class SceneDocument(TypedDict):
-    """Describes a scene's ``calibration.json``."""
-
-    figures: SceneFigures
-    front: str
-    lenses: str
-    scale: ScaleDocument
-    left_out: dict[str, str]
-    refinement: str | None
-    warnings: list[str]
-    warning_messages: list[MessageDocument]
-    rig: CamerasDocument
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,10 +49,11 @@ class SceneCalibration:
         """Returns a message for every view that could not be joined to the others: which it is, and why."""
         return [compose("located", where=name, fault=why) for name, why in self.left_out.items()]
 
-    def figures(self) -> SceneFigures:
-        """Returns the numbers that ``calibrate --from scene --json`` prints."""
+    def figures(self) -> dict[str, Any]:
+        """Returns the numbers that ``calibrate --from scene --json`` prints. ``used_share`` is the share of matched
+        keypoints in the solution; ``points`` of a camera are those of its keypoints (``features``) in it."""
         misses = self.structure.residuals()
-        cameras: dict[str, SceneCameraFigures] = {}
+        cameras = {}
         for index, camera in enumerate(self.rig):
             of_camera = self.structure.camera_of == index
             cameras[camera.name] = {
@@ -120,8 +73,8 @@ class SceneCalibration:
             "cameras": cameras,
         }
 
-    def document(self) -> SceneDocument:
-        """Returns the calibration as JSON types, without points and residuals."""
+    def document(self) -> dict[str, Any]:
+        """Returns a scene's ``calibration.json``, without points and residuals."""
         return {
             "figures": self.figures(),
             "front": self.front,

@@ -27,7 +27,6 @@ from calibration.scene.structure import Structure, solve_structure, why_not
 from calibration.silhouette_refinement.refine import (
     FOLDS,
     GAIN_SIGMAS,
-    PRIOR_PX,
     Pairs,
     gain_of,
     minimise_tangencies,
@@ -46,7 +45,7 @@ from rig.formats.cameras.scale_json import read_scale
 from rig.formats.captures.shot_files import with_serials
 from rig.geometry import RigidTransform
 from rig.messages.message import Message, compose
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 from rig.rig import Rig
 
 VIEWS_LEAST = 8  # 28 pairs; with fewer some camera would have no pairs left once a fifth is held out
@@ -83,7 +82,7 @@ def calibrate_scene(
     scale: Path | None = None,
     front: str | None = None,
     one_lens: bool | None = None,
-    report: Progress = lambda stage, fraction: None,
+    report: Progress = discard_progress,
 ) -> SceneCalibration:
     """Calibrates the cameras of the photographs ``PHOTOS/<camera>.<ext>`` or ``PHOTOS/<camera>/<shot>.<ext>``. The same
     photographs give the same rig on the same machine.
@@ -176,7 +175,7 @@ def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.
     if len(known) < VIEWS_LEAST:
         return calibration
     masked = Capture({}, masks={name: masks[name] for name in known})
-    silhouettes = segment(masked, rig.subset(known), report=lambda stage, share: None)
+    silhouettes = segment(masked, rig.subset(known), report=discard_progress)
     done = refine_one(silhouettes, rig)
     return calibration if done is None else replace(calibration, rig=done.rig, refinement=done.reason)
 
@@ -197,11 +196,10 @@ def transformed(structure: Structure, moved: Rig, factor: float) -> Structure:
 class SingleRefinement:
     """Holds the result of a refinement by one capture.
 
-    ``rig`` is ``proposed`` if it is ``kept``, otherwise the start; ``reason`` says why. ``change_px`` is the RMS motion
-    (2D) of the image of the subject's region, of the median camera."""
+    ``rig`` is the refined one if it is ``kept``, otherwise the start; ``reason`` says why. ``change_px`` is the RMS
+    motion (2D) of the image of the subject's region by the refinement, of the median camera."""
 
     rig: Rig
-    proposed: Rig
     kept: bool
     change_px: float
     reason: Message
@@ -216,11 +214,11 @@ def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement 
     usable = [name for name in rig.names if name in capture and capture[name].quality.usable]
     if len(usable) < VIEWS_LEAST:
         return None
-    proposed = minimise_tangencies([capture], rig, focal=False, prior_px=PRIOR_PX, heads=None)
+    proposed = minimise_tangencies([capture], rig, focal=False, heads=None)
     parts = []
     for fold in range(FOLDS):
         held, others = _pairs(usable, fold, inside=True), _pairs(usable, fold, inside=False)
-        without = minimise_tangencies([capture], rig, focal=False, prior_px=PRIOR_PX, heads=None, pairs=others)
+        without = minimise_tangencies([capture], rig, focal=False, heads=None, pairs=others)
         parts.append([residuals([capture], candidate, held).px for candidate in (rig, without)])
     before, after = (np.concatenate(side) for side in zip(*parts, strict=True))
     noise = noise_of(after)
@@ -234,7 +232,7 @@ def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement 
         sigmas=gain / max(deviation, 1e-9),
     )
     change_px = float(np.median(image_distance(proposed, rig)))
-    return SingleRefinement(proposed if accepted else rig, proposed, accepted, change_px, reason)
+    return SingleRefinement(proposed if accepted else rig, accepted, change_px, reason)
 
 
 def _pairs(names: list[str], fold: int, *, inside: bool) -> Pairs:

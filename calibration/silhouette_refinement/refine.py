@@ -67,7 +67,7 @@ from rig.camera import Camera
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
 from rig.messages.message import Message, compose
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 from rig.rig import Rig
 
 PRIOR_PX = 0.2  # standard deviation in the image, of a camera that states no covariance
@@ -158,28 +158,24 @@ def refine(
     rig: Rig,
     *,
     focal: bool = False,
-    prior_px: float = PRIOR_PX,
     heads: Heads | None = None,
-    report: Progress = lambda stage, fraction: None,
+    report: Progress = discard_progress,
 ) -> Refinement:
     """Refines extrinsics, and with ``focal`` also focal lengths, from all captures.
 
     The result is kept if each capture, held out in its turn (several at a time if there are more than ``FOLDS``),
-    agrees better with cameras refined by the others. ``prior_px`` is the standard deviation in the image of a camera
-    without a covariance. ``heads`` is a model whose rims are used as well, once the tangencies have converged. Raises
-    TooFewCaptures."""
+    agrees better with cameras refined by the others. ``heads`` is a model whose rims are used as well, once
+    the tangencies have converged. Raises TooFewCaptures."""
     if len(captures) < 2:
         raise TooFewCaptures(len(captures))
     folds = min(FOLDS, len(captures))
-    proposed = minimise_tangencies(captures, rig, focal=focal, prior_px=prior_px, heads=heads)
+    proposed = minimise_tangencies(captures, rig, focal=focal, heads=heads)
     report("refine", 1 / (folds + 1))
     parts = []
     for fold in range(folds):
         others = [i for i in range(len(captures)) if i % folds != fold]
         other_heads = None if heads is None else heads.subset(others)
-        without = minimise_tangencies(
-            [captures[i] for i in others], rig, focal=focal, prior_px=prior_px, heads=other_heads
-        )
+        without = minimise_tangencies([captures[i] for i in others], rig, focal=focal, heads=other_heads)
         held_out = captures[fold::folds]
         parts.append((residuals(held_out, rig), residuals(held_out, without)))
         report("refine", (fold + 2) / (folds + 1))
@@ -254,7 +250,6 @@ def minimise_tangencies(
     start: Rig,
     *,
     focal: bool,
-    prior_px: float,
     heads: Heads | None,
     pairs: Pairs | None = None,
 ) -> Rig:
@@ -263,7 +258,7 @@ def minimise_tangencies(
 
     Only tangencies of ``pairs`` of cameras count if these are given. The covariances of the result are those of the
     last step, in the subject's gauge (``calibration.adjustment.gauge``)."""
-    here = _Refining(captures, start, focal, prior_px, pairs)
+    here = _Refining(captures, start, focal, pairs)
     correction = here.prior.centre
     solution = None
     for k in range(STEPS):
@@ -290,16 +285,11 @@ class _Refining:
     """Holds what stays constant while the tangencies of a refinement are found anew in each step."""
 
     def __init__(
-        self,
-        captures: Sequence[Mapping[str, Silhouette]],
-        start: Rig,
-        focal: bool,
-        prior_px: float,
-        pairs: Pairs | None,
+        self, captures: Sequence[Mapping[str, Silhouette]], start: Rig, focal: bool, pairs: Pairs | None
     ) -> None:
         self.captures, self.start, self.focal, self.pairs = captures, start, focal, pairs
         self.projection = _projection(start, focal=focal)
-        information = gauge_free(_prior(start, focal=focal, prior_px=prior_px), self.projection)
+        information = gauge_free(_prior(start, focal=focal), self.projection)
         self.prior = Quadratic.prior(information, np.zeros(len(information)))
 
     def rig(self, correction: Float[np.ndarray, " p"]) -> Rig:
@@ -347,14 +337,14 @@ def _pose_places(rig: Rig, *, focal: bool) -> Int[np.ndarray, " q"]:
     return np.concatenate([per_camera(focal=focal) * k + np.arange(6) for k in range(len(rig))])
 
 
-def _prior(rig: Rig, *, focal: bool, prior_px: float) -> Float[np.ndarray, "p p"]:
+def _prior(rig: Rig, *, focal: bool) -> Float[np.ndarray, "p p"]:
     """Returns the prior information of the cameras: their covariances, and that of the focal length's logarithm."""
     centre = rig.centre_world()[None]
     blocks = []
     for camera in rig:
         depth = float(camera.camera_from_world.apply(centre)[0, 2])
         block = np.zeros((per_camera(focal=focal),) * 2)
-        block[:6, :6] = camera_information(camera, depth, prior_px)
+        block[:6, :6] = camera_information(camera, depth, PRIOR_PX)
         block[6:, 6:] = FOCAL_SPREAD**-2
         blocks.append(block)
     return np.asarray(scipy.linalg.block_diag(*blocks))
@@ -419,17 +409,14 @@ class _Extremes:
     slopes: Float[np.ndarray, "e 2"]
 
 
-def find_frontier(silhouettes: Mapping[str, Silhouette], rig: Rig, gate_px: float = GATE_PX) -> list[Tangency]:
+def find_frontier(silhouettes: Mapping[str, Silhouette], rig: Rig) -> list[Tangency]:
     """Returns the frontier points of every pair of cameras that both contours show without ambiguity. ``rig`` must
     contain only cameras with a usable silhouette."""
     contours = [Contour.of(camera, silhouettes[camera.name]) for camera in rig]
-    frontier = []
-    for one, two in combinations(contours, 2):
-        frontier += _pair(one, two, gate_px)
-    return frontier
+    return [point for one, two in combinations(contours, 2) for point in _pair(one, two)]
 
 
-def _pair(one: Contour, two: Contour, gate_px: float) -> list[Tangency]:
+def _pair(one: Contour, two: Contour) -> list[Tangency]:
     u, v = epipolar_plane_axes(one.camera, two.camera, one.rays.mean(axis=0) + two.rays.mean(axis=0))
     angles = [np.arctan2(contour.rays @ v, contour.rays @ u) for contour in (one, two)]
     if max(np.ptp(angle) for angle in angles) > LONGEST_SPAN:
@@ -437,18 +424,14 @@ def _pair(one: Contour, two: Contour, gate_px: float) -> list[Tangency]:
     first, second = (_extremes(c, angle, u, v) for c, angle in zip((one, two), angles, strict=True))
     if not len(first.angle) or not len(second.angle):
         return []
-    steepness = np.linalg.norm(first.slopes, axis=1)
-    other_steepness = np.linalg.norm(second.slopes, axis=1)
-    apart = (
-        np.abs(first.angle[:, None] - second.angle[None, :])
-        / np.hypot(steepness[:, None], other_steepness[None, :])
-        * np.sqrt(2.0)
-    )
+    steepness, other_steepness = (np.linalg.norm(each.slopes, axis=1) for each in (first, second))
+    gap = np.abs(first.angle[:, None] - second.angle[None, :])
+    apart = gap / np.hypot(steepness[:, None], other_steepness[None, :]) * np.sqrt(2.0)
     apart[first.side[:, None] != second.side[None, :]] = np.inf
     frontier = []
-    for i, j in zip(*np.nonzero(apart < gate_px), strict=True):
+    for i, j in zip(*np.nonzero(apart < GATE_PX), strict=True):
         rivals = np.concatenate([np.delete(apart[i], j), np.delete(apart[:, j], i)])
-        if len(rivals) and rivals.min() < 2.0 * gate_px:
+        if len(rivals) and rivals.min() < 2.0 * GATE_PX:
             continue
         names, pixels = (one.camera.name, two.camera.name), (first.pixels[i], second.pixels[j])
         difference = float(first.angle[i] - second.angle[j])

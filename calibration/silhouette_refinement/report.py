@@ -2,54 +2,19 @@
 
 from dataclasses import dataclass
 from html import escape
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from calibration.report import STYLE, listed, table
 from calibration.silhouette_refinement.refine import Refinement, robust_rms
-from rig.formats.cameras.cameras_json import CamerasDocument, document_from_rig
+from rig.formats.cameras.cameras_json import document_from_rig
 from rig.geometry import vector_from_rotation
-from rig.messages.message import Message, MessageDocument, documents_of, texts_of
+from rig.messages.message import Message, documents_of, texts_of
 from rig.rig import Rig
 
 BINS, HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT = 24, 420.0, 160.0
-
-
-class HeldOut(TypedDict):
-    """Holds the residuals (robust RMS, px) of captures held out, before and after, and the number of equations."""
-
-    before_px: float
-    after_px: float
-    noise_px: float
-    equations: int
-
-
-class RefinedCamera(TypedDict):
-    """Holds the residuals of one camera's tangencies (px) before and after, and how far it was moved."""
-
-    before_px: float
-    after_px: float
-    equations: int
-    change_px: float
-    turn_mrad: float
-    shift_mm: float
-    focal_change: float
-
-
-class RefinementDocument(TypedDict):
-    """Describes what ``refine --json`` prints."""
-
-    kept: bool
-    reason: str
-    reason_message: MessageDocument
-    captures: list[str]
-    held_out: HeldOut
-    cameras: dict[str, RefinedCamera]
-    warnings: list[str]
-    warning_messages: list[MessageDocument]
-    rig: CamerasDocument
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,8 +26,8 @@ class RefinementRun:
     captures: tuple[str, ...]
     warnings: tuple[Message, ...] = ()
 
-    def document(self) -> RefinementDocument:
-        """Returns what ``refine --json`` prints."""
+    def document(self) -> dict[str, Any]:
+        """Returns what ``refine --json`` prints: residuals are robust RMS, px."""
         refinement = self.refinement
         return {
             "kept": refinement.kept,
@@ -125,7 +90,8 @@ def refinement_page(run: RefinementRun) -> str:
     return "\n".join(parts)
 
 
-def _camera(run: RefinementRun, name: str) -> RefinedCamera:
+def _camera(run: RefinementRun, name: str) -> dict[str, float]:
+    """Returns the residuals of a camera's tangencies before and after, and how far it was moved."""
     refinement, start, end = run.refinement, run.start[name], run.refinement.proposed[name]
     motion = end.camera_from_world @ start.camera_from_world.inverse()
     after = refinement.after.of(name)

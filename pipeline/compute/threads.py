@@ -72,6 +72,11 @@ def map_in_threads(work: Callable[[int], Result], count: int) -> list[Result]:
     return [found[k] for k in range(count)]
 
 
+def map_strips(work: Callable[[slice], None], size: int, rows: int) -> None:
+    """Runs ``work`` on strips of at most ``rows`` rows of an image that is ``size`` rows high, in several threads."""
+    map_in_threads(lambda k: work(slice(k * rows, min((k + 1) * rows, size))), -(-size // rows))
+
+
 def cut(count: int, parts: int) -> list[tuple[int, int]]:
     """Cuts ``range(count)`` into at most ``parts`` slices of nearly equal length. Returns the first index and the index
     after the last one of each; no slice is empty unless ``count`` is 0."""

@@ -38,7 +38,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity
 from rig.mesh import vertex_normals
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 from rig.rig import Rig
 
 LEVEL, STEPS = "p95", 4  # as the contour solver's own stage with more modes
@@ -74,7 +74,7 @@ def solve_contour(
     *,
     features: Mapping[str, Mapping[str, np.ndarray]] | None = None,
     landmarks: LandmarkObservations | None = None,
-    report: Progress = lambda stage, fraction: None,
+    report: Progress = discard_progress,
 ) -> ContourSolution:
     """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes, from a start
     pose: the first ``settings.modes`` modes first, the rest once those have converged. ``features`` are pixels by

@@ -43,7 +43,7 @@ from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
 from rig.mesh import face_normals, vertex_normals
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 
 MAX_TURN = 0.0  # cosine between a triangle before and after; a right angle is a fold
 MIN_AREA = 0.02  # of the triangle's own, before
@@ -118,7 +118,7 @@ def refine_to_surface(
     eyes: Mapping[str, EyeEvidence] | None = None,
     patches: PatchSearch | None = None,
     outlines: OutlineSearch | None = None,
-    report: Progress = lambda stage, fraction: None,
+    report: Progress = discard_progress,
 ) -> DeformedSurface:
     """Deforms the fitted head to the measured surface.
 
@@ -177,7 +177,7 @@ def deform_to_points(
     look: Callable[[Vertices], PatchPlaces] | None = None,
     outlines: Outlines | None = None,
     shared_error: float = SHARED_ERROR,
-    report: Progress = lambda stage, fraction: None,
+    report: Progress = discard_progress,
 ) -> DeformedSurface:
     """Deforms a surface to measured points, where there are points near it.
 

@@ -13,6 +13,7 @@ the same unit prior, orthogonal to the span of the eigenheads. They move along t
 surface changes no silhouette.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -43,20 +44,22 @@ SCALES = (KernelScale(40.0, 2.0), KernelScale(18.0, 1.2))
 FREE = 0.4  # share of the variance that need not be symmetric
 
 
-def with_kernel(
-    model: HeadModel, count: int, *, scales: tuple[KernelScale, ...] = SCALES, most: int = 300
-) -> HeadModel:
+def with_kernel(model: HeadModel, count: int, *, most: int = 300) -> HeadModel:
     """Returns the model with its first ``count`` eigenheads as modes, followed by at most ``most`` modes of the
-    Gaussian process (mm per standard deviation)."""
+    Gaussian process: displacements of the cage's vertices along their normals (mm per standard deviation), orthogonal
+    to the eigenheads."""
     span = with_modes(model, count)
-    modes = kernel_modes(span, scales, most)
-    sigma = np.linalg.norm(modes.reshape(len(modes), -1), axis=1).astype(np.float32)
-    return replace(
-        span, modes=np.concatenate([span.modes, modes]), sigma=np.concatenate([span.sigma, sigma]), _bases={}
-    )
+    points = span.mean.astype(float)
+    nodes = spread_nodes(points, min(NODES, len(points)))
+    fields = _leading_fields(points, points[nodes], lambda x, y: covariance(x, y, SCALES), most)
+    normals = vertex_normals(points, span.levels["cage"].faces)
+    modes = (fields[:, :, None] * normals[None]).reshape(len(fields), -1)
+    axes, _ = np.linalg.qr(span.modes.reshape(len(span.modes), -1).astype(float).T)
+    modes -= (modes @ axes) @ axes.T
+    return _with_more_modes(span, modes.reshape(len(fields), -1, 3))
 
 
-def with_fine_kernel(model: HeadModel, *, length_mm: float, amplitude_mm: float, most: int = 400) -> HeadModel:
+def with_fine_kernel(model: HeadModel, *, length_mm: float, amplitude_mm: float) -> HeadModel:
     """Returns the model with more modes, of a shorter length, that deform the face region only, for solvers that see
     more of the face than its outline.
 
@@ -65,44 +68,38 @@ def with_fine_kernel(model: HeadModel, *, length_mm: float, amplitude_mm: float,
     """
     level = model.levels["cage"]
     points = model.mean.astype(float)
-    inside = np.flatnonzero(level.face_region)
-    nodes = inside[spread_nodes(points[inside], min(NODES, len(inside)))]
-    values, vectors = np.linalg.eigh(_gaussian(points[nodes], points[nodes], length_mm, amplitude_mm))
+    inside = points[level.face_region]
+    nodes = inside[spread_nodes(inside, min(NODES, len(inside)))]
+
+    def gaussian(x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "n m"]:
+        return amplitude_mm**2 * np.exp(_square_distance(x, y) / (-2.0 * length_mm**2))
+
+    outside, _ = KDTree(inside).query(points)
+    fields = _leading_fields(points, nodes, gaussian, 400) * np.exp(-0.5 * (outside / (0.5 * length_mm)) ** 2)
+    return _with_more_modes(model, fields[:, :, None] * vertex_normals(points, level.faces)[None])
+
+
+def _leading_fields(
+    points: Float[np.ndarray, "v 3"],
+    nodes: Float[np.ndarray, "n 3"],
+    process: Callable[[np.ndarray, np.ndarray], Float[np.ndarray, "_ _"]],
+    most: int,
+) -> Float[np.ndarray, "r v"]:
+    """Returns the leading eigenfunctions, at most so many, of the process with the covariance ``process``, each scaled
+    by its standard deviation. Nystroem: f_k(x) = k(x, nodes) u_k / sqrt(value_k) has covariance sum_k f_k f_k^T ~ k."""
+    values, vectors = np.linalg.eigh(process(nodes, nodes))
     order = np.argsort(values)[::-1]
     share = np.cumsum(values[order]) / values.sum()
     order = order[: min(most, int(np.searchsorted(share, KEPT)) + 1)]
-    fields = _gaussian(points, points[nodes], length_mm, amplitude_mm) @ (vectors[:, order] / np.sqrt(values[order]))
-    outside, _ = KDTree(points[inside]).query(points)
-    fields *= np.exp(-0.5 * (outside / (0.5 * length_mm)) ** 2)[:, None]
-    modes = (fields.T[:, :, None] * vertex_normals(points, level.faces)[None]).astype(np.float32)
-    sigma = np.linalg.norm(modes.reshape(len(modes), -1), axis=1).astype(np.float32)
+    return (process(points, nodes) @ (vectors[:, order] / np.sqrt(values[order]))).T
+
+
+def _with_more_modes(model: HeadModel, modes: Float[np.ndarray, "r v0 3"]) -> HeadModel:
+    added = modes.astype(np.float32)
+    sigma = np.linalg.norm(added.reshape(len(added), -1), axis=1).astype(np.float32)
     return replace(
-        model, modes=np.concatenate([model.modes, modes]), sigma=np.concatenate([model.sigma, sigma]), _bases={}
+        model, modes=np.concatenate([model.modes, added]), sigma=np.concatenate([model.sigma, sigma]), _bases={}
     )
-
-
-def _gaussian(
-    x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "m 3"], length_mm: float, amplitude_mm: float
-) -> Float[np.ndarray, "n m"]:
-    return amplitude_mm**2 * np.exp(_square_distance(x, y) / (-2.0 * length_mm**2))
-
-
-def kernel_modes(model: HeadModel, scales: tuple[KernelScale, ...], most: int) -> Float[np.ndarray, "r v0 3"]:
-    """Returns the leading eigenfunctions of the Gaussian process: displacements of the cage's vertices along their
-    normals (mm per standard deviation), orthogonal to the model's modes."""
-    points = model.mean.astype(float)
-    normals = vertex_normals(points, model.levels["cage"].faces)
-    nodes = spread_nodes(points, min(NODES, len(points)))
-    values, vectors = np.linalg.eigh(covariance(points[nodes], points[nodes], scales))
-    order = np.argsort(values)[::-1]
-    share = np.cumsum(values[order]) / values.sum()
-    order = order[: min(most, int(np.searchsorted(share, KEPT)) + 1)]
-    # Nystroem: f_k(x) = k(x, nodes) u_k / sqrt(value_k) has covariance sum_k f_k f_k^T ~ k.
-    fields = covariance(points, points[nodes], scales) @ (vectors[:, order] / np.sqrt(values[order]))
-    modes = (fields.T[:, :, None] * normals[None]).reshape(len(order), -1)
-    span, _ = np.linalg.qr(model.modes.reshape(len(model.modes), -1).astype(float).T)
-    modes -= (modes @ span) @ span.T
-    return modes.reshape(len(order), -1, 3).astype(np.float32)
 
 
 def covariance(

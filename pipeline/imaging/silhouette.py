@@ -1,7 +1,8 @@
 """Defines silhouettes, and the paper's costs of their differences (section 4.3)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -38,6 +39,10 @@ class Silhouette:
     mask: Mask
     distance: Float32[np.ndarray, "h w"]
     quality: ViewQuality = ViewQuality()
+
+    def judged(self, **quality: Any) -> "Silhouette":
+        """Returns the silhouette with other values of these attributes of its quality."""
+        return replace(self, quality=replace(self.quality, **quality))
 
 
 def silhouette_from_mask(mask: Mask) -> Silhouette:

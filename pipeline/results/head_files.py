@@ -19,7 +19,7 @@ from jaxtyping import Float, UInt8, UInt16
 from pipeline.head_model.subdivision import boundary_loops, close_loop
 from pipeline.results.reconstruction import QUALITY, Reconstruction, asset_extras, ply_comments
 from pipeline.texturing.chart_colours import CODES, ENCODED
-from pipeline.texturing.layout.normal_map import normal_mapped, png, vertex_tangents
+from pipeline.texturing.layout.normal_map import normal_mapped, vertex_tangents
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.pores.skin_maps import SkinMaps
 from pipeline.texturing.sets.specular import Specular
@@ -34,6 +34,7 @@ from rig.formats.meshes.printing import stl_bytes, threemf_bytes
 from rig.formats.meshes.scene import Part, Scene, Skin
 from rig.formats.meshes.usdz import scene_usdz_bytes
 from rig.formats.pictures.exr import write_exr
+from rig.formats.pictures.images import encode_image
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 
@@ -124,7 +125,7 @@ def head_skin(result: Reconstruction, head: Mesh) -> Skin | None:
     normals = texturing.normals @ result.head.fit.world_from_head.rotation
     places = head.vertices[layout.source]
     tangents = vertex_tangents(places, normals[layout.source], layout.uv, layout.faces)
-    return replace(skin, normal_map=png(texturing.skin.normals), tangents=tangents)
+    return replace(skin, normal_map=encode_image(".png", texturing.skin.normals), tangents=tangents)
 
 
 def plain_skin(atlas: Atlas | None, kind: str) -> Skin | None:
@@ -155,7 +156,7 @@ def _glb(result: Reconstruction, head: Mesh, normals: Float[np.ndarray, "v 3"]) 
         mapped = normal_mapped(head.vertices, normals, result.texturing.atlas.layout, result.texturing.reduced)
         extras["rows_of_ply"] = mapped.rows.tolist()
         skin = replace(skin, uv=mapped.uv, source=mapped.rows, faces=mapped.mesh.faces)
-        skin = replace(skin, normal_map=png(mapped.image), tangents=mapped.tangents)
+        skin = replace(skin, normal_map=encode_image(".png", mapped.image), tangents=mapped.tangents)
     elif skin is not None and skin.source is not None:
         extras["repeated_vertices"] = skin.source[len(head.vertices) :].tolist()
     morphs = blendshape_rig.moving if blendshape_rig is not None and result.settings.outputs.morphs else {}
@@ -165,8 +166,7 @@ def _glb(result: Reconstruction, head: Mesh, normals: Float[np.ndarray, "v 3"]) 
 def encoded(image: UInt8[np.ndarray, "s s 3"], kind: str) -> bytes:
     """Returns a texture (sRGB) as the bytes of an image file; ``kind`` is a key of ``ENCODINGS``."""
     suffix, _, options = ENCODINGS[kind]
-    _, data = cv2.imencode(suffix, np.ascontiguousarray(image[:, :, ::-1]), list(options))  # OpenCV's blue comes first
-    return data.tobytes()
+    return encode_image(suffix, image, options)
 
 
 def printable(head: Mesh) -> Mesh:
@@ -219,21 +219,19 @@ def write_skin_maps(folder: Path, atlas: Atlas, maps: SkinMaps) -> None:
 def strength_png(specular: Specular) -> bytes:
     """Returns glTF's specular strength as a PNG whose alpha it is; the colours of the pixels are white."""
     alpha = specular.strength()
-    return cv2.imencode(".png", cv2.merge([np.full_like(alpha, 255)] * 3 + [alpha]), PNG_SPEED)[1].tobytes()
+    white = np.full_like(alpha, 255)
+    return cv2.imencode(".png", cv2.merge([white, white, white, alpha]), PNG_SPEED)[1].tobytes()
 
 
 def _write_png(path: Path, image: UInt8[np.ndarray, "s s 3"] | UInt16[np.ndarray, "s s"]) -> None:
-    stored = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
-    write_atomically(path, cv2.imencode(".png", stored, PNG_SPEED)[1].tobytes())
+    write_atomically(path, encode_image(".png", image, PNG_SPEED))
 
 
 def landmarks_document(result: Reconstruction) -> dict[str, Any]:
     """Returns ``landmarks.mrk.json``, a point list of 3D Slicer, as JSON types, with one control point for each
     landmark: in the patient's axes LPS (to the left, posterior, superior; mm) with the head frame's origin and true
     size. A point (x, y, z) of the head frame is (x, -z, y)."""
-    place = result.head.fit.world_from_head
-    head_from_world = RigidTransform(place.rotation, place.translation).inverse()  # keeps the size, as head.glb does
-    lps_from_world = RigidTransform(LPS_FROM_HEAD, np.zeros(3)) @ head_from_world
+    lps_from_world = RigidTransform(LPS_FROM_HEAD, np.zeros(3)) @ head_from_world(result)
     points = {
         name: MarkupPoint(lps_from_world.apply(landmark.position_mm), uncertainty(landmark.std_mm))
         for name, landmark in result.evidence.landmarks.items()

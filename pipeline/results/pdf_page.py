@@ -1,23 +1,27 @@
 """Pages of a PDF: A4, in the fonts that every reader has, with lines, tables and pictures."""
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
 
 import cv2
-import numpy as np
 from fpdf import FPDF
 
 from pipeline.results.overlays import Resized
+from rig.formats.pictures.images import encode_image
 
 MARGIN_MM, WIDTH_MM, LINE_MM = 16.0, 178.0, 5.0  # A4 less its margins
 INK, FAINT, GOOD, BAD = (30, 30, 30), (110, 110, 110), (20, 110, 60), (178, 24, 43)
-JPEG_QUALITY = 92
+JPEG_OPTIONS = (cv2.IMWRITE_JPEG_QUALITY, 92)
 
 
 class PdfPage(FPDF):
-    """Draws A4 pages with a document's margins and fonts; characters outside Latin-1 become question marks."""
+    """Draws A4 pages with a document's margins and fonts; characters outside Latin-1 become question marks. ``date``
+    (ISO 8601) is that of the document, so that the same content gives the same bytes."""
 
-    def __init__(self) -> None:
+    def __init__(self, title: str, date: str) -> None:
         super().__init__(unit="mm", format="A4")
+        self.set_creation_date(datetime.fromisoformat(date).replace(tzinfo=UTC))
+        self.set_title(title)
         self.set_margins(MARGIN_MM, MARGIN_MM, MARGIN_MM)
         self.set_auto_page_break(False)
 
@@ -31,13 +35,13 @@ class PdfPage(FPDF):
         """Draws pictures side by side, each ``width_mm`` wide, and goes below them."""
         top, height = self.get_y(), width_mm * row[0].shape[0] / row[0].shape[1]
         for column, image in enumerate(row):
-            self.image(jpeg_of(image), x=MARGIN_MM + column * width_mm, y=top, w=width_mm)
+            self.image(encode_image(".jpg", image, JPEG_OPTIONS), x=MARGIN_MM + column * width_mm, y=top, w=width_mm)
         self.set_y(top + height)
 
     def scale_of(self, legend: Resized, ends: tuple[str, str]) -> None:
         """Draws a scale of colours with words at both of its ends and 0 in its middle, and goes below it."""
         left, top, width = MARGIN_MM + 39, self.get_y(), 100
-        self.image(jpeg_of(legend), x=left, y=top, w=width, h=4)
+        self.image(encode_image(".jpg", legend, JPEG_OPTIONS), x=left, y=top, w=width, h=4)
         self.set_y(top + 4)
         self.set_font("Helvetica", size=8)
         for share, text in ((0.0, ends[0]), (0.5, "0"), (1.0, ends[1])):
@@ -58,12 +62,6 @@ class PdfPage(FPDF):
                 self.cell(width, LINE_MM, latin(text), border="B", align=align)
             self.ln(LINE_MM)
         self.ln(LINE_MM / 2)
-
-
-def jpeg_of(image: Resized) -> bytes:
-    """Returns a picture as the bytes of a JPEG file."""
-    _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(image[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return jpeg.tobytes()
 
 
 def latin(text: str) -> str:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.expression import BlendshapeRig
-from pipeline.evidence.pose import PoseEvidence, angles_deg
+from pipeline.evidence.pose import angles_deg
 from pipeline.faces.detection import FaceDetection
 from pipeline.faces.irises import Iris, UnseenEye
 from pipeline.faces.subject import SubjectFaces
@@ -25,7 +25,6 @@ from pipeline.results.report_types import (
     FaceReport,
     GazeReport,
     MorphsReport,
-    PoseReport,
     Report,
     SetsReport,
     SimilarityReport,
@@ -66,31 +65,35 @@ def report_document(result: Reconstruction) -> Report:
         },
         "cranium": head.cranium,
         "front": result.alignment.front,
-        "pose": _pose(result.pose),
+        "pose": {
+            "method": result.pose.method,
+            "rival": result.pose.rival,
+            "off": dict(result.pose.off),
+            "doubtful": result.pose.doubtful,
+        },
         "faces": {} if result.faces.subject is None else _faces(result.faces.subject, evidence.cameras),
         "cameras": {
             name: _camera(figures, head.fit.camera_shift.get(name), result.views.silhouettes.get(name))
             for name, figures in evidence.cameras.items()
         },
         "pictures": dict(result.views.assignment),
-        "coefficients": _numbers(np.delete(head.fit.coefficients, np.asarray(head.model.posed, int))),  # no expressions
+        "coefficients": np.delete(head.fit.coefficients, np.asarray(head.model.posed, int)).tolist(),  # no expressions
         "expression": [
-            {"name": each.name, "words": each.words, "weight": each.weight, "std": _finite(each.std)}
+            {"name": each.name, "words": each.words, "weight": each.weight, "std": each.std}
             for each in evidence.expression
         ],
         "morphs": None if evidence.blendshape_rig is None else _morphs(evidence.blendshape_rig),
         "template": None,
         "world_from_head": similarity_document(head.fit.world_from_head),
         "landmarks": {
-            name: {"position": _numbers(mark.position_mm), "std": _optional_numbers(mark.std_mm)}
+            name: {"position": mark.position_mm.tolist(), "std": None if mark.std_mm is None else mark.std_mm.tolist()}
             for name, mark in evidence.landmarks.items()
         },
         "measurements": {
-            name: {"value": length.value_mm, "std": _finite(length.std_mm)}
-            for name, length in evidence.measurements.items()
+            name: {"value": length.value_mm, "std": length.std_mm} for name, length in evidence.measurements.items()
         },
         "eyes": eyes_document(result.faces.eyes, head.fit.world_from_head),
-        "quality": {"median": _finite(np.median(refined.deviation_mm)), "max": _finite(refined.deviation_mm.max())},
+        "quality": {"median": float(np.median(refined.deviation_mm)), "max": float(refined.deviation_mm.max())},
         "texture": _texture(result.texturing),
         "bust": None if result.bust is None else _bust(result.bust),
         "evaluations": head.fit.evaluations,
@@ -106,7 +109,7 @@ def report_document(result: Reconstruction) -> Report:
         document["hair"] = {"covered_share": shell.covered, "highest_mm": float(shell.height_mm.max())}
     if result.scale_sigma:
         document["scale_sigma"] = result.scale_sigma
-    return document
+    return _plain(document)
 
 
 def _camera(
@@ -114,23 +117,14 @@ def _camera(
 ) -> CameraReport:
     return {
         "used": figures.used,
-        "iou": _finite(figures.iou),
-        "contour_rms_px": _finite(figures.contour_rms_px),
-        "excluded_share": _finite(figures.excluded_share),
+        "iou": figures.iou,
+        "contour_rms_px": figures.contour_rms_px,
+        "excluded_share": figures.excluded_share,
         "samples": figures.samples,
-        "xor_cost": _finite(figures.xor_cost),
-        "xor_cost_start": _finite(figures.xor_cost_start),
-        "camera_shift": _optional_numbers(shift),
+        "xor_cost": figures.xor_cost,
+        "xor_cost_start": figures.xor_cost_start,
+        "camera_shift": None if shift is None else shift.tolist(),
         "view": None if silhouette is None else _view(silhouette.quality),
-    }
-
-
-def _pose(pose: PoseEvidence) -> PoseReport:
-    return {
-        "method": pose.method,
-        "rival": _finite(pose.rival),
-        "off": {name: _finite(share) for name, share in pose.off.items()},
-        "doubtful": pose.doubtful,
     }
 
 
@@ -144,23 +138,23 @@ def _face(face: FaceDetection | None) -> FaceReport:
         return {"found": False, "box_px": None, "roll_deg": None, "landmarks": 0, "score": None}
     return {
         "found": True,
-        "box_px": _numbers(face.box_px),
-        "roll_deg": _finite(face.roll_deg),
+        "box_px": face.box_px.tolist(),
+        "roll_deg": face.roll_deg,
         "landmarks": len(face.landmarks_px),
-        "score": _finite(face.score),
+        "score": face.score,
     }
 
 
 def _view(quality: ViewQuality) -> ViewReport:
     return {
         "usable": quality.usable,
-        "contrast": _finite(quality.contrast),
+        "contrast": quality.contrast,
         "cut_off": list(quality.cut_off),
         "components": quality.components,
         "holes": quality.holes,
         "warnings": texts_of(quality.warnings),
         "warning_messages": documents_of(quality.warnings),
-        "figures": _plain(quality.figures),
+        "figures": dict(quality.figures),
     }
 
 
@@ -181,7 +175,7 @@ def _texture(texturing: Texturing) -> TextureReport:
     return {
         "vertices": len(vertices.views),
         "filled": int(np.count_nonzero(vertices.views == 0)),
-        "gains": _plain(vertices.gains),
+        "gains": dict(vertices.gains),
         "chart": None if texturing.chart is None else _chart(texturing.chart),
         "light": None if texturing.albedo is None else _light(texturing.albedo.light),
         "skin": None if texturing.skin is None else skin_document(texturing.skin),
@@ -218,28 +212,25 @@ def skin_document(maps: SkinMaps) -> SkinReport:
 
 
 def _chart(chart: ChartColours) -> dict[str, object]:
-    document = {
+    return {
         "cameras": {name: {"matrix": each.matrix, "off": each.off} for name, each in chart.cameras.items()},
         "frame": "world",
         "normal": chart.normal_world,
     }
-    return _plain(document)
 
 
 def _light(light: Light) -> dict[str, object]:
-    document = {
+    return {
         "frame": "world",
         "harmonics": HARMONICS,
         "coefficients": light.coefficients.T,  # a row a channel: red, green, blue
         "convention": ON_CHART if light.on_chart else MEAN_ONE,
         "residual": light.residual,
     }
-    return _plain(document)
 
 
 def _bust(bust: Bust) -> BustReport:
     surface = bust.surface
-    median = np.median(surface.deviation_mm[surface.seen])
     return {
         "spacing_mm": bust.spacing_mm,
         "vertices": len(bust.views),
@@ -247,7 +238,10 @@ def _bust(bust: Bust) -> BustReport:
         "seen_share": float(np.mean(surface.seen)),
         "closed": len(boundary_edges(surface.mesh_world.faces)) == 0,
         "parts": {name: float(np.mean(surface.part == code)) for code, name in enumerate(PART_NAMES)},
-        "quality": {"median_seen": _finite(median), "max": _finite(surface.deviation_mm.max())},
+        "quality": {
+            "median_seen": float(np.median(surface.deviation_mm[surface.seen])),
+            "max": float(surface.deviation_mm.max()),
+        },
         "filled": int(np.count_nonzero(bust.views == 0)),
         "flipped": surface.faults.turned,
         "folded": surface.faults.folded,
@@ -257,21 +251,8 @@ def _bust(bust: Bust) -> BustReport:
     }
 
 
-def _finite(value: float | np.floating | None) -> float | None:
-    """Returns the value, or None if it is not finite, because JSON cannot express that."""
-    return float(value) if value is not None and math.isfinite(value) else None
-
-
-def _numbers(values: Float[np.ndarray, " n"]) -> list[float]:
-    return values.astype(float).tolist()
-
-
-def _optional_numbers(values: Float[np.ndarray, " n"] | None) -> list[float] | None:
-    return None if values is None else _numbers(values)
-
-
 def _plain(value: Any) -> Any:
-    """Returns a nested document converted to JSON types."""
+    """Returns a nested document converted to JSON types, in which None stands for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

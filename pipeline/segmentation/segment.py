@@ -154,8 +154,8 @@ def _doubted(silhouette: Silhouette) -> Silhouette:
     text = compose("outline-guessed", share=weak)
     kept = tuple(warning for warning in quality.warnings if not _concerns(warning, "outline-weak"))
     if weak > MAX_WEAK_SHARE_USABLE:
-        return replace(silhouette, quality=replace(quality, warnings=(*kept, compose("view-unused", remark=text))))
-    return replace(silhouette, quality=replace(quality, warnings=kept, doubts=(text,)))
+        return silhouette.judged(warnings=(*kept, compose("view-unused", remark=text)))
+    return silhouette.judged(warnings=kept, doubts=(text,))
 
 
 def _concerns(message: Message, code: str) -> bool:
@@ -492,4 +492,4 @@ def _judged(silhouette: Silhouette, strange: float, missing: float, *, ready: bo
         text = compose("mask-incomplete-ready" if ready else "mask-incomplete", share=missing)
         warnings.append(compose("view-unused", remark=text) if bad else text)
     figures = {**quality.figures, "strange_share": round(strange, 4), "missing_share": round(missing, 4)}
-    return replace(silhouette, quality=replace(quality, usable=usable, warnings=tuple(warnings), figures=figures))
+    return silhouette.judged(usable=usable, warnings=tuple(warnings), figures=figures)

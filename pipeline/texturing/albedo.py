@@ -10,15 +10,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, UInt8
 
-from pipeline.compute.threads import in_threads
-from pipeline.geometry.projection_kernels import interpolate, rasterise
+from pipeline.compute.threads import map_strips
 from pipeline.texturing.chart_colours import ChartColours, levelled_by_chart
-from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, spread_texels
+from pipeline.texturing.layout.uv_unwrap import Atlas, draw_over_layout
 from pipeline.texturing.light import Light, fit_light, transfer
 from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown
 from pipeline.texturing.vertex_colours import Texture
+from pipeline.texturing.visibility import LINEAR
 from pipeline.warnings import ReportWarning
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.mesh import Mesh
@@ -93,27 +93,16 @@ def multiplied(atlas: Atlas, factors: Float[np.ndarray, "v 3"]) -> UInt8[np.ndar
     """Returns the texture's image with each texel multiplied, in linear light, by the factors interpolated from the
     corners of the texel's triangle."""
     image, size = atlas.image, len(atlas.image)
-    coarse = _factor_image(atlas.layout, factors)
-    linear = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
+    coarse = draw_over_layout(atlas.layout, factors[atlas.layout.source], FACTORS_PX)
     encoded = np.rint(255 * srgb_from_linear(np.arange(CODES + 1) / CODES)).astype(np.uint8)
     stored = np.empty((size, size, 3), np.uint8)  # blue first, as the texture's own
     at = ((np.arange(size) + 0.5) * len(coarse) / size - 0.5).astype(np.float32)
 
-    def work(first: int, last: int) -> None:
-        for band in range(first, last):
-            rows = slice(band * BAND_ROWS, min((band + 1) * BAND_ROWS, size))
-            x, y = np.meshgrid(at, at[rows])
-            by = cv2.remap(coarse, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            light = np.clip(linear[image[rows]] * by, 0.0, 1.0)
-            stored[rows] = encoded[(CODES * light + 0.5).astype(np.int32)][:, :, ::-1]
+    def work(rows: slice) -> None:
+        x, y = np.meshgrid(at, at[rows])
+        by = cv2.remap(coarse, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        light = np.clip(LINEAR[image[rows]] * by, 0.0, 1.0)
+        stored[rows] = encoded[(CODES * light + 0.5).astype(np.int32)][:, :, ::-1]
 
-    in_threads(-(-size // BAND_ROWS), work)
+    map_strips(work, size, BAND_ROWS)
     return stored[:, :, ::-1]
-
-
-def _factor_image(layout: Layout, factors: Float[np.ndarray, "v 3"]) -> Float32[np.ndarray, "s s 3"]:
-    """Spreads the vertices' factors over the layout; texels outside get the factor of the nearest one."""
-    texels, ones = FACTORS_PX * layout.uv - 0.5, np.ones(len(layout.uv))
-    _, shown = rasterise(texels, ones, layout.faces, FACTORS_PX, FACTORS_PX)
-    image = interpolate(shown, texels, ones, layout.faces, factors[layout.source].astype(np.float32))
-    return spread_texels(image, shown >= 0)

@@ -16,15 +16,15 @@ from jaxtyping import Float, UInt8
 from pipeline.compute.threads import map_in_threads
 from pipeline.imaging.colour_chart import Chart, ChartCorrection, chart_correction, chart_normal, charts_in
 from pipeline.texturing.light import BAND_FACTORS, Light, harmonics
+from pipeline.texturing.visibility import LINEAR
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture
-from rig.colour_space import linear_from_srgb, srgb_from_linear
+from rig.colour_space import srgb_from_linear
 from rig.image import ImageRgb
 from rig.messages.message import compose
 from rig.rig import Rig
 
 CODES = 4095
-LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
 ENCODED = np.rint(255 * srgb_from_linear(np.arange(CODES + 1) / CODES)).astype(np.uint8)
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.compute.threads import in_threads
+from pipeline.compute.threads import map_in_threads
 from pipeline.geometry.projection import camera_depths, depth_map, project_points
 from pipeline.texturing.neighbourhood import Neighbourhood
 from rig.camera import Camera, Intrinsics
@@ -92,20 +92,15 @@ def transfer(
     unhidden = harmonics(normals) * BAND_FACTORS
     towards = spread_directions(directions)
     basis = harmonics(towards) * (4.0 / directions)  # the sphere's 4 pi by the matt surface's pi
-    parts: list[np.ndarray] = [np.zeros_like(unhidden) for _ in range(directions)]
 
-    def work(first: int, last: int) -> None:
-        for i in range(first, last):
-            cosine = np.clip(normals @ towards[i], 0.0, None)
-            facing = np.flatnonzero(cosine > 0)
-            hidden = _hidden(_lamp_camera(mesh_world, towards[i]), mesh_world, facing, cosine[facing])
-            parts[i] = (cosine[facing] * hidden)[:, None] * basis[i]
-            rows[i] = facing
+    def hide(i: int) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 9"]]:
+        cosine = np.clip(normals @ towards[i], 0.0, None)
+        facing = np.flatnonzero(cosine > 0)
+        share = _hidden(_lamp_camera(mesh_world, towards[i]), mesh_world, facing, cosine[facing])
+        return facing, (cosine[facing] * share)[:, None] * basis[i]
 
-    rows: list[np.ndarray] = [np.zeros(0, np.int64)] * directions
-    in_threads(directions, work)
     hidden = np.zeros_like(unhidden)
-    for facing, part in zip(rows, parts, strict=True):  # in order, so that the sum has the same bits on any machine
+    for facing, part in map_in_threads(hide, directions):  # in order, so that the sum has the same bits on any machine
         hidden[facing] += part
     return unhidden - (1.0 - RETURNED) * around.calmed(hidden, CALM)
 

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
-from pipeline.compute.threads import in_threads
+from pipeline.compute.threads import map_in_threads
 from pipeline.texturing.paint_kernels import LANES, by_rings, first_guess, relax
 from pipeline.texturing.view_selection_kernels import level_view
 
@@ -126,9 +126,8 @@ def level_views(
     fields = np.zeros((*weights.shape, 4), np.float32)
     fields[:, :, :3] = (agreed - codes) * (weights > 0)[:, :, None]
 
-    def work(first: int, last: int) -> None:
-        for k in range(first, last):
-            level_view(fields[k], weights[k] > 0, around.starts, around.indices, LEVELLING, SWEEPS, FACTOR)
+    def work(k: int) -> None:
+        level_view(fields[k], weights[k] > 0, around.starts, around.indices, LEVELLING, SWEEPS, FACTOR)
 
-    in_threads(len(weights), work)
+    map_in_threads(work, len(weights))
     return fields

@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pipeline.compute.threads import in_threads
+from pipeline.compute.threads import map_strips
 from pipeline.compute.trace import traced
 from pipeline.fusion.refinement import neighbours
 from pipeline.fusion.vote_kernels import blurred_over_mesh
 from pipeline.geometry.projection import camera_depths
-from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings
 from pipeline.texturing.layout.uv_unwrap import (
@@ -22,9 +21,9 @@ from pipeline.texturing.layout.uv_unwrap import (
     Layout,
     ModelLayout,
     NoLayout,
+    draw_over_layout,
     lay_out_charts,
     model_layout,
-    spread_texels,
 )
 from pipeline.texturing.paint_kernels import paint_rows
 from pipeline.texturing.vertex_colours import Texture
@@ -54,29 +53,21 @@ def paint_texture(
         size: of the image.
     """
     stored = np.empty((size, size, 3), np.uint8)  # blue first: encoders take it as it is
-    cv2.resize(_coarse(layout, colours), (size, size), dst=stored, interpolation=cv2.INTER_NEAREST)
+    beside = np.rint(draw_over_layout(layout, colours[layout.source, ::-1], COARSE)).astype(np.uint8)
+    cv2.resize(beside, (size, size), dst=stored, interpolation=cv2.INTER_NEAREST)
     texels = size * layout.uv - 0.5
     choice = decision.choice(colours)
     corners = texels[layout.faces, 1]
     low, high = corners.min(axis=1), corners.max(axis=1)
 
-    def paint(first: int, last: int) -> None:
-        for band in range(first, last):
-            row = band * BAND_ROWS
-            which = np.flatnonzero((high >= row) & (low <= row + BAND_ROWS - 1))
-            paint_rows(stored, row, BAND_ROWS, which, texels, layout.faces, layout.source, decision.pictures, choice)
+    def paint(rows: slice) -> None:
+        which = np.flatnonzero((high >= rows.start) & (low <= rows.stop - 1))
+        paint_rows(
+            stored, rows.start, BAND_ROWS, which, texels, layout.faces, layout.source, decision.pictures, choice
+        )  # fmt: skip
 
-    in_threads(size // BAND_ROWS, paint)
+    map_strips(paint, size, BAND_ROWS)
     return Atlas(layout, stored[:, :, ::-1])
-
-
-def _coarse(layout: Layout, colours: UInt8[np.ndarray, "v 3"]) -> UInt8[np.ndarray, "s s 3"]:
-    """Paints the vertices' colours in a small image, blue first; texels beside the layout get the nearest colour."""
-    texels, ones = COARSE * layout.uv - 0.5, np.ones(len(layout.uv))
-    _, shown = rasterise(texels, ones, layout.faces, COARSE, COARSE)
-    values = np.ascontiguousarray(colours[layout.source, ::-1]).astype(np.float32)
-    image = interpolate(shown, texels, ones, layout.faces, values)
-    return np.rint(spread_texels(image, shown >= 0)).astype(np.uint8)
 
 
 def texture_size(

@@ -105,7 +105,6 @@ class Texture:
     views: UInt8[np.ndarray, " v"]
     gains: Mapping[str, Rgb] = field(default_factory=dict)  # linear, by camera
     offsets: Mapping[str, Rgb] = field(default_factory=dict)
-    filled: int = 0
     decision: Decision | None = None  # where it was asked for
     dim: Float32[np.ndarray, "v 3"] | None = None  # linear, of a dim view of each vertex; where it was asked for
     warnings: tuple[ReportWarning, ...] = ()
@@ -231,8 +230,8 @@ def texture(
     whole = fill_unknown(agreed, seen > 0, mesh_world.faces, parts)
     codes, by_camera = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8), _by_name(views, gains)
     dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
-    filled, warnings = int(np.count_nonzero(seen == 0)), (*_gain_warnings(by_camera), *unlike)
-    return Texture(codes, seen, by_camera, _by_name(views, offsets), filled, decision, dim, warnings)
+    warnings = (*_gain_warnings(by_camera), *unlike)
+    return Texture(codes, seen, by_camera, _by_name(views, offsets), decision, dim, warnings)
 
 
 def wide_doubtful_surface(weights: Weights, mesh_world: Mesh) -> Bool[np.ndarray, " v"]:
@@ -314,7 +313,7 @@ def _gain_warnings(gains: Mapping[str, Rgb]) -> tuple[ReportWarning, ...]:
 def _untextured(count: int) -> Texture:
     code = round(255 * float(srgb_from_linear(np.array(GREY))))
     warning = compose("no-texture")
-    return Texture(np.full((count, 3), code, np.uint8), np.zeros(count, np.uint8), filled=count, warnings=(warning,))
+    return Texture(np.full((count, 3), code, np.uint8), np.zeros(count, np.uint8), warnings=(warning,))
 
 
 def blend_as_paper(
@@ -346,7 +345,7 @@ def blend_as_paper(
     if not known.any():
         return _untextured(len(normals))
     colours = fill_unknown(total / np.where(known, weights, 1.0)[:, None], known, mesh.faces)
-    return Texture(np.rint(colours).clip(0, 255).astype(np.uint8), views, filled=int(np.count_nonzero(~known)))
+    return Texture(np.rint(colours).clip(0, 255).astype(np.uint8), views)
 
 
 def fill_unobserved_patches(

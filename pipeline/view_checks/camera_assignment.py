@@ -27,7 +27,7 @@ from pipeline.multiview.tangency import (
     rays_about,
 )
 from rig.camera import Camera
-from rig.messages.message import Message, compose, texts_of
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 MIN_NOISE_PX, MAX_NOISE_PX = 0.5, 1.5  # of one tangency: what masks leave, and what exchanges may not hide in
@@ -47,22 +47,12 @@ MIN_CAMERAS = 3
 @dataclass(frozen=True, slots=True, eq=False)
 class Assignment:
     """Holds which cameras hold each other's pictures. ``pictures`` has an entry for every camera that holds another's
-    picture: the name under which its own is filed.
-
-    ``gain`` is how much smaller the misfit of the tangent planes is after the exchange; ``overwhelming`` whether that
-    leaves no doubt.
+    picture: the name under which its own is filed. ``overwhelming`` is whether the misfit of the tangent planes becomes
+    so much smaller by the exchange that no doubt is left.
     """
 
     pictures: Mapping[str, str]
-    gain: float = 0.0
     overwhelming: bool = False
-
-    def messages(self) -> list[Message]:
-        """Returns one message for each ring of cameras that exchanged pictures."""
-        return ring_messages(self.pictures, compose("what-pictures"))
-
-    def __str__(self) -> str:
-        return "; ".join(texts_of(self.messages()))
 
 
 NOTHING = Assignment({})
@@ -79,10 +69,9 @@ def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignme
     Returns:
         An empty assignment if every camera holds its own picture, or if no exchange explains the disagreement.
     """
-    seen = with_masks(silhouettes, rig)
+    seen, hulls = outlined(silhouettes, rig)
     if len(seen) < MIN_CAMERAS:
         return NOTHING
-    hulls = [outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen]
     if not (mean_misfit(tangency_errors_px(hulls, seen)) > SUSPECT_MISFIT).any():  # more than good masks do
         return NOTHING
     misfit = _misfit_tensor(hulls, seen)
@@ -92,11 +81,10 @@ def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignme
 def own_misfit(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, float]:
     """Returns, for each camera, how much its picture contradicts the others (mean robust misfit of its tangent planes):
     about 0.2 for the right picture, 0.5 and more for another camera's."""
-    seen = with_masks(silhouettes, rig)
+    seen, hulls = outlined(silhouettes, rig)
     if len(seen) < MIN_CAMERAS:
         return dict.fromkeys(seen.names, CUT_OFF_MISFIT)
-    errors_px = tangency_errors_px([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
-    return dict(zip(seen.names, mean_misfit(errors_px, CUT_OFF_MISFIT).tolist(), strict=True))
+    return dict(zip(seen.names, mean_misfit(tangency_errors_px(hulls, seen), CUT_OFF_MISFIT).tolist(), strict=True))
 
 
 def rings(pictures: Mapping[str, str]) -> list[tuple[str, ...]]:
@@ -129,11 +117,13 @@ def _ring_message(ring: tuple[str, ...], what: Message) -> Message:
     return compose("exchanged-ring", names=names, last=last, what=what, filed=filed)
 
 
-def with_masks(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
-    """Returns the rig with only those cameras whose mask is thicker than a few pixels somewhere."""
-    return rig.subset(
+def outlined(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Rig, list[Float[np.ndarray, "_ 2"]]]:
+    """Returns those cameras of the rig whose mask is thicker than a few pixels somewhere, and the convex hulls (px) of
+    their outlines."""
+    seen = rig.subset(
         name for name in rig.names if name in silhouettes and silhouettes[name].distance.min() < -INSET_PX
     )
+    return seen, [outer_hull(silhouettes[name], INSET_PX) for name in seen.names]
 
 
 def tangency_errors_px(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np.ndarray, "n n 2"]:
@@ -173,7 +163,7 @@ def _judged(held: Int[np.ndarray, " n"], misfit: Float32[np.ndarray, "n n n n"],
     if gain < NAMED_GAIN or (mean_after[displaced] > FITTING_MISFIT).any() or (after > before)[displaced].any():
         return NOTHING
     pictures = {rig.names[i]: rig.names[held[i]] for i in displaced.tolist()}
-    return Assignment(pictures, gain, gain >= REPAIRED_GAIN)
+    return Assignment(pictures, gain >= REPAIRED_GAIN)
 
 
 def _noise_px(errors_px: Float[np.ndarray, " n"]) -> float:

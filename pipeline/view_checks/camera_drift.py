@@ -66,11 +66,6 @@ class Drift:
     sigmas: float
     moved: bool
 
-    @property
-    def code(self) -> str:
-        """Returns the code of the warning about this camera."""
-        return "camera-moved" if self.moved else "mask-loose"
-
     def warning(self) -> Message:
         """Returns the warning about this camera."""
         shift_px = float(np.linalg.norm(self.shift_px))
@@ -80,9 +75,6 @@ class Drift:
             "camera-shifted", camera=self.camera, shift_px=shift_px, turn_deg=self.turn_deg, sigmas=self.sigmas
         )
         return compose("camera-moved", finding=shifted)
-
-    def __str__(self) -> str:
-        return self.warning().text
 
 
 def find_drift(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Drift, ...]:

@@ -20,7 +20,6 @@ from pipeline.view_checks.camera_assignment import (
     FITTING_MISFIT,
     MIN_CAMERAS,
     NOTHING,
-    Assignment,
     find_assignment,
     own_misfit,
     ring_messages,
@@ -118,7 +117,9 @@ def assign_images(
         face = guards.find_face(capture.images, rig)
         if face is not None and not assignment.pictures.keys().isdisjoint(face.views):
             assignment = NOTHING
-    masks = assignment.pictures if _masks_alone(capture, silhouettes, assignment) else {}
+    masks_given = assignment.pictures.keys() <= capture.masks.keys()
+    alone = masks_given and masks_alone_exchanged(capture.images, silhouettes, assignment.pictures)
+    masks = assignment.pictures if alone else {}
     what = compose("what-masks") if masks else compose("what-pictures")
     if assignment.pictures and (exchanged == "refuse" or not assignment.overwhelming):
         found = ring_messages(assignment.pictures, what)
@@ -126,17 +127,15 @@ def assign_images(
     if not assignment.pictures:
         overruled += _check_rig(capture, rig, distinct, guards)
     pictures = {} if masks else assignment.pictures
-    if masks:
-        capture = reassign_images(capture, masks=masks)
+    if assignment.pictures:
+        capture = reassign_images(capture, masks=masks) if masks else _filed_back(capture, pictures, rig)
         silhouettes = segmented(capture)
-    elif pictures:
-        capture = _filed_back(capture, pictures, rig)
-        silhouettes = segmented(capture)
-        plates = _composed(plates, pictures)
-    warnings = (*overruled, *_warnings(pictures, masks, plates, duplicates))
-    if not assignment.pictures and loose_outlines(distinct, rig):
-        warnings = (*warnings, compose("outlines-loose"))
-    return ImageAssignment(capture, _left_out(silhouettes, duplicates), pictures, plates, warnings)
+    plates = _composed(plates, pictures) if pictures else plates
+    loose = not assignment.pictures and loose_outlines(distinct, rig)
+    outlines = [compose("outlines-loose")] if loose else []
+    warnings = (*overruled, *_warnings(pictures, masks, plates, duplicates), *outlines)
+    silhouettes = {n: s.judged(usable=False) if n in duplicates else s for n, s in silhouettes.items()}
+    return ImageAssignment(capture, silhouettes, pictures, plates, warnings)
 
 
 def _check_rig(capture: Capture, rig: Rig, distinct: Mapping[str, Silhouette], guards: Guards) -> list[ReportWarning]:
@@ -148,17 +147,6 @@ def _check_rig(capture: Capture, rig: Rig, distinct: Mapping[str, Silhouette], g
     if face is None or not face.holds_the_rig:
         return [guards.refuse(WrongRig(wrong))]
     return [compose("lens-doubtful", finding=wrong)] if wrong.code == "other-lenses" else []
-
-
-def _masks_alone(capture: Capture, silhouettes: Mapping[str, Silhouette], assignment: Assignment) -> bool:
-    """Tells whether only the ready masks are exchanged and not the photographs: the photographs fit the masks once
-    these are filed right."""
-    names = assignment.pictures.keys()
-    return (
-        bool(names)
-        and names <= capture.masks.keys()
-        and masks_alone_exchanged(capture.images, silhouettes, assignment.pictures)
-    )
 
 
 def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
@@ -233,13 +221,6 @@ def _same(one: UInt8[np.ndarray, "_ _ 3"], two: UInt8[np.ndarray, "_ _ 3"]) -> b
     return bool(
         np.percentile(np.abs(a - b), 99) < MAX_REENCODED and (a.std() > MAX_REENCODED or np.array_equal(one, two))
     )
-
-
-def _left_out(silhouettes: Mapping[str, Silhouette], names: Mapping[str, str]) -> dict[str, Silhouette]:
-    return {
-        name: replace(s, quality=replace(s.quality, usable=False)) if name in names else s
-        for name, s in silhouettes.items()
-    }
 
 
 def _composed(plates: Mapping[str, str], pictures: Mapping[str, str]) -> dict[str, str]:

@@ -80,8 +80,7 @@ def _judge_counting(tracks: SceneTracks, seen: Rig) -> list[ReportWarning]:
     """Returns a warning if all principal points are off by as much to the right as down."""
 
     def read(shift_px: float) -> Rig:
-        points = [replace(c.intrinsics, cx=c.intrinsics.cx - shift_px, cy=c.intrinsics.cy - shift_px) for c in seen]
-        return Rig(tuple(replace(camera, intrinsics=k) for camera, k in zip(seen, points, strict=True)))
+        return seen.with_intrinsics(lambda k: replace(k, cx=k.cx - shift_px, cy=k.cy - shift_px))
 
     shift = estimate(tracks, read, SHIFTS)
     if abs(shift.value) < max(MIN_SHIFT_PX, MIN_SHIFT_SIGMAS * shift.deviation):
@@ -123,8 +122,7 @@ def estimate(tracks: SceneTracks, read: Callable[[float], Rig], values: Sequence
 
 
 def _with(rig: Rig, lens: Callable[[Distortion], Distortion]) -> Rig:
-    lenses = [replace(camera.intrinsics, distortion=lens(camera.intrinsics.distortion)) for camera in rig]
-    return Rig(tuple(replace(camera, intrinsics=k) for camera, k in zip(rig, lenses, strict=True)))
+    return rig.with_intrinsics(lambda k: replace(k, distortion=lens(k.distortion)))
 
 
 def _times(lens: Distortion, share: float) -> Distortion:

@@ -19,8 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.tangency import outer_hull
-from pipeline.view_checks.camera_assignment import FITTING_MISFIT, INSET_PX, mean_misfit, tangency_errors_px, with_masks
+from pipeline.view_checks.camera_assignment import FITTING_MISFIT, mean_misfit, outlined, tangency_errors_px
 from rig.camera import Intrinsics
 from rig.messages.message import Message, compose
 from rig.plausibility import alternative_conventions
@@ -68,20 +67,19 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None
         rig: the cameras as calibrated.
     """
     usable = {name for name, s in silhouettes.items() if s.quality.usable}
-    found = _contradiction(silhouettes, with_masks({name: silhouettes[name] for name in usable}, rig))
+    found = _contradiction(*outlined({name: silhouettes[name] for name in usable}, rig))
     lost = {name for name, s in silhouettes.items() if JUDGED_BY_OTHERS in s.quality.figures} - usable
     if found is not None or len(lost) < MANY_LOST * len(silhouettes):
         return found
-    among_all = with_masks({name: silhouettes[name] for name in usable | lost}, rig)
-    named = _contradiction(silhouettes, among_all)  # views that a wrong rig alone makes contradict each other
+    among_all = outlined({name: silhouettes[name] for name in usable | lost}, rig)
+    named = _contradiction(*among_all)  # views that a wrong rig alone makes contradict each other
     return None if named is None or named.code == "other-rig" else named
 
 
-def _contradiction(silhouettes: Mapping[str, Silhouette], seen: Rig) -> Message | None:
+def _contradiction(seen: Rig, hulls: Sequence[Pixels]) -> Message | None:
     """Returns why most of the cameras ``seen`` contradict each other, as ``wrong_rig`` does."""
     if len(seen) < MIN_CAMERAS:
         return None
-    hulls = [outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen]
     as_written = _median_misfit(hulls, seen)
     if not as_written >= MIN_WRONG:
         return None
@@ -91,9 +89,13 @@ def _contradiction(silhouettes: Mapping[str, Silhouette], seen: Rig) -> Message 
     for other, read, remedy in alternative_conventions(seen):
         message = compose("other-convention", convention=other, remedy=remedy)
         found.append((_judged_misfit(hulls, read), message))
-    found.append((_judged_misfit(hulls, _counted_from_below(seen)), compose("principal-points-from-below")))
+    from_below = seen.with_intrinsics(lambda k: replace(k, cy=k.height - 1.0 - k.cy))
+    found.append((_judged_misfit(hulls, from_below), compose("principal-points-from-below")))
+    on_side = seen.with_intrinsics(
+        lambda k: replace(k, width=k.height, height=k.width, fx=k.fy, fy=k.fx, cx=k.cy, cy=k.cx)
+    )
     for message, turn in () if square else _SQUARE_CONVENTIONS:  # width and height were exchanged with the pictures
-        found.append((_judged_misfit(_read(hulls, seen, turn), _on_its_side(seen)), message))
+        found.append((_judged_misfit(_read(hulls, seen, turn), on_side), message))
     (best, message), *others = sorted(found, key=lambda one: one[0])
     kin = MIRRORED if message.code in MIRRORED else ()  # where the lens's axis is in the middle, they are one
     next_best = min(as_written, *(misfit for misfit, other in others if other != message and other.code not in kin))
@@ -113,10 +115,8 @@ def _judged_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
 def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
     """Tells whether most outlines contradict the others because of loose masks. Meant for rigs with which ``wrong_rig``
     finds no fault."""
-    seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
-    if len(seen) < MIN_CAMERAS:
-        return False
-    return _median_misfit([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen) >= MIN_WRONG
+    seen, hulls = outlined({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
+    return len(seen) >= MIN_CAMERAS and _median_misfit(hulls, seen) >= MIN_WRONG
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,19 +177,18 @@ def find_lens_reading(hulls: Sequence[Pixels], rig: Rig, misfit: Callable[[Rig],
 
 def _with_lenses(rig: Rig, at: Float[np.ndarray, " 3"]) -> Rig:
     factor, (right, down) = float(np.exp(np.clip(at[0], -2.0, 2.0))), at[1:].tolist()
-    return _changed(
-        rig,
-        lambda k: replace(k, fx=k.fx * factor, fy=k.fy * factor, cx=k.cx + right * k.width, cy=k.cy + down * k.height),
+    return rig.with_intrinsics(
+        lambda k: replace(k, fx=k.fx * factor, fy=k.fy * factor, cx=k.cx + right * k.width, cy=k.cy + down * k.height)
     )
 
 
 def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
     """Returns the one camera that contradicts all others while these agree without it; None if there is none. That
     camera was moved farther than ``camera_drift`` can measure, or its pose or mask is wrong."""
-    seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
+    seen, hulls = outlined({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
     if len(seen) < MISPLACED_AMONG:
         return None
-    errors_px = tangency_errors_px([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
+    errors_px = tangency_errors_px(hulls, seen)
     misfit, planes = mean_misfit(errors_px), np.isfinite(errors_px).sum(axis=(1, 2))
     worst = int(np.argmax(misfit))
     if misfit[worst] < MIN_MISPLACED or planes[worst] < MIN_PLANES:
@@ -219,20 +218,6 @@ def _missed_shares(hulls: Sequence[Pixels], rig: Rig) -> Float[np.ndarray, "c c 
     widths = np.array([camera.intrinsics.width for camera in rig], float)
     together = np.hypot(widths[:, None], widths[None, :]) / np.sqrt(2.0)
     return np.abs(tangency_errors_px(hulls, rig)) / together[..., None]
-
-
-def _changed(rig: Rig, change: Callable[[Intrinsics], Intrinsics]) -> Rig:
-    return Rig(tuple(replace(camera, intrinsics=change(camera.intrinsics)) for camera in rig))
-
-
-def _counted_from_below(rig: Rig) -> Rig:
-    """Returns the rig with principal points whose rows were counted upwards from the picture's bottom."""
-    return _changed(rig, lambda k: replace(k, cy=k.height - 1.0 - k.cy))
-
-
-def _on_its_side(rig: Rig) -> Rig:
-    """Returns the rig with the axes of each camera's picture exchanged."""
-    return _changed(rig, lambda k: replace(k, width=k.height, height=k.width, fx=k.fy, fy=k.fx, cx=k.cy, cy=k.cx))
 
 
 def _read(hulls: Sequence[Pixels], rig: Rig, turn: Turn) -> list[Pixels]:

@@ -6,7 +6,7 @@ does nothing else.
 """
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
@@ -103,10 +103,12 @@ def usable_views(
         overruled.append(compose("pose-doubtful", finding=compose("pose-few-views", usable=usable, needed=MIN_VIEWS)))
     elif usable < MIN_VIEWS:
         overruled.append(guards.refuse(TooFewViews(silhouettes, capture)))
-        silhouettes = {name: _tried(silhouette) for name, silhouette in silhouettes.items()}
+        silhouettes = {
+            n: s.judged(usable=s.quality.usable or float(s.mask.mean()) > MIN_AREA) for n, s in silhouettes.items()
+        }
     low = find_low_crowns(silhouettes, rig, find_face)
     left_out = usable - len(low) >= MIN_VIEWS
-    silhouettes = {n: _left_out(s) if left_out and n in low else s for n, s in silhouettes.items()}
+    silhouettes = {n: s.judged(usable=False) if left_out and n in low else s for n, s in silhouettes.items()}
     crowns = [compose("crown-low", camera=name, low_mm=mm) for name, mm in low.items()]
     silhouettes, moved = without_moved_cameras(silhouettes, rig)
     unexplained = silhouettes
@@ -120,16 +122,6 @@ def usable_views(
     return UsableViews(assigned.capture, silhouettes, assigned.pictures, warnings)
 
 
-def _tried(silhouette: Silhouette) -> Silhouette:
-    """Returns the silhouette as a usable one if it shows anything."""
-    usable = silhouette.quality.usable or float(silhouette.mask.mean()) > MIN_AREA
-    return replace(silhouette, quality=replace(silhouette.quality, usable=usable))
-
-
-def _left_out(silhouette: Silhouette) -> Silhouette:
-    return replace(silhouette, quality=replace(silhouette.quality, usable=False))
-
-
 def without_moved_cameras(
     silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[dict[str, Silhouette], dict[str, ReportWarning]]:
@@ -138,11 +130,11 @@ def without_moved_cameras(
     kept, warnings = dict(silhouettes), dict[str, ReportWarning]()
     for drift in find_drift(silhouettes, rig):
         if drift.moved:
-            kept[drift.camera] = _left_out(silhouettes[drift.camera])
+            kept[drift.camera] = silhouettes[drift.camera].judged(usable=False)
         warnings[drift.camera] = drift.warning()
     misplaced = misplaced_camera(kept, rig)
     if misplaced is not None:
-        kept[misplaced] = _left_out(kept[misplaced])
+        kept[misplaced] = kept[misplaced].judged(usable=False)
         warnings[misplaced] = compose("camera-moved", finding=compose("camera-misplaced", camera=misplaced))
     return kept, warnings
 
@@ -207,8 +199,7 @@ def with_picture_faults(
         usable = silhouettes[name].quality.usable and fault is None
         fault = fault or blurred.get(name)
         if fault is not None:
-            quality = replace(silhouettes[name].quality, usable=usable, warnings=(fault,), doubts=())
-            found[name] = replace(silhouettes[name], quality=quality)
+            found[name] = silhouettes[name].judged(usable=usable, warnings=(fault,), doubts=())
     return found
 
 

@@ -29,7 +29,7 @@ from rig.formats.pictures.images import write_image
 from rig.formats.rig_toml import RigConfig
 from rig.image import ImageRgb
 from rig.messages.message import compose
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 from rig.rig import Rig
 
 HIDDEN_BY_BOARD = ("view", "swapped", "moved", "plates", "overexposed")  # faults that a board in the picture causes
@@ -76,11 +76,7 @@ def preview(config: RigConfig, out: Path, make_driver: MakeDriver = driver_for) 
 
 
 def capture(
-    config: RigConfig,
-    out: Path,
-    make_driver: MakeDriver = driver_for,
-    *,
-    report: Progress = lambda stage, fraction: None,
+    config: RigConfig, out: Path, make_driver: MakeDriver = driver_for, *, report: Progress = discard_progress
 ) -> Shot:
     """Takes one shot and writes it as the capture folder ``out`` (`eigenhead rig capture`). ``report`` is called with
     "warm up", "shot" and "done".

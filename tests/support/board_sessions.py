@@ -56,7 +56,7 @@ def session(
         if len(ids) >= 6
     ]
     sizes = {camera.name: (camera.intrinsics.width, camera.intrinsics.height) for camera in rig}
-    return Session(rig, poses, Detections(board, sizes, tuple(poses), tuple(views), ()))
+    return Session(rig, poses, Detections(board, sizes, tuple(poses), tuple(views)))
 
 
 def visible(camera: Camera, world_from_board: RigidTransform, board: Board) -> tuple[np.ndarray, np.ndarray]:

@@ -2,14 +2,15 @@
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
+from rig.formats.pictures.images import encode_image
 from rig.geometry import look_at
 from rig.rig import Rig
 
@@ -59,10 +60,7 @@ def rename(path: str, other: str) -> Callable[[Path], None]:
     return harm
 
 
-def png(image: np.ndarray) -> bytes:
-    return cv2.imencode(".png", image)[1].tobytes()
-
-
+png = partial(encode_image, ".png")
 FEATURES = "eigenhead-features/1"
 
 

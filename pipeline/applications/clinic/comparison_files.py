@@ -15,7 +15,6 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -336,9 +335,7 @@ def comparison_pdf(document: Mapping[str, Any], rows: Sequence[tuple[str, Sequen
         document: what compare.json says.
         rows: of pictures, with their titles.
     """
-    pdf = PdfPage()
-    pdf.set_creation_date(datetime.fromisoformat(document["date"]).replace(tzinfo=UTC))
-    pdf.set_title("eigenhead: comparison of two visits")
+    pdf = PdfPage("eigenhead: comparison of two visits", document["date"])
     pdf.add_page()
     _tables_page(pdf, document)
     pdf.add_page()

@@ -43,7 +43,6 @@ from rig.errors import InputError
 from rig.formats.meshes.markups import AXES, Axes
 from rig.formats.meshes.mesh_file import SURFACE_ENDINGS, read_mesh
 from rig.geometry import RigidTransform, Similarity, rigid_fit
-from rig.mesh import Mesh
 from rig.messages.message import compose
 
 PerPoint = Float[np.ndarray, " n"]
@@ -205,10 +204,10 @@ class PatientSurface:
 def read_surface(path: Path, axes: Axes | None = None) -> PatientSurface:
     """Reads a .ply, .obj, .glb or .stl. Axes are ``axes``, else those that the file's header states (``SPACE=RAS``, as
     3D Slicer writes it), else LPS. Raises InputError naming every fault."""
-    vertices, faces = welded(read_mesh(path, SURFACE_ENDINGS))
+    mesh, _ = welded(read_mesh(path, SURFACE_ENDINGS))
     found = _stated_axes(path)
     data = path.read_bytes()
-    reference = Reference.of(Mesh(vertices, faces), {}, path.name, hashlib.sha256(data).hexdigest())
+    reference = Reference.of(mesh, {}, path.name, hashlib.sha256(data).hexdigest())
     return PatientSurface(reference, axes or found or "LPS", axes is None and found is not None)
 
 

@@ -129,7 +129,7 @@ def placed_eyeballs(
     for name in centres:
         if not _is_open(mesh, triangles, landmarks, name.removeprefix("eye_")):
             continue
-        points = _samples(mesh, triangles[_near(mesh, triangles, centres[name])])
+        points = sample_triangles(mesh, triangles[_near(mesh, triangles, centres[name])])
         gaze, back = gazes.get(name, AHEAD), 0.0
         while back < BACK_MM and _depths(Eyeball(centres[name] - back * AHEAD, gaze), points).max(initial=0.0) > 0.0:
             back += STEP_MM
@@ -151,7 +151,7 @@ def _near(mesh: Places, triangles: Int[np.ndarray, "g 3"], centre: Float[np.ndar
     return near[triangles].all(axis=1)
 
 
-def _samples(mesh: Places, triangles: Int[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 7 3"]:
+def sample_triangles(mesh: Places, triangles: Int[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 7 3"]:
     """Returns points of each triangle: corners, middles of edges, and the middle."""
     corners = mesh[triangles]
     middles = 0.5 * (corners + np.roll(corners, -1, axis=1))
@@ -178,7 +178,7 @@ def lifted(
         for _ in range(ROUNDS):
             push = np.zeros(len(mesh))
             for weight in WEIGHTS:
-                depths = _depths(eyeball, _samples(mesh + weight * out, about))
+                depths = _depths(eyeball, sample_triangles(mesh + weight * out, about))
                 np.maximum.at(push, about, (depths / weight)[:, None])
             rows = np.flatnonzero(push)
             if not len(rows):

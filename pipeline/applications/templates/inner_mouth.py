@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import KDTree
 
+from pipeline.applications.templates.eyeballs import sample_triangles
 from pipeline.applications.templates.pivots import Points
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.geometry.registration.rigid import procrustes
@@ -164,12 +165,10 @@ def _moving(
     return InnerMouth(moved, moves)
 
 
-def _about(
-    mesh: Places, triangles: Int[np.ndarray, "g 3"], inner: InnerMouth, margin_mm: float = ABOUT_MM
-) -> Int[np.ndarray, " r"]:
+def _about(mesh: Places, triangles: Int[np.ndarray, "g 3"], inner: InnerMouth) -> Int[np.ndarray, " r"]:
     """Returns which triangles lie about the parts, or where the jaw takes them."""
     points = np.concatenate([inner.posed("jawOpen", weight)[name] for name in inner.parts for weight in (0.0, 1.0)])
-    low, high = points.min(axis=0) - margin_mm, points.max(axis=0) + margin_mm
+    low, high = points.min(axis=0) - ABOUT_MM, points.max(axis=0) + ABOUT_MM
     corners = mesh[triangles]
     return np.flatnonzero(((corners.max(axis=1) > low) & (corners.min(axis=1) < high)).all(axis=1))
 
@@ -308,7 +307,8 @@ class _Front:
     @classmethod
     def of(cls, inner: InnerMouth, shape: str, weight: float) -> "_Front":
         posed = inner.posed(shape, weight)
-        rows = np.concatenate([_samples(posed[name], inner.parts[name].faces) for name in TEETH])
+        samples = [sample_triangles(posed[name], inner.parts[name].faces) for name in TEETH]
+        rows = np.concatenate(samples).reshape(-1, 3)
         axis = _axis(inner)
         lowest = float(rows[:, 1].min()) - 2.0 * RISE_MM
         cells = (int(360.0 / TURN_DEG), int((rows[:, 1].max() - lowest) / RISE_MM) + 4)
@@ -330,17 +330,9 @@ class _Front:
 
     def depths(self, posed: Float[np.ndarray, "m 3"], triangles: Int[np.ndarray, "a 3"]) -> Float[np.ndarray, " a"]:
         """Returns how far each triangle reaches into the teeth and the gap before them, mm; 0 where it does not."""
-        points = _samples(posed, triangles)
+        points = sample_triangles(posed, triangles).reshape(-1, 3)
         turn, height, away = self.cells(points)
         inside = (height >= 0) & (height < self.reach.shape[1])
         reach = np.where(inside, self.reach[turn, np.clip(height, 0, self.reach.shape[1] - 1)], 0.0)
         depth = np.where((reach > 0.0) & (away > reach - DEEP_MM), reach + GAP_MM - away, 0.0)
-        return np.maximum(depth.reshape(-1, len(triangles)).max(axis=0), 0.0)
-
-
-def _samples(vertices: Float[np.ndarray, "n 3"], triangles: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "s 3"]:
-    """Returns corners of triangles, then middles of their edges, then their own."""
-    corners = vertices[triangles]
-    middles = 0.5 * (corners + np.roll(corners, -1, axis=1))
-    seven = np.concatenate([corners, middles, corners.mean(axis=1, keepdims=True)], axis=1)
-    return np.moveaxis(seven, 1, 0).reshape(-1, 3)
+        return np.maximum(depth.reshape(len(triangles), -1).max(axis=1), 0.0)

@@ -41,6 +41,11 @@ class Surface:
     faces: Int[np.ndarray, "f 3"]
     normals: Float[np.ndarray, "t 3"]
 
+    @classmethod
+    def of(cls, vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> "Surface":
+        """Returns the mesh with its normals."""
+        return cls(vertices, faces, vertex_normals(vertices, faces))
+
     def placed(self, place: Similarity) -> "Surface":
         """Returns the surface moved by a similarity."""
         return Surface(place.apply(self.vertices), self.faces, self.normals @ place.rotation.T)
@@ -51,7 +56,7 @@ def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -
     corners = vertices[faces] - vertices[np.unique(faces)].mean(axis=0)
     if np.einsum("fx,fx->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
         faces = faces[:, ::-1]
-    return Surface(vertices, faces, vertex_normals(vertices, faces))
+    return Surface.of(vertices, faces)
 
 
 def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]], name: str) -> Similarity:

@@ -97,12 +97,13 @@ def register(
     placed = surface.placed(place)
     welded, joined = weld(placed)
     parts = components(welded)
-    skin = skin_parts(welded, parts, _head(model, model.vertices(np.zeros(0))))
+    faces = model.levels["full"].faces
+    skin = skin_parts(welded, parts, Surface.of(model.vertices(np.zeros(0)), faces))
     report("likeness", 0.2)
     marks = {mark: place.apply(point) for mark, point in (landmarks or {}).items() if mark in model.landmarks}
     like = fit_model_to_mesh(model, welded, SurfaceMarks.of_landmarks(model, marks))
     covered = _check(like, name, marked=bool(landmarks))
-    head, faces = _head(model, like.vertices), model.levels["full"].faces
+    head = Surface.of(like.vertices, faces)
     report("drawing", 0.7)
     pairs = {mark: (point, head.vertices[model.landmarks[mark]]) for mark, point in marks.items()}
     rest = _drawn(welded, skin[parts], head, list(pairs.values()))
@@ -155,7 +156,7 @@ def weld(mesh: Surface) -> tuple[Surface, Int[np.ndarray, " t"]]:
     joined = joined.ravel()
     faces, vertices = joined[mesh.faces].astype(np.int32), mesh.vertices[first]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    return Surface(vertices, faces, vertex_normals(vertices, faces)), joined
+    return Surface.of(vertices, faces), joined
 
 
 def components(mesh: Surface) -> Int[np.ndarray, " t"]:
@@ -190,11 +191,6 @@ def balls(mesh: Surface, parts: Int[np.ndarray, " t"], among: Bool[np.ndarray, "
         closed[part] = axes[-1] > ROUND * axes[0]
     number = np.where(closed, np.cumsum(closed) - 1, -1)
     return number[parts]
-
-
-def _head(model: HeadModel, vertices: Float[np.ndarray, "v 3"]) -> Surface:
-    faces = model.levels["full"].faces
-    return Surface(vertices, faces, vertex_normals(vertices, faces))
 
 
 def _used(mesh: Surface) -> Flags:

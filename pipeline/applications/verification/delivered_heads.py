@@ -28,7 +28,7 @@ from pipeline.head_model.pca import Components, orthogonalised
 from rig.errors import InputError
 from rig.geometry import rigid_fit
 from rig.messages.message import Message, compose
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 
 MEAN_HEADS = 5.0  # as many observed heads as the known mean counts for
 SPREAD_HEADS = 20.0  # and the known covariance
@@ -54,7 +54,7 @@ class Delivered:
     deviation_mm: Float[np.ndarray, "N V0"]  # along the normal, above zero
 
 
-def updated_model(parts: ModelParts, delivered: Delivered, *, name: str, report: Progress | None = None) -> ModelParts:
+def updated_model(parts: ModelParts, delivered: Delivered, *, name: str, report: Progress) -> ModelParts:
     """Returns the model that ``parts`` becomes by heads that it made. Its figures have the mean distance of a face from
     the modes before and after (mm), each head held out once."""
     known = Population(parts.mean.astype(float), parts.modes.astype(float))
@@ -104,7 +104,7 @@ def updated(
     heads: Float[np.ndarray, "N V 3"],
     deviation_mm: Float[np.ndarray, "N V"],
     *,
-    report: Progress | None = None,
+    report: Progress = discard_progress,
 ) -> Components:
     """Returns the population that is known after N heads were observed, which are aligned to its mean.
 
@@ -115,8 +115,7 @@ def updated(
     for k in range(ROUNDS):
         expected, spread = _expected(now, heads, deviation_mm)
         now = pooled(known, expected, spread)
-        if report:
-            report("updating the population", (k + 1) / ROUNDS)
+        report("updating the population", (k + 1) / ROUNDS)
     flat = now.modes.reshape(len(now.modes), -1)
     sigma = np.linalg.norm(flat, axis=1)
     scores = (expected - now.mean).reshape(len(heads), -1) @ (flat / sigma[:, None] ** 2).T
@@ -154,7 +153,7 @@ def _expected(
     return expected, (np.linalg.cholesky(covariance).T @ flat).reshape(-1, vertices, 3)
 
 
-def build_from_results(folder: Path, out: Path, *, name: str, report: Progress | None = None) -> Built:
+def build_from_results(folder: Path, out: Path, *, name: str, report: Progress = discard_progress) -> Built:
     """Builds a model from all results below ``folder`` and saves it as ``out``. Results whose warnings doubt the head
     are left out.
 
@@ -180,7 +179,7 @@ def find_results(folder: Path) -> tuple[Path, ...]:
 
 
 def read_delivered(
-    folder: Path, folders: tuple[Path, ...], model: HeadModel, *, report: Progress | None = None
+    folder: Path, folders: tuple[Path, ...], model: HeadModel, *, report: Progress = discard_progress
 ) -> tuple[Delivered, dict[str, Message]]:
     """Reads results that ``model`` made. Returns the heads, and why results were left out, by their place below
     ``folder``. Raises InputError naming every damaged result."""
@@ -199,8 +198,7 @@ def read_delivered(
         names.append(name)
         points.append(_neutral_points(model, measured))
         deviations.append(np.maximum(measured.stated_mm[: len(model.mean)], MIN_DEVIATION_MM))
-        if report:
-            report("reading results", (k + 1) / len(folders))
+        report("reading results", (k + 1) / len(folders))
     if faults:
         raise InputError(str(folder), faults)
     empty = np.zeros((0, *model.mean.shape))

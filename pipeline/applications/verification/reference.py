@@ -66,10 +66,10 @@ class Reference:
 def read_reference(path: Path, landmarks: Path | None = None) -> Reference:
     """Reads a scan with its landmarks: from the file ``landmarks`` or, if None, from the file of the same name beside
     the scan if there is one. Raises InputError that names every fault."""
-    vertices, faces = welded(read_mesh(path))
+    mesh, _ = welded(read_mesh(path))
     landmarks_path = landmarks or landmark_file(path)
     marks = {} if landmarks_path is None else read_landmarks(landmarks_path)
-    return Reference.of(Mesh(vertices, faces), marks, path.name, sha256_of(path))
+    return Reference.of(mesh, marks, path.name, sha256_of(path))
 
 
 def _edge_numbers(edges: Int[np.ndarray, "e 2"], count: int) -> Int[np.ndarray, " e"]:

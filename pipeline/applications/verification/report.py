@@ -1,12 +1,11 @@
 """``report.json`` of a verification (format ``eigenhead-verification/1``)."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from typing import TypedDict
+from typing import Any
 
 from pipeline.applications.verification.best_fit import BestFit
-from pipeline.applications.verification.judgement import Judged, Judgement, Limits, RegionError
+from pipeline.applications.verification.judgement import Judged, Judgement, Limits
 from pipeline.applications.verification.measured import ResultIdentity
 from pipeline.applications.verification.reference import Reference
 from rig.geometry import vector_from_rotation
@@ -14,83 +13,8 @@ from rig.geometry import vector_from_rotation
 FORMAT = "eigenhead-verification/1"
 
 
-class RegionReport(TypedDict):
-    """Describes the errors of a region of the head (mm); ``covered`` is its area's share in the reference."""
-
-    covered: float
-    mean_mm: float
-    rms_mm: float
-    median_mm: float
-    p95_mm: float
-
-
-class AlignmentReport(TypedDict):
-    """Describes the motion ``x_reference = rotation @ x_world + translation`` (mm), and how it was found."""
-
-    method: str
-    start: str
-    rotation: list[list[float]]
-    rotation_vector: list[float]
-    translation: list[float]
-    rms_mm: float
-    points: int
-    size_error_percent: float
-
-
-class DistanceReport(TypedDict):
-    """Describes a distance between two landmarks (mm): on the measured head, on the reference, and measured minus
-    reference."""
-
-    measured_mm: float
-    reference_mm: float
-    error_mm: float
-
-
-class CaptureReport(TypedDict):
-    """Describes the judgement of one capture. ``warnings`` are the codes of its result."""
-
-    alignment: AlignmentReport
-    probing_form_mm: float
-    size_error_percent: float
-    distance_rms_mm: float | None
-    distances: dict[str, DistanceReport]
-    regions: dict[str, RegionReport]
-    warnings: list[str]
-
-
-class CheckReport(TypedDict):
-    """Describes a figure and its limit; ``value`` and ``passed`` are null if the captures or the reference do not
-    provide the figure."""
-
-    value: float | None
-    limit: float
-    passed: bool | None
-
-
-class ReferenceReport(TypedDict):
-    """Describes the scan that was the reference: its name and digest, its size, and the names of its landmarks."""
-
-    name: str
-    sha256: str
-    vertices: int
-    triangles: int
-    landmarks: list[str]
-
-
-class VerificationReport(TypedDict):
-    """Describes ``report.json`` of a verification."""
-
-    format: str
-    version: str
-    date: str
-    passed: bool
-    checks: dict[str, CheckReport]
-    model: dict[str, str]
-    reference: ReferenceReport
-    limits: dict[str, float]
-    captures: dict[str, CaptureReport]
-    repeated: dict[str, RegionReport]
-    repeatability: dict[str, dict[str, float]]
+VerificationReport = dict[str, Any]
+"""Describes ``report.json``: figures of the judgement by name, each as its class has it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +27,8 @@ class Occasion:
 
 
 def report_document(judgement: Judgement, reference: Reference, occasion: Occasion) -> VerificationReport:
-    """Returns ``report.json`` of a verification, as JSON types."""
+    """Returns ``report.json`` of a verification, as JSON types. ``value`` and ``passed`` of a check are null if the
+    captures or the reference do not provide its figure."""
     return {
         "format": FORMAT,
         "version": version("eigenhead"),
@@ -123,12 +48,12 @@ def report_document(judgement: Judgement, reference: Reference, occasion: Occasi
         },
         "limits": asdict(occasion.limits),
         "captures": {one.name: _capture(one) for one in judgement.captures},
-        "repeated": _regions(judgement.repeated),
+        "repeated": {name: asdict(of) for name, of in judgement.repeated.items()},
         "repeatability": {name: dict(figures) for name, figures in judgement.repeatability.items()},
     }
 
 
-def _capture(one: Judged) -> CaptureReport:
+def _capture(one: Judged) -> dict[str, Any]:
     return {
         "alignment": _alignment(one.fit, one.size_error_percent),
         "probing_form_mm": one.probing_form_mm,
@@ -138,12 +63,13 @@ def _capture(one: Judged) -> CaptureReport:
             name: {"measured_mm": measured, "reference_mm": true, "error_mm": measured - true}
             for name, (measured, true) in one.distances_mm.items()
         },
-        "regions": _regions(one.regions),
+        "regions": {name: asdict(of) for name, of in one.regions.items()},
         "warnings": list(one.warnings),
     }
 
 
-def _alignment(fit: BestFit, size_error_percent: float) -> AlignmentReport:
+def _alignment(fit: BestFit, size_error_percent: float) -> dict[str, Any]:
+    """Returns the motion ``x_reference = rotation @ x_world + translation`` (mm), and how it was found."""
     motion = fit.reference_from_world
     return {
         "method": "rigid, least squares of the distances along the reference's normals over the face, by area",
@@ -154,17 +80,4 @@ def _alignment(fit: BestFit, size_error_percent: float) -> AlignmentReport:
         "rms_mm": fit.rms_mm,
         "points": fit.points,
         "size_error_percent": size_error_percent,
-    }
-
-
-def _regions(regions: Mapping[str, RegionError]) -> dict[str, RegionReport]:
-    return {
-        name: {
-            "covered": of.covered,
-            "mean_mm": of.mean_mm,
-            "rms_mm": of.rms_mm,
-            "median_mm": of.median_mm,
-            "p95_mm": of.p95_mm,
-        }
-        for name, of in regions.items()
     }

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -119,9 +118,7 @@ def write_verification(
 
 def certificate_pdf(report: VerificationReport, judgement: Judgement, pictures: Pictures) -> bytes:
     """Returns the certificate as a PDF of two pages. The same report and pictures give the same bytes."""
-    pdf = PdfPage()
-    pdf.set_creation_date(datetime.fromisoformat(report["date"]).replace(tzinfo=UTC))
-    pdf.set_title("eigenhead: verification of a studio")
+    pdf = PdfPage("eigenhead: verification of a studio", report["date"])
     pdf.add_page()
     _figures_page(pdf, report, judgement)
     pdf.add_page()

@@ -4,8 +4,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
+from trimesh.remesh import subdivide
 
+from pipeline.applications.model_building.correspondence.scans import welded
 from rig.errors import InputError
 from rig.formats.meshes.mesh_file import TexturedMesh, read_textured_mesh
 from rig.image import ImageRgb
@@ -55,10 +57,10 @@ class RawScan:
         mesh = self.painted.mesh
         if self.painted.image is None or self.painted.uv is None:
             return mesh
-        vertices, faces = np.concatenate([mesh.vertices, self.painted.uv], axis=1), mesh.faces
+        vertices, faces, painted = mesh.vertices, mesh.faces, {"uv": self.painted.uv}
         while len(faces) < DRAWN_TRIANGLES:
-            vertices, faces = _quartered(vertices, faces)
-        return Mesh(vertices[:, :3], faces, _texels(self.painted.image, vertices[:, 3:]))
+            vertices, faces, painted = subdivide(vertices, faces, vertex_attributes=painted)
+        return Mesh(vertices, faces.astype(np.int32), _texels(self.painted.image, painted["uv"]))
 
 
 def read_raw_scan(path: Path) -> RawScan:
@@ -76,12 +78,7 @@ def read_raw_scan(path: Path) -> RawScan:
 
 def raw_scan(painted: TexturedMesh, name: str) -> RawScan:
     """Joins the vertices of a mesh that lie at the same position, and drops its degenerate triangles."""
-    mesh = painted.mesh
-    _, first, joined = np.unique(mesh.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
-    corners = joined.ravel()[mesh.faces]
-    proper: Bool[np.ndarray, " f"] = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
-    used, faces = np.unique(corners[proper], return_inverse=True)
-    whole = Mesh(mesh.vertices[first[used]], faces.reshape(-1, 3).astype(np.int32))
+    mesh, (whole, proper) = painted.mesh, welded(painted.mesh)
     return RawScan(name, whole, replace(painted, mesh=Mesh(mesh.vertices, mesh.faces[proper], mesh.colours)))
 
 
@@ -100,16 +97,3 @@ def _texels(image: ImageRgb, uv: Float[np.ndarray, "n 2"]) -> UInt8[np.ndarray, 
     upper = (1.0 - across) * image[top, left] + across * image[top, right]
     lower = (1.0 - across) * image[bottom, left] + across * image[bottom, right]
     return np.rint((1.0 - down) * upper + down * lower).astype(np.uint8)
-
-
-def _quartered(
-    vertices: Float[np.ndarray, "v k"], faces: Int[np.ndarray, "f 3"]
-) -> tuple[Float[np.ndarray, "w k"], Int[np.ndarray, "g 3"]]:
-    """Splits every triangle into four at the middles of its edges."""
-    edges = np.sort(np.concatenate([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]]), axis=1)
-    ends, which = np.unique(edges, axis=0, return_inverse=True)
-    opposite = len(vertices) + which.reshape(3, -1).T
-    (a, b, c), (x, y, z) = faces.T, opposite.T
-    quarters = [(a, z, y), (b, x, z), (c, y, x), (x, y, z)]
-    parts = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters]).astype(np.int32)
-    return np.concatenate([vertices, vertices[ends].mean(axis=1)]), parts

@@ -86,53 +86,12 @@ NEAR_MM = 8.0  # of a mean adult: a lifted point that differs by this weighs a q
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ScanSighting:
-    """Holds the face found on a scan."""
-
-    scan: RawScan  # turned over where its triangles looked inwards
-    unit: str | None  # of ``UNITS_MM``; None where no unit makes it a head, and an adult's size was assumed
-    mm_per_unit: float
-    turned_over: bool
-    face: MatchedFaces  # in mm: the scan's own axes and origin, times ``mm_per_unit``
-    lids_mm: Float[np.ndarray, "32 3"] | None  # edges of the lids, as ``FaceDetection.lids_px``; None: not found
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Glance:
     """Holds a face in one picture, lifted onto the scan (its own unit)."""
 
     detection: FaceDetection
     scan_from_face: Similarity  # of a mean adult's points, mm
     from_outside: bool  # a mask seen from behind shows a face, too, whose nose is farthest away
-
-
-def sight_scan(scan: RawScan, networks: FaceNetworks, renderer: Renderer) -> ScanSighting:
-    """Finds the face of a scan, its unit and its axes. Raises InputError if no picture shows a face."""
-    mesh = scan.drawable()
-    lights = (UNLIT, HEADLIGHT) if scan.is_coloured else (HEADLIGHT,)
-    glance = next((found for light in lights if (found := _search(mesh, light, networks, renderer))), None)
-    if glance is None:
-        raise InputError(scan.name, [compose("scan-no-face")])
-    unit, factor = unit_of(glance.scan_from_face.scale)
-    inward = _looks_inwards(mesh, glance.scan_from_face)
-    if inward:
-        scan, mesh = scan.turned_over(), Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.colours)
-    large = Mesh(mesh.vertices * factor, mesh.faces, mesh.colours)
-    placed = replace(
-        glance.scan_from_face,
-        scale=glance.scan_from_face.scale * factor,
-        translation=glance.scan_from_face.translation * factor,
-    )
-    rig = front_rig(placed)
-    matched = None
-    for light in lights:
-        subject = find_subject(_pictures(rig, large, light, renderer), rig, networks, eye_distance_mm=None)
-        if subject.matched is not None and len(subject.matched.detections) > 1:
-            matched = subject.matched
-            break
-    if matched is None:
-        raise InputError(scan.name, [compose("scan-no-face")])
-    return ScanSighting(scan, unit, factor, inward, matched, _lids(matched, rig))
 
 
 def unit_of(scale: float) -> tuple[str | None, float]:
@@ -257,28 +216,6 @@ def _lids(face: MatchedFaces, rig: Rig) -> Float[np.ndarray, "32 3"] | None:
         return None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Fitted:
-    """Holds a template on a scan, in the frame of the model's mean head (its scale too)."""
-
-    likeness: Likeness  # the model on the scan
-    vertices: Float[np.ndarray, "t 3"]  # the template on the scan
-    met: Bool[np.ndarray, " t"]  # vertices that lie on the scan; others continue the shape
-
-
-def fit_template(
-    template: Template, model: HeadModel, scan: Surface, marks: SurfaceMarks | None, report: Progress
-) -> Fitted:
-    """Fits the model with its expressions to a scan (head frame), carries the template with it, and draws the template
-    onto the scan."""
-    report("fitting the model", 0.3)
-    like = fit_model_to_mesh(with_expressions(model), scan, marks, STAGES)
-    carried = template.surface_binding.on(like.vertices, model.levels["full"].faces)
-    report("drawing the template", 0.6)
-    vertices, met = drawn_onto(carried, template, model, scan)
-    return Fitted(like, vertices, met)
-
-
 def drawn_onto(
     carried: Float[np.ndarray, "t 3"], template: Template, model: HeadModel, scan: Surface
 ) -> tuple[Float[np.ndarray, "t 3"], Bool[np.ndarray, " t"]]:
@@ -288,7 +225,7 @@ def drawn_onto(
     and lids stay as smooth as they are there; what lies deeper in them follows by its stiffness. All other parts follow
     the skin (``SurfaceBinding.with_skin``)."""
     binding, target = template.surface_binding, MetSurface(scan)
-    welded, joined = weld(surface_of(binding.rest, template.mesh.triangles()))
+    welded, joined = weld(Surface.of(binding.rest, template.mesh.triangles()))
     first = np.unique(joined, return_index=True)[1]  # a row of the file for every joined vertex
     is_skin = np.zeros(len(welded.vertices), bool)
     is_skin[joined[binding.skin]] = True
@@ -323,11 +260,6 @@ def drawn_onto(
     return out, met[joined]
 
 
-def surface_of(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> Surface:
-    """Returns a surface with its normals."""
-    return Surface(vertices, faces, vertex_normals(vertices, faces))
-
-
 def _near_face(points: Float[np.ndarray, "n 3"], model: HeadModel) -> Bool[np.ndarray, " n"]:
     """Tells which points of a registered template lie near the face of the mean head: points there that are no skin lie
     in the mouth, the nose or the sockets."""
@@ -359,9 +291,7 @@ class PlacedScan:
 
     def surface(self) -> Surface:
         """Returns the scan's surface in the mean head's frame and scale."""
-        mesh = self.scan.mesh
-        vertices = self.head_from_scan.apply(mesh.vertices)
-        return Surface(vertices, mesh.faces, vertex_normals(vertices, mesh.faces))
+        return Surface.of(self.head_from_scan.apply(self.scan.mesh.vertices), self.scan.mesh.faces)
 
 
 def place_scan(
@@ -371,7 +301,7 @@ def place_scan(
     face is found, or too few landmarks are named."""
     if not landmarks:
         with Renderer.create() as renderer:
-            return place_on_face(model, sight_scan(scan, load_networks(), renderer))
+            return _place_on_face(scan, model, load_networks(), renderer)
     head_from_scan = place_by_landmarks(model, landmarks, scan.name)
     unit, factor = unit_of(1.0 / head_from_scan.scale)
     inward = not np.array_equal(outward(scan.mesh.vertices, scan.mesh.faces).faces, scan.mesh.faces)
@@ -387,26 +317,50 @@ def place_scan(
     )
 
 
-def place_on_face(model: HeadModel, sighting: ScanSighting) -> PlacedScan:
-    """Places a scan by its face, whatever that face's size: its points become marks, the lids' edges among them."""
-    places = landmark_map(model)
+def _place_on_face(scan: RawScan, model: HeadModel, networks: FaceNetworks, renderer: Renderer) -> PlacedScan:
+    """Places a scan by its face, whatever that face's size: its points become marks, the lids' edges among them. Raises
+    InputError if no picture shows a face."""
+    mesh = scan.drawable()
+    lights = (UNLIT, HEADLIGHT) if scan.is_coloured else (HEADLIGHT,)
+    glance = next((found for light in lights if (found := _search(mesh, light, networks, renderer))), None)
+    if glance is None:
+        raise InputError(scan.name, [compose("scan-no-face")])
+    unit, factor = unit_of(glance.scan_from_face.scale)
+    inward = _looks_inwards(mesh, glance.scan_from_face)
+    if inward:
+        scan, mesh = scan.turned_over(), Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.colours)
+    large = Mesh(mesh.vertices * factor, mesh.faces, mesh.colours)
+    placed = replace(
+        glance.scan_from_face,
+        scale=glance.scan_from_face.scale * factor,
+        translation=glance.scan_from_face.translation * factor,
+    )
+    rig = front_rig(placed)
+    matched = None
+    for light in lights:
+        subject = find_subject(_pictures(rig, large, light, renderer), rig, networks, eye_distance_mm=None)
+        if subject.matched is not None and len(subject.matched.detections) > 1:
+            matched = subject.matched
+            break
+    if matched is None:
+        raise InputError(scan.name, [compose("scan-no-face")])
+    places, lids_mm = landmark_map(model), _lids(matched, rig)
     which, mean = np.flatnonzero(~places.slides), model.vertices(np.zeros(0))
-    found = sighting.face.points_world[which]
+    found = matched.points_world[which]
     weights = 1.0 / (places.deviation_mm[which] ** 2).sum(axis=1)
     head_from_mm = procrustes(found, places.expected(mean)[which], weights)
     points, deviation = places.points(mean), np.full(places.rows.shape, MARK_MM)
     points[which] = head_from_mm.apply(found) - places.offset_mm[which]
-    if sighting.lids_mm is not None:
-        points[LIDS], deviation[LIDS] = head_from_mm.apply(sighting.lids_mm[np.r_[EDGES, EDGES + 16]]), LID_MM
-    mm_from_scan = Similarity(sighting.mm_per_unit, np.eye(3), np.zeros(3))
+    if lids_mm is not None:
+        points[LIDS], deviation[LIDS] = head_from_mm.apply(lids_mm[np.r_[EDGES, EDGES + 16]]), LID_MM
     return PlacedScan(
-        scan=sighting.scan,
-        turned_over=sighting.turned_over,
-        unit=sighting.unit,
-        mm_per_unit=sighting.mm_per_unit,
-        head_from_scan=head_from_mm @ mm_from_scan,
+        scan=scan,
+        turned_over=inward,
+        unit=unit,
+        mm_per_unit=factor,
+        head_from_scan=head_from_mm @ Similarity(factor, np.eye(3), np.zeros(3)),
         marks=SurfaceMarks(places.rows[which], places.weights[which], points[which], deviation[which]),
-        views=len(sighting.face.detections),
+        views=len(matched.detections),
     )
 
 
@@ -467,10 +421,14 @@ def wrap(
     report("finding the face", 0.0)
     placed = place_scan(scan, model, landmarks)
     surface = placed.surface()
-    fitted = fit_template(template, model, surface, placed.marks, report)
-    _check(fitted.likeness, scan.name)
+    report("fitting the model", 0.3)
+    like = fit_model_to_mesh(with_expressions(model), surface, placed.marks, STAGES)
+    carried = template.surface_binding.on(like.vertices, model.levels["full"].faces)
+    report("drawing the template", 0.6)
+    drawn, met = drawn_onto(carried, template, model, surface)
+    _check(like, scan.name)
     report("measuring", 0.9)
-    vertices = placed.head_from_scan.inverse().apply(fitted.vertices)
+    vertices = placed.head_from_scan.inverse().apply(drawn)
     mesh, triangles = placed.scan.mesh, template.mesh.triangles()
     index = SurfaceIndex(mesh.vertices, mesh.faces, 2.0 / placed.mm_per_unit)
     hits = _closest(index, vertices, vertex_normals(vertices, triangles), placed.mm_per_unit)
@@ -478,10 +436,10 @@ def wrap(
         template=template,
         placed=placed,
         vertices=vertices,
-        covered=fitted.met,
+        covered=met,
         distance_mm=hits.distances * placed.mm_per_unit,
-        scan_distance_mm=_scan_distances(placed, vertices, triangles, fitted.met),
-        likeness=fitted.likeness,
+        scan_distance_mm=_scan_distances(placed, vertices, triangles, met),
+        likeness=like,
         index=index,
     )
 
@@ -531,6 +489,5 @@ def _check(like: Likeness, name: str) -> None:
 
 def surface_in_head(wrapped: Wrapped) -> tuple[Surface, Surface]:
     """Returns scan and template in the frame and scale of the mean head, for drawing."""
-    place = wrapped.placed.head_from_scan
-    vertices, faces = place.apply(wrapped.vertices), wrapped.template.mesh.triangles()
-    return wrapped.placed.surface(), Surface(vertices, faces, vertex_normals(vertices, faces))
+    vertices = wrapped.placed.head_from_scan.apply(wrapped.vertices)
+    return wrapped.placed.surface(), Surface.of(vertices, wrapped.template.mesh.triangles())

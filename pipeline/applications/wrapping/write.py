@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Int, UInt8
 
@@ -14,11 +13,11 @@ from pipeline.applications.templates.write.mesh import (
     Tile,
     corner_tiles,
     filled,
+    read_in_tile,
     template_materials,
     tile_suffix,
 )
 from pipeline.applications.wrapping.wrap import Wrapped, residual_colours, surface_in_head
-from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.results.overlays import clay, contact_sheet
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.ply import ply_bytes
@@ -72,9 +71,7 @@ def _write_obj(folder: Path, wrapped: Wrapped) -> None:
     template, textures = wrapped.template, baked_textures(wrapped)
     files = {tile: f"wrapped{tile_suffix(tile)}.jpg" for tile in textures}
     for tile, image in textures.items():
-        quality = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
-        _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[:, :, ::-1]), quality)
-        write_atomically(folder / files[tile], data.tobytes())
+        write_image(folder / files[tile], image, quality=JPEG_QUALITY)
     mesh, library = template.mesh, None
     if textures:
         mesh, materials = template_materials(template, files)
@@ -162,16 +159,10 @@ def _tile(
     wrapped: Wrapped, corners: Int[np.ndarray, "f 3"], tile: Int[np.ndarray, " 2"], size: int
 ) -> UInt8[np.ndarray, "s s 3"]:
     mesh = wrapped.template.mesh
-    uv = mesh.uv[mesh.corner_uv[corners.ravel()]] - tile
-    texels = size * np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1) - 0.5
-    faces, ones = np.arange(len(uv), dtype=np.int32).reshape(-1, 3), np.ones(len(uv))
-    faces.flags.writeable = False  # as the compiled loops know it
-    _, shown = rasterise(texels, ones, faces, size, size)
     rows, middle = mesh.corners[corners.ravel()], wrapped.vertices.mean(axis=0)
     normals = vertex_normals(wrapped.vertices, mesh.triangles())
     values = np.concatenate([wrapped.vertices - middle, normals], axis=1)[rows].astype(np.float32)
-    read = interpolate(shown, texels, ones, faces, values)
-    known = shown >= 0
+    read, known = read_in_tile(mesh, corners, tile, size, values)
     image, places = np.zeros((size, size, 3), np.uint8), np.flatnonzero(known)
     for first in range(0, len(places), CHUNK):
         part = places[first : first + CHUNK]

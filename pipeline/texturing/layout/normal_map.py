@@ -11,12 +11,11 @@ A texel shows the same point of the head in the normal map and in the texture, s
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from pipeline.compute.array_cache import cached_arrays
-from pipeline.compute.threads import in_threads
+from pipeline.compute.threads import map_strips
 from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.head_model.decimation import decimate
 from pipeline.head_model.model import HeadModel
@@ -103,12 +102,10 @@ def normal_mapped(
     coarse = _image(uv, reduced.faces, np.concatenate([reduced_normals, tangents[:, :3]], axis=1), size)
     turned = np.empty_like(fine)
 
-    def work(first: int, last: int) -> None:
-        for start in range(first * BAND_ROWS, min(last * BAND_ROWS, size), BAND_ROWS):
-            band = slice(start, start + BAND_ROWS)
-            turned[band] = _in_frame(_unit(fine[band]), _unit(coarse[band, :, 3:]), _unit(coarse[band, :, :3]), sign)
+    def work(band: slice) -> None:
+        turned[band] = _in_frame(_unit(fine[band]), _unit(coarse[band, :, 3:]), _unit(coarse[band, :, :3]), sign)
 
-    in_threads(-(-size // BAND_ROWS), work)
+    map_strips(work, size, BAND_ROWS)
     inside = np.asarray(np.isfinite(turned[:, :, 0]))
     codes = np.where(inside[:, :, None], np.rint(127.5 + 127.5 * turned), 0.0).astype(np.float32)
     image = np.clip(spread_texels(codes, inside), 0, 255).astype(np.uint8)
@@ -160,8 +157,3 @@ def _in_frame(wanted: Picture, tangent: Picture, normal: Picture, sign: np.float
     x, z = (np.einsum("yxc,yxc->yx", wanted, axis) for axis in (tangent, normal))
     y = np.einsum("yxc,yxc->yx", wanted, bitangent)
     return _unit(np.stack([(x - lean * z) / (1 - lean**2), y, (z - lean * x) / (1 - lean**2)], axis=2))
-
-
-def png(image: UInt8[np.ndarray, "s s 3"]) -> bytes:
-    """Returns the normal map as the bytes of a PNG file. Lossy compression would show in highlights."""
-    return cv2.imencode(".png", image[:, :, ::-1])[1].tobytes()

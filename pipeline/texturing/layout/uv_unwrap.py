@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from pipeline.compute.array_cache import cached_arrays
 from pipeline.compute.trace import traced
 from pipeline.fusion.grid_kernels import component_of
-from pipeline.geometry.projection_kernels import rasterise
+from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from rig.errors import EigenheadError
@@ -211,6 +211,16 @@ def _stretch(points: Float[np.ndarray, "n 3"], uv: Float[np.ndarray, "n 2"], fac
     over = np.bincount(faces.ravel(), np.repeat(area * square, 3), len(points))
     found = np.sqrt(over / np.bincount(faces.ravel(), np.repeat(area, 3), len(points)))
     return found / np.median(found)
+
+
+def draw_over_layout(
+    layout: Layout, values: Float[np.ndarray, "n k"] | UInt8[np.ndarray, "n k"], size: int
+) -> Float32[np.ndarray, "s s k"]:
+    """Draws values of a layout's vertices as an image; texels beside the layout get those of the nearest one."""
+    texels, ones = size * layout.uv - 0.5, np.ones(len(layout.uv))
+    _, shown = rasterise(texels, ones, layout.faces, size, size)
+    drawn = interpolate(shown, texels, ones, layout.faces, np.ascontiguousarray(values, np.float32))
+    return spread_texels(drawn, shown >= 0)
 
 
 def spread_texels(image: Float32[np.ndarray, "s s k"], known: Bool[np.ndarray, "s s"]) -> Float32[np.ndarray, "s s k"]:

@@ -20,12 +20,11 @@ import numpy as np
 import scipy.fft
 from jaxtyping import Bool, Complex, Float, Float16, Float32, Int, UInt8
 
-from pipeline.compute.threads import in_threads
-from pipeline.geometry.projection_kernels import interpolate, rasterise
-from pipeline.texturing.layout.uv_unwrap import Layout, spread_texels
+from pipeline.compute.threads import map_in_threads, map_strips
+from pipeline.texturing.layout.uv_unwrap import Layout, draw_over_layout
 from pipeline.texturing.light import BAND_FACTORS, harmonics
 from pipeline.texturing.paint_kernels import Choice, Pictures, paint_rows
-from rig.colour_space import linear_from_srgb
+from pipeline.texturing.visibility import LINEAR
 from rig.mesh import Mesh
 
 COARSE = 1024  # side of the images: metric and light are smooth
@@ -82,7 +81,7 @@ def texel_frames(
     area2 = np.maximum(uu * vv - uv**2, 1e-9)
     slope = np.stack([vv * on_u - uv * on_v, uu * on_v - uv * on_u], axis=1) / area2[:, None]
     values = np.concatenate([np.stack([uu, uv, vv], axis=1), slope, skin[layout.source, None]], axis=1)
-    image = _image(layout, values)
+    image = draw_over_layout(layout, values, COARSE)
     return TexelFrames(image[:, :, :3].copy(), image[:, :, 3:5].copy(), image[:, :, 5].copy())
 
 
@@ -115,12 +114,6 @@ def _steps(layout: Layout, mesh: Mesh) -> tuple[Float[np.ndarray, "n 3"], Float[
 def _sums(faces: Int[np.ndarray, "f 3"], values: Float[np.ndarray, "f 3"], count: int) -> Float[np.ndarray, "n 3"]:
     columns = [np.bincount(faces.ravel(), np.repeat(values[:, axis], 3), count) for axis in range(3)]
     return np.stack(columns, axis=1)
-
-
-def _image(layout: Layout, values: Float[np.ndarray, "n k"]) -> Float32[np.ndarray, "s s k"]:
-    texels, ones = COARSE * layout.uv - 0.5, np.ones(len(layout.uv))
-    _, shown = rasterise(texels, ones, layout.faces, COARSE, COARSE)
-    return spread_texels(interpolate(shown, texels, ones, layout.faces, values.astype(np.float32)), shown >= 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,7 +156,6 @@ MAX_SHIFT_MM = 0.4  # between the two sets, for errors of the geometry and of th
 MIN_SKIN = 0.05
 STRIP_ROWS = 128
 BLURRED_SIDE = 32  # texels of a patch's side for a Gaussian of a sixth of it
-LINEAR = np.maximum(linear_from_srgb(np.arange(256) / 255.0), 0.0).astype(np.float32)
 
 Spectra = Complex[np.ndarray, "n p q"]
 
@@ -203,18 +195,17 @@ def estimate_detail(strips: Strips, halves: HalfPictures, frames: TexelFrames) -
         chosen = rows[parity::2]
         found = np.zeros((len(chosen), OCTAVES, 2))
 
-        def work(first: int, last: int, chosen: range = chosen, found: np.ndarray = found) -> None:
-            for k in range(first, last):
-                low, high = max(chosen[k], 0), min(chosen[k] + side, size)
-                missing = ((low - chosen[k], chosen[k] + side - high), (hop, hop))
-                cut = [[np.pad(image[low:high].astype(np.float32), missing) for image in pair] for pair in light]
-                parts = _row_of_patches(cut[0], cut[1], chosen[k], size, frames, found[k])
-                if parts is not None:
-                    inside = slice(low - chosen[k], high - chosen[k])
-                    heights[low:high] += parts[0][inside]
-                    brightness[low:high] += parts[1][inside].astype(np.float16)
+        def work(k: int, chosen: range = chosen, found: np.ndarray = found) -> None:
+            low, high = max(chosen[k], 0), min(chosen[k] + side, size)
+            missing = ((low - chosen[k], chosen[k] + side - high), (hop, hop))
+            cut = [[np.pad(image[low:high].astype(np.float32), missing) for image in pair] for pair in light]
+            parts = _row_of_patches(cut[0], cut[1], chosen[k], size, frames, found[k])
+            if parts is not None:
+                inside = slice(low - chosen[k], high - chosen[k])
+                heights[low:high] += parts[0][inside]
+                brightness[low:high] += parts[1][inside].astype(np.float16)
 
-        in_threads(len(chosen), work)
+        map_in_threads(work, len(chosen))
         figures += found.sum(axis=0)
     return SkinDetail(heights, brightness, tuple((figures[:, 0] / np.maximum(figures[:, 1], 1e-12)).tolist()))
 
@@ -230,16 +221,15 @@ def _painted(strips: Strips, halves: HalfPictures) -> tuple[list[np.ndarray], li
     size = strips.size
     full, added = (list(np.zeros((2, size, size), np.float16)) for _ in range(2))
 
-    def work(first: int, last: int) -> None:
-        for strip in range(first, last):
-            row = strip * STRIP_ROWS
-            rows = slice(row, min(row + STRIP_ROWS, size))
-            for half, choice in enumerate(halves.choices):
-                fine = log_light(strips.paint(row, rows.stop - row, halves.full, choice))
-                full[half][rows] = fine
-                added[half][rows] = fine - log_light(strips.paint(row, rows.stop - row, halves.work, choice))
+    def work(rows: slice) -> None:
+        for half, choice in enumerate(halves.choices):
+            fine, coarse = (
+                log_light(strips.paint(rows.start, rows.stop - rows.start, pictures, choice))
+                for pictures in (halves.full, halves.work)
+            )
+            full[half][rows], added[half][rows] = fine, fine - coarse
 
-    in_threads(-(-size // STRIP_ROWS), work)
+    map_strips(work, size, STRIP_ROWS)
     return full, added
 
 

@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float16, Float32, Int32, UInt8, UInt16
 
-from pipeline.compute.threads import in_threads
+from pipeline.compute.threads import map_strips
 from pipeline.compute.trace import traced
 from pipeline.geometry.projection import project_points
-from pipeline.texturing.chart_colours import CODES, ENCODED, LINEAR, ChartColours, in_true_colours
+from pipeline.texturing.chart_colours import CODES, ENCODED, ChartColours, in_true_colours
 from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout
 from pipeline.texturing.light import fit_light, transfer
 from pipeline.texturing.paint_kernels import Choice, Pictures
 from pipeline.texturing.pores.relief import MIN_SKIN, HalfPictures, Strips, TexelFrames, estimate_detail, texel_frames
 from pipeline.texturing.vertex_colours import Texture
-from pipeline.texturing.visibility import Decision, pack_pictures
+from pipeline.texturing.visibility import LINEAR, Decision, pack_pictures
 from rig.camera import Camera
 from rig.capture import ReadImage
 from rig.colour_space import linear_from_srgb
@@ -201,14 +201,11 @@ def skin_maps(
     displacement: UInt16[np.ndarray, "s s"] = np.empty((size, size), np.uint16)
     drawn: UInt8[np.ndarray, "s s 3"] = np.empty((size, size, 3), np.uint8)
 
-    def work(first: int, last: int) -> None:
-        for strip in range(first, last):
-            row = strip * STRIP_ROWS
-            rows = slice(row, min(row + STRIP_ROWS, size))
-            displacement[rows] = codes_of(found.heights_mm[rows])
-            drawn[rows] = normal_codes(found.heights_mm, rows, frames)
+    def work(rows: slice) -> None:
+        displacement[rows] = codes_of(found.heights_mm[rows])
+        drawn[rows] = normal_codes(found.heights_mm, rows, frames)
 
-    in_threads(-(-size // STRIP_ROWS), work)
+    map_strips(work, size, STRIP_ROWS)
     maps = SkinMaps(displacement, drawn, found.repeated, close.views.names)
     return maps, sharpened_atlas(atlas, found.brightness)
 
@@ -261,11 +258,9 @@ def sharpened_atlas(atlas: Atlas, brightness: Float16[np.ndarray, "s s"]) -> Atl
     size = len(atlas.image)
     stored: UInt8[np.ndarray, "s s 3"] = np.empty((size, size, 3), np.uint8)  # blue first, as the painter's
 
-    def work(first: int, last: int) -> None:
-        for strip in range(first, last):
-            rows = slice(strip * STRIP_ROWS, min((strip + 1) * STRIP_ROWS, size))
-            light = LINEAR[atlas.image[rows, :, ::-1]] * np.exp(brightness[rows].astype(np.float32))[:, :, None]
-            stored[rows] = ENCODED[(CODES * np.minimum(light, 1.0) + 0.5).astype(np.int32)]
+    def work(rows: slice) -> None:
+        light = LINEAR[atlas.image[rows, :, ::-1]] * np.exp(brightness[rows].astype(np.float32))[:, :, None]
+        stored[rows] = ENCODED[(CODES * np.minimum(light, 1.0) + 0.5).astype(np.int32)]
 
-    in_threads(-(-size // STRIP_ROWS), work)
+    map_strips(work, size, STRIP_ROWS)
     return Atlas(atlas.layout, stored[:, :, ::-1])

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float16, Float32, UInt8
 
-from pipeline.compute.threads import in_threads, map_in_threads
+from pipeline.compute.threads import map_in_threads, map_strips
 from pipeline.compute.trace import traced
 from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.imaging.masks import box_around
@@ -129,23 +129,22 @@ def specular_light(
     seen = np.asarray(np.all(weights[:, layout.faces] > 0, axis=2))
     light = np.zeros((size, size, 3), np.float32)
 
-    def work(first: int, last: int) -> None:
-        for row in range(first * STRIP_ROWS, min(last * STRIP_ROWS, size), STRIP_ROWS):
-            strip = shown[row : row + STRIP_ROWS]
-            total = np.full(strip.shape, 1e-12, np.float32)
-            for k, picture in enumerate(pictures):
-                values = np.concatenate([decision.pictures.places[k][layout.source], weights[k][:, None]], axis=1)
-                at = interpolate(strip, texels - (0.0, row), ones, layout.faces, values.astype(np.float32))
-                weight = np.where((strip >= 0) & seen[k][np.maximum(strip, 0)], at[:, :, 2], np.float32(0.0))
-                if not weight.any():
-                    continue
-                x, y = np.nan_to_num(at[:, :, 0]), np.nan_to_num(at[:, :, 1])
-                found = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-                light[row : row + STRIP_ROWS] += weight[:, :, None] * found
-                total += weight
-            light[row : row + STRIP_ROWS] /= total[:, :, None]
+    def work(rows: slice) -> None:
+        strip = shown[rows]
+        total = np.full(strip.shape, 1e-12, np.float32)
+        for k, picture in enumerate(pictures):
+            values = np.concatenate([decision.pictures.places[k][layout.source], weights[k][:, None]], axis=1)
+            at = interpolate(strip, texels - (0.0, rows.start), ones, layout.faces, values.astype(np.float32))
+            weight = np.where((strip >= 0) & seen[k][np.maximum(strip, 0)], at[:, :, 2], np.float32(0.0))
+            if not weight.any():
+                continue
+            x, y = np.nan_to_num(at[:, :, 0]), np.nan_to_num(at[:, :, 1])
+            found = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            light[rows] += weight[:, :, None] * found
+            total += weight
+        light[rows] /= total[:, :, None]
 
-    in_threads(-(-size // STRIP_ROWS), work)
+    map_strips(work, size, STRIP_ROWS)
     strength = light.mean(axis=2)
     above, below = (float(np.maximum(sign * strength, 0.0).mean()) for sign in (1.0, -1.0))
     exchanged = below > EXCHANGED * above and below > MIN_EXCHANGED * float((shown >= 0).mean())

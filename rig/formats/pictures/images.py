@@ -6,7 +6,7 @@ ignored, since calibrations refer to the sensor's own rows and columns."""
 
 import hashlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -60,11 +60,11 @@ COLOUR_FLAGS = (  # the reducing ones give BGR; OpenCV has no RGB variant of the
 PAGED_SUFFIXES = (".tif", ".tiff", ".webp")  # of files that hold several pictures
 PIXELS_MOST = 100_000_000  # 100 Mpx, the largest studio backs; more is a decompression bomb
 # Sensor noise does not repeat, so a search for repeats is useless: this halves the time and saves a sixth of space.
-PNG_OPTIONS = [
+PNG_OPTIONS = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
-]
+)
 
 
 def is_picture(path: Path) -> bool:
@@ -77,12 +77,16 @@ def write_image(
 ) -> None:
     """Writes RGB or grey pixels in the format of the suffix. ``quality`` is JPEG's; ``parents`` makes the folder if
     need be."""
-    image = np.ascontiguousarray(image)
-    pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if path.suffix == ".jpg" else PNG_OPTIONS
-    done, data = cv2.imencode(path.suffix, pixels, options)
+    options = (cv2.IMWRITE_JPEG_QUALITY, quality) if path.suffix == ".jpg" else PNG_OPTIONS
+    write_atomically(path, encode_image(path.suffix, image, options), parents=parents)
+
+
+def encode_image(suffix: str, image: np.ndarray, options: Sequence[int] = ()) -> bytes:
+    """Returns RGB or grey pixels as the bytes of a file of the format ``suffix``; ``options`` are OpenCV's."""
+    pixels = np.ascontiguousarray(image[:, :, ::-1] if image.ndim == 3 else image)  # OpenCV's blue comes first
+    done, data = cv2.imencode(suffix, pixels, options)
     assert done
-    write_atomically(path, data.tobytes(), parents=parents)
+    return data.tobytes()
 
 
 def read_image(path: Path) -> ImageRgb:

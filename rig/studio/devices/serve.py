@@ -21,6 +21,7 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import write_rig
+from rig.formats.pictures.images import encode_image
 from rig.image import ImageRgb
 from rig.messages.message import compose
 from rig.studio.devices.sources import ImageSource, SceneImages
@@ -329,9 +330,7 @@ def _develop(image: ImageRgb, lighting: _Look, rng: np.random.Generator) -> byte
         # the read noise of the sensor, one value, does not go with the light
         dim = image * np.float32(lighting.light) + rng.standard_normal(image.shape, np.float32)
         image = np.clip(np.round(dim), 0, 255).astype(np.uint8)
-    done, data = cv2.imencode(".jpg", image[:, :, ::-1], _JPEG)
-    assert done
-    return data.tobytes()
+    return encode_image(".jpg", image, _JPEG)
 
 
 def _bumped(image: ImageRgb, amount_px: float) -> ImageRgb:

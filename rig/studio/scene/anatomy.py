@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from rig.mesh import face_normals
+
 Landmarks = Mapping[str, Float[np.ndarray, " 3"]]
 
 PAINTED = (
@@ -51,6 +53,20 @@ def grid_faces(rows: int, columns: int, *, closed: bool = True) -> Int[np.ndarra
     a, b = row * columns + column, row * columns + (column + 1) % columns
     c, d = a + columns, b + columns
     return np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)])
+
+
+def turned_along(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], outward: Float[np.ndarray, "v 3"]
+) -> Int[np.ndarray, "f 3"]:
+    """Returns the triangles, all turned over if they look against ``outward``, the directions at the vertices."""
+    along = (face_normals(vertices, faces) * outward[faces[:, 0]]).sum() > 0
+    return faces if along else faces[:, ::-1]
+
+
+def directions_of(elevation: Float[np.ndarray, "r c"], azimuth: Float[np.ndarray, "_ c"]) -> Float[np.ndarray, "r c 3"]:
+    """Returns the unit vectors of a grid; both angles in radians, azimuth counted from z towards x."""
+    ring = np.cos(elevation)
+    return np.stack([ring * np.sin(azimuth), np.sin(elevation), ring * np.cos(azimuth)], axis=-1)
 
 
 def finer_grid(field: Float[np.ndarray, "r c *_"], times: int) -> Float[np.ndarray, "_ _ *_"]:

@@ -14,7 +14,7 @@ from trimesh.remesh import subdivide
 
 from rig.geometry import Similarity
 from rig.mesh import Mesh, boundary_edges
-from rig.studio.scene.anatomy import Landmarks, grid_faces
+from rig.studio.scene.anatomy import Landmarks, grid_faces, turned_along
 from rig.studio.scene.skin_texture import eye_gap
 
 Vector = Float[np.ndarray, " 3"]
@@ -100,9 +100,7 @@ def surface(eye: Eye, rng: np.random.Generator) -> EyeSurface:
     off_axis = reach.reshape(len(angles), SECTORS) * np.sin(angles)[:, None]
     faces = grid_faces(len(angles), SECTORS)
     vertices = eye.centre + reach[:, None] * directions.reshape(-1, 3)
-    first = vertices[faces[0]]
-    if np.cross(first[1] - first[0], first[2] - first[0]) @ (first[0] - eye.centre) < 0.0:
-        faces = faces[:, ::-1]
+    faces = turned_along(vertices, faces, vertices - eye.centre)
     cornea = _step(off_axis, LIMBUS_MM, 0.5)
     oil = GLOSS_WHITE + (GLOSS_EYE - GLOSS_WHITE) * cornea
     return EyeSurface(vertices, faces, _paint(off_axis, eye.iris, rng), oil.ravel())

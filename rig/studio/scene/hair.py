@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from rig.errors import InputError
 from rig.mesh import Mesh, vertex_normals
 from rig.messages.message import compose
-from rig.studio.scene.anatomy import Anatomy, Landmarks, finer_grid, grid_faces
+from rig.studio.scene.anatomy import Anatomy, Landmarks, directions_of, finer_grid, grid_faces, turned_along
 from rig.studio.scene.skin_texture import smoothstep
 from rig.studio.sensor.sensor import around, waves
 
@@ -87,8 +87,7 @@ def grow(vertices: Float[np.ndarray, "v 3"], body: Anatomy, style: HairStyle, rn
     elevation, azimuth = np.meshgrid(
         np.radians(np.linspace(90.0, LOWEST_DEG, ROWS)), np.arange(COLUMNS) * 2 * np.pi / COLUMNS, indexing="ij"
     )
-    ring = np.cos(elevation)
-    directions = np.stack([ring * np.sin(azimuth), np.sin(elevation), ring * np.cos(azimuth)], axis=-1)
+    directions = directions_of(elevation, azimuth)
     radius = outer_radius(vertices - centre, open_ears=not style.over_ears)
     inside = _inside_hairline(centre + radius[:, :, None] * directions, body, style, rng)
     grown = np.clip(inside / (22.0 * body.unit), 0.0, 1.0)
@@ -288,9 +287,8 @@ def hang(shell: Hair, below: Points, body: Anatomy, style: HairStyle, rng: np.ra
     radius -= 16.0 * body.unit * edge**2  # its front edge turns in towards the neck
     ring = np.stack([np.sin(angle + np.pi), np.zeros_like(angle), np.cos(angle + np.pi)], axis=1)
     sheet = axis + radius[:, :, None] * ring + (TOP_MM * body.unit - drop)[:, :, None] * np.array([0.0, 1.0, 0.0])
-    vertices, faces = sheet.reshape(-1, 3), grid_faces(SHEET_ROWS, SHEET_COLUMNS, closed=False)[:, ::-1]
-    if (vertex_normals(vertices, faces) * np.tile(ring, (SHEET_ROWS, 1))).sum() < 0:
-        faces = faces[:, ::-1]
+    vertices, faces = sheet.reshape(-1, 3), grid_faces(SHEET_ROWS, SHEET_COLUMNS, closed=False)
+    faces = turned_along(vertices, faces, np.tile(ring, (SHEET_ROWS, 1)))
     points = np.stack([np.tile(angle * 85.0, (SHEET_ROWS, 1)), drop, np.zeros_like(drop)], axis=-1).reshape(-1, 3)
     shade = 1.0 - 0.25 * np.tile(edge, (SHEET_ROWS, 1)).ravel()
     if style.curl_mm:
@@ -357,8 +355,7 @@ def knot(shell: Hair, body: Anatomy, style: HairStyle, rng: np.random.Generator)
         up[..., None] * outward,
     ]
     vertices, faces = (centre + sum(offset)).reshape(-1, 3), grid_faces(BUN_ROWS, BUN_COLUMNS)
-    if (vertex_normals(vertices, faces) * (vertices - centre)).sum() < 0:
-        faces = faces[:, ::-1]
+    faces = turned_along(vertices, faces, vertices - centre)
     points = np.stack([(around_axis + 0.75 * polar) * style.bun_mm, polar * 20.0, np.zeros_like(polar)], axis=-1)
     shade = 1.0 + 0.3 * twist.ravel()
     along = 3.0 * np.cross(outward, vertices - centre) / style.bun_mm

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from trimesh.remesh import subdivide
 
 from rig.mesh import Mesh, vertex_normals
 from rig.studio.scene.anatomy import Anatomy, Landmarks
@@ -75,45 +76,23 @@ class RelievedSkin:
 def relieved(head: Mesh, relief: SkinRelief, values: Mapping[str, Float[np.ndarray, "v _"]]) -> RelievedSkin:
     """Divides the triangles of a head where it has a relief, and moves their corners to it. ``values`` are those of the
     head's vertices."""
-    normals = vertex_normals(head.vertices, head.faces)
-    table = np.concatenate([head.vertices, normals, *values.values()], axis=1)
-    near = (relief.share(head.vertices) > 0)[head.faces].any(axis=1)
+    places, attributes = head.vertices, {"normals": vertex_normals(head.vertices, head.faces), **values}
+    near = (relief.share(places) > 0)[head.faces].any(axis=1)
     inner, outer = head.faces[near], head.faces[~near]
-    while len(inner) and _edge_mm(table, inner) > EDGE_MM:
-        table, inner = _halved(table, inner)
-    places, normals = table[:, :3], table[:, 3:6] / np.linalg.norm(table[:, 3:6], axis=1, keepdims=True)
+    while len(inner) and np.median(np.linalg.norm(places[inner[:, 0]] - places[inner[:, 1]], axis=1)) > EDGE_MM:
+        places, inner, attributes = subdivide(places, inner, vertex_attributes=attributes)
+    normals = attributes.pop("normals")
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     slopes = relief.slopes(places)
     slopes -= (slopes * normals).sum(axis=1, keepdims=True) * normals
     tilted = normals - slopes
-    columns = np.cumsum([6, *(array.shape[1] for array in values.values())])
     return RelievedSkin(
         places + relief.heights_mm(places)[:, None] * normals,
         np.concatenate([outer, inner]),
         tilted / np.linalg.norm(tilted, axis=1, keepdims=True),
         places,
-        {
-            name: table[:, first : first + array.shape[1]]
-            for first, (name, array) in zip(columns, values.items(), strict=False)
-        },
+        attributes,
     )
-
-
-def _edge_mm(table: Float[np.ndarray, "v _"], faces: Int[np.ndarray, "f 3"]) -> float:
-    return float(np.median(np.linalg.norm(table[faces[:, 0], :3] - table[faces[:, 1], :3], axis=1)))
-
-
-def _halved(
-    table: Float[np.ndarray, "v k"], faces: Int[np.ndarray, "f 3"]
-) -> tuple[Float[np.ndarray, "w k"], Int[np.ndarray, "g 3"]]:
-    """Divides every triangle into four at the middles of its edges."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    key = edges[:, 0].astype(np.int64) * len(table) + edges[:, 1]
-    _, first, which = np.unique(key, return_index=True, return_inverse=True)
-    middles = 0.5 * (table[edges[first, 0]] + table[edges[first, 1]])
-    ab, bc, ca = (len(table) + which).reshape(3, -1)
-    a, b, c = faces.T
-    corners = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-    return np.concatenate([table, middles]), np.concatenate([np.stack(f, axis=1) for f in corners])
 
 
 def skin_paint(

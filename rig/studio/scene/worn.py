@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from rig.errors import InputError
 from rig.mesh import Mesh, boundary_edges, face_normals, vertex_normals
 from rig.messages.message import compose
-from rig.studio.scene.anatomy import Anatomy, grid_faces
+from rig.studio.scene.anatomy import Anatomy, directions_of, grid_faces, turned_along
 from rig.studio.scene.hair import COLUMNS, LOWEST_DEG, ROWS, outer_radius
 from rig.studio.sensor.sensor import around
 
@@ -90,7 +90,7 @@ def cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, b
         radius = np.maximum(radius, outer_radius(hair - centre, open_ears=False))
     azimuth = np.arange(COLUMNS) * 2 * np.pi / COLUMNS
     elevation = np.radians(np.linspace(90.0, LOWEST_DEG, ROWS))
-    directions = _directions(elevation[:, None], azimuth[None, :])
+    directions = directions_of(np.repeat(elevation[:, None], COLUMNS, axis=1), azimuth[None, :])
     surface = (centre + (radius + CAP_MM * body.unit)[:, :, None] * directions - body.ears) / body.unit
     slope = (CAP_AHEAD[1] - CAP_BEHIND[1]) / (CAP_AHEAD[0] - CAP_BEHIND[0])
     above = surface[:, :, 1] - (CAP_AHEAD[1] + slope * (surface[:, :, 2] - CAP_AHEAD[0]))
@@ -105,7 +105,8 @@ def cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, b
     crown -= SEAM_MM * (seam[:, None] * directions[ROWS // 3])[None] * np.linspace(0, 1, CAP_ROWS)[:, None, None]
     hem = crown[-1:] - 5.0 * body.unit * directions[ROWS // 2][None]
     grid = np.concatenate([crown, hem])
-    shell = grid.reshape(-1, 3), _outward(grid.reshape(-1, 3), grid_faces(CAP_ROWS + 1, COLUMNS), centre)
+    vertices, faces = grid.reshape(-1, 3), grid_faces(CAP_ROWS + 1, COLUMNS)
+    shell = vertices, turned_along(vertices, faces, vertices - centre)
     return joined([shell, _visor(crown[-1], azimuth, body)])
 
 
@@ -185,8 +186,7 @@ def _tube(path: Float[np.ndarray, "n 3"], radius_mm: float, reference: Vector, *
         grid = np.concatenate([np.repeat(path[:1, None], SIDES, 1), grid, np.repeat(path[-1:, None], SIDES, 1)])
     vertices, faces = grid.reshape(-1, 3), grid_faces(len(grid), SIDES)
     middle = np.concatenate([path, path[:1]]) if closed else np.concatenate([path[:1], path, path[-1:]])
-    out = ((vertices - np.repeat(middle, SIDES, axis=0))[faces[:, 0]] * face_normals(vertices, faces)).sum()
-    return vertices, faces if out > 0 else faces[:, ::-1]
+    return vertices, turned_along(vertices, faces, vertices - np.repeat(middle, SIDES, axis=0))
 
 
 def joined(surfaces: list[AnySurface]) -> AnySurface:
@@ -194,17 +194,6 @@ def joined(surfaces: list[AnySurface]) -> AnySurface:
     starts = np.cumsum([0] + [len(vertices) for vertices, _ in surfaces])
     faces = [faces + start for (_, faces), start in zip(surfaces, starts[:-1], strict=True)]
     return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(faces)
-
-
-def _directions(elevation: Float[np.ndarray, "r 1"], azimuth: Float[np.ndarray, "1 c"]) -> Float[np.ndarray, "r c 3"]:
-    ring = np.cos(elevation)
-    up = np.broadcast_to(np.sin(elevation), (len(elevation), azimuth.shape[1]))
-    return np.stack([ring * np.sin(azimuth), up, ring * np.cos(azimuth)], axis=-1)
-
-
-def _outward(vertices: Vertices, faces: Int[np.ndarray, "f 3"], centre: Vector) -> Int[np.ndarray, "f 3"]:
-    away = (face_normals(vertices, faces) * (vertices - centre)[faces[:, 0]]).sum()
-    return faces if away > 0 else faces[:, ::-1]
 
 
 def shirt(
@@ -229,9 +218,7 @@ def shirt(
     out /= np.linalg.norm(out, axis=2, keepdims=True)
     grid = grid + out * (folds * np.clip(np.linspace(-0.3, 1, len(grid)), 0.0, 1)[:, None])[:, :, None]
     points = grid.reshape(-1, 3)
-    faces = grid_faces(len(grid), CLOTH_COLUMNS)
-    outward = (face_normals(points, faces) * out.reshape(-1, 3)[faces[:, 0]]).sum()
-    return points, faces if outward > 0 else faces[:, ::-1]
+    return points, turned_along(points, grid_faces(len(grid), CLOTH_COLUMNS), out.reshape(-1, 3))
 
 
 def _rings(

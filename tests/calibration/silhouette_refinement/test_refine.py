@@ -131,7 +131,7 @@ def test_focal_lengths_that_are_off_by_three_thousandths_come_closer(renderer):
     rig, rng = default_layout(), np.random.default_rng(0)
     captures = list(captures_of(renderer, rig, 4, rng))
     off = Rig(tuple(zoomed(camera, 3e-3 * rng.standard_normal()) for camera in disturbed(rig, 0.3, rng)))
-    fixed, free = (minimise_tangencies(captures, off, focal=focal, prior_px=0.2, heads=None) for focal in (False, True))
+    fixed, free = (minimise_tangencies(captures, off, focal=focal, heads=None) for focal in (False, True))
     assert rms(image_distance(free, rig)) < rms(image_distance(fixed, rig)) < rms(image_distance(off, rig))
     assert _focal_error(free, rig) < 0.8 * _focal_error(off, rig)
     assert _focal_error(fixed, rig) == pytest.approx(_focal_error(off, rig))
@@ -150,7 +150,7 @@ def test_rims_of_the_heads_bring_the_cameras_closer_still(renderer):
     off = disturbed(rig, 0.5, rng)
     heads = Heads(with_modes(load_model(), MODES), [subject.start for subject in subjects])
     seen = [subject.seen for subject in subjects]
-    plain, rims = (minimise_tangencies(seen, off, focal=False, prior_px=0.2, heads=chosen) for chosen in (None, heads))
+    plain, rims = (minimise_tangencies(seen, off, focal=False, heads=chosen) for chosen in (None, heads))
     assert rms(image_distance(rims, rig)) < 0.9 * rms(image_distance(plain, rig))
 
 

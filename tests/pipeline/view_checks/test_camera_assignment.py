@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.view_checks.camera_assignment import _miss_px, find_assignment, own_misfit, rings
+from pipeline.view_checks.camera_assignment import _miss_px, find_assignment, own_misfit, ring_messages, rings
+from rig.messages.message import compose
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.support.silhouette_subjects import captures_of, disturbed
@@ -50,7 +51,8 @@ def test_exchanges_of_two_are_found(subjects):
         found = find_assignment(exchanged(captures[number % 2], filed), rig)
         assert found.pictures == filed
         assert found.overwhelming
-        assert str(found) == f"{one} and {two} hold each other's pictures"
+        (said,) = ring_messages(found.pictures, compose("what-pictures"))
+        assert said.text == f"{one} and {two} hold each other's pictures"
 
 
 @pytest.mark.gl

@@ -127,7 +127,7 @@ def test_a_bad_stretch_of_one_outline_is_no_moved_camera():
     found = _judge("cam02", planes(moved), camera)
     assert found is not None
     np.testing.assert_allclose(found.shift_px, shift, atol=1e-3)
-    assert (found.moved, found.code) == (True, "camera-moved")
+    assert (found.moved, found.warning().code) == (True, "camera-moved")
 
 
 LOOSE_PX, GOOD_PX = 2.4, 0.2
@@ -139,8 +139,8 @@ def test_a_camera_whose_planes_all_touch_the_crown_may_have_a_loose_mask():
     crown = [(x, y, LOOSE_PX if y < 0 else -LOOSE_PX) for x, y, _ in CROWN]
     found = _judge("cam02", planes(crown, GOOD_PX), camera)
     assert found is not None
-    assert (found.moved, found.code) == (False, "mask-loose")
-    assert "the mask is loose, or the camera moved by" in str(found)
+    assert (found.moved, found.warning().code) == (False, "mask-loose")
+    assert "the mask is loose, or the camera moved by" in found.warning().text
     far = _judge("cam02", planes([(x, y, 4.0 * excess) for x, y, excess in crown], GOOD_PX), camera)
     assert far is not None
     assert far.moved  # no mask is loose by ten pixels

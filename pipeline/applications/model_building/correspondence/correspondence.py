@@ -1,10 +1,11 @@
-"""Brings raw scans into correspondence (section 3.2): landmark warp, cylindrical resampling, second pass, refinement.
+"""Brings raw scans into correspondence (section 3.2): landmark warp, cylindrical resampling, refinement.
 
-Every scan is first moved rigidly (by its landmarks) into the head frame. The reference is the scan nearest to the mean.
-Its surface gets the default model's connectivity, because modes on a scan's own hundred thousand vertices would take a
-hundred megabytes (the paper keeps the scan's vertices). Then the paper's steps follow unchanged. Landmarks alone leave
-the surface free to slide between them, so by default a refinement follows: the most probable head under a prior of
-heads, given the scan's landmarks and surface, and from there a smooth displacement along the normals onto the scan.
+Every scan is first moved rigidly (by its landmarks) into the head frame. Its surface gets the default model's
+connectivity, because modes on a scan's own hundred thousand vertices would take a hundred megabytes (the paper keeps
+the scan's vertices). The paper's steps, ``on_reference`` and ``warp_and_resample``, draw figure 3. Landmarks alone
+leave the surface free to slide between them, so a model is built of what the refinement finds: the most probable head
+under a prior of heads, given the scan's landmarks and surface, and from there a smooth displacement along the normals
+onto the scan.
 
 The prior allows more heads than a model's own span. A PCA of 138 heads has 137 directions, and a new head needs others:
 alone, on heads outside its span, it pulls vertices to wrong positions. Two facts are known besides the sample. A head
@@ -17,7 +18,6 @@ Rays are cast from the vertical axis through the head outwards. A ray is (angle,
 the face), pi/2 along +x (the subject's left); height is y. Scans are worked on in several processes, for SuperLU and
 numpy hold the interpreter."""
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -57,7 +57,6 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 FEW = 12  # with fewer items the processes' start (two seconds) costs more than they save
-_BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 _CHUNK = 4  # items per message: the task's constant data (a prior of 40 MB) is sent once for each chunk
 PerVertex = Float[np.ndarray, " N"]
 _TAUBIN = (0.5, -0.53)  # weights of a step that smooths and of one that restores the size
@@ -65,6 +64,13 @@ _SMOOTHINGS = 4  # pairs of steps: they halve the noise of points; 8 would remov
 # Normals lead while the shape is millimetres off; close by they would pin a vertex to where its own, still wrong,
 # normal points (0.43 mm instead of 0.19 on heads inside the span), so there nearness decides.
 BROAD, FINE = Search(5, 15.0, 12.0, 1.0), Search(4, 4.0, 1.0, 0.05)
+STIFFNESS = (3.0, 1.0, 0.5)
+MARK_MM = 0.5  # standard deviation of a marked landmark, per axis
+WORKERS = 2  # processes
+# Of figure 3: the drawing of the reference, in which a matched vertex weighs 1; the warp, which must not follow the
+# errors of landmarks; and how far a sample may lie from the warped vertex.
+REFERENCE_STIFFNESS, MARK_WEIGHT = (30.0, 30.0, 10.0, 10.0, 3.0, 3.0, 1.0, 1.0, 0.5, 0.5), 0.3
+MARK_SMOOTHING_MM, SAMPLE_REACH_MM = 1.0, 15.0
 GLOBAL, LOCAL = 0.8, 0.6  # factors of both parts' standard deviations; their squares add up to 1
 LENGTH_MM = 60.0  # of the Gaussian of the distance between vertices
 # Localised modes; with 300 the held-out error is a tenth larger (tests/laboratory/notes/head-models.md).
@@ -81,17 +87,14 @@ class Workers:
 
     pool: ProcessPoolExecutor | None
 
-    def over(
-        self, work: Callable[[Item], Result], items: Sequence[Item], stage: str, report: Progress | None
-    ) -> list[Result]:
+    def over(self, work: Callable[[Item], Result], items: Sequence[Item], stage: str, report: Progress) -> list[Result]:
         """Runs ``work`` on the items and returns the results in their order. Raises the exception of the first item
         that fails."""
         results = map(work, items) if self.pool is None else self.pool.map(work, items, chunksize=_CHUNK)
         out = []
         for result in results:
             out.append(result)
-            if report:
-                report(stage, len(out) / len(items))
+            report(stage, len(out) / len(items))
         return out
 
 
@@ -102,31 +105,8 @@ def workers(count: int, items: int) -> Iterator[Workers]:
         yield Workers(None)
         return
     # fresh interpreters: a fork would copy locks that threads (BLAS, numba) of this process hold
-    with _single_threaded_children(), ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
         yield Workers(pool)
-
-
-@contextmanager
-def _single_threaded_children() -> Iterator[None]:
-    """Makes processes that are started in the block use one thread for linear algebra, as there is one process for each
-    core."""
-    before = os.environ.get(_BLAS_THREADS)
-    os.environ[_BLAS_THREADS] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[_BLAS_THREADS]
-        else:
-            os.environ[_BLAS_THREADS] = before
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Cast:
-    """Holds where rays meet a surface: radius (mm) and triangle, NaN and -1 where they do not."""
-
-    radii: PerVertex
-    triangles: Int[np.ndarray, " N"]
 
 
 def coordinates(points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, " _"], ...]:
@@ -149,13 +129,13 @@ class CylinderIndex:
         self._rows = int((vertices[:, 1].max() - self._low) / CELL_MM) + 1
         self._start, self._members = bin_triangles(self._vertices, self._faces, self._low, self._rows)
 
-    def cast(self, angles: PerVertex, heights: PerVertex, near: PerVertex | None = None) -> Cast:
-        """Returns each ray's hit whose radius is nearest to ``near`` (mm), or without ``near`` the outermost hit."""
+    def cast(self, angles: PerVertex, heights: PerVertex, near: PerVertex | None = None) -> PerVertex:
+        """Returns the radius (mm) of each ray's hit, NaN without one: the radius nearest to ``near``, or without it the
+        outermost."""
         wanted = np.full(len(angles), np.inf) if near is None else np.asarray(near, float)
-        found, triangles = cast_rays(
+        return cast_rays(
             self._vertices, self._faces, self._low, self._rows, self._start, self._members, angles, heights, wanted
         )
-        return Cast(found, triangles)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +149,7 @@ class Prior:
 
 
 def registration_prior(
-    mean: Float[np.ndarray, "V 3"], modes: Float[np.ndarray, "M V 3"], faces: Int[np.ndarray, "F 3"], *, seed: int = 0
+    mean: Float[np.ndarray, "V 3"], modes: Float[np.ndarray, "M V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Prior:
     """Returns the mixture for a model's mean and modes (mm per sigma), mirrored if the mesh is symmetric."""
     opposite = mirror_images(mean, faces)
@@ -177,7 +157,7 @@ def registration_prior(
         mean = (mean + mean[opposite] * _MIRROR) / 2
         modes = np.concatenate([modes, modes[:, opposite] * _MIRROR]) / np.sqrt(2)
     modes = modes.astype(np.float32)
-    local = localised(mean, modes, seed=seed)
+    local = localised(mean, modes)
     return Prior(mean, np.concatenate([GLOBAL * modes, LOCAL * local]).astype(np.float32), len(modes))
 
 
@@ -193,16 +173,14 @@ def mirror_images(mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"])
     return opposite if found.mean() > _SYMMETRIC else None
 
 
-def localised(
-    mean: Float[np.ndarray, "V 3"], modes: Float32[np.ndarray, "M V 3"], *, seed: int = 0
-) -> Float32[np.ndarray, "K V 3"]:
+def localised(mean: Float[np.ndarray, "V 3"], modes: Float32[np.ndarray, "M V 3"]) -> Float32[np.ndarray, "K V 3"]:
     """Returns the ``KEPT`` strongest modes of the covariance multiplied by a Gaussian of the distance on the mean head.
 
     That product K is too large to store (400 MB), so its rows are computed in blocks and multiplied once by a random
     sketch: K ~ Y (P^T Y)^-1 Y^T with Y = K P (Halko, Martinsson, Tropp 2011, section 5.5)."""
     size = mean.size
     flat = modes.reshape(len(modes), size)
-    probe = np.random.default_rng(seed).standard_normal((size, min(KEPT + _SPARE, size))).astype(np.float32)
+    probe = np.random.default_rng(0).standard_normal((size, min(KEPT + _SPARE, size))).astype(np.float32)
     sketch = np.empty_like(probe)
     for first in range(0, len(mean), _BLOCK):
         rows = slice(first, first + _BLOCK)
@@ -219,54 +197,16 @@ def localised(
     return (vectors[:, strongest].T @ root).reshape(-1, *mean.shape).astype(np.float32)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Matching:
-    """Holds the settings of correspondence. Lengths in mm."""
-
-    refine: bool = True
-    reach_mm: float = 15.0  # a sample farther than this from the warped vertex is another part of the head: void
-    landmark_smoothing_mm: float = 1.0  # landmarks are marked to about 0.5 mm; the warp must not follow such errors
-    broad: Search = BROAD
-    fine: Search = FINE
-    mark_mm: float = 0.5  # standard deviation of a marked landmark, per axis
-    reference_stiffness: tuple[float, ...] = (30.0, 30.0, 10.0, 10.0, 3.0, 3.0, 1.0, 1.0, 0.5, 0.5)  # per iteration
-    stiffness: tuple[float, ...] = (3.0, 1.0, 0.5)
-    mark_weight: float = 0.3  # of a landmark in giving the reference its connectivity, beside 1 of a matched vertex
-    workers: int = 2  # processes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Correspondence:
-    """Holds heads with the same vertices (mm): row k is scan k, moved into the common frame by ``frame_from_scan``.
-    ``void`` marks vertices without a surface on the scan."""
-
-    heads: Float[np.ndarray, "N V 3"]
-    void: Bool[np.ndarray, "N V"]
-    reference: int
-    frame_from_scan: list[RigidTransform]
-
-
-def correspond(
-    scans: Sequence[Scan], template: HeadModel, matching: Matching | None = None, *, report: Progress | None = None
-) -> Correspondence:
-    """Returns the scans as heads with the connectivity of the template's cage. The scans must have passed
-    ``scan_checks.check``."""
-    matching = matching or Matching()
-    frames = common_frame(scans, template)
-    placed_scans = list(zip(scans, frames, strict=True))
-    reference = nearest_mean(np.array([frame.apply(stacked(scan.landmarks)) for scan, frame in placed_scans]))
-    with workers(matching.workers, len(scans)) as crew:
-        shape = on_reference(prepared(scans[reference], frames[reference]), template, matching)
-        heads, void = np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
-        for stage in ("first pass", "second pass"):
-            sample = partial(_resampled, shape, _landmark_rows(template), matching)
-            found = crew.over(sample, placed_scans, stage, report)
-            heads, void = np.array([head for head, _ in found]), np.array([mask for _, mask in found])
-            reference = nearest_mean(heads)
-            shape = heads[reference]
-        if matching.refine:
-            heads = _refined(placed_scans, template, matching, crew, report)
-    return Correspondence(heads, void, reference, frames)
+def correspond(scans: Sequence[Scan], template: HeadModel, report: Progress) -> Float[np.ndarray, "N V 3"]:
+    """Returns the scans as heads with the vertices of the template's cage (mm), moved into the common frame. The scans
+    must have passed ``scan_checks.check``."""
+    count = len(template.mean)
+    faces, mean = template.levels["cage"].faces, template.vertices(np.zeros(0))[:count]
+    prior = registration_prior(mean, template.basis("full", len(template.modes), np.arange(count)), faces)
+    one = partial(_most_probable, prior, faces, _landmark_rows(template))
+    placed_scans = list(zip(scans, common_frame(scans, template), strict=True))
+    with workers(WORKERS, len(scans)) as crew:
+        return np.array(crew.over(one, placed_scans, "refining", report))
 
 
 def common_frame(scans: Sequence[Scan], template: HeadModel) -> list[RigidTransform]:
@@ -302,26 +242,14 @@ def _averaging(faces: Int[np.ndarray, "F 3"], count: int) -> sparse.csr_array:
     return sparse.csr_array(sparse.diags_array(1 / np.asarray(both.sum(1)).ravel()) @ both)
 
 
-def nearest_mean(shapes: Float[np.ndarray, "N L 3"]) -> int:
-    """Returns the index of the shape closest to the mean of all: the reference (step 1 of section 3.2)."""
-    return int(((shapes - shapes.mean(0)) ** 2).sum((1, 2)).argmin())
-
-
-def on_reference(target: Target, template: HeadModel, matching: Matching) -> Float[np.ndarray, "V 3"]:
+def on_reference(target: Target, template: HeadModel) -> Float[np.ndarray, "V 3"]:
     """Returns the template's cage vertices placed on the surface of the reference scan."""
     surface = template.vertices(np.zeros(0))[: len(template.mean)]
     index = _landmark_rows(template)
     warped = landmark_warp(surface[index], target.marks, surface)
     fixed = {int(row): mark for row, mark in zip(index, target.marks, strict=True)}
-    return draw_to_target(
-        warped,
-        template.levels["cage"].faces,
-        target,
-        matching.broad,
-        matching.reference_stiffness,
-        marks=fixed,
-        mark_weight=matching.mark_weight,
-    )
+    faces = template.levels["cage"].faces
+    return draw_to_target(warped, faces, target, BROAD, REFERENCE_STIFFNESS, marks=fixed, mark_weight=MARK_WEIGHT)
 
 
 def warp_and_resample(
@@ -329,57 +257,25 @@ def warp_and_resample(
     index: Int[np.ndarray, " L"],
     marks: Float[np.ndarray, "L 3"],
     cylinder: CylinderIndex,
-    matching: Matching,
 ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
     """Warps the reference to the target's landmarks and resamples it on the target's surface (steps 3 and 4 of section
     3.2). Returns the warped reference, its resampling, and where the target has no surface; such vertices keep the
     warped position."""
-    warped = landmark_warp(shape[index], marks, shape, smoothing=matching.landmark_smoothing_mm)
+    warped = landmark_warp(shape[index], marks, shape, smoothing=MARK_SMOOTHING_MM)
     angles, heights, radii = coordinates(warped)
-    cast = cylinder.cast(angles, heights, radii)
-    void = ~(np.abs(cast.radii - radii) < matching.reach_mm)
-    sampled = points_at(angles, heights, np.where(void, radii, cast.radii))
+    hits = cylinder.cast(angles, heights, radii)
+    void = ~(np.abs(hits - radii) < SAMPLE_REACH_MM)
+    sampled = points_at(angles, heights, np.where(void, radii, hits))
     sampled[index], void[index] = marks, False  # landmarks stay fixed
     return warped, sampled, void
 
 
-def _resampled(
-    shape: Float[np.ndarray, "V 3"],
-    index: Int[np.ndarray, " L"],
-    matching: Matching,
-    placed_scan: tuple[Scan, RigidTransform],
-) -> tuple[Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
-    scan, frame_from_scan = placed_scan
-    vertices = frame_from_scan.apply(scan.vertices)
-    marks = frame_from_scan.apply(stacked(scan.landmarks))
-    return warp_and_resample(shape, index, marks, CylinderIndex(vertices, scan.faces), matching)[1:]
-
-
-def _refined(
-    placed_scans: Sequence[tuple[Scan, RigidTransform]],
-    template: HeadModel,
-    matching: Matching,
-    crew: Workers,
-    report: Progress | None,
-) -> Float[np.ndarray, "N V 3"]:
-    count = len(template.mean)
-    faces, mean = template.levels["cage"].faces, template.vertices(np.zeros(0))[:count]
-    prior = registration_prior(mean, template.basis("full", len(template.modes), np.arange(count)), faces)
-    one = partial(_most_probable, prior, faces, _landmark_rows(template), matching)
-    return np.array(crew.over(one, placed_scans, "refining", report))
-
-
 def _most_probable(
-    prior: Prior,
-    faces: Int[np.ndarray, "F 3"],
-    index: Int[np.ndarray, " L"],
-    matching: Matching,
-    placed_scan: tuple[Scan, RigidTransform],
+    prior: Prior, faces: Int[np.ndarray, "F 3"], index: Int[np.ndarray, " L"], placed_scan: tuple[Scan, RigidTransform]
 ) -> Float[np.ndarray, "V 3"]:
     scan, frame = placed_scan
     target = prepared(scan, frame)
-    fitted = statistical(prior, faces, index, target, matching)
-    return draw_to_target(fitted, faces, target, matching.fine, matching.stiffness)
+    return draw_to_target(statistical(prior, faces, index, target), faces, target, FINE, STIFFNESS)
 
 
 def _landmark_rows(template: HeadModel) -> Int[np.ndarray, " L"]:
@@ -387,7 +283,7 @@ def _landmark_rows(template: HeadModel) -> Int[np.ndarray, " L"]:
 
 
 def statistical(
-    prior: Prior, faces: Int[np.ndarray, "F 3"], index: Int[np.ndarray, " L"], target: Target, matching: Matching
+    prior: Prior, faces: Int[np.ndarray, "F 3"], index: Int[np.ndarray, " L"], target: Target
 ) -> Float[np.ndarray, "V 3"]:
     """Returns the most probable head under the prior, given the scan's landmarks and surface: first with broad modes,
     then with all.
@@ -397,7 +293,7 @@ def statistical(
     mean, areas = prior.mean, vertex_areas(prior.mean, faces)
     shape = landmark_warp(mean[index], target.marks, mean, smoothing=20.0)
     points = np.concatenate([mean, np.repeat(mean[index], 3, axis=0)])  # a landmark is three planes
-    for search, count in ((matching.broad, prior.broad), (matching.fine, len(prior.modes))):
+    for search, count in ((BROAD, prior.broad), (FINE, len(prior.modes))):
         tree = oriented_tree(target, search)
         modes = np.ascontiguousarray(prior.modes[:count].transpose(1, 2, 0))
         for _ in range(search.steps):
@@ -409,7 +305,7 @@ def statistical(
             columns = np.concatenate([moves, motion_columns(points, normals)], axis=1)
             ahead = np.concatenate([dots(target.vertices[near] - mean, planes), (target.marks - mean[index]).ravel()])
             information = weight * areas / 100.0 / search.plane_mm**2
-            known = np.concatenate([information, np.full(3 * len(index), matching.mark_mm**-2)])
+            known = np.concatenate([information, np.full(3 * len(index), MARK_MM**-2)])
             priors = np.repeat([1.0, 0.0], [count, 6])
             solution = solve_with_prior(columns, ahead, known, priors, np.zeros(count + 6), precision=np.float32)
             z, turn, shift = np.split(solution, [count, count + 3])

@@ -54,13 +54,12 @@ def bin_triangles(vertices, faces, low, rows):  # pragma: no cover - compiled
 
 @njit(cache=True)
 def cast_rays(vertices, faces, low, rows, start, members, angles, heights, wanted):  # pragma: no cover - compiled
-    """Casts horizontal rays from the y axis, each at an angle (rad) and a height (mm). Returns the radius (mm) and the
-    triangle of each ray's hit: the one nearest to its ``wanted`` radius, or the outermost one if that is infinite; NaN
-    and -1 without hit.
+    """Casts horizontal rays from the y axis, each at an angle (rad) and a height (mm). Returns the radius (mm) of each
+    ray's hit: the one nearest to its ``wanted`` radius, or the outermost one if that is infinite; NaN without hit.
 
     Intersections are after Moeller and Trumbore 1997. ``start`` and ``members`` are the results of ``bin_triangles``.
     """
-    radii, triangles = np.full(len(angles), np.nan), np.full(len(angles), -1, np.int64)
+    radii = np.full(len(angles), np.nan)
     width = 2 * np.pi / CELLS_ROUND
     for k in range(len(angles)):
         row = int(np.floor((heights[k] - low) / CELL_MM))
@@ -92,6 +91,5 @@ def cast_rays(vertices, faces, low, rows, start, members, angles, heights, wante
                 continue
             miss = -radius if wanted[k] == np.inf else abs(radius - wanted[k])
             if miss < best:
-                best = miss
-                radii[k], triangles[k] = radius, members[m]
-    return radii, triangles
+                best, radii[k] = miss, radius
+    return radii

@@ -149,9 +149,9 @@ def voids(scan: Scan, template: HeadModel) -> tuple[Bool[np.ndarray, "H A"], Boo
     heights = np.arange(at["gnathion"][1] + 4, at["glabella"][1] + 35, _CELL_MM)
     angles = -np.pi + 2 * np.pi * (np.arange(_ROUND) + 0.5) / _ROUND
     columns, rows = np.meshgrid(angles, heights)
-    cast = CylinderIndex(placed, scan.faces).cast(columns.ravel(), rows.ravel())
+    radii = CylinderIndex(placed, scan.faces).cast(columns.ravel(), rows.ravel())
     face = (np.abs(columns) < np.radians(65)) & (rows < at["glabella"][1] + 15)
-    return np.isnan(cast.radii).reshape(rows.shape), face
+    return np.isnan(radii).reshape(rows.shape), face
 
 
 def outward_share(scan: Scan, template: HeadModel) -> float:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from pipeline.head_model.landmarks import NAMES
 from rig.errors import InputError
@@ -50,12 +50,12 @@ def find_scans(folder: Path) -> list[Path]:
 
 def read_scan(path: Path) -> Scan:
     """Returns a scan with its landmarks. Raises InputError."""
-    vertices, faces = welded(read_mesh(path))
+    mesh, _ = welded(read_mesh(path))
     landmarks_path = landmark_file(path)
     if landmarks_path is None:
         beside = ", ".join(path.with_suffix(suffix).name for suffix in LANDMARK_SUFFIXES)
         raise InputError(path.name, [f"has no landmarks beside it ({beside})"])
-    return Scan(path.stem, vertices, faces, read_landmarks(landmarks_path))
+    return Scan(path.stem, mesh.vertices, mesh.faces, read_landmarks(landmarks_path))
 
 
 def landmark_file(mesh: Path) -> Path | None:
@@ -64,16 +64,17 @@ def landmark_file(mesh: Path) -> Path | None:
     return next((path for path in beside if path.is_file()), None)
 
 
-def welded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    """Returns the mesh with every position stored once, and without unused vertices.
+def welded(mesh: Mesh) -> tuple[Mesh, Bool[np.ndarray, " F"]]:
+    """Returns the mesh with every position stored once, without unused vertices, colours and degenerate triangles; and
+    which triangles it kept.
 
     Files repeat vertices along texture seams, or for each triangle; a surface torn there has no neighbours over which
     noise could be smoothed."""
     _, first, index = np.unique(mesh.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
     corners = index.ravel()[mesh.faces]
-    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(1)]
-    used, faces = np.unique(corners, return_inverse=True)
-    return mesh.vertices[first[used]], faces.reshape(-1, 3).astype(np.int32)
+    proper = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
+    used, faces = np.unique(corners[proper], return_inverse=True)
+    return Mesh(mesh.vertices[first[used]], faces.reshape(-1, 3).astype(np.int32)), proper
 
 
 def read_landmarks(path: Path, axes: Axes = "LPS") -> dict[str, Float[np.ndarray, " 3"]]:

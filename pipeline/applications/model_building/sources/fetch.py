@@ -16,7 +16,7 @@ from pipeline.applications.model_building.sources.imports import import_model
 from pipeline.head_model.model_file import ModelParts, save_model
 from pipeline.head_model.model_names import models_folder
 from rig.errors import EigenheadError
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ def fetch_model(
     source: str | Path | None = None,
     commit: str | None = None,
     timeout_s: float = 1800.0,
-    report: Progress | None = None,
+    report: Progress = discard_progress,
 ) -> Fetched:
     """Downloads the named model and saves it below ``models_folder()``.
 
@@ -82,10 +82,9 @@ def fetch_model(
     url = str(source) if source is not None else remote.url
     if url.startswith("-"):
         raise CannotFetch(name, f"{url!r} is no address")
-    say = report or (lambda stage, fraction: None)
     with tempfile.TemporaryDirectory(prefix="eigenhead-fetch-") as scratch:
         folder = Path(scratch)
-        _check_out(name, url, wanted, remote, folder, timeout_s=timeout_s, say=say)
+        _check_out(name, url, wanted, remote, folder, timeout_s=timeout_s, report=report)
         licence_text = _licence(name, folder / remote.licence_file)
         parts = import_model(folder, name=name, report=report)
     path = models_folder() / f"{name}.npz"
@@ -94,23 +93,24 @@ def fetch_model(
 
 
 def _check_out(
-    name: str, url: str, commit: str, remote: Remote, folder: Path, *, timeout_s: float, say: Progress
+    name: str, url: str, commit: str, remote: Remote, folder: Path, *, timeout_s: float, report: Progress
 ) -> None:
     """Checks out the needed files of the pinned commit into ``folder``, without history."""
-    say("fetching", 0.0)
+    report("fetching", 0.0)
     place = str(Path(url).resolve()) if Path(url).exists() else url
     _git(name, folder, timeout_s, "init", "--quiet")
     _git(name, folder, timeout_s, "remote", "add", "origin", place)
     _git(name, folder, timeout_s, "sparse-checkout", "set", "--no-cone", *(f"/{path}" for path in remote.needed))
-    _git(name, folder, timeout_s, "fetch", "--progress", "--depth=1", "--filter=blob:none", "origin", commit, say=say)
-    _git(name, folder, timeout_s, "checkout", "--progress", "--detach", "FETCH_HEAD", say=say)
+    fetching = ("fetch", "--progress", "--depth=1", "--filter=blob:none", "origin", commit)
+    _git(name, folder, timeout_s, *fetching, report=report)
+    _git(name, folder, timeout_s, "checkout", "--progress", "--detach", "FETCH_HEAD", report=report)
     found = _git(name, folder, timeout_s, "rev-parse", "HEAD").strip()
     if found != commit:
         raise CannotFetch(name, f"{url} answered with commit {found}, pinned is {commit}")
-    say("fetching", 1.0)
+    report("fetching", 1.0)
 
 
-def _git(name: str, folder: Path, timeout_s: float, *arguments: str, say: Progress | None = None) -> str:
+def _git(name: str, folder: Path, timeout_s: float, *arguments: str, report: Progress = discard_progress) -> str:
     """Runs one git command and returns its output. It never asks for a password; its progress lines are reported."""
     environment = os.environ | {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C", "GIT_LFS_SKIP_SMUDGE": "1"}
     try:
@@ -120,7 +120,7 @@ def _git(name: str, folder: Path, timeout_s: float, *arguments: str, say: Progre
             )
             with process:
                 try:
-                    out = _waited(process, errors, time.monotonic() + timeout_s, say)
+                    out = _waited(process, errors, time.monotonic() + timeout_s, report)
                 except BaseException:  # also where the report cancels: git must not go on downloading
                     process.kill()
                     raise
@@ -138,7 +138,7 @@ def _git(name: str, folder: Path, timeout_s: float, *arguments: str, say: Progre
     return out.decode(errors="replace")
 
 
-def _waited(process: subprocess.Popen[bytes], errors: IO[bytes], until: float, say: Progress | None) -> bytes:
+def _waited(process: subprocess.Popen[bytes], errors: IO[bytes], until: float, report: Progress) -> bytes:
     """Returns the standard output of a process, and reports its progress lines meanwhile. Raises TimeoutExpired."""
     while True:
         try:
@@ -146,10 +146,9 @@ def _waited(process: subprocess.Popen[bytes], errors: IO[bytes], until: float, s
         except subprocess.TimeoutExpired:
             if time.monotonic() > until:
                 raise
-        if say is not None:
-            errors.seek(0)
-            seen = _PROGRESS.findall(errors.read())
-            say("fetching", int(seen[-1]) / 100 if seen else 0.0)
+        errors.seek(0)
+        seen = _PROGRESS.findall(errors.read())
+        report("fetching", int(seen[-1]) / 100 if seen else 0.0)
 
 
 def _licence(name: str, path: Path) -> str:

@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 from pipeline.applications.model_building.training.training import Training, above_neck, face_region, finish
 from pipeline.geometry.registration.nonrigid import landmark_warp
 from pipeline.geometry.registration.rigid import motion_about, motion_columns, solve_with_prior
-from pipeline.geometry.surface_index import Hits, SurfaceIndex
+from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.expressions import Expressions, visible
 from pipeline.head_model.landmarks import MIDLINE, NAMES, mirrored
 from pipeline.head_model.model import HeadModel, load_model
@@ -31,7 +31,7 @@ from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz
 from rig.geometry import RigidTransform, rigid_fit
 from rig.mesh import vertex_normals
 from rig.messages.message import compose
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 
 Vertices = Float[np.ndarray, "V 3"]
 
@@ -106,7 +106,7 @@ _BASEL_NAMES = {
 }  # fmt: skip
 
 
-def import_model(path: Path, *, name: str | None = None, report: Progress | None = None) -> ModelParts:
+def import_model(path: Path, *, name: str | None = None, report: Progress = discard_progress) -> ModelParts:
     """Reads a model of another format and converts it; a model file of this project is only renamed.
 
     A folder with exactly one model file stands for that file. Raises CannotImport."""
@@ -120,19 +120,16 @@ def import_model(path: Path, *, name: str | None = None, report: Progress | None
     elif path.suffix.lower() == ".npz":
         try:
             with open_npz(path) as file:
-                read = _read_ours if "meta" in file else read_ict_compact if "landmarks68" in file else read_plain
-            foreign = read(path)
+                ours, compact = "meta" in file, "landmarks68" in file
+            if ours:
+                parts = read_parts(path)[0]
+                return replace(parts, name=name) if name else parts
+            foreign = read_ict_compact(path) if compact else read_plain(path)
         except (OSError, *DAMAGE) as fault:
             raise CannotImport(path, compose("file-incomplete", reason=str(fault)).text) from None
-        if isinstance(foreign, ModelParts):
-            return replace(foreign, name=name) if name else foreign
     else:
         raise CannotImport(path, "it is neither a folder nor .npz, .h5 or .hdf5" if path.exists() else "no such file")
     return adopt(replace(foreign, name=name) if name else foreign, report=report)
-
-
-def _read_ours(path: Path) -> ModelParts:
-    return read_parts(path)[0]
 
 
 def read_ict_compact(path: Path) -> Foreign:
@@ -155,7 +152,7 @@ def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
     return visible(Expressions(names, shapes))
 
 
-def read_ict_repository(folder: Path, *, report: Progress | None = None) -> Foreign:
+def read_ict_repository(folder: Path, *, report: Progress = discard_progress) -> Foreign:
     """Returns ICT-FaceKit from its repository's layout: generic_neutral_mesh.obj and identity000.obj ... in
     centimetres."""
     inside = next((f for f in (folder, folder / "FaceXModel") if (f / "generic_neutral_mesh.obj").is_file()), None)
@@ -165,32 +162,34 @@ def read_ict_repository(folder: Path, *, report: Progress | None = None) -> Fore
     paths = sorted(inside.glob("identity[0-9][0-9][0-9].obj"))
     if not paths:
         raise CannotImport(folder, "FaceXModel holds no identity000.obj and following")
-    modes = []
-    for k, path in enumerate(paths):
-        vertices, _ = read_obj(path, polygons=False)
-        if len(vertices) != len(neutral):
-            raise CannotImport(folder, f"{path.name} has {len(vertices)} vertices, the neutral mesh {len(neutral)}")
-        modes.append((vertices - neutral)[:ICT_VERTICES] * 10.0)
-        if report:
-            report("reading identity shapes", (k + 1) / len(paths))
+    modes = _displacements(folder, paths, neutral, "reading identity shapes", report)
     skin = [p for p in polygons if max(p) < ICT_VERTICES]
     faces = np.array([(p[0], p[k], p[k + 1]) for p in skin for k in range(1, len(p) - 1)], np.int32)
-    found = _ict(neutral[:ICT_VERTICES] * 10.0, np.array(modes, np.float32), faces, np.array(ICT_LANDMARKS_68))
+    found = _ict(neutral[:ICT_VERTICES] * 10.0, modes, faces, np.array(ICT_LANDMARKS_68))
     return replace(found, expressions=_repository_expressions(inside, neutral, report))
 
 
-def _repository_expressions(folder: Path, neutral: Vertices, report: Progress | None) -> Expressions | None:
+def _repository_expressions(folder: Path, neutral: Vertices, report: Progress) -> Expressions | None:
     """Returns the expressions from meshes named after them: browDown_L.obj and so on. Raises CannotImport."""
     paths = [path for path in sorted(folder.glob("*.obj")) if ICT_EXPRESSION.fullmatch(path.stem)]
+    if not paths:
+        return None
+    shapes = _displacements(folder, paths, neutral, "reading expressions", report)
+    return visible(Expressions(tuple(p.stem for p in paths), shapes))
+
+
+def _displacements(
+    folder: Path, paths: list[Path], neutral: Vertices, stage: str, report: Progress
+) -> Float[np.ndarray, "M V 3"]:
+    """Returns how meshes (cm) of the repository ``folder`` differ from the neutral one, mm. Raises CannotImport."""
     shapes = []
     for k, path in enumerate(paths):
         vertices, _ = read_obj(path, polygons=False)
         if len(vertices) != len(neutral):
             raise CannotImport(folder, f"{path.name} has {len(vertices)} vertices, the neutral mesh {len(neutral)}")
         shapes.append((vertices - neutral)[:ICT_VERTICES] * 10.0)
-        if report:
-            report("reading expressions", (k + 1) / len(paths))
-    return visible(Expressions(tuple(p.stem for p in paths), np.array(shapes, np.float32))) if paths else None
+        report(stage, (k + 1) / len(paths))
+    return np.array(shapes, np.float32)
 
 
 def _ict(mean: np.ndarray, modes: np.ndarray, faces: np.ndarray, points: np.ndarray) -> Foreign:
@@ -289,16 +288,15 @@ def _check_plain(path: Path, mean: np.ndarray, modes: np.ndarray, faces: np.ndar
         raise CannotImport(path, "a face index lies outside the vertices")
 
 
-def adopt(foreign: Foreign, *, report: Progress | None = None) -> ModelParts:
+def adopt(foreign: Foreign, *, report: Progress = discard_progress) -> ModelParts:
     """Converts a model to this project's parts: orthogonal modes, all 26 landmarks, head frame, face region, closed
     openings, levels. Raises CannotImport."""
-    say = report or (lambda stage, fraction: None)
     extent = float(np.ptp(foreign.mean, axis=0).max())
     if not 100 < extent < 600:
         raise CannotImport(foreign.name, f"its mean is {extent:.3g} mm large, which no head is: convert it to mm")
-    say("turning modes", 0.0)
+    report("turning modes", 0.0)
     modes, sigma = orthogonalised(foreign.modes)
-    say("carrying landmarks over", 0.0)
+    report("carrying landmarks over", 0.0)
     faces = close_openings(foreign.mean, foreign.faces)
     landmarks = complete_landmarks(foreign.mean, faces, foreign.landmarks)
     mean = foreign.mean - foreign.mean[[landmarks["tragion_right"], landmarks["tragion_left"]]].mean(0)
@@ -319,25 +317,23 @@ def adopt(foreign: Foreign, *, report: Progress | None = None) -> ModelParts:
     return replace(parts, expressions=foreign.expressions)
 
 
+MISSED_DRAWS = 10  # random heads
+OPENING_MM = 90.0  # of eyes and mouth; the neck is wider
+
+
 def largest_miss(
-    original: Float[np.ndarray, "M V 3"],
-    modes: Float[np.ndarray, "K V 3"],
-    sigma: Float[np.ndarray, " K"],
-    *,
-    draws: int = 10,
+    original: Float[np.ndarray, "M V 3"], modes: Float[np.ndarray, "K V 3"], sigma: Float[np.ndarray, " K"]
 ) -> float:
     """Returns the largest distance (mm) between vertices of random heads of the original and their best fits by the
     converted model."""
     theirs, ours = (m.reshape(len(m), -1).astype(float) for m in (original, rounded(modes)))
-    heads = np.random.default_rng(11).standard_normal((draws, len(theirs))) @ theirs
+    heads = np.random.default_rng(11).standard_normal((MISSED_DRAWS, len(theirs))) @ theirs
     missed = heads - (heads @ ours.T / sigma**2) @ ours
-    return float(np.linalg.norm(missed.reshape(draws, -1, 3), axis=2).max())
+    return float(np.linalg.norm(missed.reshape(MISSED_DRAWS, -1, 3), axis=2).max())
 
 
-def close_openings(
-    vertices: Vertices, faces: Int[np.ndarray, "F 3"], largest_mm: float = 90.0
-) -> Int[np.ndarray, "G 3"]:
-    """Returns the faces with strips that close every opening up to ``largest_mm`` wide except the neck."""
+def close_openings(vertices: Vertices, faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
+    """Returns the faces with strips that close every opening up to ``OPENING_MM`` wide except the neck."""
     loops = boundary_loops(faces)
     if not loops:
         return faces
@@ -345,7 +341,7 @@ def close_openings(
     strips = [
         close_loop(vertices, loop)
         for loop, width in zip(loops, widths, strict=True)
-        if width < min(largest_mm, max(widths)) and len(loop) > 2
+        if width < min(OPENING_MM, max(widths)) and len(loop) > 2
     ]
     return np.concatenate([faces, *strips]).astype(np.int32)
 
@@ -404,30 +400,13 @@ def _likeness(default: HeadModel, mean: Vertices, faces: Int[np.ndarray, "F 3"],
     index = int(np.linalg.norm(mean - chin, axis=1).argmin())
     use = (above_neck(mean, {"gnathion": index}) > 0) & (areas > 0)
     some = np.flatnonzero(use)[:: max(1, int(use.sum()) // 3000)]  # enough for 60 modes, and three times faster
-    fit = fit_surface(default, mean[some], areas[some] * (areas[use].sum() / areas[some].sum()), start, 60)
-    return fit.vertices(default)
+    z, place = fit_surface(default, mean[some], areas[some] * (areas[use].sum() / areas[some].sum()), start, 60)
+    return place.apply(default.vertices(z))
 
 
-_STEP_MM = 5e-3  # mean move of a step at which the iteration ends
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SurfaceFit:
-    """Holds the head of a model that fits a surface best."""
-
-    coefficients: Float[np.ndarray, " m"]  # standard deviations
-    target_from_head: RigidTransform
-    distances: Float[np.ndarray, " N"]  # mm, of each point to the fitted surface
-    iterations: int
-
-    def vertices(self, model: HeadModel, level: str = "full") -> Vertices:
-        """Returns the fitted head in the target's frame."""
-        return self.target_from_head.apply(model.vertices(self.coefficients, level))
-
-    def measured(self, model: HeadModel, points: Float[np.ndarray, "N 3"], level: str = "full") -> "SurfaceFit":
-        """Returns the same fit with the distances of other points."""
-        index = SurfaceIndex(self.vertices(model, level), model.levels[level].faces)
-        return replace(self, distances=index.closest(points).distances)
+STEP_MM = 5e-3  # mean move of a step at which the iteration ends
+MAX_STEPS = 40
+SPREAD_MM = 10.0  # residuals of neighbouring points are not independent: one counts per so many mm squared of surface
 
 
 def fit_surface(
@@ -438,24 +417,19 @@ def fit_surface(
     count: int,
     *,
     sigma_mm: float = 0.5,
-    spread_mm: float = 10.0,
-    level: str = "full",
-    iterations: int = 40,
-) -> SurfaceFit:
+) -> tuple[Float[np.ndarray, " m"], RigidTransform]:
     """Estimates the pose and ``count`` coefficients that bring the model's surface to the points, under the prior.
+    Returns the coefficients (standard deviations) and target_from_head.
 
-    ``weights`` are the areas (mm²) that the points represent. Residuals of neighbouring points are not independent, so
-    one residual of standard deviation ``sigma_mm`` counts per ``spread_mm`` squared of surface. The first iterations
-    fit only the pose and few modes and downweight distant points (Geman and McClure), so that a rough start does not
-    distort the head."""
-    basis = model.basis(level, count)
-    faces = model.levels[level].faces
+    ``weights`` are the areas (mm²) that the points represent; ``sigma_mm`` is the standard deviation of a residual. The
+    first steps fit only the pose and few modes and downweight distant points (Geman and McClure), so that a rough start
+    does not distort the head."""
+    basis, faces = model.basis("full", count), model.levels["full"].faces
     z, pose = np.zeros(count), start
-    information = weights / spread_mm**2 / sigma_mm**2
-    used = 0
-    for step in range(iterations):
+    information = weights / SPREAD_MM**2 / sigma_mm**2
+    for step in range(MAX_STEPS):
         active = count if step >= 8 else (0, 0, 0, 5, 5, 15, 15, 30)[step]
-        hits = _closest(model, z, pose, level, faces, points)
+        hits = SurfaceIndex(pose.apply(model.vertices(z)), faces).closest(points)
         scale = max(3.0 * float(np.median(hits.distances)), 3.0 * sigma_mm) if step < 12 else np.inf
         robust = (1 + (hits.distances / scale) ** 2) ** -2
         few, normals, centre = basis[:active], hits.normals, points.mean(0)
@@ -467,18 +441,7 @@ def fit_surface(
         delta = solve_with_prior(columns, ahead, information * robust, prior, state)
         z[: len(few)] += delta[: len(few)]
         moved = motion_about(centre, delta[len(few) :]) @ pose
-        pose, used = RigidTransform(moved.rotation, moved.translation), step + 1
-        if step > 12 and float(np.abs(columns @ delta).mean()) < _STEP_MM:
+        pose = RigidTransform(moved.rotation, moved.translation)
+        if step > 12 and float(np.abs(columns @ delta).mean()) < STEP_MM:
             break
-    return SurfaceFit(z, pose, _closest(model, z, pose, level, faces, points).distances, used)
-
-
-def _closest(
-    model: HeadModel,
-    z: Float[np.ndarray, " m"],
-    pose: RigidTransform,
-    level: str,
-    faces: Int[np.ndarray, "F 3"],
-    points: Float[np.ndarray, "N 3"],
-) -> Hits:
-    return SurfaceIndex(pose.apply(model.vertices(z, level)), faces).closest(points)
+    return z, pose

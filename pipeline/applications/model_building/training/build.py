@@ -1,7 +1,7 @@
 """Builds a head model from a folder of raw scans: checks, correspondence (section 3.2), alignment, principal components
 (3.1)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.applications.model_building.correspondence.correspondence import Matching, correspond, workers
+from pipeline.applications.model_building.correspondence.correspondence import WORKERS, correspond, workers
 from pipeline.applications.model_building.correspondence.scan_checks import Checked, check
-from pipeline.applications.model_building.correspondence.scans import Scan, find_scans, read_scan
+from pipeline.applications.model_building.correspondence.scans import find_scans, read_scan
 from pipeline.applications.model_building.training.training import Training, train
 from pipeline.head_model.model import HeadModel, assemble
 from pipeline.head_model.model_file import ModelParts, read_parts, save_model
@@ -35,14 +35,7 @@ class Built:
 
 
 def build_model(
-    scans_folder: Path,
-    out: Path,
-    *,
-    name: str,
-    licence: str = "not stated",
-    on_bad: Literal["stop", "skip"] = "stop",
-    matching: Matching | None = None,
-    report: Progress | None = None,
+    scans_folder: Path, out: Path, *, name: str, on_bad: Literal["stop", "skip"] = "stop", report: Progress
 ) -> Built:
     """Builds a model from the scans of a folder and saves it as ``out``.
 
@@ -50,17 +43,17 @@ def build_model(
     them; with ``"skip"`` they are left out. Raises InputError too if fewer than 3 sound scans remain."""
     parts, sha256 = read_parts(model_path("default"))
     template = assemble(parts, sha256)
-    good, skipped = read_checked(scans_folder, template, report=report)
+    good, skipped = read_checked(scans_folder, template, report)
     if skipped and on_bad == "stop":
         raise InputError(
             str(scans_folder), [*skipped.values(), "mend or remove them, or leave them out with --skip-bad"]
         )
     if len(good) < FEWEST:
         raise InputError(str(scans_folder), [f"{len(good)} sound scans, needed are {FEWEST}", *skipped.values()])
-    heads = corresponded_cages([entry.scan for entry in good], template, matching, report=report)
+    heads = cages_through(correspond([entry.scan for entry in good], template, report), template)
     training = Training(
         name=name,
-        licence=licence,
+        licence="not stated",
         source=f"{len(good)} raw scans",
         notice="Built by eigenhead from raw scans; the rights in the scans apply.",
         subjects={"total": len(good), "male": 0, "female": 0},  # scans do not say
@@ -75,12 +68,10 @@ def build_model(
     return Built(built, tuple(entry.scan.name for entry in good), repaired, skipped)
 
 
-def read_checked(
-    folder: Path, template: HeadModel, *, report: Progress | None = None
-) -> tuple[list[Checked], dict[str, str]]:
+def read_checked(folder: Path, template: HeadModel, report: Progress) -> tuple[list[Checked], dict[str, str]]:
     """Returns the sound scans of a folder, and the others' faults by name. Raises InputError for an empty folder."""
     paths = find_scans(folder)
-    with workers(2, len(paths)) as crew:
+    with workers(WORKERS, len(paths)) as crew:
         found = crew.over(partial(_read_and_check, template), paths, "checking scans", report)
     good = [entry for entry in found if isinstance(entry, Checked)]
     return good, {path.stem: fault for path, fault in zip(paths, found, strict=True) if isinstance(fault, str)}
@@ -92,13 +83,6 @@ def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
         return check(read_scan(path), template)
     except InputError as fault:
         return str(fault)
-
-
-def corresponded_cages(
-    scans: Sequence[Scan], template: HeadModel, matching: Matching | None = None, *, report: Progress | None = None
-) -> Float[np.ndarray, "N V0 3"]:
-    """Computes cages (mm) whose subdivided surface passes through the corresponded points of the scans."""
-    return cages_through(correspond(scans, template, matching, report=report).heads, template)
 
 
 def cages_through(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> Float[np.ndarray, "N V0 3"]:

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.applications.model_building.correspondence.correspondence import (
     CylinderIndex,
-    Matching,
     common_frame,
     on_reference,
     points_at,
@@ -32,6 +31,7 @@ from pipeline.geometry.projection import picture
 from pipeline.head_model.landmarks import NAMES
 from pipeline.head_model.model import HeadModel
 from rig.camera import Camera, Intrinsics
+from rig.formats.pictures.images import encode_image
 from rig.geometry import look_at, rotation_from_vector
 from rig.mesh import vertex_normals
 from rig.progress import Progress
@@ -65,8 +65,8 @@ def scan_head(
     """Returns a raw scan of a head (head frame, mm) in the scanner's frame: rotated and shifted slightly."""
     angles, heights = _grid(vertices, scanner, rng)
     columns, rows = np.meshgrid(angles, heights)
-    cast = CylinderIndex(vertices, faces).cast(columns.ravel(), rows.ravel())
-    radii = cast.radii + scanner.noise_mm * rng.standard_normal(len(cast.radii))
+    radii = CylinderIndex(vertices, faces).cast(columns.ravel(), rows.ravel())
+    radii = radii + scanner.noise_mm * rng.standard_normal(len(radii))
     points = points_at(columns.ravel(), rows.ravel(), radii)
     marks = {n: vertices[v] + scanner.landmark_noise_mm * rng.standard_normal(3) for n, v in landmarks.items()}
     valid = np.isfinite(radii) & ~_swallowed(points, {n: vertices[v] for n, v in landmarks.items()}, scanner, rng)
@@ -136,19 +136,17 @@ _DISTANCE_MM = 1600.0
 _BEHIND_RAD = 2.4
 
 
-def show_model(model: HeadModel, folder: Path, *, modes: int = 5, report: Progress | None = None) -> list[Path]:
+def show_model(model: HeadModel, folder: Path, *, modes: int, report: Progress) -> list[Path]:
     """Writes modes.png, correspondence.png and curves.png (the last where training heads are known) into a folder."""
-    say = report or (lambda stage, fraction: None)
-    say("drawing modes", 0.0)
+    report("drawing modes", 0.0)
     pictures = {"modes.png": modes_figure(model, modes)}
-    say("drawing correspondence", 0.0)
+    report("drawing correspondence", 0.0)
     pictures["correspondence.png"] = correspondence_figure(model)
     if len(model.scores):
-        pictures["curves.png"] = curves_figure(model, report=report)
+        pictures["curves.png"] = curves_figure(model, report)
     folder.mkdir(parents=True, exist_ok=True)
     for name, image in pictures.items():
-        _, data = cv2.imencode(".png", image[:, :, ::-1])
-        (folder / name).write_bytes(data.tobytes())
+        (folder / name).write_bytes(encode_image(".png", image))
     return [folder / name for name in pictures]
 
 
@@ -173,7 +171,7 @@ def shaded(
     return cv2.resize(picture(camera, vertices, faces, colours, PAPER), PANEL, interpolation=cv2.INTER_AREA)
 
 
-def modes_figure(model: HeadModel, modes: int = 5) -> Image:
+def modes_figure(model: HeadModel, modes: int) -> Image:
     """Draws figure 2: one row for each mode, with heads at -3, 0 and +3 standard deviations."""
     faces = model.levels["full"].faces
     rows = []
@@ -187,12 +185,12 @@ def modes_figure(model: HeadModel, modes: int = 5) -> Image:
     return np.vstack(rows)
 
 
-def correspondence_figure(model: HeadModel, *, seed: int = 3) -> Image:
+def correspondence_figure(model: HeadModel) -> Image:
     """Draws figure 3: reference, target scan, warped reference, and resampled head with its voids in red.
 
     Each is seen from the front and from behind. Both heads are drawn at random from the model and scanned by the
     simulated scanner, holes included."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(3)
     count = min(20, len(model.modes))
     faces = model.levels["full"].faces
     scanner = Scanner(spacing_mm=2.0, holes=5, hole_mm=20.0)
@@ -202,11 +200,10 @@ def correspondence_figure(model: HeadModel, *, seed: int = 3) -> Image:
     ]
     frames = common_frame(scans, model)
     reference, target = (prepared(scan, frame) for scan, frame in zip(scans, frames, strict=True))
-    matching = Matching()
     index = np.array([model.landmarks[name] for name in NAMES])
-    shape = on_reference(reference, model, matching)
+    shape = on_reference(reference, model)
     cylinder = CylinderIndex(target.vertices, scans[1].faces)
-    warped, sampled, void = warp_and_resample(shape, index, target.marks, cylinder, matching)
+    warped, sampled, void = warp_and_resample(shape, index, target.marks, cylinder)
     cage = model.levels["cage"].faces
     steps = (
         ("reference", shape, cage, None),
@@ -218,7 +215,7 @@ def correspondence_figure(model: HeadModel, *, seed: int = 3) -> Image:
     return np.vstack([np.hstack(front), np.hstack([shaded(v, f, marked, _BEHIND_RAD) for _, v, f, marked in steps])])
 
 
-def curves_figure(model: HeadModel, *, report: Progress | None = None) -> Image:
+def curves_figure(model: HeadModel, report: Progress) -> Image:
     """Draws compactness, generalisation (leave one out) and specificity as curves over the number of modes."""
     counts = [
         c for c in (1, 2, 5, 10, 20, 40, USED_MODES, 100, 137) if c <= min(len(model.modes), len(model.scores) - 1)

@@ -14,7 +14,7 @@ from pipeline.head_model.decimation import decimate
 from pipeline.head_model.model_file import ModelParts
 from pipeline.head_model.pca import Components, align, principal_components
 from pipeline.head_model.subdivision import check_manifold, refine, row_count
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 
 PAPER_FACES = 96_000  # section 3.1; its levels of 95 % and 99 % have 4,800 and 960 triangles
 FACE_WEIGHT = 4.0  # decimation keeps the face region this much more exactly than skull and neck
@@ -37,17 +37,16 @@ class Training:
     subdivisions: int
 
 
-def train(training: Training, *, report: Progress | None = None) -> ModelParts:
+def train(training: Training, *, report: Progress) -> ModelParts:
     """Computes a model's parts: rigid Procrustes alignment (no scale), PCA, levels, generalisation and specificity.
 
     Raises NotAManifold."""
-    say = report or (lambda stage, fraction: None)
     check_manifold(training.faces)
-    say("aligning", 0.0)
+    report("aligning", 0.0)
     heads = in_head_frame(training.heads, training.landmarks)
     heads = align(heads, above_neck(heads[0], training.landmarks))
     heads = centred(heads, training.landmarks)
-    say("principal components", 0.0)
+    report("principal components", 0.0)
     components = principal_components(heads)
     region = face_region(components.mean, training.landmarks)
     used = min(USED_MODES, len(components.modes))
@@ -65,13 +64,12 @@ def finish(
     region: Bool[np.ndarray, " V0"],
     figures: Mapping[str, float],
     *,
-    report: Progress | None = None,
+    report: Progress = discard_progress,
 ) -> ModelParts:
     """Builds the parts of a model from its components. Decimated levels are chosen on the mean head."""
-    say = report or (lambda stage, fraction: None)
-    say("decimating", 0.0)
+    report("decimating", 0.0)
     decimated = levels_of(components.mean, training.faces, region, training.landmarks, training.subdivisions)
-    say("decimating", 1.0)
+    report("decimating", 1.0)
     return ModelParts(
         name=training.name,
         licence=training.licence,
@@ -157,7 +155,11 @@ def compactness(sigma: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
 
 
 def generalisation(
-    components: Components, region: Bool[np.ndarray, " V"], counts: Iterable[int], *, report: Progress | None = None
+    components: Components,
+    region: Bool[np.ndarray, " V"],
+    counts: Iterable[int],
+    *,
+    report: Progress = discard_progress,
 ) -> dict[int, float]:
     """Computes the mean vertex distance (mm, over ``region``) of each head to the nearest head in the PCA of all
     others, by number of modes.
@@ -177,8 +179,7 @@ def generalisation(
             used = directions[: min(count, len(points) - 2)]
             left = offset - used.T @ (used @ offset)
             errors[count] += np.linalg.norm((left @ axes).reshape(-1, 3), axis=1).mean() / len(points)
-        if report:
-            report("leaving one out", (k + 1) / len(points))
+        report("leaving one out", (k + 1) / len(points))
     return {count: float(value) for count, value in errors.items()}
 
 

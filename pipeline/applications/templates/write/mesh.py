@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from pipeline.applications.templates.carrying import SurfaceBinding
 from pipeline.applications.templates.template_file import Template
@@ -93,17 +93,29 @@ def _tile(
 ) -> UInt8[np.ndarray, "s s 3"]:
     side = len(atlas.image)
     size = min(side, MAX_TEXELS)
+    values = (side * places[mesh.corners[corners.ravel()]] - 0.5).astype(np.float32)
+    read, known = read_in_tile(mesh, corners, tile, size, values)
+    image = np.asarray(
+        cv2.remap(atlas.image, read[..., 0], read[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8
+    )
+    return filled(image, known)
+
+
+def read_in_tile(
+    mesh: PolygonMesh,
+    corners: Int[np.ndarray, "f 3"],
+    tile: Int[np.ndarray, " 2"],
+    size: int,
+    values: Float32[np.ndarray, "c k"],
+) -> tuple[Float32[np.ndarray, "s s k"], Bool[np.ndarray, "s s"]]:
+    """Returns values of the ``corners`` of triangles (of the mesh's polygons) at the texels of a tile, interpolated,
+    and which texels lie in a triangle."""
     uv = mesh.uv[mesh.corner_uv[corners.ravel()]] - tile
     texels = size * np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1) - 0.5
     faces, ones = np.arange(len(uv), dtype=np.int32).reshape(-1, 3), np.ones(len(uv))
     faces.flags.writeable = False  # as the compiled loops know it
     _, shown = rasterise(texels, ones, faces, size, size)
-    values = (side * places[mesh.corners[corners.ravel()]] - 0.5).astype(np.float32)
-    read = interpolate(shown, texels, ones, faces, values)
-    image = np.asarray(
-        cv2.remap(atlas.image, read[..., 0], read[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8
-    )
-    return filled(image, shown >= 0)
+    return interpolate(shown, texels, ones, faces, values), shown >= 0
 
 
 def filled(image: UInt8[np.ndarray, "s s 3"], known: Bool[np.ndarray, "s s"]) -> UInt8[np.ndarray, "s s 3"]:

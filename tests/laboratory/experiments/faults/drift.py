@@ -80,7 +80,7 @@ def draw(model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.
 
 def said_of(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:
     """Returns the codes of the warnings about cameras, by camera."""
-    return {found.camera: found.code for found in find_drift(silhouettes, rig)}
+    return {found.camera: found.warning().code for found in find_drift(silhouettes, rig)}
 
 
 def aimed_beside(camera: Camera, rng: np.random.Generator) -> Camera:

@@ -173,5 +173,5 @@ def _warnings_of_good(
     rig = off_by(true_rig, CALIBRATION_PX, rng)
     codes = ["cameras-exchanged"] if find_assignment(silhouettes, rig).pictures else []
     codes += ["wrong-rig"] if wrong_rig(silhouettes, rig) else []
-    codes += [drift.code for drift in find_drift(silhouettes, rig)]
+    codes += [drift.warning().code for drift in find_drift(silhouettes, rig)]
     return {"worn": worn, "codes": codes}

@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.applications.model_building.sources.imports import SurfaceFit, fit_surface
+from pipeline.applications.model_building.sources.imports import fit_surface
+from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.landmarks import SEVEN_POINTS
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import vertex_areas
 from rig.errors import InputError
 from rig.formats.meshes.mesh_file import read_mesh
-from rig.geometry import rigid_fit
+from rig.geometry import RigidTransform, rigid_fit
 from rig.progress import Progress
 from tests.laboratory.experiments.records import Outcome
 from tests.support.model_draws import of_draws
@@ -69,32 +70,31 @@ def floor(name: str, model: HeadModel, truth: Truth, count: int = 0) -> dict:
     mean and 95th percentile of the distances (mm, area-weighted), and the size of the coefficients in standard
     deviations. ``name``: the model's name in the row."""
     used = min(count or len(model.modes), len(model.modes))
-    fit = best_likeness(model, truth, used)
-    z = np.abs(fit.coefficients)
+    coefficients, place = best_likeness(model, truth, used)
+    surface = SurfaceIndex(place.apply(model.vertices(coefficients)), model.levels["full"].faces)
+    distances, z = surface.closest(truth.points).distances, np.abs(coefficients)
     return {
         "model": name,
         "truth": truth.name,
         "modes": "all" if count == 0 else count,
         "modes_used": used,
-        "median_mm": weighted_quantile(fit.distances, truth.areas, 0.5),
-        "mean_mm": float(fit.distances @ truth.areas / truth.areas.sum()),
-        "p95_mm": weighted_quantile(fit.distances, truth.areas, 0.95),
+        "median_mm": weighted_quantile(distances, truth.areas, 0.5),
+        "mean_mm": float(distances @ truth.areas / truth.areas.sum()),
+        "p95_mm": weighted_quantile(distances, truth.areas, 0.95),
         "largest_sigma": float(z.max()),
         "beyond_3_sigma": int((z > 3).sum()),
         "rms_sigma": float(np.sqrt((z**2).mean())),
     }
 
 
-def best_likeness(model: HeadModel, truth: Truth, count: int) -> SurfaceFit:
-    """Fits the model to the truth's points, starting from the seven feature points. Returns the fit, with distances to
-    every point."""
+def best_likeness(model: HeadModel, truth: Truth, count: int) -> tuple[Float[np.ndarray, " m"], RigidTransform]:
+    """Fits the model to the truth's points, starting from the seven feature points. Returns coefficients and pose."""
     ours = model.vertices(np.zeros(0))
     source = np.array([ours[model.landmarks[name]] for name in truth.features])
     start = rigid_fit(source, np.array(list(truth.features.values())))
     some = np.random.default_rng(0).permutation(len(truth.points))[:POINTS]
     areas = truth.areas[some] * (truth.areas.sum() / truth.areas[some].sum())
-    rough = fit_surface(model, truth.points[some], areas, start, count, sigma_mm=SIGMA_MM)
-    return rough.measured(model, truth.points)
+    return fit_surface(model, truth.points[some], areas, start, count, sigma_mm=SIGMA_MM)
 
 
 def weighted_quantile(values: Float[np.ndarray, " N"], weights: Float[np.ndarray, " N"], share: float) -> float:

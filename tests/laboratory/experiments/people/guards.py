@@ -28,7 +28,7 @@ from pipeline.segmentation.segment import segment
 from pipeline.settings import OutputSettings, Settings
 from pipeline.texturing import vertex_colours
 from pipeline.view_checks import head_size, one_moment, usable_views
-from pipeline.view_checks.guards import GUARDS, FaceEvidence, Guard, Guards, find_face_evidence
+from pipeline.view_checks.guards import FaceEvidence, Guards, find_face_evidence
 from pipeline.view_checks.lens_distortion import judge_distortion
 from rig.capture import Capture
 from rig.errors import EigenheadError
@@ -51,6 +51,16 @@ MOVED_MM = (10.0, 20.0)
 CUT_SHARE = 0.12  # of a mask's height, from its crown
 WRONG_SCALES = (0.3, 3.0)  # of the studio's rig
 FAULTY = "faulty"
+REFUSING = (  # codes of each guard that refuses a capture
+    ("size-refused",), ("too-few-views",), ("pictures-exchanged",), ("pictures-the-same",), ("outlines-unexplained",),
+    ("other-rig", "other-lenses", "other-convention", "principal-points-from-below", "rig-mirrored",
+     "pictures-flipped", "pictures-turned"), ("no-subject",),
+    ("features-beside-face", "features-of-size", "features-from-bottom", "features-transposed",
+     "features-of-other-pictures", "features-of-no-landmark", "features-sides-exchanged", "too-few-features",
+     "too-few-features-remarks"),
+)  # fmt: skip
+WARNING = ("camera-moved", "view-left-out", "mask-contradicted", "crown-low", "moments-differ", "view-unlike",
+           "lens-doubtful", "mask-loose", "scale-implausible", "outlines-loose")  # fmt: skip
 NAMED_BY = {
     "another moment": {"moments-differ", "view-unlike"},
     "open jaw": {"moments-differ", "view-unlike"},
@@ -105,8 +115,8 @@ def guards(
     judged: list[Row] = []
     for number, (name, job) in enumerate(jobs.items()):
         judged += records.row(name, lambda job=job: {"judged": list(job())}, number / len(jobs))["judged"]
-    rows = [row for guard in GUARDS for row in rows_of(guard, judged)]
-    refusing = {code for guard in GUARDS if guard.kind != "warns" for code in guard.codes}
+    rows = [row for codes in (*REFUSING, *((code,) for code in WARNING)) for row in rows_of(codes, judged)]
+    refusing = {code for codes in REFUSING for code in codes}
     figures = {}
     for good, alarm, count in ((True, "false_alarms", "good"), (False, "hits", "faulty")):
         those = [one for one in judged if one["good"] is good]
@@ -115,7 +125,7 @@ def guards(
         those = [one for one in judged if one["source"] == fault]
         named = sum(not codes.isdisjoint(one["codes"]) for one in those)
         figures |= {f"{fault}_named": float(named), f"{fault}_planted": float(len(those))}
-    header = ("guard", "kind", "captures", "false_alarms", "good", "hits", "faulty", "evidence", "prevents")
+    header = ("guard", "captures", "false_alarms", "good", "hits", "faulty")
     text = markdown.table(header, [[row[name] for name in header] for row in rows])
     lines = [*text.splitlines(), *map(str, figures.items())]
     return {"figures": figures, "rows": rows, "markdown": text, "lines": lines}
@@ -245,19 +255,16 @@ def codes_of(message: Message) -> set[str]:
     return codes
 
 
-def rows_of(guard: Guard, judged: Iterable[Row]) -> list[Row]:
+def rows_of(codes: Sequence[str], judged: Iterable[Row]) -> list[Row]:
     """Returns a guard's false alarms and hits, a row for each source of captures."""
     total, raised = Counter[tuple[str, bool]](), Counter[tuple[str, bool]]()
     for one in judged:
         key = one["source"], one["good"]
         total[key] += 1
-        raised[key] += any(code in guard.codes for code in one["codes"])
+        raised[key] += any(code in codes for code in one["codes"])
     return [
         {
-            "guard": guard.codes[0],
-            "kind": guard.kind,
-            "evidence": "; ".join(guard.evidence),
-            "prevents": guard.prevents,
+            "guard": codes[0],
             "captures": source,
             "false_alarms": raised[source, True],
             "good": total[source, True],

@@ -120,7 +120,7 @@ def differences(model: HeadModel, found: Mapping[str, Reconstruction], again: Re
         ("albedo", albedos, texels(albedo_of(again).atlas.image, face)),
     ):
         row |= {f"{kind}_floor": _difference(images["studio"], second)}
-        for suffix, change in (("", _as_it_is), ("_level", levelled)):
+        for suffix, change in (("", lambda codes, to: codes), ("_level", levelled)):
             pairs = {
                 f"{a}_{b}": _difference(images[a], change(images[b], images[a])) for a, b in combinations(LIGHTS, 2)
             }
@@ -174,10 +174,6 @@ def levelled(codes: UInt8[np.ndarray, "n 3"], to: UInt8[np.ndarray, "n 3"]) -> U
     ours, theirs = linear_from_srgb(codes / 255.0), linear_from_srgb(to / 255.0)
     ratio = np.median(theirs, axis=0) / np.maximum(np.median(ours, axis=0), 1e-4)
     return np.rint(255 * srgb_from_linear(ours * ratio)).astype(np.uint8)
-
-
-def _as_it_is(codes: np.ndarray, to: np.ndarray) -> np.ndarray:
-    return codes
 
 
 def _difference(one: UInt8[np.ndarray, "n 3"], other: UInt8[np.ndarray, "n 3"]) -> float:

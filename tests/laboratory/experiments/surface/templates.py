@@ -43,7 +43,10 @@ def templates(model: HeadModel, facekit: HeadModel, *, bench: Bench, subjects: i
         row = records.row(label, lambda m=fitted, d=drawn, k=marked: _round_trips(m, facekit, d, k, subjects))
         rows.append({"model": label} | row)
     figures = {f"{row['model']}_{name}": value for row in rows for name, value in row.items() if name != "model"}
-    return {"figures": figures, "rows": rows, "markdown": _table(rows)}
+    header = ("model", "median, mm", "worst draw", "95 %", "landmarks, mm", "off the surface, mm", "on the skin")
+    names = ("median_mm", "worst_median_mm", "p95_mm", "landmarks_mm", "off_median_mm", "skin_share")
+    table = markdown.table(header, [[row["model"], *(row[name] for name in names)] for row in rows])
+    return {"figures": figures, "rows": rows, "markdown": table}
 
 
 def foreign(
@@ -117,9 +120,3 @@ def _landmarks(model: HeadModel, facekit: HeadModel, found: Registration, order:
     put = found.surface_binding.on(mean, model.levels["full"].faces)[np.argsort(order)]
     pairs = [(model.landmarks[name], facekit.landmarks[name]) for name in MULTI_PIE]
     return float(np.mean([np.linalg.norm(mean[ours] - put[theirs]) for ours, theirs in pairs]))
-
-
-def _table(rows: list[Row]) -> str:
-    header = ("model", "median, mm", "worst draw", "95 %", "landmarks, mm", "off the surface, mm", "on the skin")
-    names = ("median_mm", "worst_median_mm", "p95_mm", "landmarks_mm", "off_median_mm", "skin_share")
-    return markdown.table(header, [[row["model"], *(row[name] for name in names)] for row in rows])

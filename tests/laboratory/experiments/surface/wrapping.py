@@ -46,7 +46,10 @@ def wrapping(facekit: HeadModel, truths: Mapping[str, Path], *, bench: Bench) ->
     for number, (name, path) in enumerate(truths.items()):
         rows.append({"scan": name} | records.row(name, lambda n=name, p=path: one(n, p), number / len(truths)))
     figures = {f"{row['scan']}_{name}": value for row in rows for name, value in row.items() if name != "scan"}
-    return {"figures": figures, "rows": rows, "markdown": _table(rows), "pictures": pictures}
+    header = ("scan", "on the scan", "median, mm", "95 %", "all vertices", "scan to template", "landmarks, mm")
+    names = ("covered_share", "median_mm", "p95_mm", "all_median_mm", "scan_median_mm", "landmarks_mm")
+    table = markdown.table(header, [[row["scan"], *(row[name] for name in names)] for row in rows])
+    return {"figures": figures, "rows": rows, "markdown": table, "pictures": pictures}
 
 
 def own_template(model: HeadModel) -> Template:
@@ -73,9 +76,3 @@ def _landmarks_mm(vertices: np.ndarray, model: HeadModel, truth: Truth) -> float
     names = [name for name in truth.features if name in model.landmarks]
     apart = [np.linalg.norm(vertices[model.landmarks[name]] - truth.features[name]) for name in names]
     return float(np.mean(apart))
-
-
-def _table(rows: list[Row]) -> str:
-    header = ("scan", "on the scan", "median, mm", "95 %", "all vertices", "scan to template", "landmarks, mm")
-    names = ("covered_share", "median_mm", "p95_mm", "all_median_mm", "scan_median_mm", "landmarks_mm")
-    return markdown.table(header, [[row["scan"], *(row[name] for name in names)] for row in rows])

@@ -19,7 +19,6 @@ from pipeline.head_model.model import load_model
 from rig.errors import InputError
 from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.geometry import rotation_from_vector
-from rig.mesh import vertex_normals
 from rig.progress import discard_progress
 
 
@@ -27,7 +26,7 @@ def surface(*meshes: trimesh.Trimesh) -> Surface:
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]).astype(np.int32)
-    return Surface(vertices, faces, vertex_normals(vertices, faces))
+    return Surface.of(vertices, faces)
 
 
 def polygons(vertices: np.ndarray, faces: np.ndarray) -> PolygonMesh:

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from pipeline.applications.templates.likeness import SurfaceMarks
+from pipeline.applications.templates.placement import Surface
 from pipeline.applications.templates.template_file import Template
 from pipeline.applications.wrapping.scan import raw_scan, read_raw_scan
 from pipeline.applications.wrapping.wrap import (
@@ -17,7 +18,6 @@ from pipeline.applications.wrapping.wrap import (
     nearest_axis,
     place_scan,
     residual_colours,
-    surface_of,
     unit_of,
     wrap,
 )
@@ -83,11 +83,11 @@ def template(model: HeadModel) -> Template:
 def test_a_template_lies_on_the_scan_it_was_drawn_to(model: HeadModel, template: Template) -> None:
     """The scan is the model's mean with a bump of 3 mm, 20 mm broad, on the crown and on a cheek."""
     mean, faces = model.vertices(np.zeros(0)), model.levels["full"].faces
-    scan = surface_of(mean, faces)
+    scan = Surface.of(mean, faces)
     crown, cheek = mean[mean[:, 1].argmax()], mean[np.linalg.norm(mean - (45.0, -20.0, 60.0), axis=1).argmin()]
     squares = [((mean - at) ** 2).sum(axis=1) for at in (crown, cheek)]
     bump = np.exp(-0.5 * np.array(squares) / 20.0**2).sum(axis=0)
-    scan = surface_of(mean + 3.0 * bump[:, None] * scan.normals, faces)
+    scan = Surface.of(mean + 3.0 * bump[:, None] * scan.normals, faces)
     carried = template.surface_binding.on(mean, faces)
     drawn, met = drawn_onto(carried, template, model, scan)
     index, skin = SurfaceIndex(scan.vertices, scan.faces), template.surface_binding.skin

@@ -11,12 +11,14 @@ from scipy.spatial.distance import cdist
 from pipeline.applications.model_building.correspondence import correspondence as prior
 from pipeline.applications.model_building.correspondence.correspondence import (
     FEW,
-    Correspondence,
-    Matching,
-    _resampled,
+    CylinderIndex,
+    Prior,
+    _most_probable,
+    common_frame,
     correspond,
-    nearest_mean,
+    on_reference,
     prepared,
+    warp_and_resample,
     workers,
 )
 from pipeline.applications.model_building.correspondence.scans import Scan
@@ -25,6 +27,7 @@ from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.landmarks import NAMES, mirrored, stacked
 from pipeline.head_model.model import HeadModel
 from rig.geometry import RigidTransform
+from rig.progress import discard_progress
 
 SUBJECTS = (4, 40, 100)
 
@@ -42,44 +45,41 @@ def scans(model: HeadModel) -> list[Scan]:
 
 
 @pytest.fixture(scope="module")
-def papers(model: HeadModel, scans: list[Scan]) -> Correspondence:
-    return correspond(scans, model, Matching(refine=False))
+def papers(model: HeadModel, scans: list[Scan]) -> tuple[list[np.ndarray], np.ndarray]:
+    """Samples of each scan in its own frame, by the paper's steps, and which of them are void."""
+    frames, index = common_frame(scans, model), np.array([model.landmarks[name] for name in NAMES])
+    shape, heads, voids = on_reference(prepared(scans[0], frames[0]), model), [], []
+    for scan, frame in zip(scans, frames, strict=True):
+        cylinder = CylinderIndex(frame.apply(scan.vertices), scan.faces)
+        _, head, void = warp_and_resample(shape, index, frame.apply(stacked(scan.landmarks)), cylinder)
+        heads.append(frame.inverse().apply(head))
+        voids.append(void)
+    return heads, np.array(voids)
 
 
-def in_scans(found: Correspondence) -> list[np.ndarray]:
-    """The heads in their scans' own frames."""
-    return [frame.inverse().apply(head) for head, frame in zip(found.heads, found.frame_from_scan, strict=True)]
-
-
-def test_landmarks_stay_where_they_were_marked(model: HeadModel, scans: list[Scan], papers: Correspondence) -> None:
+def test_landmarks_stay_where_they_were_marked(model: HeadModel, scans: list[Scan], papers: tuple) -> None:
     index = [model.landmarks[name] for name in NAMES]
-    for scan, head, void in zip(scans, in_scans(papers), papers.void, strict=True):
+    for scan, head, void in zip(scans, *papers, strict=True):
         np.testing.assert_allclose(head[index], stacked(scan.landmarks), atol=1e-9)
         assert not void[index].any()
 
 
-def test_what_is_not_void_lies_on_the_scan(scans: list[Scan], papers: Correspondence, model: HeadModel) -> None:
+def test_what_is_not_void_lies_on_the_scan(scans: list[Scan], papers: tuple, model: HeadModel) -> None:
     """Samples are points of the scan's own triangles; landmarks alone may lie off them."""
     sampled = np.ones(len(model.mean), bool)
     sampled[[model.landmarks[name] for name in NAMES]] = False
-    for scan, head, void in zip(scans, in_scans(papers), papers.void, strict=True):
+    for scan, head, void in zip(scans, *papers, strict=True):
         some = np.flatnonzero(sampled & ~void)[::7]
         assert SurfaceIndex(scan.vertices, scan.faces).closest(head[some]).distances.max() < 0.05
 
 
-def test_vertices_of_a_hole_are_void_and_those_of_the_cheek_are_not(model: HeadModel, papers: Correspondence) -> None:
+def test_vertices_of_a_hole_are_void_and_those_of_the_cheek_are_not(model: HeadModel, papers: tuple) -> None:
     """The scanner loses what is behind the ears, in every scan."""
     places = model.vertices(np.zeros(0))[: len(model.mean)]
     lost = np.linalg.norm(places - (places[model.landmarks["tragion_left"]] + [0, 0, -18.0]), axis=1) < 6.0
     cheek = np.linalg.norm(places - places[model.landmarks["zygion_left"]], axis=1) < 15.0
-    assert papers.void[:, lost].mean() > 0.8
-    assert papers.void[:, cheek].mean() < 0.05
-
-
-def test_the_reference_is_the_shape_nearest_the_mean(papers: Correspondence) -> None:
-    assert papers.reference == nearest_mean(papers.heads)
-    line = np.array([0.0, 1.0, 5.0])[:, None, None] * np.ones((3, 4, 3))
-    assert nearest_mean(line) == 1
+    assert papers[1][:, lost].mean() > 0.8
+    assert papers[1][:, cheek].mean() < 0.05
 
 
 @pytest.mark.slow
@@ -89,11 +89,9 @@ def test_the_refinement_finds_the_true_vertices(model: HeadModel, scans: list[Sc
     Bound on the median: the scan's own step between samples (2.5 mm) places a vertex to 2.5 / sqrt(12) an axis of the
     surface, 1.0 mm in the plane. Normal to the surface only the facets' sag counts: 2.5^2 / (8 * 50 mm) = 0.02 mm.
     """
-    found = correspond(scans, model, Matching())
-    region = model.levels["cage"].face_region
-    for k, head, void in zip(SUBJECTS, in_scans(found), found.void, strict=True):
-        scan = scans[SUBJECTS.index(k)]
-        use = region & ~void
+    found, use = correspond(scans, model, discard_progress), model.levels["cage"].face_region
+    for k, scan, placed, frame in zip(SUBJECTS, scans, found, common_frame(scans, model), strict=True):
+        head = frame.inverse().apply(placed)
         assert np.median(SurfaceIndex(scan.vertices, scan.faces).closest(head[use]).distances) < 0.1
         marks = truth(model, k)[[model.landmarks[name] for name in NAMES]]
         turn, shift = _motion(marks, stacked(scan.landmarks))
@@ -180,7 +178,7 @@ def test_processes_give_what_one_gives_in_order_and_say_how_far_they_are() -> No
         assert crew.pool is not None
         assert crew.over(math.sqrt, items, "roots", lambda _, share: said.append(share)) == [k**0.5 for k in items]
         with pytest.raises(ValueError, match="domain"):
-            crew.over(math.sqrt, [-1.0], "roots", None)
+            crew.over(math.sqrt, [-1.0], "roots", discard_progress)
     assert said == [(k + 1) / len(items) for k in range(len(items))]
     with workers(2, FEW - 1) as crew:
         assert crew.pool is None
@@ -188,10 +186,10 @@ def test_processes_give_what_one_gives_in_order_and_say_how_far_they_are() -> No
 
 def test_what_processes_are_given_can_travel(model: HeadModel, scans: list[Scan]) -> None:
     """A scan, the template and the work on them, as processes receive them."""
-    index = np.array([model.landmarks[name] for name in NAMES])
-    frame = RigidTransform.identity()
-    work = partial(_resampled, model.mean.astype(float), index, Matching())
+    index, faces = np.array([model.landmarks[name] for name in NAMES]), model.levels["cage"].faces
+    (frame,), mean = common_frame(scans[:1], model), model.vertices(np.zeros(0))[: len(model.mean)]
+    work = partial(_most_probable, Prior(mean, model.modes[:2].astype(np.float32), 1), faces, index)
     again = pickle.loads(pickle.dumps(work))
     scan, template = pickle.loads(pickle.dumps((scans[0], model)))
-    np.testing.assert_array_equal(again((scan, frame))[0], work((scans[0], frame))[0])
+    np.testing.assert_array_equal(again((scan, frame)), work((scans[0], frame)))
     np.testing.assert_array_equal(template.vertices(np.ones(3)), model.vertices(np.ones(3)))
