@@ -93,16 +93,16 @@ def test_capture_writes_a_folder_that_reads_back(config: RigConfig, tmp_path: Pa
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_capture_overwrites_nothing(config: RigConfig, tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "kept").touch()
+def test_capture_overwrites_nothing_and_needs_a_calibration_of_its_size(config: RigConfig, tmp_path: Path) -> None:
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "file").touch()
     with pytest.raises(InputError, match="is there already"):
-        capture(config, tmp_path / "out")
-
-
-def test_capture_needs_a_calibration(config: RigConfig, tmp_path: Path) -> None:
+        capture(config, tmp_path / "kept")
     with pytest.raises(NoCalibration):
         capture(dataclasses.replace(config, calibration=None), tmp_path / "out")
+    write_rig(flat_rig(width=640, height=480), tmp_path / "cameras.json")
+    with pytest.raises(ShotFailed, match="size: 320 x 240, calibrated 640 x 480"):
+        capture(dataclasses.replace(config, calibration=str(tmp_path / "cameras.json")), tmp_path / "out")
 
 
 def test_a_shot_that_fails_names_everything_and_writes_nothing(
@@ -114,13 +114,6 @@ def test_a_shot_that_fails_names_everything_and_writes_nothing(
     with pytest.raises(ShotFailed, match=r"cam02: missing.*cam00: dark"):
         capture(quick, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_calibration_of_another_size_is_noticed(studio: StudioDevices, config: RigConfig, tmp_path: Path) -> None:
-    write_rig(flat_rig(width=640, height=480), tmp_path / "cameras.json")
-    changed = dataclasses.replace(config, calibration=str(tmp_path / "cameras.json"))
-    with pytest.raises(ShotFailed, match="size: 320 x 240, calibrated 640 x 480"):
-        capture(changed, tmp_path / "out")
 
 
 def test_check_has_a_row_for_every_camera(studio: StudioDevices, config: RigConfig) -> None:
