@@ -120,7 +120,7 @@ def test_another_process_with_another_hash_seed_finds_it(folder: Path) -> None:
             capture_output=True,
             text=True,
             check=True,
-            timeout=60,
+            timeout=300,
         ).stdout
         for seed in ("1", "2")
     ]

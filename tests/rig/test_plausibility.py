@@ -12,6 +12,7 @@ from rig.plausibility import rig_faults
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
+from tests.support.changed_rigs import relensed, reposed
 from tests.support.layouts import ARRANGEMENTS_DEG, arrangement
 from tests.support.scenes import fan
 
@@ -19,40 +20,31 @@ GL = np.diag([1.0, -1.0, -1.0])
 STUDIO = default_layout()
 
 
-def posed(rig, pose):
-    return Rig(tuple(replace(camera, camera_from_world=pose(camera.camera_from_world)) for camera in rig))
-
-
 def scaled(factor):
-    return posed(STUDIO, lambda pose: RigidTransform(pose.rotation, factor * pose.translation))
+    return reposed(STUDIO, lambda pose: RigidTransform(pose.rotation, factor * pose.translation))
 
 
 def north(distance_mm):
-    return posed(STUDIO, lambda pose: pose @ RigidTransform(np.eye(3), np.array([0.0, distance_mm, 0.0])))
-
-
-def measured(rig, change, name=None):
-    """The rig with what ``change`` makes of the intrinsics of all cameras, or of the one that is named."""
-    return Rig(tuple(replace(c, intrinsics=change(c.intrinsics)) if name in (None, c.name) else c for c in rig))
+    return reposed(STUDIO, lambda pose: pose @ RigidTransform(np.eye(3), np.array([0.0, distance_mm, 0.0])))
 
 
 def lensed(rig, name, lens):
-    return measured(rig, lambda intrinsics: replace(intrinsics, distortion=lens), name)
+    return relensed(rig, lambda intrinsics: replace(intrinsics, distortion=lens), name)
 
 
 def of_other_size(factor):
     keys = ("fx", "fy", "cx", "cy")
-    return measured(STUDIO, lambda k: replace(k, **{key: factor * getattr(k, key) for key in keys}))
+    return relensed(STUDIO, lambda k: replace(k, **{key: factor * getattr(k, key) for key in keys}))
 
 
 def recorded(lens, **intrinsics):
-    straight = measured(STUDIO, lambda k: replace(k, distortion=Distortion(), **intrinsics), "cam05")
+    straight = relensed(STUDIO, lambda k: replace(k, distortion=Distortion(), **intrinsics), "cam05")
     return Rig(tuple(replace(c, recorded=lens) if c.name == "cam05" else c for c in straight))
 
 
 def in_another_world(rig, rng):
     world_from_new = RigidTransform(rotation_from_vector(rng.normal(0, 1, 3)), rng.normal(0, 800, 3))
-    return posed(rig, lambda pose: pose @ world_from_new)
+    return reposed(rig, lambda pose: pose @ world_from_new)
 
 
 def test_good_rigs_have_no_faults_in_any_world():
@@ -65,7 +57,7 @@ def test_good_rigs_have_no_faults_in_any_world():
 
 
 def test_strong_but_real_lenses_and_fisheyes_have_no_faults():
-    wide = measured(STUDIO, lambda k: replace(k, fx=600.0, fy=600.0))
+    wide = relensed(STUDIO, lambda k: replace(k, fx=600.0, fy=600.0))
     assert rig_faults(lensed(wide, "cam03", Distortion(k1=-0.3, k2=0.1, k3=-0.015))) == []
     assert rig_faults(lensed(STUDIO, "cam03", Distortion(k1=0.5, k2=-0.3))) == []
     width = STUDIO["cam05"].intrinsics.width
@@ -75,7 +67,7 @@ def test_strong_but_real_lenses_and_fisheyes_have_no_faults():
     assert rig_faults(recorded(RecordedLens("rational", (0.12, -0.05, 1e-3, -8e-4, 0.01, 0.31, 0.02, 0.003)))) == []
 
 
-ONE_PLACE = posed(STUDIO, lambda pose: RigidTransform(pose.rotation, -pose.rotation @ np.array([1.0, 2.0, 3.0])))
+ONE_PLACE = reposed(STUDIO, lambda pose: RigidTransform(pose.rotation, -pose.rotation @ np.array([1.0, 2.0, 3.0])))
 TOO_LARGE = "*translations are wanted in millimetres; "
 FAULTS = {
     **{
@@ -95,11 +87,11 @@ FAULTS = {
         "cam05: the lens is absurd (k1 = *k4 = -1000*",
     ),
     "no principal points": (
-        measured(STUDIO, lambda k: replace(k, cx=0.0, cy=0.0)),
+        relensed(STUDIO, lambda k: replace(k, cx=0.0, cy=0.0)),
         "every principal point (cx, cy) is 0*",
     ),
     "shares of the picture": (
-        measured(STUDIO, lambda k: replace(k, fx=1.2, fy=1.6, cx=0.5, cy=0.5)),
+        relensed(STUDIO, lambda k: replace(k, fx=1.2, fy=1.6, cx=0.5, cy=0.5)),
         "fx, fy, cx and cy are shares of the pictures' size*",
     ),
     **{
@@ -130,7 +122,7 @@ def test_a_fault_of_the_whole_rig_or_of_one_lens_is_one_sentence(rig, sentence):
 
 
 def test_a_focal_length_in_mm_is_named_and_not_its_lens():
-    in_mm = measured(STUDIO, lambda k: replace(k, fx=50.0, fy=50.0))
+    in_mm = relensed(STUDIO, lambda k: replace(k, fx=50.0, fy=50.0))
     for camera, fault in zip(STUDIO, rig_faults(in_mm), strict=True):
         assert fault.text.startswith(f"{camera.name}: a focal length of 50 px is absurd")
 
@@ -152,5 +144,5 @@ def test_a_focal_length_in_mm_is_named_and_not_its_lens():
 def test_another_convention_is_recognised_by_trying_it(written, word):
     rng = np.random.default_rng(3)
     for rig in (STUDIO, in_another_world(STUDIO, rng), arrangement("a")):
-        (fault,) = rig_faults(posed(rig, written))
+        (fault,) = rig_faults(reposed(rig, written))
         assert word in fault.text

@@ -10,6 +10,7 @@ from rig.formats.cameras.cameras_file import find_rig_file
 from rig.formats.pictures.images import write_image
 from rig.geometry import look_at
 from rig.rig import Rig
+from tests.support.changed_rigs import relensed
 
 POINTS = np.random.default_rng(4).uniform(-80.0, 80.0, (20, 3))
 
@@ -55,5 +56,4 @@ NAMES = {
 
 def square(rig: Rig) -> Rig:
     """The rig with square pixels, which is all that some formats know."""
-    lenses = [replace(camera.intrinsics, fy=camera.intrinsics.fx) for camera in rig]
-    return Rig(tuple(replace(c, intrinsics=lens) for c, lens in zip(rig, lenses, strict=True)))
+    return relensed(rig, lambda intrinsics: replace(intrinsics, fy=intrinsics.fx))

@@ -7,6 +7,7 @@ import pytest
 
 from calibration.adjustment.gauge import align_world
 from calibration.result import CalibrationRefused
+from calibration.scene.matching import Matches
 from calibration.scene.scene import calibrate_scene, judged
 from rig.errors import InputError
 from rig.formats.pictures.images import write_image
@@ -79,8 +80,6 @@ def test_faults_of_the_photographs_are_named(tmp_path: Path) -> None:
 
 def test_half_of_the_views_must_join() -> None:
     """Asked of a structure, for a scene that falls apart so is slow to draw."""
-    from calibration.scene.matching import Matches
-
     structure = solved().structure
     names = [*structure.rig.names, *(f"more{index}" for index in range(7))]
     matches = Matches((), True, dict.fromkeys(names, (640, 480)), dict.fromkeys(names, 500), {}, 0)

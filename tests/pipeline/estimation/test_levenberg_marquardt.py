@@ -86,13 +86,10 @@ def test_a_prior_pulls_by_its_information() -> None:
     assert problem.equations(found.at).matrix[0, 0] == pytest.approx(5.0)
 
 
-def test_what_is_held_stays() -> None:
+def test_what_is_held_and_what_nothing_determines_stays() -> None:
     free = np.array([False, True])
     found = minimise(Problem((Rosenbrock(),), 2, np.add, free), np.array([3.0, 0.0]), TIGHT)
     np.testing.assert_allclose(found.value, [3.0, 9.0])
-
-
-def test_an_unknown_that_nothing_determines_stays() -> None:
     term = Quadratic.prior(np.diag([1.0, 0.0]), np.array([2.0, 7.0]))
     found = minimise(Problem((term,), 2, np.add), np.array([0.0, 3.0]), TIGHT)
     np.testing.assert_allclose(found.value, [2.0, 3.0], atol=1e-9)

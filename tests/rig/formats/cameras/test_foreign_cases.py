@@ -12,19 +12,16 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_file import read_cameras, write_rig_file
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
+from tests.support.changed_rigs import relensed
 from tests.support.fan_rig import fan
 from tests.support.planted_keys import base
 
 
-def with_lens(rig: Rig, coefficients: tuple[float, ...]) -> Rig:
-    lens = RecordedLens("kannala-brandt", coefficients)
-    straight = [replace(camera.intrinsics, distortion=Distortion()) for camera in rig]
-    return Rig(tuple(replace(c, recorded=lens, intrinsics=k) for c, k in zip(rig, straight, strict=True)))
-
-
 @pytest.mark.parametrize("place", ["top", "frame"])
 def test_instant_ngp_says_a_fisheye_by_its_flag(place: str, tmp_path: Path) -> None:
-    rig = with_lens(fan(3), (0.02, -0.01, 0.003, 1e-3))
+    lens = RecordedLens("kannala-brandt", (0.02, -0.01, 0.003, 1e-3))
+    straight = relensed(fan(3), lambda k: replace(k, distortion=Distortion()))
+    rig = Rig(tuple(replace(camera, recorded=lens) for camera in straight))
     write_rig_file(rig, tmp_path / "transforms.json", "nerfstudio")
     document = json.loads((tmp_path / "transforms.json").read_text())
     del document["camera_model"]

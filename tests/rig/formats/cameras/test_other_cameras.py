@@ -15,6 +15,7 @@ from rig.formats.cameras.colmap import write_colmap
 from rig.formats.cameras.opencv_yaml import write_aniposelib
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
+from tests.support.changed_rigs import relensed, reposed
 from tests.support.fan_rig import NAMES, POINTS, fan, find_cameras, square, write_blanks
 from tests.support.shared_data import shared
 
@@ -72,9 +73,8 @@ def test_an_unknown_format_is_named(tmp_path: Path) -> None:
 
 def bent(lens: RecordedLens) -> Rig:
     """The fan with a foreign lens before every camera."""
-    return Rig(
-        tuple(replace(c, intrinsics=replace(c.intrinsics, distortion=Distortion()), recorded=lens) for c in fan())
-    )
+    straight = relensed(fan(), lambda k: replace(k, distortion=Distortion()))
+    return Rig(tuple(replace(camera, recorded=lens) for camera in straight))
 
 
 FISHEYE = RecordedLens("kannala-brandt", (-0.02, 0.004, -0.001, 0.0002))
@@ -139,13 +139,8 @@ def test_the_published_caliscope_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("unit", "scale"), [("", 1.0), ("", 1000.0), ('unit = "mm"', 1.0), ('unit = "m"', 1000.0)])
 def test_the_unit_of_an_aniposelib_file(unit: str, scale: float, tmp_path: Path) -> None:
-    rig = fan(3)
-    metres = tuple(
-        replace(c, camera_from_world=replace(c.camera_from_world, translation=c.camera_from_world.translation / scale))
-        for c in rig
-    )
-    path = tmp_path / "calibration.toml"
-    write_aniposelib(Rig(metres), path)
+    rig, path = fan(3), tmp_path / "calibration.toml"
+    write_aniposelib(reposed(rig, lambda pose: replace(pose, translation=pose.translation / scale)), path)
     path.write_text(path.read_text().replace('unit = "mm"', unit))
     back = read_rig_file(path)
     np.testing.assert_allclose(back["cam01"].camera_from_world.translation, rig["cam01"].camera_from_world.translation)
