@@ -21,7 +21,7 @@ from tests.support.services import small_capture
 # The names of the contract.
 NAMES = [
     "table1", "table2", "table3", "cost", "levels", "peers", "limit", "robustness", "convergence", "alignment",
-    "drift", "exchanges", "false-alarms", "posterior", "views", "repeat", "relief", "pores", "span", "detail",
+    "drift", "exchanges", "posterior", "views", "repeat", "relief", "pores", "span", "detail",
     "hidden", "capped", "expressions", "visible", "people", "planted", "surfaces", "texture", "light", "templates",
     "shapes", "eyeballs", "gazes", "inner-mouth", "meshes", "wrap", "scaling", "growth", "scale",
     "real"
@@ -60,7 +60,7 @@ def heights(*, top_mm: int = 3) -> int:
 
 def test_every_name_of_the_contract_is_there() -> None:
     assert not set(NAMES) - set(EXPERIMENTS)  # guards came later
-    assert len(NAMES) == 40
+    assert len(NAMES) == 39
     assert all(f"  {name} " in describe() for name in EXPERIMENTS | BENCHMARKS)
 
 

@@ -224,13 +224,7 @@ def test_operator_masks_need_no_plate_and_a_camera_with_neither_is_refused(scan:
 
 @pytest.mark.parametrize(
     ("across_px", "value", "coarse", "holes"),
-    [
-        ((3, 3), 0.1, 0.9, 0),
-        ((8, 8), 0.1, 0.9, 0),
-        ((14, 14), 0.1, 0.9, 1),
-        ((40, 20), 0.4, 1.0, 0),
-        ((40, 20), 0.4, 0.9, 1),
-    ],
+    [(3, 0.1, 0.9, 0), (8, 0.1, 0.9, 0), (14, 0.1, 0.9, 1), (28, 0.4, 1.0, 0), (28, 0.4, 0.9, 1)],
 )
 def test_a_hole_is_filled_that_is_small_or_that_the_coarse_level_calls_subject(
     across_px: int, value: float, coarse: float, holes: int

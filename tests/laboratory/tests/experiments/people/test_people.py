@@ -86,11 +86,10 @@ def test_the_seen_face_is_bare_and_seen_by_two_of_the_cameras() -> None:
     ("change", "wrong"),
     [({}, False), ({"turn_deg": 3.1}, True), ({"shift_mm": 5.1}, True), ({"deviations_off": 3.1}, True)],
 )
-def test_a_result_is_wrong_by_its_pose_or_by_its_own_statement(change: dict, wrong: bool) -> None:
+def test_a_result_is_wrong_by_its_pose_or_by_its_own_statement_and_only_its_own_warnings_speak_of_it(
+    change: dict, wrong: bool
+) -> None:
     assert is_wrong(row(**change)) == wrong
-
-
-def test_only_warnings_of_the_result_speak_of_it() -> None:
     assert not is_warned(row(warnings=["camera-gain", "mask-contradicted", "eyes-closed"]))
     assert all(is_warned(row(warnings=["camera-gain", code])) for code in SPEAKING)
     assert set(SPEAKING) - {"pose-doubtful"} <= set(WARNING_CODES)
