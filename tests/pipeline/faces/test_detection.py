@@ -38,14 +38,11 @@ def test_small_and_large_faces_are_found(networks: FaceNetworks, scale: float) -
     assert np.abs(face.landmarks_px[[33, 263]] - corners).max() < 0.03 * face.size_px
 
 
-def test_a_face_of_a_twentieth_of_a_picture_is_found(networks: FaceNetworks) -> None:
+def test_a_face_of_a_twentieth_of_a_picture_is_found_and_two_faces_are_two(networks: FaceNetworks) -> None:
     middle = (300.0, 600.0)
     image = drawn_face(1000, 800, (middle,), scale=0.24)
     (face,) = find_faces(image, networks)
     assert np.abs(face.landmarks_px.mean(axis=0) - middle).max() < 0.3 * face.size_px
-
-
-def test_two_faces_are_two(networks: FaceNetworks) -> None:
     image = drawn_face(900, 480, ((220.0, 240.0), (660.0, 240.0)))
     faces = find_faces(image, networks)
     middles = sorted(float(face.landmarks_px[:, 0].mean()) for face in faces)

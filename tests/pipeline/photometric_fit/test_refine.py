@@ -71,11 +71,8 @@ def test_gloss_before_three_narrow_cameras_is_no_relief(model: HeadModel) -> Non
     assert off.max() < 0.8
 
 
-def test_a_usual_rig_is_searched_as_ever() -> None:
+def test_a_usual_rig_is_searched_as_ever_and_a_narrow_one_farther_and_without_shading() -> None:
     assert rounds_of_rig(1.02) == tuple(replace(each, reach_mm=1.02 * each.reach_mm) for each in ROUNDS)
-
-
-def test_a_narrow_rig_is_searched_farther_and_without_shading() -> None:
     rounds = rounds_of_rig(3.0)
     assert rounds[0].reach_mm == 3.0 * ROUNDS[0].reach_mm
     assert len(rounds) == len(ROUNDS) + 4
