@@ -102,13 +102,10 @@ def test_a_legacy_board_is_detected_and_told(tmp_path: Path) -> None:
     assert texts_of(found.remarks) == ["the board was found with legacy = true: say so in board.toml"]
 
 
-def test_a_wrong_width_of_markers_is_said_once_and_passes_for_no_blur(tmp_path: Path) -> None:
+def test_a_wrong_width_of_markers_is_said_once_and_a_charuco_board_called_a_checkerboard_named(tmp_path: Path) -> None:
     with pytest.raises(WrongBoard, match="correct marker_ratio") as refused:
         detect_folder(written(tmp_path, TOLD), replace(TOLD, marker_ratio=0.6))
     assert str(refused.value).count("marker_ratio") == 1
-
-
-def test_a_charuco_board_that_is_called_a_checkerboard_is_named(tmp_path: Path) -> None:
     checkerboard = Board("checkerboard", TOLD.columns, TOLD.rows, TOLD.square_mm)
     with pytest.raises(WrongBoard, match=r'its squares hold markers .*write kind = "charuco"'):
         detect_folder(written(tmp_path, TOLD), checkerboard)

@@ -234,9 +234,11 @@ def test_a_silent_port_times_out() -> None:
         assert time.monotonic() - started_s < 2.0
 
 
-def test_a_port_that_is_not_there(tmp_path: Path) -> None:
+def test_a_port_that_is_not_there_or_that_another_program_has(tmp_path: Path, port: Path) -> None:
     with pytest.raises(TriggerUnplugged, match="unplugged"):
         TriggerBox(str(tmp_path / "no-such-port"))
+    with TriggerBox(str(port)), pytest.raises(TriggerUnplugged, match="cannot be opened"):
+        TriggerBox(str(port))
 
 
 def test_pulling_the_cable_is_an_error_at_once(tmp_path: Path, outputs: Outputs) -> None:
@@ -248,11 +250,6 @@ def test_pulling_the_cable_is_an_error_at_once(tmp_path: Path, outputs: Outputs)
             box.status()
         assert time.monotonic() - started_s < 1.5
     assert not plugged.port.is_symlink()
-
-
-def test_a_second_program_cannot_take_the_box(port: Path) -> None:
-    with TriggerBox(str(port)), pytest.raises(TriggerUnplugged, match="cannot be opened"):
-        TriggerBox(str(port))
 
 
 def test_a_closed_box_leaves_no_thread_descriptor_or_file(tmp_path: Path, outputs: Outputs) -> None:

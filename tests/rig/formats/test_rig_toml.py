@@ -32,12 +32,16 @@ def faults_of(changed: dict[str, Any]) -> str:
     return str(caught.value)
 
 
-def test_example_describes_eleven_cameras() -> None:
+def test_example_describes_eleven_cameras_and_defaults_suffice() -> None:
     config = read_rig_config(EXAMPLE)
     assert config.names == tuple(f"cam{i:02}" for i in range(11))
     assert {camera.driver for camera in config.cameras} == {"genicam", "gphoto", "opencv"}
     assert config.calibration_file == EXAMPLE.parent / "cameras.json"
     assert config.lights.outputs == (0, 1)
+    config = rig_config_from_document(document(), Path("/rigs"))
+    assert config.cameras[0].trigger == "external"
+    assert config.plates_folder == Path("/rigs/plates")
+    assert config.calibration_file is None
 
 
 def test_example_shows_every_key() -> None:
@@ -51,13 +55,6 @@ def test_example_shows_every_key() -> None:
         (ShotConfig, set(written["shot"])),
     ):
         assert {field.name for field in dataclasses.fields(kind)} == keys
-
-
-def test_defaults_suffice() -> None:
-    config = rig_config_from_document(document(), Path("/rigs"))
-    assert config.cameras[0].trigger == "external"
-    assert config.plates_folder == Path("/rigs/plates")
-    assert config.calibration_file is None
 
 
 def test_unknown_keys_are_refused_with_the_nearest() -> None:

@@ -53,12 +53,9 @@ def test_every_code_is_composed_with_its_parameters() -> None:
     assert wrong == []
 
 
-def test_every_code_of_the_catalogue_is_used() -> None:
+def test_every_code_of_the_catalogue_is_used_and_every_warning_of_a_result_in_it() -> None:
     used = {code for tree in modules().values() for _, codes, _ in composed(tree) for code in codes}
     assert CATALOGUE.keys() - used - {"verbatim"} == set()
-
-
-def test_every_warning_of_a_result_is_a_message() -> None:
     assert set(WARNING_CODES) - CATALOGUE.keys() == set()
 
 

@@ -77,14 +77,11 @@ def test_cameras_that_are_not_aligned_are_told(tmp_path: Path) -> None:
     assert "cam02 not aligned in cameras.xml" in read.remarks[0].text
 
 
-def test_a_dot_in_a_label_belongs_to_the_name(tmp_path: Path) -> None:
+def test_a_dot_in_a_label_belongs_to_the_name_and_labels_that_repeat_take_their_groups(tmp_path: Path) -> None:
     read = read_cameras(metashape(tmp_path, (r'label="cam(\d\d)">', r'label="2024.11.25_cam.\1">')))
     assert read.rig.names[0] == "2024.11.25_cam.00"
     read = read_cameras(metashape(tmp_path, (r'label="cam(\d\d)">', r'label="shots\\\\cam.\1.TIF">')))
     assert read.rig.names[0] == "cam.00"
-
-
-def test_labels_that_repeat_take_their_groups(tmp_path: Path) -> None:
     grouped = (
         r'(<camera id="(\d+)" sensor_id="\d+" label=")(cam\d\d)(".*?</camera>)',
         r'<group id="\2" label="\3" type="folder">\1IMG_0001\4</group>',

@@ -60,15 +60,12 @@ def test_opencv_matrices_in_one_file(unit: float, vectors: bool, tmp_path: Path)
         np.testing.assert_allclose(back[camera.name].project(POINTS), camera.project(POINTS), atol=1e-6)
 
 
-def test_a_yaml_of_opencv_without_cameras_says_what_is_wanted(tmp_path: Path) -> None:
+def test_an_unknown_format_and_a_yaml_of_opencv_without_cameras_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'ply' is none of eigenhead, colmap"):
+        write_rig_file(fan(), tmp_path / "x", "ply")
     (tmp_path / "board.yml").write_text("%YAML:1.0\n---\nsquare: 25.\n")
     with pytest.raises(InputError, match=r"board\.yml: holds no camera; wanted are K_<name>, dist_<name>, R_<name>"):
         read_rig_file(tmp_path / "board.yml")
-
-
-def test_an_unknown_format_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="'ply' is none of eigenhead, colmap"):
-        write_rig_file(fan(), tmp_path / "x", "ply")
 
 
 def bent(lens: RecordedLens) -> Rig:

@@ -118,13 +118,6 @@ def test_a_fault_is_named(folder: Path, harm: Callable[[Path], None], words: str
     assert words in caught.value.faults[0].text
 
 
-def test_captures_in_a_folder_are_named(folder: Path) -> None:
-    for name in ("monday", "tuesday"):
-        write_capture(folder.parent / "week" / name, small_capture(), small_rig())
-    with pytest.raises(InputError, match="but monday, tuesday do: give one of these"):
-        read_capture(folder.parent / "week")
-
-
 def test_a_plate_and_a_folder_of_plates_go_together(folder: Path) -> None:
     """A picture with a colour chart is put beside the plate that is there already."""
     name = read_capture(folder)[1].names[0]
@@ -170,12 +163,16 @@ def test_all_faults_are_named_at_once(folder: Path) -> None:
     assert len(caught.value.faults) == 3
 
 
-def test_a_rig_s_faults_come_with_its_file_s_name(folder: Path) -> None:
+def test_a_rig_s_faults_come_with_its_file_s_name_and_captures_in_a_folder_are_named(folder: Path) -> None:
     (folder / "cameras.json").write_text("{}")
     with pytest.raises(InputError, match=r"capture: cameras\.json: "):
         read_capture(folder)
     with pytest.raises(InputError, match="is no folder"):
         read_capture(folder / "absent")
+    for name in ("monday", "tuesday"):
+        write_capture(folder.parent / "week" / name, small_capture(), small_rig())
+    with pytest.raises(InputError, match="but monday, tuesday do: give one of these"):
+        read_capture(folder.parent / "week")
 
 
 def test_the_shared_capture_is_read() -> None:

@@ -36,9 +36,13 @@ def test_signs_case_and_leading_zeros_do_not_count(pattern: str) -> None:
     assert found == {name: [pattern.format(i)] for i, name in enumerate(CAMERAS[:10])}
 
 
-def test_names_that_vary_are_filed_where_each_names_one_camera() -> None:
+def test_names_that_vary_are_filed_where_each_names_one_camera_or_several_may_be() -> None:
     names = [f"{name}_{1000 + 7 * i}.png" for i, name in enumerate(CAMERAS)]
     assert match_names(names, CAMERAS) == {name: [file] for name, file in zip(CAMERAS, names, strict=True)}
+    names = [f"{name}_{shot:03}.png" for name in CAMERAS for shot in (1, 2, 3)]
+    assert match_names(names, CAMERAS) == {}
+    found = match_names(names, CAMERAS, several=True)
+    assert found == {name: [f"{name}_{shot:03}.png" for shot in (1, 2, 3)] for name in CAMERAS}
 
 
 @pytest.mark.parametrize(
@@ -71,13 +75,6 @@ def test_what_leaves_a_doubt_is_nobody_s(names: list[str]) -> None:
 )
 def test_a_name_is_one_camera_s_or_nobody_s(names: list[str], cameras: list[str], found: dict[str, list[str]]) -> None:
     assert match_names(names, cameras) == found
-
-
-def test_several_files_of_a_camera_go_together_where_that_may_be() -> None:
-    names = [f"{name}_{shot:03}.png" for name in CAMERAS for shot in (1, 2, 3)]
-    assert match_names(names, CAMERAS) == {}
-    found = match_names(names, CAMERAS, several=True)
-    assert found == {name: [f"{name}_{shot:03}.png" for shot in (1, 2, 3)] for name in CAMERAS}
 
 
 def test_numbers_for_names_are_found_by_what_they_stand_beside() -> None:
