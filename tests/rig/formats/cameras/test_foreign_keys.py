@@ -20,7 +20,7 @@ PAGE = Path(__file__).parents[4] / "docs" / "foreign-cameras.md"
 ELSEWHERE = {("colmap", "sparse/1")}  # told by what reads the folder: tests/rig/formats/captures/test_shot_files.py
 # Read, and without effect for this value or in this place: what else the row says is in the test named.
 AS_IT_IS = {
-    ("metashape", "group@label"): "test_labels_that_repeat_take_their_groups",
+    ("metashape", "group@label"): "test_a_dot_in_a_label_belongs_to_the_name_and_labels_that_repeat_take_their_groups",
     ("metashape", "camera@component_id"): "test_cameras_of_two_components_are_refused",
     ("metashape", "chunk/components"): "test_cameras_of_two_components_are_refused",
     ("metashape", "component@id"): "test_cameras_of_two_components_are_refused",

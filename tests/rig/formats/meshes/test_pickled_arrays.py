@@ -53,7 +53,7 @@ def test_sparse_matrices_become_dense(tmp_path: Path, make: Callable[[np.ndarray
     np.testing.assert_array_equal(read_pickled_arrays(written(tmp_path, {"J": make(dense)}))["J"], dense)
 
 
-def test_nothing_that_a_pickle_names_is_run_and_a_number_in_place_of_bytes_reserves_nothing(tmp_path: Path) -> None:
+def test_nothing_that_a_pickle_names_is_run(tmp_path: Path) -> None:
     mark = tmp_path / "mark"
     with pytest.raises(InputError, match="system"):
         read_pickled_arrays(written(tmp_path, {"v": np.zeros(3), "x": Runs(mark)}))
