@@ -19,8 +19,10 @@ from rig.camera import Camera
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import read_rig_file
 from rig.formats.cameras.cameras_json import read_rig
+from rig.geometry import RigidTransform
 from rig.rig import Rig
 from tests.support.board_sessions import CHECKERBOARD, Session, session, visible
+from tests.support.changed_rigs import relensed, reposed
 from tests.support.shared_data import shared
 
 CAMERAS, SHOTS = 7, 20
@@ -172,36 +174,15 @@ def renamed(rig: Rig, names: dict[str, str]) -> Rig:
 
 def mirrored(rig: Rig) -> Rig:
     flip = np.diag([-1.0, 1.0, 1.0])
-    return Rig(
-        tuple(
-            replace(
-                camera,
-                camera_from_world=replace(
-                    camera.camera_from_world,
-                    rotation=flip @ camera.camera_from_world.rotation @ flip,
-                    translation=flip @ camera.camera_from_world.translation,
-                ),
-            )
-            for camera in rig
-        )
-    )
+    return reposed(rig, lambda pose: RigidTransform(flip @ pose.rotation @ flip, flip @ pose.translation))
 
 
 def larger(rig: Rig) -> Rig:
-    return Rig(
-        tuple(
-            replace(
-                c, camera_from_world=replace(c.camera_from_world, translation=1.04 * c.camera_from_world.translation)
-            )
-            for c in rig
-        )
-    )
+    return reposed(rig, lambda pose: replace(pose, translation=1.04 * pose.translation))
 
 
 def zoomed(rig: Rig) -> Rig:
-    first, *rest = rig.cameras
-    lens = replace(first.intrinsics, fx=1.06 * first.intrinsics.fx, fy=1.06 * first.intrinsics.fy)
-    return Rig((replace(first, intrinsics=lens), *rest))
+    return relensed(rig, lambda k: replace(k, fx=1.06 * k.fx, fy=1.06 * k.fy), rig.names[0])
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ EXPERIMENTS = {
     "alignment": Record("experiments.paper.alignment:alignment", "Counts right alignments without feature points."),
     "drift": Record("experiments.faults.drift:drift", "Counts how often a turned camera, and a good one, is named."),
     "exchanges": Record("experiments.faults.exchanges:exchanges", "Counts how often exchanged pictures are repaired."),
-    "false-alarms": Record("experiments.faults.exchanges:false_alarms", "Counts warnings on good captures."),
     "posterior": Record("experiments.paper.posterior_check:posterior_check", "Compares it with a Markov chain."),
     "views": Record("experiments.paper.views:views", "Plans where cameras should stand."),
     "repeat": Record("experiments.surface.repeat:repeat", "Measures how well repeated shots of one subject agree."),

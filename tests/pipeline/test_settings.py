@@ -26,6 +26,7 @@ def nested(depth: int) -> list[Any]:
         ({"warnings": []}, "unknown key 'warnings'"),
         ({"surface": "head"}, "unknown key 'surface'; did you mean 'outputs.surface'?"),
         ({"outputs": {"texture_sizes": 1}}, "unknown key 'outputs.texture_sizes'; did you mean 'texture_size'?"),
+        ({"bust": {"spacing_mm": 0.4}}, "bust.spacing_mm is 0.4, wanted 0.5 to 3"),
         ({"bust": {"spacing_mm": 10**400}}, "bust.spacing_mm is 1000"),
         ({"bust": {"spacing_mm": 10**5000}}, "bust.spacing_mm is too large a value"),
         ({"bust": {"spacing_mm": True}}, "bust.spacing_mm is True"),
@@ -43,8 +44,9 @@ def test_what_cannot_be_is_named_in_text_that_can_be_sent(document: dict[str, An
     message.text.encode()
 
 
-def test_a_whole_number_is_a_length() -> None:
-    assert settings_from_document({"bust": {"spacing_mm": 1}}).bust.spacing_mm == 1.0
+def test_a_whole_number_is_a_length_and_the_least_one_is_allowed() -> None:
+    for spacing in (1, 0.5):
+        assert settings_from_document({"bust": {"spacing_mm": spacing}}).bust.spacing_mm == spacing
 
 
 def test_numbers_of_earlier_versions_are_passed_over_with_one_warning() -> None:

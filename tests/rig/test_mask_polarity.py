@@ -18,14 +18,11 @@ def test_the_borders_are_background(subject: np.ndarray, turns: int) -> None:
     assert subject_convention(np.rot90(~subject, turns)) == "black"
 
 
-def test_a_close_up_decides_nothing_and_follows_the_others() -> None:
+def test_single_masks_may_be_inverted_and_a_close_up_follows_the_others() -> None:
+    masks = {"a": BUST, "b": ~BUST, "c": HEAD, "d": CLOSE_UP}
+    assert inverted_masks(masks, {}) == ["b"]
     assert subject_convention(CLOSE_UP) is None
     middle = np.array([160.0, 120.0])
     assert inverted_masks({"a": CLOSE_UP}, {"a": middle}) == []
     masks = {"a": ~BUST, "b": ~HEAD, "c": ~CLOSE_UP}
     assert inverted_masks(masks, dict.fromkeys(masks, middle)) == ["a", "b", "c"]
-
-
-def test_single_masks_may_be_inverted() -> None:
-    masks = {"a": BUST, "b": ~BUST, "c": HEAD, "d": CLOSE_UP}
-    assert inverted_masks(masks, {}) == ["b"]

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibration.adjustment.state import BundleState
 from calibration.board.board import Board, board_poses
 from calibration.board.corners import Found
 from calibration.board.detection import Detections, View
@@ -73,3 +74,17 @@ def visible(camera: Camera, world_from_board: RigidTransform, board: Board) -> t
     if board.kind == "checkerboard" and not inside.all():
         inside[:] = False
     return np.flatnonzero(inside), pixels[inside]
+
+
+def planted(source: Session) -> BundleState:
+    """Returns the true cameras and the true poses of the board as the state of a bundle."""
+    rig, shots = source.rig, source.detections.shots
+    return BundleState(
+        np.stack([camera.intrinsics.values() for camera in rig]),
+        np.stack([camera.camera_from_world.rotation for camera in rig]),
+        np.stack([camera.camera_from_world.translation for camera in rig]),
+        np.stack([source.poses[shot].rotation for shot in shots]),
+        np.stack([source.poses[shot].translation for shot in shots]),
+        np.zeros(len(rig)),
+        np.zeros((len(shots), 6)),
+    )

@@ -1,4 +1,4 @@
-"""A fan of cameras with lenses, and the names of its file in every format."""
+"""A fan of cameras with lenses, the names of its file in every format, and pictures for those that want them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from rig.camera import Camera, Distortion, Intrinsics
-from rig.formats.cameras.cameras_json import write_rig
-from rig.formats.cameras.colmap import write_colmap
-from rig.formats.cameras.opencv_yaml import write_aniposelib, write_caliscope
+from rig.formats.cameras.cameras_file import find_rig_file
+from rig.formats.pictures.images import write_image
 from rig.geometry import look_at
 from rig.rig import Rig
+from tests.support.changed_rigs import relensed
 
 POINTS = np.random.default_rng(4).uniform(-80.0, 80.0, (20, 3))
 
@@ -25,19 +25,18 @@ def fan(count: int = 5) -> Rig:
     return Rig(tuple(cameras))
 
 
-def write(kind: str, rig: Rig, folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    match kind:
-        case "ours":
-            write_rig(rig, folder / "cameras.json")
-        case "colmap text":
-            write_colmap(rig, folder / "sparse" / "0")
-        case "colmap binary":
-            write_colmap(rig, folder, binary=True)
-        case "caliscope":
-            write_caliscope(rig, folder / "camera_array.toml")
-        case "aniposelib":
-            write_aniposelib(rig, folder / "calibration.toml")
+def write_blanks(rig: Rig, folder: Path) -> None:
+    """Writes a black picture for each camera, since some formats leave the size to the pictures."""
+    for camera in rig:
+        pixels = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
+        write_image(folder / "images" / f"{camera.name}.png", pixels)
+
+
+def find_cameras(folder: Path) -> Path:
+    """Returns the file of cameras in ``folder``."""
+    found = find_rig_file(folder)
+    assert found is not None
+    return found
 
 
 NAMES = {
@@ -57,9 +56,4 @@ NAMES = {
 
 def square(rig: Rig) -> Rig:
     """The rig with square pixels, which is all that some formats know."""
-    lenses = [replace(camera.intrinsics, fy=camera.intrinsics.fx) for camera in rig]
-    return Rig(tuple(replace(c, intrinsics=lens) for c, lens in zip(rig, lenses, strict=True)))
-
-
-OTHERS = ("metashape", "realitycapture", "realitycapture-csv", "nerfstudio", "opencv-yaml")
-KINDS = ("ours", "colmap text", "colmap binary", "caliscope", "aniposelib")
+    return relensed(rig, lambda intrinsics: replace(intrinsics, fy=intrinsics.fx))

@@ -60,22 +60,25 @@ def traced(width: int, height: int, gloss: float) -> list[tuple[np.ndarray, np.n
     return found
 
 
-def trace(camera: Camera, gloss: float) -> tuple[np.ndarray, np.ndarray]:
-    """Linear light (H, W, 3) and mask."""
-    k = camera.intrinsics
+def hits(camera: Camera, lamp: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Which pixels' rays meet the ellipsoid; there its points (mm), its normals, and the highlight (0 to 1) of a lamp
+    in the direction ``lamp``."""
     pixels = pixel_grid(camera)
     depth = ray_ellipsoid(camera, pixels)
     hit = np.isfinite(depth)
     rays = camera.rays_world(pixels[hit])
     points = camera.centre_world + rays * (depth[hit] / (rays @ camera.axis_world))[:, None]
-    colour = pattern(points)
-    if gloss:
-        normals = points / SEMI_AXES**2
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        lamp = np.array([0.3, 0.5, 0.81])
-        half = lamp - rays
-        half /= np.linalg.norm(half, axis=1, keepdims=True)
-        colour = colour + gloss * (np.clip((normals * half).sum(1), 0, 1) ** 120)[:, None]
-    light = np.tile(np.array(SCREEN), (len(pixels), 1))
-    light[hit] = colour
+    normals = points / SEMI_AXES**2
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    half = lamp - rays
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    return hit, points, normals, np.clip((normals * half).sum(1), 0, 1) ** 120
+
+
+def trace(camera: Camera, gloss: float) -> tuple[np.ndarray, np.ndarray]:
+    """Linear light (H, W, 3) and mask."""
+    k = camera.intrinsics
+    hit, points, _, mirrored = hits(camera, np.array([0.3, 0.5, 0.81]))
+    light = np.tile(np.array(SCREEN), (len(hit), 1))
+    light[hit] = pattern(points) + gloss * mirrored[:, None]
     return light.reshape(k.height, k.width, 3), hit.reshape(k.height, k.width)

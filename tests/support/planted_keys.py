@@ -11,10 +11,9 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 
-from rig.formats.cameras.cameras_file import find_rig_file, write_rig_file
+from rig.formats.cameras.cameras_file import write_rig_file
 from rig.formats.cameras.colmap import COLMAP_MODELS, REFUSED_MODELS
-from rig.formats.pictures.images import write_image
-from tests.support.fan_rig import NAMES, fan, square
+from tests.support.fan_rig import NAMES, fan, find_cameras, square, write_blanks
 
 Plant = Callable[[Path, str, object], None]
 
@@ -24,9 +23,8 @@ def base(kind: str, folder: Path) -> Path:
     rig = square(fan(4)) if kind == "realitycapture-csv" else fan(4)
     written = "colmap-text" if kind == "colmap" else kind
     write_rig_file(rig, folder / NAMES[written], written)
-    for camera in rig if kind.startswith("realitycapture") else ():  # which leave the size to the pictures
-        pixels = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
-        write_image(folder / "images" / f"{camera.name}.png", pixels)
+    if kind.startswith("realitycapture"):
+        write_blanks(rig, folder)
     if kind == "metashape":
         path = folder / "cameras.xml"
         tree = ElementTree.parse(path)
@@ -45,9 +43,7 @@ def base(kind: str, folder: Path) -> Path:
                 cameras.remove(camera)
                 group.append(camera)
         tree.write(path)
-    found = find_rig_file(folder)
-    assert found is not None
-    return found
+    return find_cameras(folder)
 
 
 def plant_xml(path: Path, key: str, value: object) -> None:

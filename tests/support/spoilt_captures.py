@@ -12,6 +12,7 @@ from rig.camera import Camera
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
+from tests.support.changed_rigs import reposed
 
 OVER_EARS = HairStyle(thickness_mm=18.0, over_ears=True)
 WRONG_SHARE, WRONG_RADII_PX = 0.2, (6.0, 18.0)
@@ -46,7 +47,7 @@ def knocked(rig: Rig, name: str, turn_deg: float, rng: np.random.Generator) -> R
     around = rng.uniform(0.0, 2.0 * np.pi)
     turn = np.radians(turn_deg) * np.array([np.cos(around), np.sin(around), 0.0])
     motion = RigidTransform(rotation_from_vector(turn), np.zeros(3))
-    return Rig(tuple(replace(c, camera_from_world=motion @ c.camera_from_world) if c.name == name else c for c in rig))
+    return reposed(rig, lambda pose: motion @ pose, name)
 
 
 def loosened(silhouettes: Mapping[str, Silhouette]) -> dict[str, Silhouette]:

@@ -18,35 +18,15 @@ from calibration.adjustment.gauge import (
     world_motions,
 )
 from calibration.adjustment.lens_prior import LensPrior, weak_prior
-from calibration.adjustment.state import (
-    PER_CAMERA,
-    PER_SHOT,
-    BundleState,
-    Observations,
-    intrinsics_of,
-    observations,
-    residuals,
-)
+from calibration.adjustment.state import PER_CAMERA, PER_SHOT, Observations, intrinsics_of, observations, residuals
 from calibration.board.board import Board
 from calibration.calibrate import calibrate_detections
 from pipeline.estimation.levenberg_marquardt import Evidence
 from pipeline.estimation.terms import NormalEquations
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.rig import Rig
-from tests.support.board_sessions import CHARUCO, Session, rig_of, session
-
-
-def planted(source: Session) -> BundleState:
-    rig, shots = source.rig, source.detections.shots
-    return BundleState(
-        np.stack([camera.intrinsics.values() for camera in rig]),
-        np.stack([camera.camera_from_world.rotation for camera in rig]),
-        np.stack([camera.camera_from_world.translation for camera in rig]),
-        np.stack([source.poses[shot].rotation for shot in shots]),
-        np.stack([source.poses[shot].translation for shot in shots]),
-        np.zeros(len(rig)),
-        np.zeros((len(shots), 6)),
-    )
+from tests.support.board_sessions import CHARUCO, Session, planted, rig_of, session
+from tests.support.changed_rigs import reposed
 
 
 def seen_in(source: Session) -> Observations:
@@ -101,7 +81,7 @@ def test_jacobians_of_pose_and_lens_are_finite_differences() -> None:
 def test_a_rig_moved_as_a_whole_is_the_same_rig() -> None:
     rig = rig_of(11, np.random.default_rng(0))
     motion = RigidTransform(rotation_from_vector(np.array([0.4, -0.8, 0.3])), np.array([300.0, -50.0, 120.0]))
-    turned = Rig(tuple(replace(c, camera_from_world=c.camera_from_world @ motion) for c in rig))
+    turned = reposed(rig, lambda pose: pose @ motion)
     assert image_distance(turned, rig).max() < 1e-6
     for camera, other in zip(align_world(turned, rig), rig, strict=True):
         np.testing.assert_allclose(camera.centre_world, other.centre_world, atol=1e-6)

@@ -25,7 +25,7 @@ from calibration.quality.outliers import (
 from rig.camera import Camera, Intrinsics
 from rig.geometry import RigidTransform
 from rig.messages.message import compose
-from tests.support.board_sessions import CHECKERBOARD, Session, session, visible
+from tests.support.board_sessions import CHECKERBOARD, Session, planted, session, visible
 
 SHOT, NOISE_PX = "shot04", 0.2
 
@@ -37,21 +37,7 @@ def good() -> Session:
 
 @pytest.fixture(scope="module")
 def state(good: Session) -> BundleState:
-    """The planted rig as a solution."""
-    cameras, poses = list(good.rig), list(good.poses.values())
-    return BundleState(
-        np.array([intrinsics_row(camera.intrinsics) for camera in cameras]),
-        np.stack([camera.camera_from_world.rotation for camera in cameras]),
-        np.stack([camera.camera_from_world.translation for camera in cameras]),
-        np.stack([pose.rotation for pose in poses]),
-        np.stack([pose.translation for pose in poses]),
-        np.zeros(len(cameras)),
-        np.zeros((len(poses), 6)),
-    )
-
-
-def intrinsics_row(k: Intrinsics) -> list[float]:
-    return [k.fx, k.fy, k.cx, k.cy, k.distortion.k1, k.distortion.k2, k.distortion.p1, k.distortion.p2, k.distortion.k3]
+    return planted(good)
 
 
 def of_shot(source: Session, shot: str = SHOT) -> list[View]:
@@ -122,21 +108,10 @@ def test_a_view_that_its_own_lens_does_not_explain_is_left_out(good: Session) ->
 def test_bad_views_are_those_far_beyond_the_median(good: Session, state: BundleState) -> None:
     views, names, shots = list(good.detections.views), list(good.rig.names), list(good.poses)
     rms = view_rms(state, observations(views, names, shots, CHECKERBOARD))
-    expected = [
-        np.sqrt(
-            (
-                (
-                    good.rig[view.camera].project(good.poses[view.shot].apply(CHECKERBOARD.corners()[view.found.ids]))
-                    - view.found.corners
-                )
-                ** 2
-            )
-            .sum(axis=1)
-            .mean()
-        )
-        for view in views
-    ]
-    np.testing.assert_allclose(rms, expected, atol=1e-9)
+    for view, found_px in zip(views, rms, strict=True):
+        corners = good.poses[view.shot].apply(CHECKERBOARD.corners()[view.found.ids])
+        off = good.rig[view.camera].project(corners) - view.found.corners
+        assert found_px == pytest.approx(np.sqrt((off**2).sum(axis=1).mean()), abs=1e-9)
     limit = max(VIEW_RATIO * float(np.median(rms)), VIEW_LEAST_PX)
     for shift, bad in ((0.8 * limit, False), (1.2 * limit, True)):
         views[5] = with_corners(good.detections.views[5], good.detections.views[5].found.corners + [shift, 0.0])

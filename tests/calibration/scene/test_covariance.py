@@ -57,16 +57,13 @@ def test_it_is_the_schur_complement_of_dense_normal_equations(one_lens: bool) ->
     np.testing.assert_allclose(ours / np.outer(scale, scale), dense / np.outer(scale, scale), atol=1e-6)
 
 
-def test_a_motion_of_the_world_costs_nothing() -> None:
+def test_a_motion_of_the_world_costs_nothing_and_blocks_are_covariances_in_the_subjects_gauge() -> None:
     observed = structure(one_lens=True)
     system = reduced_camera_system(observed, NOISE_PX)
     scaled = system / np.sqrt(np.outer(np.diag(system), np.diag(system)))
     assert (np.linalg.eigvalsh(scaled)[:7] < 1e-9).all()
     assert np.linalg.eigvalsh(scaled)[7] > 1e-9
-
-
-def test_the_blocks_are_covariances_in_the_subjects_gauge() -> None:
-    found = uncertainty(structure(one_lens=True))
+    found = uncertainty(observed)
     assert found.noise_px == pytest.approx(NOISE_PX, rel=0.15)  # of 360 residuals: 4 % for normal ones, MAD 6 %
     for block in found.blocks:
         assert np.linalg.eigvalsh(block).min() > 0

@@ -65,13 +65,10 @@ def test_a_printed_tag_does() -> None:
         scaled_by_length(views, free, free, TagSize("DICT_5X5_50", 40.0))
 
 
-def test_cameras_that_agree_with_the_length_stay() -> None:
+def test_cameras_that_agree_with_the_length_stay_and_covariances_grow_with_the_rig() -> None:
     near = times(RIG, 1.001)
     same, remarks = scaled_by_length(BLANK, near, near, cameras())
     assert (same.cameras, remarks) == (near.cameras, [])
-
-
-def test_covariances_grow_with_the_rig() -> None:
     camera = RIG.cameras[0]
     before = np.diag([1e-6, 1e-6, 1e-6, 0.1, 0.1, 0.1])
     (after,) = times(type(RIG)((Camera(camera.name, camera.intrinsics, camera.camera_from_world, before),)), 2.0)

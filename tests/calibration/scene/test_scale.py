@@ -49,25 +49,18 @@ def picked(which: int) -> dict[str, np.ndarray]:
     return {name: wedge_rig()[name].project(ENDS[which : which + 1])[0] for name in ("cam00", "cam02", "cam04")}
 
 
-def test_two_points(photographs: Path) -> None:
+def test_two_points_two_cameras_and_a_printed_tag(photographs: Path) -> None:
     known = PointDistance(picked(0), picked(1), float(np.linalg.norm(ENDS[1] - ENDS[0])))
     found = find_scale(structure(ENDS), known, find_photographs(photographs), HEAD)
     assert found.factor == pytest.approx(1 / UNIT, rel=1e-6)
     assert (found.source, found.assumed) == ("points", False)
     assert 0.001 < found.share < 0.05  # a pixel is 0.9 mm here, of 62
-
-
-def test_two_cameras(photographs: Path) -> None:
     rig = wedge_rig()
     apart = float(np.linalg.norm(rig["cam00"].centre_world - rig["cam04"].centre_world))
-    known = CameraDistance(("cam00", "cam04"), apart)
-    found = find_scale(structure(ENDS), known, find_photographs(photographs), HEAD)
+    between = CameraDistance(("cam00", "cam04"), apart)
+    found = find_scale(structure(ENDS), between, find_photographs(photographs), HEAD)
     assert found.factor == pytest.approx(1 / UNIT, rel=1e-9)
-
-
-def test_a_printed_tag(photographs: Path) -> None:
-    known = TagSize("DICT_4X4_50", TAG_MM)
-    found = find_scale(structure(ENDS), known, find_photographs(photographs), HEAD)
+    found = find_scale(structure(ENDS), TagSize("DICT_4X4_50", TAG_MM), find_photographs(photographs), HEAD)
     assert found.factor == pytest.approx(1 / UNIT, rel=0.01)  # 12 corners to 0.3 px, of sides of 35 px
     assert f"({TAG_NUMBER})" in found.provenance.text
 

@@ -1,7 +1,5 @@
 """Up is found whichever way round photographs were held."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -9,19 +7,15 @@ from calibration.scene.scene import QUARTER, in_guessed_frame, quarter_turns
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
+from tests.support.changed_rigs import reposed
 
 ELSEWHERE = RigidTransform(rotation_from_vector(np.array([0.4, -1.1, 2.0])), np.array([30.0, -200.0, 900.0]))
 
 
 def held(rig: Rig, turns: list[int]) -> Rig:
     """The cameras turned about their axes, in another world frame."""
-    rolls = [RigidTransform(np.linalg.matrix_power(QUARTER, k), np.zeros(3)) for k in turns]
-    return Rig(
-        tuple(
-            replace(camera, camera_from_world=roll @ camera.camera_from_world @ ELSEWHERE)
-            for camera, roll in zip(rig, rolls, strict=True)
-        )
-    )
+    rolls = iter([RigidTransform(np.linalg.matrix_power(QUARTER, k), np.zeros(3)) for k in turns])
+    return reposed(rig, lambda pose: next(rolls) @ pose @ ELSEWHERE)
 
 
 def worst_deg(found: Rig, studio: Rig) -> float:

@@ -52,15 +52,10 @@ def test_points_of_another_crop_or_size_lie_beside_the_face(
         )
 
 
-def test_points_of_no_landmark_say_nothing() -> None:
-    rig, places = default_layout(), landmark_map(MODEL)
-    face = found_on(MODEL.vertices(np.zeros(0)), places, rig)
-    assert features_beside_face({"nobody": {"cam00": np.zeros(2)}}, face, rig, MODEL, places) is None
-
-
-def test_points_whose_rows_count_from_the_bottom_are_named() -> None:
+def test_points_of_no_landmark_say_nothing_and_rows_that_count_from_the_bottom_are_named() -> None:
     rig, places = default_layout(), landmark_map(MODEL)
     face = found_on(MODEL.vertices(np.random.default_rng(3).normal(size=8)), places, rig)
+    assert features_beside_face({"nobody": {"cam00": np.zeros(2)}}, face, rig, MODEL, places) is None
     turned = {
         name: {v: np.array([x, rig[v].intrinsics.height - 1 - y]) for v, (x, y) in views.items()}
         for name, views in picked((0.0, 0.0)).items()

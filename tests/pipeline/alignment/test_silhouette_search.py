@@ -1,7 +1,5 @@
 """The search begins as the body stands, however cameras are mounted, and all around where a fan has no middle."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -10,6 +8,7 @@ from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from rig.geometry import RigidTransform, Similarity, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout, rig_from_directions
+from tests.support.changed_rigs import reposed
 from tests.support.layouts import circle_directions
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -18,7 +17,7 @@ UP = np.array([0.0, 1.0, 0.0])
 def rolled(rig: Rig, turn_deg: float) -> Rig:
     """The rig with every camera turned about its axis; pictures are square, so that sizes stay."""
     roll = RigidTransform(rotation_from_vector(np.radians([0.0, 0.0, turn_deg])), np.zeros(3))
-    return Rig(tuple(replace(camera, camera_from_world=roll @ camera.camera_from_world) for camera in rig))
+    return reposed(rig, lambda pose: roll @ pose)
 
 
 def standing(rig: Rig) -> dict[str, Silhouette]:
@@ -57,15 +56,12 @@ def test_a_ring_has_no_middle_and_a_fan_has() -> None:
     assert fan_strength(default_layout()) > 0.5
 
 
-def test_upright_axes_look_forward_and_stand_up() -> None:
+def test_upright_axes_look_forward_and_stand_up_and_the_turn_between_poses_is_an_angle() -> None:
     forward = np.array([0.3, 0.2, 0.9])
     axes = upright_axes(UP, forward)
     np.testing.assert_allclose(axes[:, 2], forward / np.linalg.norm(forward))
     assert axes[:, 1] @ UP > 0.9
     assert np.linalg.det(axes) == pytest.approx(1.0)
-
-
-def test_the_turn_between_poses_is_an_angle() -> None:
     one = Similarity.identity()
     other = Similarity(1.2, rotation_from_vector(np.radians([0.0, 170.0, 0.0])), np.ones(3))
     assert turn_between_deg(one, other) == pytest.approx(170.0)

@@ -139,7 +139,7 @@ def test_a_block_that_raises_is_recorded_and_ends_the_trace() -> None:
 
 def test_processor_seconds_are_a_thread_s_and_the_process_s() -> None:
     def work() -> None:
-        until = time.thread_time() + 0.03
+        until = time.thread_time() + 0.2
         while time.thread_time() < until:
             pass
 
@@ -149,7 +149,7 @@ def test_processor_seconds_are_a_thread_s_and_the_process_s() -> None:
         worker.start()
         worker.join()
     stage = spans_of(document_of(trace, 1), "stage")[0]["args"]
-    assert stage["cpu_s"] < 0.02 < 0.03 <= stage["process_cpu_s"]
+    assert stage["cpu_s"] < 0.1 < 0.2 <= stage["process_cpu_s"]
 
 
 def test_a_loop_is_named_by_what_holds_it() -> None:

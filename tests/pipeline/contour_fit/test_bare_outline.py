@@ -35,14 +35,14 @@ def at_outline(cells: np.ndarray) -> np.ndarray:
     return cells[row.astype(int), column.astype(int)]
 
 
-def test_smooth_skin_is_a_skull() -> None:
-    cells = bare_cells(ball(), np.ones((SIZE, SIZE), np.float32), PX_PER_MM)
+def test_smooth_skin_is_a_skull_and_hair_as_light_as_skin_is_none() -> None:
+    light = np.ones((SIZE, SIZE), np.float32)
+    cells = bare_cells(ball(), light, PX_PER_MM)
     assert at_outline(cells).all()
     assert not cells[MIDDLE // CELL_PX, MIDDLE // CELL_PX]  # far from any outline
-
-
-def test_hair_as_light_as_skin_is_no_skull() -> None:
-    assert not at_outline(bare_cells(ball(tufts_mm=2.5), np.ones((SIZE, SIZE), np.float32), PX_PER_MM)).any()
+    assert not at_outline(bare_cells(ball(tufts_mm=2.5), light, PX_PER_MM)).any()
+    no_subject = signed_distance(np.zeros((SIZE, SIZE), bool))
+    assert not bare_cells(no_subject, light, PX_PER_MM).any()
 
 
 def test_smooth_hair_is_no_skull() -> None:
@@ -52,11 +52,6 @@ def test_smooth_hair_is_no_skull() -> None:
     cells = bare_cells(ball(), skin, PX_PER_MM)
     assert not cells[: (MIDDLE - 20) // CELL_PX].any()
     assert cells[(MIDDLE + 40) // CELL_PX :].any()
-
-
-def test_a_view_without_a_subject_has_none() -> None:
-    empty = signed_distance(np.zeros((40, 60), bool))
-    assert not bare_cells(empty, np.ones((40, 60), np.float32), PX_PER_MM).any()
 
 
 @pytest.fixture(scope="module")

@@ -48,14 +48,10 @@ def test_opposites_and_weights_at_their_limit_are_doubtful(weights: dict[str, fl
 
 
 @pytest.mark.slow
-def test_a_smile_is_named_and_its_weights_are_told(renderer: Renderer) -> None:
+def test_a_smile_is_named_its_weights_are_told_and_a_neutral_face_makes_none(renderer: Renderer) -> None:
     found = {each.name: each for each in found_in(load_model(), WEIGHTS, renderer)}
     for name, weight in WEIGHTS.items():
         assert found[name].weight == pytest.approx(weight, abs=0.15), name  # three of its deviations
     spurious = [each for name, each in found.items() if name not in WEIGHTS and each.weight > 0.25]
     assert spurious == []
-
-
-@pytest.mark.slow
-def test_a_neutral_face_is_said_to_make_none(renderer: Renderer) -> None:
     assert [each for each in found_in(load_model(), {}, renderer) if each.weight > 0.1] == []

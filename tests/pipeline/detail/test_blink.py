@@ -75,19 +75,14 @@ def test_a_model_that_does_not_blink_says_nothing_of_lids() -> None:
     assert not blink_shift(fit, model, {}).any()
 
 
-def test_lids_that_the_found_face_shows_apart_are_not_closed(model: HeadModel) -> None:
-    """The photographs show no white between them, and the points lie as if they were closed."""
+def test_lids_lie_as_the_found_face_shows_them(model: HeadModel) -> None:
     fit = fit_of(model)
+    # No white between them, and the points lie as if they were closed.
     surface = points_of(model, with_lids(fit, model, {"left": 1.0}))
     apart = {"left": EyeEvidence(0.0, 0.01, 5, opening=0.2)}
     lids, unexplained = estimate_eyelid_closure(fit, model, head_of(model, fit), surface, apart)
-    assert lids["left"] == 0.5
-    assert not unexplained
-
-
-def test_lids_that_the_found_face_shows_together_are_closed(model: HeadModel) -> None:
-    """Dark lashes, and points that say that the model's blink does not fit."""
-    fit = fit_of(model)
+    assert (lids["left"], unexplained) == (0.5, frozenset())
+    # Dark lashes, and points that say that the model's blink does not fit.
     together = {"left": EyeEvidence(0.1, 0.3, 5, opening=0.04)}
     _, unexplained = estimate_eyelid_closure(fit, model, head_of(model, fit), points_of(model, fit), together)
     assert unexplained == {"left"}

@@ -39,6 +39,7 @@ def test_planted_weights_are_read_though_the_fit_lacks_most_eigenheads(model: He
         # The prior takes up to TAIL / (w + median) of a variance off: 0.1 of a weight that is known to 0.15.
         assert found[name] == pytest.approx(weight, abs=0.12), name
     assert sum(weight for name, weight in found.items() if name not in FACE) < 0.3
+    assert max(weights_of(model, read(model, {})).values()) < 0.1
 
 
 def test_what_a_head_has_of_other_eigenheads_is_no_expression(model: HeadModel) -> None:
@@ -47,10 +48,6 @@ def test_what_a_head_has_of_other_eigenheads_is_no_expression(model: HeadModel) 
         return sum(abs(weight - FACE.get(name, 0.0)) for name, weight in found.items())
 
     assert off(None) < 0.5 * off(EIGENHEADS)
-
-
-def test_a_neutral_surface_is_told_no_expression(model: HeadModel) -> None:
-    assert max(weights_of(model, read(model, {})).values()) < 0.1
 
 
 def test_weights_carry_their_deviations_and_nothing_else_changes(model: HeadModel) -> None:

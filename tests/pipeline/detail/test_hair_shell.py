@@ -39,12 +39,17 @@ def test_hair_is_covered_and_skin_stays(capped: tuple[Mesh, Mesh, np.ndarray]) -
     assert np.median(made.height_mm[top]) == pytest.approx(HAIR_MM - HEAD_MM, abs=1.0)
 
 
-def test_no_vertex_lies_inside_the_skin(capped: tuple[Mesh, Mesh, np.ndarray]) -> None:
+def test_no_vertex_lies_inside_the_skin_and_a_head_without_hair_is_the_head(
+    capped: tuple[Mesh, Mesh, np.ndarray],
+) -> None:
     head, bust, part = capped
     sunk = Mesh(bust.vertices * np.where(part == Part.HAIR, 1.0, 0.97)[:, None], bust.faces)
     made = hair_shell(head, sunk, part)
     inner = HEAD_MM * np.cos(np.radians(2.5))  # the middle of the ball's triangles
     assert np.linalg.norm(made.vertices_world, axis=1).min() > inner
+    bald = hair_shell(head, bust, np.zeros_like(part))
+    np.testing.assert_array_equal(bald.vertices_world, head.vertices)
+    assert bald.covered == 1.0
 
 
 def test_hair_that_hangs_beside_the_head_is_not_reached(capped: tuple[Mesh, Mesh, np.ndarray]) -> None:
@@ -55,10 +60,3 @@ def test_hair_that_hangs_beside_the_head_is_not_reached(capped: tuple[Mesh, Mesh
     made = hair_shell(head, both, np.concatenate([part, np.full(len(hanging), Part.HAIR, np.uint8)]))
     assert made.covered < MIN_COVERED
     assert np.linalg.norm(made.vertices_world, axis=1).max() < 1.1 * HAIR_MM
-
-
-def test_a_head_without_hair_is_the_head(capped: tuple[Mesh, Mesh, np.ndarray]) -> None:
-    head, bust, part = capped
-    made = hair_shell(head, bust, np.zeros_like(part))
-    np.testing.assert_array_equal(made.vertices_world, head.vertices)
-    assert made.covered == 1.0

@@ -56,11 +56,15 @@ def test_a_share_of_the_points_deviation_stays_however_many_they_are() -> None:
         np.testing.assert_allclose(added[side], 0.25 * factor * NOISE_MM, rtol=0.02)
 
 
-def test_the_result_repeats_to_the_bit() -> None:
+def test_the_result_repeats_to_the_bit_and_without_points_nothing_moves() -> None:
     surface = ellipsoid_points(np.random.default_rng(0), AXES_MM, NOISE_MM, 10_000)
     first, second = drawn(surface)[2], drawn(surface)[2]
     np.testing.assert_array_equal(first.vertices, second.vertices)
     np.testing.assert_array_equal(first.deviation_mm, second.deviation_mm)
+    none = SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.uint8))
+    vertices, _, found = drawn(none)
+    np.testing.assert_array_equal(found.vertices, vertices)
+    assert np.isfinite(found.deviation_mm).all()
 
 
 def test_outliers_do_not_pull() -> None:
@@ -98,13 +102,6 @@ def test_hair_bounds_and_does_not_pull() -> None:
         off = np.linalg.norm(found.vertices, axis=1) - radius
         assert -0.6 < off.min() <= off.max() < 0.15
         assert not found.observed.any()
-
-
-def test_without_points_nothing_moves() -> None:
-    none = SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.uint8))
-    vertices, _, found = drawn(none)
-    np.testing.assert_array_equal(found.vertices, vertices)
-    assert np.isfinite(found.deviation_mm).all()
 
 
 def test_thinning_keeps_parts_and_sides_apart() -> None:

@@ -10,27 +10,17 @@ from tests.support.subdivided_spheres import RADIUS_MM, subdivided_sphere
 LENGTH_MM = 20.0
 
 
-@pytest.fixture(scope="module")
-def covariance() -> tuple[np.ndarray, np.ndarray]:
-    """Node places and the field's covariance on 2,562 nodes (edges of 10 mm)."""
+def test_variance_and_correlation_are_those_of_a_matern_field_on_a_sphere() -> None:
     vertices, _, nodes = subdivided_sphere()
-    places = nodes.fine.shape @ vertices
-    field = smooth_field(places, nodes.fine.faces, LENGTH_MM)
-    return places, np.linalg.inv(field.precision().toarray())
-
-
-def test_the_variance_is_that_of_the_equation_on_a_sphere(covariance: tuple[np.ndarray, np.ndarray]) -> None:
+    places = nodes.fine.shape @ vertices  # 2,562, with edges of 10 mm
+    matrix = np.linalg.inv(smooth_field(places, nodes.fine.faces, LENGTH_MM).precision().toarray())
     # In spherical harmonics: sum of (2 l + 1) / (4 pi R^2) / (tau^2 (kappa^2 + l (l + 1) / R^2)^2), tau^2 = L^2 / 4 pi;
     # 1.02 here, since R is only four lengths. Edges of half a length add a few per cent.
     degree = np.arange(2000)
     spectrum = (LENGTH_MM**-2 + degree * (degree + 1) / RADIUS_MM**2) ** -2
     expected = ((2 * degree + 1) * spectrum).sum() / (RADIUS_MM * LENGTH_MM) ** 2
-    assert np.diag(covariance[1]).mean() == pytest.approx(expected, rel=0.06)
-    assert np.ptp(np.diag(covariance[1])) < 0.15
-
-
-def test_correlation_falls_as_that_of_a_matern_field(covariance: tuple[np.ndarray, np.ndarray]) -> None:
-    places, matrix = covariance
+    assert np.diag(matrix).mean() == pytest.approx(expected, rel=0.06)
+    assert np.ptp(np.diag(matrix)) < 0.15
     arc = RADIUS_MM * np.arccos(np.clip(places @ places[0] / RADIUS_MM**2, -1.0, 1.0))
     ring = (arc > 5.0) & (arc < 60.0)
     expected = arc[ring] / LENGTH_MM * k1(arc[ring] / LENGTH_MM)

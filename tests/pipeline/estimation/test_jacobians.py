@@ -38,7 +38,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import FittingSettings
 from pipeline.view_checks.camera_drift import ShiftEquations, ShiftTerm
 from rig.geometry import Similarity, rotation_from_vector
-from tests.support.board_sessions import session
+from tests.support.board_sessions import planted, session
 from tests.support.photo_scene import ellipsoid_model
 from tests.support.scenes import fan
 
@@ -81,16 +81,8 @@ def tangency(focal: bool) -> Case:
 def small_bundle() -> tuple[BundleState, Observations]:
     """Three cameras, five shots, the board in motion, some corners off."""
     source, rng = session(cameras=3, shots=5, seed=1), np.random.default_rng(0)
-    d = source.detections
-    state = BundleState(
-        np.stack([camera.intrinsics.values() for camera in source.rig]),
-        np.stack([camera.camera_from_world.rotation for camera in source.rig]),
-        np.stack([camera.camera_from_world.translation for camera in source.rig]),
-        np.stack([source.poses[shot].rotation for shot in d.shots]),
-        np.stack([source.poses[shot].translation for shot in d.shots]),
-        np.zeros(3),
-        rng.normal(size=(5, 6)) * [0.01, 0.01, 0.01, 10, 10, 10],
-    )
+    d, velocities = source.detections, rng.normal(size=(5, 6)) * [0.01, 0.01, 0.01, 10, 10, 10]
+    state = replace(planted(source), velocities=velocities)
     return state, observations(d.views, source.rig.names, d.shots, d.board)
 
 

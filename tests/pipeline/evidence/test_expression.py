@@ -27,7 +27,9 @@ def posed() -> tuple[HeadModel, Fit, Mesh]:
     return model, fit, Mesh(PLACE.apply(model.vertices(z)), model.levels["full"].faces)
 
 
-def test_a_report_names_what_is_strong_and_sure(posed: tuple[HeadModel, Fit, Mesh]) -> None:
+def test_a_report_names_what_is_strong_and_sure_or_what_the_finished_surface_tells(
+    posed: tuple[HeadModel, Fit, Mesh],
+) -> None:
     model, fit, _ = posed
     found = found_expressions(model, fit)
     assert [(each.words, round(each.weight, 6)) for each in found] == [
@@ -35,10 +37,6 @@ def test_a_report_names_what_is_strong_and_sure(posed: tuple[HeadModel, Fit, Mes
         ("mouth corner puller", 0.3),
     ]
     assert found[0].std == pytest.approx(0.1)
-
-
-def test_a_weight_must_be_surer_unless_the_finished_surface_tells_it(posed: tuple[HeadModel, Fit, Mesh]) -> None:
-    model, fit, _ = posed
     z = np.zeros(len(fit.coefficients))
     z[model.posed.start + model.expressions.names.index("browInnerUp")] = 0.15  # one and a half deviations
     unsure = replace(fit, coefficients=z)
@@ -55,16 +53,14 @@ def test_closed_eyes_blink(posed: tuple[HeadModel, Fit, Mesh]) -> None:
     assert shut_eyes(model, shut) == {"right"}
 
 
-def test_without_its_expression_a_head_is_neutral(posed: tuple[HeadModel, Fit, Mesh]) -> None:
+def test_without_its_expression_a_head_is_neutral_and_the_morphs_give_it_back(
+    posed: tuple[HeadModel, Fit, Mesh],
+) -> None:
     model, fit, mesh = posed
     neutral = neutral_mesh(model, PLACE, mesh, found_expressions(model, fit))
     taken_back = {"jawOpen": WEIGHTS["jawOpen"]}  # the least weights stay
     truth = PLACE.apply(model.posed_vertices(fit.coefficients[:4], taken_back))
     np.testing.assert_allclose(neutral.vertices, truth, atol=1e-3)
-
-
-def test_the_morphs_give_the_photographed_head_back(posed: tuple[HeadModel, Fit, Mesh]) -> None:
-    model, fit, mesh = posed
     head = build_blendshape_rig(model, PLACE, mesh, found_expressions(model, fit))
     assert len(head.morphs) == 53  # Apple's, and the puller that has no counterpart among them
     assert head.missing == ("tongueOut",)

@@ -33,17 +33,13 @@ def test_the_far_pupil_distance_is_the_same_wherever_the_eyes_look(target: tuple
     assert found.value_mm == pytest.approx(62.5)
 
 
-def test_its_deviation_is_that_of_both_centres_and_gazes() -> None:
-    found = pupil_distance(looking_at((0.0, 0.0, 1e9)))
+def test_its_deviation_is_that_of_both_centres_and_gazes_and_it_needs_both_eyes() -> None:
+    eyes = looking_at((0.0, 0.0, 1e9))
+    found = pupil_distance(eyes)
     assert found is not None
     assert found.std_mm == pytest.approx(np.hypot(0.1, BEHIND_MM * np.radians(1.0)) * 2**0.5, rel=1e-3)
-
-
-def test_no_pupil_distance_where_an_eye_is_not_seen() -> None:
-    eyes = looking_at((0.0, 0.0, 1e9)) | {"left": UnseenEye("closed")}
-    assert pupil_distance(eyes) is None
-    assert pupils(eyes) == {}
-    assert pupils({}) == {}
+    one = eyes | {"left": UnseenEye("closed")}
+    assert (pupil_distance(one), pupils(one), pupils({})) == (None, {}, {})
 
 
 def test_angles_are_to_the_left_and_up() -> None:

@@ -60,15 +60,12 @@ def test_standard_deviations_are_those_of_drawn_parameters(model: HeadModel) -> 
     assert found.value_mm == pytest.approx(breadth.mean(), rel=0.002)
 
 
-def test_a_rigid_motion_moves_landmarks_but_no_measurement(model: HeadModel) -> None:
+def test_a_rigid_motion_moves_landmarks_but_no_measurement_as_an_uncertain_scale_does(model: HeadModel) -> None:
     rigid = covariance()
     rigid[:COUNT] = rigid[:, :COUNT] = rigid[-1] = rigid[:, -1] = 0.0
     fit = fit_at(np.zeros(SIZE), rigid)
     assert all(m.std_mm is not None and m.std_mm < 1e-6 for m in measurements(model, fit).values())
     assert all(p.std_mm is not None and p.std_mm.min() > 0.01 for p in landmarks(model, fit).values())
-
-
-def test_an_uncertain_scale_is_uncertain_lengths(model: HeadModel) -> None:
     scale_only = np.zeros((SIZE, SIZE))
     scale_only[-1, -1] = 0.01**2
     for measurement in measurements(model, fit_at(np.zeros(SIZE), scale_only)).values():

@@ -29,14 +29,11 @@ def test_a_crop_shows_what_lies_there(size: tuple[int, int], side: float, roll: 
     assert np.abs(shown.reshape(-1, 3)[inside, :2] - expected[inside]).max() < 2.0
 
 
-def test_a_coarse_crop_is_a_mean() -> None:
+def test_a_coarse_crop_is_a_mean_and_what_lies_outside_is_black() -> None:
     checks = (np.add.outer(np.arange(1024), np.arange(1024)) % 2 * 255).astype(np.uint8)
     crop = Crop(np.array([511.5, 511.5]), 800.0, 10.0)
     shown = make_pyramid(np.repeat(checks[..., None], 3, axis=2)).sample(crop, 64)
     assert np.abs(shown.astype(float) - 127.5).max() < 2.0  # single pixels would be 0 and 255
-
-
-def test_outside_the_picture_is_black() -> None:
     white = np.full((100, 100, 3), 255, np.uint8)
     shown = make_pyramid(white).sample(Crop(np.array([0.0, 50.0]), 50.0, 0.0), 50)
     assert shown[:, :20].max() == 0

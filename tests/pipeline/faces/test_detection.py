@@ -38,14 +38,11 @@ def test_small_and_large_faces_are_found(networks: FaceNetworks, scale: float) -
     assert np.abs(face.landmarks_px[[33, 263]] - corners).max() < 0.03 * face.size_px
 
 
-def test_a_face_of_a_twentieth_of_a_picture_is_found(networks: FaceNetworks) -> None:
+def test_a_face_of_a_twentieth_of_a_picture_is_found_and_two_faces_are_two(networks: FaceNetworks) -> None:
     middle = (300.0, 600.0)
     image = drawn_face(1000, 800, (middle,), scale=0.24)
     (face,) = find_faces(image, networks)
     assert np.abs(face.landmarks_px.mean(axis=0) - middle).max() < 0.3 * face.size_px
-
-
-def test_two_faces_are_two(networks: FaceNetworks) -> None:
     image = drawn_face(900, 480, ((220.0, 240.0), (660.0, 240.0)))
     faces = find_faces(image, networks)
     middles = sorted(float(face.landmarks_px[:, 0].mean()) for face in faces)
@@ -60,15 +57,12 @@ def test_results_are_the_same_byte_for_byte(networks: FaceNetworks) -> None:
 
 
 @pytest.mark.parametrize("grain_px", [0, 4, 16])
-def test_noise_is_no_face(networks: FaceNetworks, grain_px: int) -> None:
+def test_noise_a_tiny_and_a_narrow_picture_hold_no_face(networks: FaceNetworks, grain_px: int) -> None:
+    for shape in ((8, 8, 3), (900, 30, 3)):
+        assert find_faces(np.full(shape, 128, np.uint8), networks) == ()
     rng = np.random.default_rng(grain_px)
     cells = rng.uniform(0, 255, (480 // max(grain_px, 1), 640 // max(grain_px, 1), 3)).astype(np.uint8)
     assert find_faces(np.kron(cells, np.ones((max(grain_px, 1), max(grain_px, 1), 1), np.uint8)), networks) == ()
-
-
-def test_a_tiny_and_a_narrow_picture_hold_no_face(networks: FaceNetworks) -> None:
-    assert find_faces(np.full((8, 8, 3), 128, np.uint8), networks) == ()
-    assert find_faces(np.full((900, 30, 3), 128, np.uint8), networks) == ()
 
 
 def test_a_place_without_a_face_has_a_low_score(networks: FaceNetworks) -> None:

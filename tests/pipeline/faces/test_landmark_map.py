@@ -25,38 +25,32 @@ def of_model(model: HeadModel) -> LandmarkMap:
     return landmark_map(model)
 
 
-def test_the_shipped_model_has_a_measured_map(model: HeadModel, of_model: LandmarkMap) -> None:
+def test_the_shipped_model_has_a_measured_map_whose_jaw_line_and_forehead_slide(
+    model: HeadModel, of_model: LandmarkMap
+) -> None:
     assert (of_model.rows == built_in_map("makehuman").rows).all()
     np.testing.assert_allclose(of_model.weights.sum(axis=1), 1.0, atol=1e-9)
     assert of_model.weights.min() > -1e-6
     assert not of_model.rows.flags.writeable
-
-
-def test_points_lie_on_the_landmarks_that_they_are(model: HeadModel, of_model: LandmarkMap) -> None:
-    head = model.vertices(np.zeros(0))
-    points = of_model.points(head)
-    for index, name in NAMED.items():
-        assert np.linalg.norm(points[index] - head[model.landmarks[name]]) < NEAR_MM, name
-
-
-def test_points_move_with_the_head(model: HeadModel, of_model: LandmarkMap) -> None:
-    head = model.vertices(np.array([1.0, -0.5, 2.0]))
-    np.testing.assert_allclose(of_model.points(2.0 * head + 5.0), 2.0 * of_model.points(head) + 5.0)
-    np.testing.assert_allclose(of_model.expected(head), of_model.points(head) + of_model.offset_mm)
-
-
-def test_the_two_halves_are_alike(model: HeadModel, of_model: LandmarkMap) -> None:
-    points = of_model.points(model.vertices(np.zeros(0)))
-    mirrored = points[point_table().mirror_images] * (-1.0, 1.0, 1.0)
-    # The mean head's own halves, and triangles that are not each other's mirror image, leave some of a millimetre.
-    assert np.median(np.linalg.norm(points - mirrored, axis=1)) < 0.5
-
-
-def test_jaw_line_and_forehead_slide_and_eyes_and_nose_do_not(of_model: LandmarkMap) -> None:
     assert not of_model.slides[[33, 133, 362, 263, 1, 168, 61, 291]].any()
     jaw = [172, 136, 150, 149, 176, 148, 377, 400, 378, 379, 365, 397]
     assert of_model.slides[jaw].mean() > 0.5
     assert of_model.slides.mean() < 0.4
+
+
+def test_points_lie_on_their_landmarks_halves_are_alike_and_they_move_with_the_head(
+    model: HeadModel, of_model: LandmarkMap
+) -> None:
+    head = model.vertices(np.zeros(0))
+    points = of_model.points(head)
+    for index, name in NAMED.items():
+        assert np.linalg.norm(points[index] - head[model.landmarks[name]]) < NEAR_MM, name
+    mirrored = points[point_table().mirror_images] * (-1.0, 1.0, 1.0)
+    # The mean head's own halves, and triangles that are not each other's mirror image, leave some of a millimetre.
+    assert np.median(np.linalg.norm(points - mirrored, axis=1)) < 0.5
+    head = model.vertices(np.array([1.0, -0.5, 2.0]))
+    np.testing.assert_allclose(of_model.points(2.0 * head + 5.0), 2.0 * of_model.points(head) + 5.0)
+    np.testing.assert_allclose(of_model.expected(head), of_model.points(head) + of_model.offset_mm)
 
 
 def test_covariance_adds_what_is_shared_to_what_is_not(of_model: LandmarkMap) -> None:

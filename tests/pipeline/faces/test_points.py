@@ -8,13 +8,10 @@ from rig.geometry import rotation_from_vector, vector_from_rotation
 MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
-def test_mirror_images_are_each_others() -> None:
+def test_mirror_images_are_each_others_in_shape_normals_and_bias() -> None:
     pairs = point_table().mirror_images
     assert (pairs[pairs] == np.arange(468)).all()
     assert (pairs[[33, 133, 61, 1, 10, 152]] == [263, 362, 291, 1, 10, 152]).all()
-
-
-def test_shape_normals_and_bias_are_symmetric() -> None:
     table, direction = point_table(), np.array([0.5, 0.3, np.sqrt(1 - 0.34)])
     mirrored = table.mirror_images
     np.testing.assert_allclose(table.shape_mm, table.shape_mm[mirrored] * MIRROR, atol=1e-4)

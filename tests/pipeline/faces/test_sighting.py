@@ -23,25 +23,14 @@ def glance(pictures: Mapping[str, ImageRgb], networks: FaceNetworks, rig: Rig | 
     return sight_face(find_subject(pictures, cameras, networks, effort=GLANCE), cameras, front=cameras.names[0])
 
 
-def test_nobody_blames_a_camera_behind_the_head(networks: FaceNetworks) -> None:
-    seen = glance(drawn_pictures(0.0), networks)
-    assert seen.is_found
-    assert seen.missing == ()
-    assert seen.left_deg == pytest.approx(0.0, abs=4.0)
-    assert seen.up_deg == pytest.approx(0.0, abs=6.0)  # a drawn head is no member of a population
-
-
-def test_a_face_that_looks_aside_is_told_by_how_much(networks: FaceNetworks) -> None:
-    seen = glance(drawn_pictures(25.0), networks)
-    assert seen.left_deg == pytest.approx(25.0, abs=5.0)
-    assert seen.missing == ()
-
-
-def test_a_face_that_looks_up_is_told(networks: FaceNetworks) -> None:
-    straight, up = (glance(drawn_pictures(0.0, angle), networks) for angle in (0.0, 20.0))
-    assert straight.up_deg is not None
-    assert up.up_deg is not None
-    assert up.up_deg - straight.up_deg == pytest.approx(20.0, abs=6.0)
+def test_where_a_face_looks_is_told_and_nobody_blames_a_camera_behind_the_head(networks: FaceNetworks) -> None:
+    straight, aside, up = (glance(drawn_pictures(*turn), networks) for turn in ((0.0,), (25.0,), (0.0, 20.0)))
+    assert straight.is_found
+    assert straight.missing == aside.missing == ()
+    assert straight.left_deg == pytest.approx(0.0, abs=4.0)
+    assert straight.up_deg == pytest.approx(0.0, abs=6.0)  # a drawn head is no member of a population
+    assert aside.left_deg == pytest.approx(25.0, abs=5.0)
+    assert up.up_deg == pytest.approx((straight.up_deg or 0.0) + 20.0, abs=6.0)
 
 
 def test_a_camera_that_should_show_the_face_and_does_not_is_named(networks: FaceNetworks) -> None:
@@ -66,7 +55,7 @@ def test_a_ring_has_no_front() -> None:
     assert has_front(default_layout())
 
 
-def test_pixels_go_back_to_the_files_picture() -> None:
+def test_pixels_go_back_to_the_files_picture_and_through_the_lens_of_an_undistorted_one() -> None:
     lens = Intrinsics(1600, 1200, 1500.0, 1500.0, 799.5, 599.5)
     camera = Camera("cam0", lens, RigidTransform(np.eye(3), np.zeros(3)))
     image, small = reduce_picture(np.zeros((1200, 1600, 3), np.uint8), camera, 640)
@@ -75,9 +64,6 @@ def test_pixels_go_back_to_the_files_picture() -> None:
     np.testing.assert_allclose(file_pixels(small.project(point), small, camera), camera.project(point), atol=1e-9)
     same, unchanged = reduce_picture(image, small, 640)
     assert (same is image, unchanged is small) == (True, True)
-
-
-def test_pixels_of_an_undistorted_picture_go_back_through_the_lens() -> None:
     lens, recorded = Intrinsics(1600, 1200, 900.0, 900.0, 799.5, 599.5), RecordedLens("kannala-brandt", (0.1, 0, 0, 0))
     camera = Camera("cam0", lens, RigidTransform(np.eye(3), np.zeros(3)), recorded=recorded)
     pixels = np.array([[700.0, 900.0], [1200.0, 100.0]])

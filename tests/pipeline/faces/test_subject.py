@@ -111,16 +111,11 @@ def test_a_few_views_are_enough(networks: FaceNetworks, pictures: dict[str, Imag
     assert_on_eyes(found.matched.points_world, 15.0)
 
 
-def test_pictures_without_a_face_have_none(networks: FaceNetworks) -> None:
+def test_pictures_without_a_face_have_none_and_no_pictures_neither(networks: FaceNetworks) -> None:
     rig = studio()
     empty = {c.name: np.full((c.intrinsics.height, c.intrinsics.width, 3), 120, np.uint8) for c in rig}
     found = find_subject(empty, rig, networks)
-    assert found.matched is None
-    assert found.expected == ()
-    assert not any(found.found.values())
-
-
-def test_without_pictures_nobody_is_found(networks: FaceNetworks) -> None:
+    assert (found.matched, found.expected, any(found.found.values())) == (None, (), False)
     found = find_subject({}, studio(), networks)
     assert (dict(found.found), found.matched, found.expected) == ({}, None, ())
 

@@ -108,10 +108,7 @@ def test_noise_grows_with_the_angle() -> None:
     assert view_noise_px(300.0, FACE, RIG["cam3"]) > 1.5 * view_noise_px(300.0, FACE, RIG["cam0"])
 
 
-def test_one_view_determines_nothing() -> None:
+def test_one_view_determines_nothing_and_results_are_the_same_byte_for_byte() -> None:
     assert triangulate_face({"cam0": seen(0.0)["cam0"]}, RIG) is None
-
-
-def test_results_are_the_same_byte_for_byte() -> None:
     first, second = triangulated(seen(1.0)), triangulated(seen(1.0))
     assert first.points.positions_world.tobytes() == second.points.positions_world.tobytes()

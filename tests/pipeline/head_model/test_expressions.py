@@ -21,10 +21,6 @@ from pipeline.head_model.model_names import model_path
 from rig.errors import InputError
 
 
-def test_apples_names_are_52() -> None:
-    assert len(set(ARKIT)) == 52
-
-
 @pytest.mark.parametrize(
     ("name", "said"),
     [
@@ -38,7 +34,8 @@ def test_names_are_said_in_words(name: str, said: str) -> None:
     assert words(name) == said
 
 
-def test_a_shape_that_apple_does_not_part_is_both_sides() -> None:
+def test_apples_names_are_52_and_a_shape_that_they_do_not_part_is_both_sides() -> None:
+    assert len(set(ARKIT)) == 52
     parts = arkit_parts(("browDown_L", "cheekPuff_R", "cheekPuff_L", "browInnerUp_L"))
     assert (parts["browDownLeft"], parts["cheekPuff"], parts["browInnerUp"], parts["jawOpen"]) == ((0,), (2, 1), (), ())
 
@@ -103,11 +100,8 @@ def test_weights_are_read_in_either_manner_and_every_fault_is_named() -> None:
     assert "near are jawOpen" in fault.value.faults[0].text
 
 
-def test_what_moves_no_skin_is_no_expression() -> None:
+def test_what_moves_no_skin_is_no_expression_and_blinks_close_their_own_eye() -> None:
     shapes = np.zeros((2, 5, 3), np.float32)
     shapes[1, 2, 0] = 3.0
     assert visible(Expressions(("tongueOut", "jawOpen"), shapes)).names == ("jawOpen",)
-
-
-def test_blinks_close_their_own_eye() -> None:
     assert closed_lids({"eyeBlink_L": 0.7, "jawOpen": 1.0}) == {"right": 0.0, "left": 0.7}

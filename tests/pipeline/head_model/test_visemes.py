@@ -17,9 +17,7 @@ def test_the_fifteen_are_mixtures_of_apples_shapes() -> None:
         assert set(mixture) <= set(ARKIT)
         assert all(0.0 < weight <= 1.0 for weight in mixture.values())
     assert not VISEMES["viseme_sil"]
-
-
-def test_a_mixture_leaves_out_what_a_model_lacks() -> None:
+    # What a model lacks is left out.
     shapes = {"jawOpen": np.full((4, 3), 2.0)}
     np.testing.assert_allclose(mixed(shapes, VISEMES["viseme_TH"]), 0.24)
 

@@ -36,13 +36,10 @@ def inside(count: int = 500) -> np.ndarray:
     return np.random.default_rng(2).uniform((0.0, 0.0), (WIDTH - INSIDE, HEIGHT - INSIDE), (count, 2))
 
 
-def test_reading_is_scipy_s() -> None:
+def test_reading_is_scipy_s_and_beyond_the_image_its_border_is_read() -> None:
     np.testing.assert_allclose(_read(IMAGE, inside()), expected(inside()), atol=1e-13)
     whole = np.stack(np.meshgrid(np.arange(WIDTH - 1.0), np.arange(HEIGHT - 1.0)), axis=-1).reshape(-1, 2)
     np.testing.assert_array_equal(_read(IMAGE, whole), IMAGE[:-1, :-1].ravel())
-
-
-def test_beyond_the_image_its_border_is_read() -> None:
     places = np.random.default_rng(3).uniform(-5.0, 36.0, (500, 2))
     # A place is held a thousandth of a pixel before the far edge: off by that share of the step between two pixels.
     step = max(np.abs(np.diff(IMAGE, axis=axis)).max() for axis in (0, 1))

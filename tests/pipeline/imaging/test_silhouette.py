@@ -54,15 +54,12 @@ def test_costs_are_symmetric_in_what_differs_and_zero_for_equals(a: np.ndarray, 
     assert boundary_weighted_xor(a, b, weights) == pytest.approx(weights[a != b].sum(), rel=1e-5)
 
 
-def test_a_disc_too_small_costs_the_ring_between() -> None:
+def test_a_disc_too_small_costs_the_ring_between_and_far_mismatch_hardly_counts() -> None:
     # Sum of 1 / d^2 over rings 1 .. 5 px inside a circle of 30 px: 2 pi (30 - d + 1/2) / d^2, 7 % off by pixels.
     observed = disc(30.0)
     expected = sum(2 * np.pi * (30.5 - d) / d**2 for d in range(1, 6))
     cost = boundary_weighted_xor(observed, disc(25.0), boundary_weights(observed))
     assert cost == pytest.approx(expected, rel=0.15)
-
-
-def test_far_mismatch_hardly_counts() -> None:
     observed = disc(40.0)
     weights = boundary_weights(observed)
     hole = observed & ~disc(10.0)

@@ -93,9 +93,6 @@ def test_what_determines_no_point_is_said() -> None:
     twins = Rig((camera("a", [0.0, 0.0, 1000.0]), camera("b", [0.0, 0.0, 1000.0])))
     with pytest.raises(NoPoint, match="parallel"):
         triangulate({"a": np.array([500.0, 300.0]), "b": np.array([500.0, 300.0])}, twins, noise_px=1.0)
-
-
-def test_rays_that_meet_behind_the_cameras_are_refused() -> None:
     eyes = Rig((camera("a", [-100.0, 0.0, 1000.0]), camera("b", [100.0, 0.0, 1000.0])))
     with pytest.raises(NoPoint, match="behind"):
         triangulate({"a": np.array([100.0, 384.0]), "b": np.array([940.0, 384.0])}, eyes, noise_px=1.0)

@@ -11,12 +11,9 @@ from pipeline.part_labels.codes import CHANNELS, Part, codes_from_channels
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def test_the_codes_are_those_of_written_files() -> None:
+def test_the_codes_are_those_of_written_files_and_channels_turn_into_them() -> None:
     """docs/capture-format.md and every bust.ply that was ever written count so."""
     assert [(part.value, part.name) for part in Part] == [(0, "UNSEEN"), (1, "SKIN"), (2, "HAIR"), (3, "CLOTHES")]
-
-
-def test_channels_and_codes_turn_into_each_other() -> None:
     np.testing.assert_array_equal(codes_from_channels(np.array([2, 0, 1, 0])), [3, 1, 2, 1])
     assert [CHANNELS[part.channel] for part in CHANNELS] == list(CHANNELS)
     with pytest.raises(ValueError, match="not in tuple"):

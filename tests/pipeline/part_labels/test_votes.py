@@ -36,7 +36,7 @@ def part_map(camera: Camera, border_mm: float) -> PartMap:
     return PartMap(camera.name, 255 * np.stack([~hair, hair, np.zeros_like(hair)], axis=-1).astype(np.uint8))
 
 
-def test_cells_say_what_most_of_their_pixels_show() -> None:
+def test_cells_say_what_most_of_their_pixels_show_and_a_view_without_parts_does_not_vote() -> None:
     rig = Rig((wall_camera("a", 0.0), wall_camera("b", 6.0)))
     maps = [seen_wall(camera) for camera in rig]
     votes = vote_parts(maps, {camera.name: part_map(camera, 0.0) for camera in rig}, rig)
@@ -48,11 +48,6 @@ def test_cells_say_what_most_of_their_pixels_show() -> None:
     np.testing.assert_array_equal(part_codes(votes, points)[clear], expected[clear])
     beyond = np.array([[-500.0, 0.0, 0.0], [28.0, 3.0, 40.0]])  # no cell holds them: the nearest one says
     np.testing.assert_array_equal(part_codes(votes, beyond), [Part.SKIN, Part.HAIR])
-
-
-def test_a_view_without_parts_does_not_vote() -> None:
-    rig = Rig((wall_camera("a", 0.0), wall_camera("b", 6.0)))
-    maps = [seen_wall(camera) for camera in rig]
     assert vote_parts(maps, {}, rig) is None
     votes = vote_parts(maps, {"b": part_map(rig["b"], 0.0)}, rig)
     assert votes is not None

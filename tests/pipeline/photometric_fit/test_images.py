@@ -22,10 +22,7 @@ def test_slow_shading_goes_and_fine_texture_stays() -> None:
         np.testing.assert_allclose(left, kept * waves(length_px)[MIDDLE], atol=0.15)
 
 
-def test_a_bright_wall_behind_the_head_leaves_no_trace() -> None:
+def test_a_bright_wall_behind_the_head_leaves_no_trace_and_no_subject_no_texture() -> None:
     dark, bright = (np.where(INSIDE, 100.0 + waves(6.0), wall).astype(np.float32) for wall in (0.0, 250.0))
     np.testing.assert_array_equal(without_shading(dark, INSIDE, SIGMA_PX), without_shading(bright, INSIDE, SIGMA_PX))
-
-
-def test_where_no_subject_is_there_is_no_texture() -> None:
     assert not without_shading(waves(6.0), np.zeros_like(INSIDE), SIGMA_PX).any()

@@ -15,7 +15,7 @@ from pipeline.head_model.model import load_model
 from pipeline.part_labels.codes import Part
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.write import write_result
-from pipeline.settings import BustSettings, OutputSettings, Settings, settings_from_document
+from pipeline.settings import BustSettings, OutputSettings, Settings
 from pipeline.stages.bust import Bust, colour_bust, fuse_depth, push_out_hair, shape_bust
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
@@ -26,7 +26,6 @@ from pipeline.stereo.depth_map import WindowBias
 from pipeline.warnings import Detail
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
-from rig.errors import InputError
 from rig.formats.meshes.ply import read_head_ply
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
@@ -158,9 +157,3 @@ def test_a_head_is_written_pushed_out_to_the_hair(
     assert np.median(height[up]) == pytest.approx(3.0, abs=0.5)
     section = json.loads((tmp_path / "report.json").read_text())["hair"]
     assert section["covered_share"] > 0.95
-
-
-def test_spacing_has_bounds() -> None:
-    assert settings_from_document({"bust": {"spacing_mm": 0.5}}).bust.spacing_mm == 0.5
-    with pytest.raises(InputError, match=r"bust\.spacing_mm is 0\.4, wanted 0\.5 to 3"):
-        settings_from_document({"bust": {"spacing_mm": 0.4}})

@@ -26,14 +26,11 @@ def test_dots_lie_where_the_pinhole_sees_them(centred: bool) -> None:
     assert max(errors) < 0.01
 
 
-def test_a_centred_pinhole_is_known_by_its_field_of_view_alone() -> None:
+def test_a_centred_pinhole_is_known_by_its_field_of_view_alone_and_a_pinholes_picture_stays_as_it_is() -> None:
     pinhole = pinhole_of(WIDE, centred=True)
     assert (pinhole.fx, pinhole.cx, pinhole.cy) == (pinhole.fy, 159.5, 119.5)
     assert pinhole.distortion.is_zero
     assert pinhole.fx == pytest.approx(np.sqrt(260.0 * 268.0))
-
-
-def test_a_pinholes_picture_stays_as_it_is() -> None:
     pinhole = pinhole_of(WIDE)
     picture = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
     assert undistorted_picture(picture, pinhole, pinhole) is picture

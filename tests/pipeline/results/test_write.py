@@ -113,15 +113,13 @@ def test_ply_holds_the_world_mesh_with_its_colours_quality_and_views(folder: Pat
         assert word in comments
 
 
-def test_the_same_result_is_the_same_bytes(folder: Path, scene, tmp_path: Path) -> None:
+def test_the_same_result_is_the_same_bytes_and_other_inputs_or_settings_change_the_comments(
+    folder: Path, scene, tmp_path: Path
+) -> None:
     result, capture = scene
     write_result(tmp_path, replace(result, seconds={"segmentation": 9.0}), capture)
     for file in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "report.json"):
         assert (tmp_path / file.relative_to(folder)).read_bytes() == file.read_bytes(), file.name
-
-
-def test_other_inputs_or_settings_change_the_comments(folder: Path, scene, tmp_path: Path) -> None:
-    result, capture = scene
     write_result(tmp_path / "a", replace(result, digests={"images/cam00.png": "ef" * 32}), capture)
     write_result(tmp_path / "b", replace(result, settings=Settings(method="simplex")), capture)
     headers = [read_vertices(p / "head.ply")[0] for p in (folder, tmp_path / "a", tmp_path / "b")]

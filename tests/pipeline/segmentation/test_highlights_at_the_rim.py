@@ -38,25 +38,17 @@ def test_skin_that_darkens_towards_its_rim_and_its_mixtures_keep_their_alpha() -
             assert abs(alpha_of([tuple(codes.astype(int))] * 2)[0] - true) < 0.07
 
 
-def test_faint_light_on_the_wall_that_begins_softly_is_wall() -> None:
+def test_faint_light_that_begins_softly_is_wall_and_a_lighter_coat_with_a_sharp_edge_is_not() -> None:
     plate = np.full((60, 80, 3), 120.0, np.float32)
     row = np.arange(60.0)[:, None]
     light = 0.06 * np.exp(-0.5 * ((row - 30.0) / 7.0) ** 2)  # as soft as a shadow
-    image = (plate * (1.0 + light[:, :, None])).astype(np.float32)
+    lit, coat = (plate * (1.0 + light[:, :, None])).astype(np.float32), plate.copy()
+    coat[20:, 20:60] *= 1.06
     variance = np.full((60, 80, 3), 1.0, np.float32)
-    chi2 = ((image - plate) ** 2 / variance).sum(axis=2)
-    odds = 0.5 * chi2 - ANY_COLOUR_ODDS
-    assert (odds > 0).any()
-    left, backdrop = find_shadows(image, plate, chi2, variance, odds)
-    assert backdrop[odds > 0].all()
-    assert left[30, 40] < 1.0
-
-
-def test_a_lighter_coat_with_a_sharp_edge_is_no_light_on_the_wall() -> None:
-    plate = np.full((60, 80, 3), 120.0, np.float32)
-    image = plate.copy()
-    image[20:, 20:60] *= 1.06
-    variance = np.full((60, 80, 3), 1.0, np.float32)
-    chi2 = ((image - plate) ** 2 / variance).sum(axis=2)
-    _, backdrop = find_shadows(image, plate, chi2, variance, 0.5 * chi2 - ANY_COLOUR_ODDS)
-    assert not backdrop.any()
+    for image, is_wall in ((lit, True), (coat, False)):
+        chi2 = ((image - plate) ** 2 / variance).sum(axis=2)
+        odds = 0.5 * chi2 - ANY_COLOUR_ODDS
+        assert (odds > 0).any()
+        left, backdrop = find_shadows(image, plate, chi2, variance, odds)
+        assert backdrop[odds > 0].all() == backdrop.any() == is_wall
+        assert (left[30, 40] < 1.0) == is_wall

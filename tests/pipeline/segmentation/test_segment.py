@@ -207,7 +207,7 @@ def test_a_fault_in_one_view_is_named_by_the_others(
         assert silhouettes[other].quality.warnings == ()
 
 
-def test_operator_masks_override_and_need_no_plate(scan: tuple[Capture, Rig]) -> None:
+def test_operator_masks_need_no_plate_and_a_camera_with_neither_is_refused(scan: tuple[Capture, Rig]) -> None:
     capture, rig = scan
     operator_mask = true_mask("cam02")
     backgrounds = {name: plates for name, plates in capture.backgrounds.items() if name != "cam02"}
@@ -216,32 +216,24 @@ def test_operator_masks_override_and_need_no_plate(scan: tuple[Capture, Rig]) ->
     )
     np.testing.assert_array_equal(silhouettes["cam02"].mask, operator_mask)
     assert silhouettes["cam02"].quality.usable
-
-
-def test_a_camera_with_neither_plate_nor_mask_is_refused(scan: tuple[Capture, Rig]) -> None:
-    capture, rig = scan
-    backgrounds = {name: plates for name, plates in capture.backgrounds.items() if name not in ("cam02", "cam04")}
+    del backgrounds["cam04"]
     with pytest.raises(InputError) as caught:
         segment(replace(capture, backgrounds=backgrounds), rig, report=discard_progress)
     assert len(caught.value.faults) == 2
 
 
-@pytest.mark.parametrize(("across_px", "holes"), [(3, 0), (8, 0), (14, 1)])
-def test_a_hole_as_small_as_the_white_of_an_eye_is_filled(across_px: int, holes: int) -> None:
-    """3e-4 of a subject of 240,000 px are 72 px: 8 x 8 are filled, 14 x 14 stay, as between an arm and the body."""
+@pytest.mark.parametrize(
+    ("across_px", "value", "coarse", "holes"),
+    [(3, 0.1, 0.9, 0), (8, 0.1, 0.9, 0), (14, 0.1, 0.9, 1), (28, 0.4, 1.0, 0), (28, 0.4, 0.9, 1)],
+)
+def test_a_hole_is_filled_that_is_small_or_that_the_coarse_level_calls_subject(
+    across_px: int, value: float, coarse: float, holes: int
+) -> None:
+    """3e-4 of a subject of 240,000 px are 72 px: 8 x 8 are filled, as the white of an eye is, and 14 x 14 stay, as
+    between an arm and the body."""
     alpha = np.zeros((600, 700), np.float32)
     alpha[100:500, 50:650] = 1.0
-    alpha[200 : 200 + across_px, 300 : 300 + across_px] = 0.1
-    found, left = _without_specks(alpha, np.full_like(alpha, 0.9))
-    assert left == holes
-    assert (found[205, 305] > 0.5) == (holes == 0)
-
-
-@pytest.mark.parametrize(("coarse", "holes"), [(1.0, 0), (0.9, 1)])
-def test_a_hole_that_the_coarse_level_calls_subject_is_noise(coarse: float, holes: int) -> None:
-    alpha = np.zeros((600, 700), np.float32)
-    alpha[100:500, 50:650] = 1.0
-    alpha[200:240, 300:320] = 0.4
+    alpha[200 : 200 + across_px, 300 : 300 + across_px] = value
     found, left = _without_specks(alpha, np.full_like(alpha, coarse))
     assert left == holes
     assert (found[205, 305] > 0.5) == (holes == 0)

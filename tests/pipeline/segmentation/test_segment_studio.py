@@ -109,14 +109,12 @@ def test_a_smile_is_no_reason_to_doubt_a_view(seed: int, renderer: Renderer) -> 
         assert silhouette.quality.figures["strange_share"] == 0.0
 
 
-def test_the_median_view_of_the_preset(measured: tuple[Measured, Measured, list[str]]) -> None:
-    plates, _, _ = measured
+def test_the_median_view_of_the_preset_with_its_plates_and_without(
+    measured: tuple[Measured, Measured, list[str]],
+) -> None:
+    plates, bare, silent = measured
     assert np.median(plates.iou) >= 0.995
     assert np.median(plates.rms_px) <= 0.35
-
-
-def test_the_preset_without_its_plates(measured: tuple[Measured, Measured, list[str]]) -> None:
-    _, bare, silent = measured
     assert (np.array(bare.iou) >= 0.99).mean() >= 0.9
     assert np.median(bare.rms_px) <= 0.6
     assert silent == []

@@ -74,20 +74,17 @@ def test_evaluations_are_counted_and_the_best_is_never_lost() -> None:
     assert costs == sorted(costs, reverse=True)
 
 
-def test_the_watcher_may_stop_it() -> None:
-    def cancel(evaluations: int, cost: float) -> None:
-        raise Cancelled
-
-    with pytest.raises(Cancelled):
-        minimise(sphere, np.zeros(2), np.ones(2), watch=cancel)
-
-
-def test_the_first_simplex_is_the_paper_s() -> None:
+def test_the_first_simplex_is_the_paper_s_and_the_watcher_may_stop_it() -> None:
     seen: list[np.ndarray] = []
 
     def record(x: np.ndarray) -> float:
         seen.append(x.copy())
         return sphere(x)
 
+    def cancel(evaluations: int, cost: float) -> None:
+        raise Cancelled
+
     minimise(record, np.array([1.0, 2.0]), np.array([3.0, 4.0]), limit=3)
     np.testing.assert_array_equal(seen[:3], [[1.0, 2.0], [4.0, 2.0], [1.0, 6.0]])
+    with pytest.raises(Cancelled):
+        minimise(sphere, np.zeros(2), np.ones(2), watch=cancel)

@@ -142,12 +142,9 @@ def test_every_hole_gets_its_lid() -> None:
     assert lidded(walls, only_above) is walls
 
 
-def test_a_contour_through_pixels_centres_falls_as_a_chessboard() -> None:
+def test_a_contour_through_pixels_centres_falls_as_a_chessboard_and_a_larger_pixel_averages_all_it_covers() -> None:
     rows, columns = np.mgrid[:6, :8]
     np.testing.assert_array_equal(mask_at_scale(np.zeros((6, 8), np.float32), 1.0), (rows + columns) % 2 == 1)
-
-
-def test_a_larger_pixel_averages_all_that_it_covers() -> None:
     distance = np.ones((8, 8), np.float32)
     distance[0, 0] = -100.0
     np.testing.assert_array_equal(mask_at_scale(distance, 0.25), [[True, False], [False, False]])
@@ -201,14 +198,11 @@ def test_vertices_outside_the_picture_have_no_say_and_those_on_its_edge_have() -
     assert face_pixels(mask, np.array([[20.0, 0.0]]), np.array([True])).all()
 
 
-def test_a_stretch_belongs_to_the_face_where_most_of_its_vertices_do() -> None:
+def test_a_stretch_belongs_to_the_face_where_most_of_its_vertices_do_and_to_nobody_without_any() -> None:
     face, other = (40.0, 10.0, True), (40.0, 10.0, False)
     assert outlined(face, face, other).all()
     assert not outlined(face, other).any()
     assert not outlined(face, other, other).any()
-
-
-def test_nothing_speaks_where_no_vertex_is_near_the_outline() -> None:
     speaks = outlined((40.0, 30.0, True))
     assert (speaks.shape, speaks.dtype, speaks.any()) == ((60, 80), bool, False)
 

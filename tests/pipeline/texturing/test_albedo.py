@@ -18,8 +18,8 @@ from rig.mesh import Mesh
 from tests.pipeline.texturing.test_paint import without_neck
 from tests.support.colour_difference import difference_2000, lab_from_srgb
 from tests.support.face_texels import face_texels, texels
-from tests.support.photographs import SCREEN
-from tests.support.scenes import SEMI_AXES, ellipsoid, fan, pattern, pixel_grid, ray_ellipsoid
+from tests.support.photographs import SCREEN, hits
+from tests.support.scenes import ellipsoid, fan, pattern
 
 SKIN = np.array([0.45, 0.30, 0.22])
 LAMPS = {  # towards, its light, even light; the mean over the sphere is 0.95 of each
@@ -36,18 +36,10 @@ def skin(points: np.ndarray) -> np.ndarray:
 def photograph(camera: Camera, lamp: tuple[np.ndarray, float, float]) -> tuple[np.ndarray, np.ndarray]:
     """sRGB codes and mask: matt skin, and a highlight that moves with the camera."""
     towards, strength, even = lamp[0] / np.linalg.norm(lamp[0]), lamp[1], lamp[2]
-    pixels = pixel_grid(camera)
-    depth = ray_ellipsoid(camera, pixels)
-    hit = np.isfinite(depth)
-    rays = camera.rays_world(pixels[hit])
-    points = camera.centre_world + rays * (depth[hit] / (rays @ camera.axis_world))[:, None]
-    normals = points / SEMI_AXES**2
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    half = towards - rays
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    hit, points, normals, mirrored = hits(camera, towards)
     lit = even + strength * np.clip(normals @ towards, 0, None)
-    light = np.tile(np.array(SCREEN), (len(pixels), 1))
-    light[hit] = skin(points) * lit[:, None] + GLOSS * np.clip((normals * half).sum(1), 0, 1)[:, None] ** 120
+    light = np.tile(np.array(SCREEN), (len(hit), 1))
+    light[hit] = skin(points) * lit[:, None] + GLOSS * mirrored[:, None]
     shape = (camera.intrinsics.height, camera.intrinsics.width)
     codes = np.rint(255 * srgb_from_linear(light.reshape(*shape, 3))).astype(np.uint8)
     return codes, hit.reshape(shape)
@@ -96,7 +88,7 @@ def test_the_albedos_of_two_lights_differ_by_less_than_a_third_of_what_the_textu
 
 
 @pytest.mark.slow
-def test_the_albedo_is_the_skins_own_by_the_mean_light(
+def test_the_albedo_is_the_skins_own_by_the_mean_light_which_comes_from_the_lamp(
     mesh: Mesh, layout: Layout, found: dict[str, tuple[Atlas, Albedo, np.ndarray]]
 ) -> None:
     """A lamp that lights a facing white by c is c / 4 over the sphere."""
@@ -111,11 +103,6 @@ def test_the_albedo_is_the_skins_own_by_the_mean_light(
         # The second order leaves 0.036 (rms) of a lamp's cosine: max(0, c) = 1/4 + c/2 + 5/16 P2(c) + ..., and
         # 1/6 - 1/16 - 1/12 - 5/256 = 0.0013. Of 1.8 that is 0.13 of the side that has 0.5, 0.05 of the other: 0.1.
         assert np.std(ratio / np.median(ratio)) < 0.11
-
-
-@pytest.mark.slow
-def test_the_light_comes_from_the_lamp(found: dict[str, tuple[Atlas, Albedo, np.ndarray]]) -> None:
-    for name, (_, albedo, _) in found.items():
         y, z, x = albedo.light.coefficients[1:4].mean(axis=1)
         towards = np.array([x, y, z]) / np.linalg.norm([x, y, z])
         assert towards @ (LAMPS[name][0] / np.linalg.norm(LAMPS[name][0])) > np.cos(np.radians(15))
@@ -140,19 +127,13 @@ def test_a_dim_view_is_the_one_at_its_share_of_the_weight() -> None:
     np.testing.assert_allclose(found, [[0.2] * 3, [0.0] * 3])  # the unseen view is dimmer, and does not count
 
 
-def test_without_a_texture_there_is_a_warning(mesh: Mesh) -> None:
+def test_a_black_face_or_none_with_a_texture_has_no_albedo_and_a_warning(mesh: Mesh, layout: Layout) -> None:
     count = len(mesh.vertices)
-    coloured = Texture(np.full((count, 3), 120, np.uint8), np.ones(count, np.uint8))
-    albedo, warnings = estimate_albedo(mesh, mesh.normals(), coloured, None, np.ones(count, bool), None)
-    assert albedo is None
-    assert [warning.code for warning in warnings] == ["no-albedo"]
-
-
-def test_a_black_face_has_no_albedo_and_a_warning(mesh: Mesh, layout: Layout) -> None:
-    count = len(mesh.vertices)
-    coloured = Texture(np.zeros((count, 3), np.uint8), np.ones(count, np.uint8), dim=np.zeros((count, 3), np.float32))
+    grey = Texture(np.full((count, 3), 120, np.uint8), np.ones(count, np.uint8))
+    black = Texture(np.zeros((count, 3), np.uint8), np.ones(count, np.uint8), dim=np.zeros((count, 3), np.float32))
     atlas = Atlas(layout, np.zeros((64, 64, 3), np.uint8))
     around = Neighbourhood.of(*neighbours(mesh.faces, count))
-    albedo, warnings = estimate_albedo(mesh, mesh.normals(), coloured, atlas, np.ones(count, bool), around)
-    assert albedo is None
-    assert [warning.code for warning in warnings] == ["no-albedo"]
+    for texture_with in ((grey, None), (black, atlas)):
+        albedo, warnings = estimate_albedo(mesh, mesh.normals(), *texture_with, np.ones(count, bool), around)
+        assert albedo is None
+        assert [warning.code for warning in warnings] == ["no-albedo"]

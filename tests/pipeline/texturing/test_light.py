@@ -7,6 +7,7 @@ import trimesh
 from pipeline.texturing.light import RETURNED, fit_light, harmonics, spread_directions, transfer
 from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from rig.mesh import Mesh
+from rig.studio.scene.anatomy import grid_faces
 from tests.support.scenes import ellipsoid
 
 SKIN = np.array([0.45, 0.30, 0.22])
@@ -36,10 +37,7 @@ def test_a_ball_over_the_ground_hides_its_form_factor() -> None:
     side = np.linspace(-100, 100, 41)
     x, y = np.meshgrid(side, side)
     ground = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    corner = (np.arange(40)[:, None] * 41 + np.arange(40)).ravel()
-    faces = np.concatenate(
-        [np.stack([corner, corner + 1, corner + 42], 1), np.stack([corner, corner + 42, corner + 41], 1)]
-    )
+    faces = grid_faces(41, 41, closed=False)[:, ::-1]
     ball = trimesh.creation.icosphere(4, radius=30.0)
     mesh = Mesh(
         np.concatenate([ground, np.asarray(ball.vertices) + (0, 0, 60.0)]),

@@ -14,6 +14,7 @@ from pipeline.texturing.paint import paint_texture, texture_size
 from pipeline.texturing.vertex_colours import Texture, texture
 from rig.colour_space import srgb_from_linear
 from rig.mesh import Mesh
+from tests.support.changed_rigs import relensed
 from tests.support.photographs import Shot, shoot
 from tests.support.scenes import ellipsoid, pattern
 
@@ -91,9 +92,7 @@ def test_the_same_photographs_are_the_same_texels(shot: Shot, layout: Layout, im
 def test_the_size_follows_the_photographs(shot: Shot, layout: Layout) -> None:
     every = np.arange(len(shot.mesh.vertices))
     small = texture_size(layout, shot.mesh, shot.rig, every)
-    finer = type(shot.rig)(
-        tuple(replace(c, intrinsics=replace(c.intrinsics, fx=6 * c.intrinsics.fx)) for c in shot.rig.cameras)
-    )
+    finer = relensed(shot.rig, lambda k: replace(k, fx=6 * k.fx))
     assert small == 1024
     assert texture_size(layout, shot.mesh, finer, every) == 4096
     assert texture_size(layout, shot.mesh, finer, every, wanted=2048) == 2048

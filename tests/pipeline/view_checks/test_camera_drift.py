@@ -1,7 +1,5 @@
 """Moved cameras against planted ones; the subject is a head of the model with hair and a shirt, at half size."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -12,6 +10,7 @@ from pipeline.view_checks.camera_drift import _judge, find_drift
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
+from tests.support.changed_rigs import reposed
 from tests.support.silhouette_subjects import dressed_head
 from tests.support.spoilt_captures import close_up, loosened
 
@@ -38,11 +37,7 @@ def seen(renderer, subject):
 
 def bumped(rig: Rig, name: str, turn_deg: np.ndarray) -> Rig:
     turn = RigidTransform(rotation_from_vector(np.radians(turn_deg)), np.zeros(3))
-    moved = [
-        replace(camera, camera_from_world=turn @ camera.camera_from_world) if camera.name == name else camera
-        for camera in rig
-    ]
-    return Rig(tuple(moved))
+    return reposed(rig, lambda pose: turn @ pose, name)
 
 
 @pytest.mark.gl

@@ -110,9 +110,8 @@ def test_a_mask_may_end_anywhere(heads, renderer, name, factor):
 
 def halved(silhouette, factor):
     height, width = silhouette.mask.shape
-    small = cv2.resize(
-        silhouette.mask.view(np.uint8), (int(width * factor), int(height * factor)), interpolation=cv2.INTER_NEAREST
-    )
+    size = int(width * factor), int(height * factor)
+    small = cv2.resize(silhouette.mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     return silhouette_from_mask(small.view(bool))
 
 
@@ -129,7 +128,7 @@ def test_one_wrong_mask_moves_no_crossing(heads, count):
     assert head_diameter_mm(cut, few) == pytest.approx(head_diameter_mm(whole, few), rel=0.05)
 
 
-def test_a_face_of_a_humans_size_overrules_the_outlines(heads):
+def test_a_face_of_a_humans_size_or_anyway_overrules_the_outlines(heads):
     rig, of = heads
     scaled = times(rig, 3.3)
     front = scaled[scaled.front_camera()]
@@ -138,6 +137,9 @@ def test_a_face_of_a_humans_size_overrules_the_outlines(heads):
     (warning,) = judge_head_size(of["short"], scaled, lambda: face)
     assert warning.code == "scale-implausible"
     assert "scale.json" not in warning.text
+    (warning,) = judge_head_size(of["short"], scaled, guards=Guards(anyway=True))
+    assert warning.code == "pose-doubtful"
+    assert "times as large as a head" in warning.text
 
 
 @pytest.mark.parametrize("hair", STYLES)
@@ -154,13 +156,6 @@ def test_a_mask_that_lacks_the_crown_is_named(heads, hair, count):
     cut = whole | {some.names[0]: silhouette_from_mask(mask)}
     assert find_low_crowns(cut, some, lambda: face).keys() == {some.names[0]}
     assert find_low_crowns(cut, some, lambda: None) == {}
-
-
-def test_anyway_turns_the_refusal_into_a_doubtful_pose(heads):
-    rig, of = heads
-    (warning,) = judge_head_size(of["short"], times(rig, 3.3), guards=Guards(anyway=True))
-    assert warning.code == "pose-doubtful"
-    assert "times as large as a head" in warning.text
 
 
 def head_middle(silhouettes, rig):

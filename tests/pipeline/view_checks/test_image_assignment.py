@@ -95,14 +95,12 @@ def test_masks_whose_rows_were_counted_from_the_bottom_are_turned_back(half_size
         assert all(np.array_equal(masks[name] > 0, mask) for name, mask in shot.masks.items())
 
 
-def test_an_exchange_is_refused_where_the_settings_say_so(half_size_shot):
+def test_an_exchange_is_refused_where_the_settings_say_so_and_pictures_of_another_rig_always(half_size_shot):
     with pytest.raises(ExchangedPictures, match="cam04 and cam06 hold each other's pictures"):
         judged(half_size_shot, reassign_images(half_size_shot.capture, pictures=EXCHANGE, plates=EXCHANGE), "refuse")
     with pytest.raises(ExchangedPictures, match="clean plates"):
         judged(half_size_shot, reassign_images(half_size_shot.capture, plates=EXCHANGE), "refuse")
 
-
-def test_pictures_of_another_rig_are_refused(half_size_shot):
     with pytest.raises(WrongRig, match=r"cameras\.json is of another rig"):
         judged(half_size_shot, half_size_shot.capture, rig=arrangement("a").scaled(0.5))
 

@@ -13,6 +13,7 @@ from rig.camera import Camera, Distortion
 from rig.messages.message import Message
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
+from tests.support.changed_rigs import relensed
 
 RADIUS_MM = 130.0
 PATTERN = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(700, 1400)).astype(np.float32), (0, 0), 2.5)
@@ -21,8 +22,7 @@ NAMES = ("cam00", "cam01", "cam03", "cam05", "cam06")
 
 
 def lensed(rig: Rig, k1: float) -> Rig:
-    distortion = Distortion(k1=k1)
-    return Rig(tuple(replace(c, intrinsics=replace(c.intrinsics, distortion=distortion)) for c in rig))
+    return relensed(rig, lambda intrinsics: replace(intrinsics, distortion=Distortion(k1=k1)))
 
 
 def drawn(camera: Camera, centre: np.ndarray) -> tuple[np.ndarray, Silhouette]:
@@ -73,8 +73,7 @@ def test_coefficients_that_are_not_the_pictures_are_named(
 def test_principal_points_that_count_from_one_are_named(shots, counted_from: float) -> None:
     """The bias of keypoints is below a tenth of a pixel; a quarter is what OpenCV has by itself."""
     rig, images, silhouettes = shots[-0.3]
-    points = [replace(c.intrinsics, cx=c.intrinsics.cx + counted_from, cy=c.intrinsics.cy + counted_from) for c in rig]
-    written = Rig(tuple(replace(camera, intrinsics=k) for camera, k in zip(rig, points, strict=True)))
+    written = relensed(rig, lambda k: replace(k, cx=k.cx + counted_from, cy=k.cy + counted_from))
     found = [warning.parameters["finding"] for warning in judge_distortion(images, silhouettes, written)]
     assert len(found) == (counted_from != 0.0)
     for finding in found:

@@ -14,8 +14,8 @@ from pipeline.view_checks.camera_assignment import INSET_PX, mean_misfit, tangen
 from pipeline.view_checks.rig_agreement import are_loose, find_lens_reading, misplaced_camera, wrong_rig
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.plausibility import rig_faults
-from rig.rig import Rig
 from rig.studio.scene.layout import HEIGHT, WIDTH, default_layout
+from tests.support.changed_rigs import relensed, reposed
 from tests.support.layouts import ARRANGEMENTS_DEG, arrangement
 from tests.support.subjects import off_by
 
@@ -39,11 +39,7 @@ def silhouettes(masks):
 def reflected(rig, axis):
     """The rig in a left-handed world, its rotations made proper by the same axis of the cameras."""
     mirror = np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
-
-    def pose(of):
-        return RigidTransform(mirror @ of.rotation @ mirror, mirror @ of.translation)
-
-    return Rig(tuple(replace(camera, camera_from_world=pose(camera.camera_from_world)) for camera in rig))
+    return reposed(rig, lambda pose: RigidTransform(mirror @ pose.rotation @ mirror, mirror @ pose.translation))
 
 
 def test_the_rig_that_took_the_pictures_is_left_alone(seen):
@@ -83,10 +79,9 @@ def test_quaternions_with_the_real_part_last_are_named_though_the_views_that_the
         x, y, z, w = Rotation.from_matrix(of.rotation).as_quat()
         return RigidTransform(Rotation.from_quat([y, z, w, x]).as_matrix(), of.translation)
 
-    written = [replace(c, camera_from_world=pose(c.camera_from_world)) for c in default_layout().scaled(0.5)]
     contradicted = ViewQuality(usable=False, figures={"strange_share": 0.04})
     spoilt = {name: replace(s, quality=contradicted) if k % 2 else s for k, (name, s) in enumerate(of_all.items())}
-    found = wrong_rig(spoilt, Rig(tuple(written)))
+    found = wrong_rig(spoilt, reposed(default_layout().scaled(0.5), pose))
     assert found is not None
     assert "quaternions whose real part came last" in found.text
 
@@ -95,11 +90,7 @@ def test_rotations_that_are_transposed_are_named_where_the_cameras_look_at_the_o
     """Such a rig looks at one point in either reading: only the outlines can tell."""
     _, _, of_all = seen
     rig = default_layout().scaled(0.5)
-
-    def pose(of):
-        return RigidTransform(of.rotation.T, of.translation)
-
-    written = Rig(tuple(replace(camera, camera_from_world=pose(camera.camera_from_world)) for camera in rig))
+    written = reposed(rig, lambda pose: RigidTransform(pose.rotation.T, pose.translation))
     assert rig_faults(written) == []
     found = wrong_rig(of_all, written)
     assert found is not None
@@ -115,14 +106,8 @@ def test_one_camera_far_from_its_place_is_named_and_no_good_one(seen):
         assert misplaced_camera(of_all, rig.subset(rng.choice(rig.names, count, replace=False))) is None
     for name in ("cam01", "cam04", "cam09"):
         for degrees in (15.0, 180.0):  # a shift of its picture tells turns of a few degrees
-            turn = rotation_from_vector(np.radians(degrees) * np.array([0.0, 0.0, 1.0]))
-            changed = [
-                replace(c, camera_from_world=RigidTransform(turn, np.zeros(3)) @ c.camera_from_world)
-                if c.name == name
-                else c
-                for c in rig
-            ]
-            assert misplaced_camera(of_all, Rig(tuple(changed))) == name
+            turn = RigidTransform(rotation_from_vector(np.radians([0.0, 0.0, degrees])), np.zeros(3))
+            assert misplaced_camera(of_all, reposed(rig, lambda pose, turn=turn: turn @ pose, name)) == name
 
 
 @pytest.mark.parametrize(
@@ -139,8 +124,7 @@ def test_square_pictures_turned_by_90_degrees_are_named(seen, quarters, word):
     """Others are refused when they are read: their sides are exchanged."""
     rig, masks, _ = seen
     beside, height = (WIDTH - HEIGHT) // 4, HEIGHT // 2
-    lenses = [replace(c.intrinsics, width=height, cx=c.intrinsics.cx - beside) for c in rig]
-    square = Rig(tuple(replace(camera, intrinsics=lens) for camera, lens in zip(rig, lenses, strict=True)))
+    square = relensed(rig, lambda k: replace(k, width=height, cx=k.cx - beside))
     cropped = {name: mask[:, beside:-beside] for name, mask in masks.items()}
     assert wrong_rig(silhouettes(cropped), square) is None
     turned = {name: np.rot90(mask, quarters) for name, mask in cropped.items()}  # anticlockwise
@@ -151,9 +135,7 @@ def test_square_pictures_turned_by_90_degrees_are_named(seen, quarters, word):
 def test_turned_pictures_whose_cameras_had_width_and_height_exchanged_are_named(seen, quarters, word):
     """The sizes agree then, and so do the principal points; the poses do not."""
     rig, masks, _ = seen
-    lenses = {c.name: c.intrinsics for c in rig}
-    on_side = {n: replace(k, width=k.height, height=k.width, cx=k.cy, cy=k.cx) for n, k in lenses.items()}
-    written = Rig(tuple(replace(camera, intrinsics=on_side[camera.name]) for camera in rig))
+    written = relensed(rig, lambda k: replace(k, width=k.height, height=k.width, cx=k.cy, cy=k.cx))
     turned = {name: np.rot90(mask, quarters) for name, mask in masks.items()}  # anticlockwise
     assert word in str(wrong_rig(silhouettes(turned), written))
 
@@ -171,8 +153,7 @@ def test_the_calibration_of_another_rig_is_named(seen):
 @pytest.mark.slow
 def test_principal_points_of_the_whole_picture_are_named_where_it_was_cropped(seen):
     rig, _, of_all = seen
-    changed = [lensed(c, cx=c.intrinsics.cx + 60, cy=c.intrinsics.cy + 40) for c in rig]
-    found = wrong_rig(of_all, Rig(tuple(changed)))
+    found = wrong_rig(of_all, relensed(rig, lambda k: replace(k, cx=k.cx + 60, cy=k.cy + 40)))
     assert found is not None
     changes = found.parameters["changes"]
     assert isinstance(changes, tuple)
@@ -185,25 +166,18 @@ def test_principal_points_counted_from_below_are_named(seen):
     rows = np.random.default_rng(3).normal(0.0, 14.0, 11)  # px, off the middle
 
     def rig_of(sign):
-        middle = HEIGHT / 4 - 0.5
-        cameras = zip(default_layout().scaled(0.5), rows, strict=True)
-        return Rig(tuple(lensed(c, cy=middle + sign * row) for c, row in cameras))
+        middles = iter(HEIGHT / 4 - 0.5 + sign * rows)
+        return relensed(default_layout().scaled(0.5), lambda k: replace(k, cy=next(middles)))
 
-    with_masks_moved = {}
+    moved = {}
     for camera in rig_of(1.0):
         was = default_layout().scaled(0.5)[camera.name].intrinsics.cy
         shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, camera.intrinsics.cy - was]])
         mask = of_all[camera.name].mask.astype(np.uint8)
-        with_masks_moved[camera.name] = (
-            cv2.warpAffine(mask, shift, mask.shape[::-1], borderMode=cv2.BORDER_REPLICATE) > 0
-        )
-    found = wrong_rig(silhouettes(with_masks_moved), rig_of(-1.0))
+        moved[camera.name] = cv2.warpAffine(mask, shift, mask.shape[::-1], borderMode=cv2.BORDER_REPLICATE) > 0
+    found = wrong_rig(silhouettes(moved), rig_of(-1.0))
     assert found is not None
     assert found.code == "principal-points-from-below"
-
-
-def lensed(camera, **changes):
-    return replace(camera, intrinsics=replace(camera.intrinsics, **changes))
 
 
 @pytest.mark.slow  # the studio takes ten seconds for one capture
@@ -211,8 +185,7 @@ def lensed(camera, **changes):
 def test_focal_lengths_of_another_zoom_are_found(half_size_shot, zoom):
     shot = half_size_shot
     hulls = [outer_hull(silhouette_from_mask(shot.masks[name]), INSET_PX) for name in shot.rig.names]
-    lenses = [replace(c.intrinsics, fx=zoom * c.intrinsics.fx, fy=zoom * c.intrinsics.fy) for c in shot.rig]
-    zoomed = Rig(tuple(replace(camera, intrinsics=lens) for camera, lens in zip(shot.rig, lenses, strict=True)))
+    zoomed = relensed(shot.rig, lambda k: replace(k, fx=zoom * k.fx, fy=zoom * k.fy))
     found = find_lens_reading(hulls, zoomed, lambda rig: float(np.median(mean_misfit(tangency_errors_px(hulls, rig)))))
     assert found.factor == pytest.approx(1 / zoom, rel=0.06)
     assert max(map(abs, found.shift)) < 0.02

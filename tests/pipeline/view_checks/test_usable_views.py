@@ -29,6 +29,7 @@ from rig.messages.message import compose
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
+from tests.support.changed_rigs import reposed
 from tests.support.scenes import fan
 from tests.support.silhouette_subjects import dressed_head
 
@@ -59,9 +60,7 @@ def test_good_views_all_take_part_and_remarks_of_the_reader_are_passed_on(seen: 
 def test_a_camera_that_was_turned_takes_no_part(seen: Seen) -> None:
     rig, silhouettes = seen
     turn = RigidTransform(rotation_from_vector(np.radians([0.0, 0.5, 0.0])), np.zeros(3))
-    cameras = {camera.name: camera for camera in rig}
-    cameras["cam03"] = replace(rig["cam03"], camera_from_world=turn @ rig["cam03"].camera_from_world)
-    found = judged(Rig(tuple(cameras.values())), silhouettes)
+    found = judged(reposed(rig, lambda pose: turn @ pose, "cam03"), silhouettes)
     assert [name for name, silhouette in found.silhouettes.items() if not silhouette.quality.usable] == ["cam03"]
     assert [warning.code for warning in found.warnings] == ["camera-moved"]
 

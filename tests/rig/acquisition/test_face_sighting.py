@@ -13,10 +13,14 @@ def turned(left_deg: float, up_deg: float, missing: tuple[str, ...] = ()) -> Fac
     return FaceSighting(5, True, True, "cam00", missing, left_deg, up_deg)
 
 
-def test_a_face_that_looks_into_the_front_camera_is_passed_over() -> None:
+def test_a_face_that_looks_into_the_front_camera_is_passed_over_and_no_face_is_one_line_at_most() -> None:
     assert face_remarks(WELL, ()) == ()
     assert face_remarks(None, ()) == ()
     assert face_remarks(FaceSighting(9, True, True, "cam00"), ()) == ()  # of a ring, which has no front
+    statue = FaceSighting(6, False, False, "cam00")
+    assert [remark.code for remark in face_remarks(statue, ())] == ["face-nowhere"]
+    assert face_remarks(FaceSighting(6, False, True, "cam00"), ()) == ()  # posters: nobody knows whose
+    assert face_remarks(statue, [Fault("empty", None, compose("nobody-in-pictures"))]) == ()
 
 
 @pytest.mark.parametrize(
@@ -42,10 +46,3 @@ def test_cameras_without_the_face_are_named_unless_a_fault_explains_it() -> None
     assert texts_of(face_remarks(sighting, [dark]))[0].startswith("no face in cam04, though")
     unset = Fault("plates", "cam04", compose("camera-without-plates"))
     assert [remark.parameters["cameras"] for remark in face_remarks(sighting, [dark, unset])] == [("cam04",)]
-
-
-def test_where_there_is_no_face_there_is_one_line_at_most() -> None:
-    statue = FaceSighting(6, False, False, "cam00")
-    assert [remark.code for remark in face_remarks(statue, ())] == ["face-nowhere"]
-    assert face_remarks(FaceSighting(6, False, True, "cam00"), ()) == ()  # posters: nobody knows whose
-    assert face_remarks(statue, [Fault("empty", None, compose("nobody-in-pictures"))]) == ()

@@ -37,8 +37,11 @@ def test_more_blur_measures_as_more() -> None:
     assert all(value is not None and value <= BLUR_MOST_PX for value in measured)
 
 
-def test_a_flat_picture_has_no_edges_to_measure() -> None:
-    assert blur_px(np.full((96, 128, 3), 90, np.uint8)) is None
+def test_what_a_picture_does_not_show_is_not_measured() -> None:
+    assert blur_px(np.full((96, 128, 3), 90, np.uint8)) is None, "without an edge"
+    assert noise_of([np.zeros((20, 20, 3), np.uint8)]) is None, "of one plate"
+    flat = np.full((480, 640, 3), 120, np.uint8)
+    assert not register(flat, flat).conclusive
 
 
 def test_exposure_counts_clipped_pixels() -> None:
@@ -65,10 +68,6 @@ def test_noise_of_plates_is_recovered_under_drifting_light(sigma: float) -> None
     assert not disturbed([plates[0], plates[1], plates[3]], sigma)
 
 
-def test_one_plate_says_nothing_of_noise() -> None:
-    assert noise_of([np.zeros((20, 20, 3), np.uint8)]) is None
-
-
 @pytest.mark.parametrize("gain", [1.0, 0.7, 0.1])
 @pytest.mark.parametrize("shift", [(0, 0), (3, -2), (-9, 12)])
 def test_movement_of_the_background_is_measured(gain: float, shift: tuple[int, int]) -> None:
@@ -86,11 +85,6 @@ def test_another_cameras_background_is_not_found() -> None:
     empty, seated = FlatStudio(False, 640, 480), FlatStudio(True, 640, 480)
     for one, other in itertools.pairwise(NAMES):
         assert register(seated(one, 0.0), empty(other, 0.0)).found < 0.1
-
-
-def test_a_plate_without_texture_is_inconclusive() -> None:
-    flat = np.full((480, 640, 3), 120, np.uint8)
-    assert not register(flat, flat).conclusive
 
 
 @pytest.mark.slow

@@ -30,9 +30,13 @@ def test_each_fault_is_named_for_its_camera() -> None:
     assert judged(pictures, plates) == expected | {("view", "cam05")}
 
 
-def test_without_a_clean_plate_neither_light_nor_view_is_judged() -> None:
+def test_without_a_clean_plate_nothing_is_judged_and_before_a_plain_wall_no_camera_moved() -> None:
     pictures = {name: SEATED(name, 0.0) // 8 for name in NAMES[:3]}
     assert judged(pictures, {}) == set()
+    # Few patches there can be placed, and what they say of the corners is an extrapolation.
+    pictures = {name: plain_wall(seed, seated=True) for seed, name in enumerate(NAMES)}
+    plates = {name: plain_wall(seed, seated=False) for seed, name in enumerate(NAMES)}
+    assert judged(pictures, plates) == set()
 
 
 def plain_wall(seed: int, *, seated: bool) -> np.ndarray:
@@ -47,10 +51,3 @@ def plain_wall(seed: int, *, seated: bool) -> np.ndarray:
         cv2.ellipse(wall, (320, 300), (90, 130), 0, 0, 360, 150.0, -1, cv2.LINE_AA)
     noise = np.random.default_rng(seed + 100 * (1 + seated)).normal(0, 2.0, (480, 640, 3))
     return np.clip(np.round(wall[..., None] + noise), 0, 255).astype(np.uint8)
-
-
-def test_soft_light_on_a_plain_wall_moves_no_camera() -> None:
-    """Few patches there can be placed, and what they say of the corners is an extrapolation."""
-    pictures = {name: plain_wall(seed, seated=True) for seed, name in enumerate(NAMES)}
-    plates = {name: plain_wall(seed, seated=False) for seed, name in enumerate(NAMES)}
-    assert judged(pictures, plates) == set()

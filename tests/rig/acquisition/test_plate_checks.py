@@ -19,16 +19,13 @@ def in_use() -> Plates:
     return Plates({}, {name: images[0] for name, images in plates_of(EMPTY).items()}, {}, None)
 
 
-def test_somebody_who_sits_in_the_new_plates_is_seen_by_comparison() -> None:
+def test_somebody_who_sits_in_the_new_plates_is_seen_by_comparison_and_another_wall_is_nobody() -> None:
     faults = occupied(plates_of(SEATED), in_use())
     assert {(fault.code, fault.camera) for fault in faults} == {("occupied", name) for name in CAMERAS}
     assert occupied(plates_of(EMPTY), in_use()) == []
     assert occupied(plates_of(EMPTY, light=0.8), in_use()) == [], "dimmer lamps are nobody"
     assert occupied(plates_of(SEATED), NO_PLATES) == [], "there is nothing to compare the first ones with"
-
-
-def test_one_camera_that_sees_another_wall_is_nobody() -> None:
-    """A bumped camera is the reason for which new plates are taken."""
+    # A bumped camera is the reason for which new plates are taken.
     taken = plates_of(EMPTY)
     taken["cam02"] = [EMPTY("cam08", 0.0) for _ in range(3)]
     assert occupied(taken, in_use()) == []

@@ -6,13 +6,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
 import pytest
 
 from rig.acquisition.trigger import TriggerBox
+from rig.drivers.base import CameraNotFound, driver_for
+from rig.formats.rig_toml import CameraConfig
 from rig.studio.devices.serve import StudioDevices
 from tests.support.textured_studio import NAMES, FlatStudio
 
@@ -62,7 +64,13 @@ def gige() -> Iterator[str]:
     """A GigE Vision camera on the loopback; its serial number."""
     if shutil.which("arv-fake-gv-camera-0.8") is None:
         pytest.skip("needs Debian's aravis-tools: no GigE Vision camera to open")
+    camera = CameraConfig(name="cam00", driver="genicam", identity="EH5", width=256, height=256)
     with subprocess.Popen(["arv-fake-gv-camera-0.8", "-i", "127.0.0.1", "-s", "EH5"]) as process:
-        time.sleep(0.5)
+        driver, until_s = driver_for(camera, Path()), time.monotonic() + 60.0
+        while process.poll() is None and time.monotonic() < until_s:
+            with suppress(CameraNotFound):  # it has not begun to answer
+                driver.open(1.0)
+                break
+        driver.close()
         yield "EH5"
         process.terminate()

@@ -51,23 +51,23 @@ def test_a_hanging_camera_does_not_hold_the_others() -> None:
         CameraFeed(dataclasses.replace(camera, name="cam01"), hanging, 1.0),
         CameraFeed(camera, SimulatedDriver(camera, "cam00", source=FlatStudio(True)), 1.0),
     ]
-    started_s = time.monotonic()
     for feed in feeds:
         feed.start()
-    assert feeds[1].wait_opened(started_s + 1.0)
-    assert feeds[1].wait_frames(3, started_s + 1.0)
+    until_s = time.monotonic() + 60.0  # nothing waits so long
+    assert feeds[1].wait_opened(until_s)
+    assert feeds[1].wait_frames(3, until_s)
     assert not feeds[0].wait_opened(time.monotonic() + 0.1)
     now_s = time.monotonic()
     feeds[1].want(now_s)
-    frame = feeds[1].collect(now_s, now_s + 1.0)
+    frame = feeds[1].collect(now_s, until_s)
     assert frame is not None
     assert frame.image.shape == (320, 240, 3)
     assert frame.time_s >= now_s
     assert feeds[0].collect(now_s, now_s + 0.05) is None
-    assert feeds[1].close(time.monotonic() + 1.0)
+    assert feeds[1].close(until_s)
     assert not feeds[0].close(time.monotonic() + 0.1)
     hanging.let_go.set()
-    assert feeds[0].close(time.monotonic() + 1.0)
+    assert feeds[0].close(until_s)
     assert str(feeds[0].state().error) == "cam01: let go"
 
 
@@ -79,7 +79,7 @@ def test_a_camera_that_comes_back_is_opened_again(recorded: Path, tmp_path: Path
         assert not feed.wait_opened(time.monotonic() + 1.0)
         assert "no camera 'later'" in str(feed.state().error)
         shutil.copytree(recorded, tmp_path / "later")
-        deadline_s = time.monotonic() + 5.0
+        deadline_s = time.monotonic() + 60.0
         while not feed.state().opened and time.monotonic() < deadline_s:
             time.sleep(0.02)
         assert feed.state().opened

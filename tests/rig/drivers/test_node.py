@@ -11,7 +11,7 @@ from rig.drivers.base import CameraLost, CameraNotFound, GrabTimeout, driver_for
 from rig.formats.rig_toml import CameraConfig
 from tests.rig.drivers.conftest import run_node
 from tests.support.frames import grab_frame
-from tests.support.raspberry_pi.picamera2 import ENCODING_S, PERIOD_NS
+from tests.support.raspberry_pi.picamera2 import ENCODING_S
 
 SMALL = CameraConfig(
     name="pi03", driver="node", identity="", trigger="software", width=160, height=120, exposure_ms=12.0
@@ -29,8 +29,7 @@ def test_a_picture_is_exposed_after_the_trigger_and_stamped_when_that_began(node
             before_s = time.monotonic()
             driver.trigger()
             frame = grab_frame(driver, 5.0)
-            late_s = frame.time_s - before_s
-            assert 0.0 <= late_s < PERIOD_NS / 1e9 + 0.5 * ENCODING_S  # not when it had been encoded and sent
+            assert before_s <= frame.time_s <= time.monotonic() - ENCODING_S  # not when it had been encoded and sent
             assert frame.image.shape == (120, 160, 3)
             assert float(np.mean(frame.image[20:])) == pytest.approx(120.0, abs=2.0)  # of the exposure
     finally:

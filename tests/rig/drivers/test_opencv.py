@@ -75,7 +75,7 @@ def test_streams_with_and_without_lengths_and_cut_by_timeouts(with_length: bool)
     port, end = serve_bytes(HEAD + parts + b"--b\r\n", pause_s=0.3)
     driver = driver_for(CameraConfig(name="c", driver="opencv", identity=f"http://u:p@127.0.0.1:{port}/"), Path())
     try:
-        driver.open(1.0)
+        driver.open(20.0)
         means = []
         for _ in range(100):
             try:
@@ -101,10 +101,10 @@ def test_arrival_is_when_the_frame_came_not_when_it_was_read() -> None:
         port, end = serve_bytes(sent + b"\r\n" * (len(sent) // 2), pause_s=0.5)
         driver = driver_for(CameraConfig(name="c", driver="opencv", identity=f"http://127.0.0.1:{port}/"), Path())
         try:
-            driver.open(1.0)
-            driver.grab(1.0)
+            driver.open(20.0)
+            driver.grab(20.0)
             time.sleep(0.3)
-            assert driver.grab(1.0).time_s < time.monotonic() - 0.2
+            assert driver.grab(20.0).time_s < time.monotonic() - 0.2
         finally:
             driver.close()
             end()

@@ -32,30 +32,28 @@ def test_code_and_parameters_survive_every_way(message: Message) -> None:
         assert str(carried) == message.text
 
 
-def test_the_text_is_the_templates() -> None:
+def test_the_text_is_the_templates_with_plain_numbers_and_infinite_ones_as_words() -> None:
     assert compose("disk-free", free_gb=12.34567, spare_gb=2).text == "12.3 GB free; uploads and jobs leave 2.0 GB"
     assert MOVED.text.startswith("cam03 contradicts all other cameras")
-
-
-@pytest.mark.parametrize(
-    ("code", "parameters"), [("no-json-object", {"more": 1}), ("camera-gain", {"camera": "cam00"}), ("camera-gain", {})]
-)
-def test_parameters_are_those_of_the_template(code: str, parameters: dict[str, str]) -> None:
-    with pytest.raises((AssertionError, KeyError)):
-        compose(code, **parameters)
-
-
-def test_an_unknown_code_is_no_message() -> None:
-    with pytest.raises(KeyError):
-        compose("nobody-says-this")
-
-
-def test_numbers_of_numpy_become_plain_and_infinite_ones_words() -> None:
     message = compose("camera-gain", camera="cam00", factor=np.float32(0.5))
     assert type(message.parameters["factor"]) is float
     endless = compose("camera-gain", camera="cam00", factor=np.inf)
     assert endless.document()["parameters"] == {"camera": "cam00", "factor": "inf"}  # pyright: ignore
     assert through_json(endless).text == "cam00 is inf times as bright as the others: check its exposure"
+
+
+@pytest.mark.parametrize(
+    ("code", "parameters"),
+    [
+        ("no-json-object", {"more": 1}),
+        ("camera-gain", {"camera": "cam00"}),
+        ("camera-gain", {}),
+        ("nobody-says-this", {}),
+    ],
+)
+def test_codes_and_parameters_are_those_of_the_templates(code: str, parameters: dict[str, str]) -> None:
+    with pytest.raises((AssertionError, KeyError)):
+        compose(code, **parameters)
 
 
 def test_what_is_no_text_is_escaped() -> None:
@@ -76,14 +74,11 @@ def test_what_is_no_message_is_refused(stored: object) -> None:
         read_message(stored)
 
 
-def test_an_error_carries_its_message() -> None:
+def test_an_error_carries_its_message_and_one_of_input_those_of_its_faults() -> None:
     error = EigenheadError(MOVED)
     assert (error.message, str(error)) == (MOVED, MOVED.text)
     assert pickle.loads(pickle.dumps(error)).message == MOVED
     assert EigenheadError("as it came").message == verbatim("as it came")
-
-
-def test_faults_of_input_are_messages() -> None:
     error = InputError("cam.json", ["is no JSON", compose("no-json-object")])
     assert error.faults == (message_of("is no JSON"), compose("no-json-object"))
     assert str(error) == "cam.json: is no JSON; is no JSON object; send one, as application/json"

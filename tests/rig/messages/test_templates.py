@@ -24,11 +24,8 @@ def test_a_template_is_filled_in(template: str, parameters: dict[str, object], t
     assert render(template, parameters) == text
 
 
-def test_forms_ask_for_a_count() -> None:
+def test_forms_ask_for_a_count_and_a_missing_parameter_is_no_empty_place() -> None:
     assert fields_of("one view of {name} | {name}: several") == {"count": "", "name": ""}
-
-
-def test_a_missing_parameter_is_no_empty_place() -> None:
     with pytest.raises(KeyError):
         render("{name}", {})
 

@@ -14,7 +14,6 @@ from rig.formats.captures.capture_folder import read_capture
 from rig.formats.meshes.ply import write_ply
 from rig.formats.rig_toml import CameraConfig, read_rig_config
 from rig.geometry import Similarity
-from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.studio.devices.serve import DeviceFault, StudioDevices, serve_scene
 from rig.studio.devices.sources import SceneImages
@@ -22,18 +21,10 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import Scene, build_scene
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
+from tests.rig.studio.test_images import egg_head
 from tests.support.frames import grab_frame
 
 pytestmark = [pytest.mark.gl, pytest.mark.slow]
-
-
-def egg() -> Mesh:
-    polar, around = np.meshgrid(np.linspace(0.01, 2.6, 40), np.arange(48) * 2 * np.pi / 48, indexing="ij")
-    unit = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], axis=-1)
-    i, j = (grid.ravel() for grid in np.meshgrid(np.arange(39), np.arange(48), indexing="ij"))
-    a, b = i * 48 + j, i * 48 + (j + 1) % 48
-    faces = np.concatenate([np.stack([a, a + 48, b], -1), np.stack([b, a + 48, b + 48], -1)])
-    return Mesh((unit * (76, 130, 96)).reshape(-1, 3), faces.astype(np.int32))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +32,8 @@ def scene(renderer: Renderer) -> Scene:
     rig = default_layout().scaled(0.5)
     upright = Similarity(1.0, np.eye(3), np.zeros(3))
     rng = np.random.default_rng(4)
-    return build_scene(Subject(egg()), rig, PRESET, rng, renderer=renderer, world_from_head=upright)
+    bare = Subject(egg_head().mesh)
+    return build_scene(bare, rig, PRESET, rng, renderer=renderer, world_from_head=upright)
 
 
 @pytest.fixture(scope="module")
@@ -91,15 +83,10 @@ def test_pictures_of_a_scene_have_noise_of_their_own_and_drifted_light(scene: Sc
 
 
 def test_simulated_driver_photographs_a_mesh_file(tmp_path: Path) -> None:
-    mesh, nothing = egg(), np.zeros(len(egg().vertices))
-    write_ply(
-        tmp_path / "egg.ply",
-        mesh,
-        normals=mesh.normals(),
-        colours=np.full((len(nothing), 3), 150, np.uint8),
-        quality=nothing,
-        views=nothing.astype(np.uint8),
-    )
+    mesh = egg_head().mesh
+    nothing = np.zeros(len(mesh.vertices))
+    grey, views = np.full((len(nothing), 3), 150, np.uint8), nothing.astype(np.uint8)
+    write_ply(tmp_path / "egg.ply", mesh, normals=mesh.normals(), colours=grey, quality=nothing, views=views)
     camera = dataclasses.replace(
         CameraConfig(name="cam05", driver="opencv", identity="egg.ply", trigger="free"), driver="simulated"
     )

@@ -66,14 +66,11 @@ def test_lids_stand_before_the_eyeballs_and_let_them_be_seen(sitter: Subject, lo
         assert 0.08 < shown.sum() * (1200.0 / 2600.0) ** 2 / (28.0 * 8.0 * 0.67) < 1.5  # the lids' gap
 
 
-def test_the_truth_holds_the_eyes_in_the_world(looking: Subject) -> None:
+def test_the_truth_holds_the_eyes_and_a_head_without_landmarks_gets_none(looking: Subject, sitter: Subject) -> None:
     pose = Similarity(1.0, rotation_from_vector(np.array([0.1, 0.7, 0.0])), np.array([5.0, -20.0, 30.0]))
     eye = looking.eyes["left"]
     placed = eye.placed(pose)
     np.testing.assert_allclose(placed.iris_centre, pose.apply(eye.iris_centre[None])[0])
     np.testing.assert_allclose(placed.gaze, pose.rotation @ eye.gaze)
-
-
-def test_a_head_without_landmarks_gets_no_eyeballs(sitter: Subject) -> None:
     with pytest.raises(InputError, match="landmarks"):
         with_gaze(Subject(sitter.mesh), 0.0, 0.0, np.random.default_rng(1))

@@ -37,12 +37,9 @@ def test_mounting_and_distance_leave_the_default_rig_as_it_was() -> None:
         assert ours[camera.name].intrinsics == camera.intrinsics
 
 
-def test_a_row_is_level_and_evenly_spaced() -> None:
+def test_a_row_is_evenly_spaced_and_a_circle_goes_all_around_from_the_front() -> None:
     at = [1000.0 * np.tan(np.radians(azimuth)) for azimuth, _ in row_directions(3, 100.0, 1000.0)]
     assert at == pytest.approx([-100.0, 0.0, 100.0])
-
-
-def test_a_circle_begins_at_the_front_and_goes_all_around() -> None:
     found = circle_directions(8, (0.0, 20.0))
     assert found[0] == (0.0, 0.0)
     assert [elevation for _, elevation in found] == [0.0, 20.0] * 4

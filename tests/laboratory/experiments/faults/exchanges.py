@@ -6,11 +6,9 @@ rotated, or one camera's files are copied over another's. They go through ``assi
 masks. An exchange counts as repaired if the fit ends within ``WORST_RATIO`` of the error of the same capture
 unexchanged; if every silhouette is the same again, so is the fit. A picture that was copied over is lost for good. So
 it is also recorded whether the capture ended like the unexchanged one without that view (``lost_view_only``).
-
-``false_alarms`` runs captures of the same kinds with nothing wrong, silhouettes alone, and counts every warning.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -20,18 +18,14 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview import tangency
 from pipeline.segmentation.segment import segment
 from pipeline.settings import FittingSettings
-from pipeline.view_checks import camera_assignment, camera_drift, image_assignment, rig_agreement
-from pipeline.view_checks.camera_assignment import find_assignment
-from pipeline.view_checks.camera_drift import find_drift
+from pipeline.view_checks import camera_assignment, image_assignment, rig_agreement
 from pipeline.view_checks.image_assignment import ExchangedPictures, ImageAssignment, assign_images
-from pipeline.view_checks.rig_agreement import wrong_rig
 from rig.capture import Capture, reassign_images
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import random_look
-from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import (
     Planted,
     binary_silhouettes,
@@ -44,7 +38,6 @@ from tests.support.subjects import (
 
 CALIBRATION_PX = 0.11  # prior of ``off_by``: a head moves by 0.2 px (2D RMS) in each image
 WORST_RATIO = 1.1  # of the fit's error after an exchange to that without
-GOOD_CODES = ("cameras-exchanged", "camera-moved", "mask-loose", "wrong-rig")  # the last is a refusal
 KINDS = ("pair", "triple", "duplicate")
 ASKED = (camera_assignment, rig_agreement, image_assignment, tangency)
 
@@ -53,7 +46,12 @@ def exchanges(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: i
     """Simulates captures whose pictures are filed under the wrong cameras. Returns the shares of these exchanges that
     are detected and repaired, by kind of exchange."""
     records = bench.records("exchanges", key_of(model.sha256, *ASKED, *CONTOUR))
-    rows = _rows(_exchanged_row, model, renderer, records, bench.report, seed=18, subjects=subjects)
+    span, rows, seed = with_modes(model, 60), [], 18
+    for i, subject in enumerate(random_subjects(subjects, seed=seed)):
+        bench.report(subject.name, i / subjects)
+        rng = np.random.default_rng([seed, i])
+        compute = partial(_exchanged_row, span, subject, renderer, rng, worn=bool(i % 2))
+        rows.append(records.row(subject.name, compute))
     found: dict[str, float] = {"captures": len(rows)}
     for kind in KINDS:
         for quantity in ("named", "repaired"):
@@ -62,29 +60,6 @@ def exchanges(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: i
     found["duplicate_lost_view_only_share"] = float(np.mean([row["duplicate"]["lost_view_only"] for row in rows]))
     found["good_called_exchanged"] = sum(bool(row["good_codes"]) for row in rows)
     return {"figures": found, "rows": rows}
-
-
-def false_alarms(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 50) -> Outcome:
-    """Simulates good captures. Returns how many get a warning that pictures are exchanged, or that a camera moved or
-    has a loose mask."""
-    records = bench.records("false_alarms", key_of(model.sha256, *ASKED, camera_drift))
-    rows = _rows(_warnings_of_good, model, renderer, records, bench.report, seed=19, subjects=subjects)
-    found: dict[str, float] = {"captures": len(rows)}
-    found |= {code: sum(code in row["codes"] for row in rows) for code in GOOD_CODES}
-    return {"figures": found, "rows": rows, "markdown": markdown.of_figures(found)}
-
-
-def _rows(
-    row_of: Callable[..., Row], model: HeadModel, renderer: Renderer, records: Records,
-    report: Callable[[str, float], None], *, seed: int, subjects: int,
-) -> list[Row]:  # fmt: skip
-    """A row a capture, every other one worn, kept so that a stopped run goes on."""
-    span, rows = with_modes(model, 60), []
-    for i, subject in enumerate(random_subjects(subjects, seed=seed)):
-        report(subject.name, i / subjects)
-        compute = partial(row_of, span, subject, renderer, np.random.default_rng([seed, i]), worn=bool(i % 2))
-        rows.append(records.row(subject.name, compute))
-    return rows
 
 
 def _exchanged_row(
@@ -162,16 +137,3 @@ def _same(one: Silhouette, two: Silhouette) -> bool:
 
 def _error_mm(model: HeadModel, subject: Planted, silhouettes: Mapping[str, Silhouette], rig: Rig) -> float:
     return mean_error_mm(model, fit_contour(model, subject.start, silhouettes, rig, FittingSettings()), subject)
-
-
-def _warnings_of_good(
-    model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator, *, worn: bool
-) -> Row:
-    """Codes of what is told of one good capture."""
-    true_rig = default_layout()
-    silhouettes = _seen(model, subject, true_rig, renderer, rng, worn=worn)
-    rig = off_by(true_rig, CALIBRATION_PX, rng)
-    codes = ["cameras-exchanged"] if find_assignment(silhouettes, rig).pictures else []
-    codes += ["wrong-rig"] if wrong_rig(silhouettes, rig) else []
-    codes += [drift.warning().code for drift in find_drift(silhouettes, rig)]
-    return {"worn": worn, "codes": codes}

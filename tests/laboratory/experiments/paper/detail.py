@@ -7,8 +7,8 @@ are from the true face region, weighted by area, to the delivered surface, witho
 - random heads of another population, with all its modes, photographed in the simulated studio;
 - random heads of the model's own 60 modes in the same studio, which the span contains: what do more modes cost there?
 
-Further figures: each camera left out and predicted from the others, a moved camera and a wrong mask, and how many true
-vertices lie in the posterior's 95 % intervals along the normal.
+Further figures: a moved camera and a wrong mask, and how many true vertices lie in the posterior's 95 % intervals along
+the normal. Photographs that were not used are predicted by ``texture`` and ``real``.
 """
 
 import hashlib
@@ -21,32 +21,24 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
-from scipy.spatial import KDTree
+from jaxtyping import Bool, Float
 
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import vertex_deviation_mm
-from pipeline.contour_fit.rim import find_rim, make_topology, pack_views
-from pipeline.geometry.projection import camera_depths, depth_maps
-from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import vertex_areas
 from pipeline.reconstruct import fit_shape
-from pipeline.segmentation.segment import segment
 from pipeline.settings import Settings, document_from_settings
 from pipeline.stages.alignment import align_head
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.faces import find_faces
 from pipeline.stages.recorder import Recorder
 from pipeline.stages.views import find_views
-from pipeline.texturing.vertex_colours import texture
-from rig.camera import Camera
 from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh
-from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -63,7 +55,6 @@ Level = Literal["span", "kernel", "photo"]
 LEVELS: tuple[Level, ...] = ("span", "kernel", "photo")
 IN_SPAN_MODES, IN_SPAN_SPREAD = 60, 0.8  # section 5.2
 FAULTS = {"bumped": Fault("bumped", "cam03", 0.1), "wrong-mask": Fault("wrong-mask", "cam03")}
-SHOWN_PX = 1.5  # a photograph's own outline is the face's where they are that close; elsewhere it is hair
 FAR_MM = 8.0  # along a normal nothing is looked for beyond
 
 
@@ -108,7 +99,7 @@ def run(
     ``<subject>_<model>_<level>_<quantity>``.
 
     Args:
-        models: by the name in the figures; the first one is used for random heads, faults and left-out cameras.
+        models: by the name in the figures; the first one is used for random heads and faults.
         captures: folders with a truth beside them.
         renderer: for the studio.
         others: the population from which random heads are drawn.
@@ -131,10 +122,6 @@ def run(
         (f"inspan-{i:02}_{label}", partial(known_row, partial(photographed_in_span, i), model, renderer))
         for i in range(in_span)
     ]
-    for name, path in captures.items():
-        for camera in read_capture(path)[1].names:
-            compute = partial(held_out_row, path, camera, model, renderer)
-            jobs.append((f"heldout-{name}-{camera}_{label}", compute))
     rows = []
     for done, (name, compute) in enumerate(jobs):
         rows.append({"name": name, **records.row(name, compute, done / len(jobs))})
@@ -245,83 +232,14 @@ def along_normal(
     return across, (end.distances < 0.1) & (np.abs(across) < FAR_MM)
 
 
-def held_out_row(path: Path, camera: str, model: HeadModel, renderer: Renderer) -> Row:
-    """Fits with all cameras but one, and predicts that camera's picture.
-
-    Figures are the RMS distance (px) of the true face's outline to the predicted one, where the photograph shows it and
-    also where hair covers it, and the PSNR over the face. The distance is from the true outline to the predicted one,
-    since the latter continues where shoulders, which no model has, hide the former.
-    """
-    known, settings = read_known(path), Settings()
-    silhouettes = segment(known.capture, known.rig, report=discard_progress)
-    rest = known.rig.subset(other for other in known.rig.names if other != camera)
-    views = pack_views(known.rig.subset([camera]), {camera: silhouettes[camera].distance})
-    true = find_rim(make_topology(known.mesh.faces, known.face), known.mesh.vertices, views)
-    shown = np.abs(true.residual) < SHOWN_PX
-    found: Row = {}
-    for level, fitted in every_level(_without(known.capture, camera), rest, model, ("span", "photo"), renderer).items():
-        mesh, full = fitted.mesh(), model.levels["full"]
-        seen = {name: silhouettes[name] for name in rest.names}
-        coloured = texture(mesh, known.capture, seen, rest, depth_maps(rest, mesh), settings=settings.texture)
-        ours = find_rim(make_topology(full.faces, full.face_region), mesh.vertices, views, whole_head=True)
-        nearest = KDTree(ours.pixel).query(true.pixel)[1]
-        across = ((true.pixel - ours.pixel[nearest]) * ours.normal[nearest]).sum(axis=1)
-        photograph, mask = known.capture.images[camera], silhouettes[camera].mask
-        psnr = colour_psnr(known.rig[camera], photograph, mesh, coloured.colours, full.face_region, mask)
-        found[level] = {"psnr_db": psnr}
-        if shown.any():  # from above, a face's outline may lie wholly before the shoulders
-            found[level]["contour_rms_px"] = _rms(across[shown], true.length[shown])
-        if len(across):
-            found[level]["contour_rms_with_hair_px"] = _rms(across, true.length)
-    return found
-
-
-def _rms(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"]) -> float:
-    return float(np.sqrt((weights @ values**2) / max(float(weights.sum()), 1e-9)))
-
-
-def _without(capture: Capture, camera: str) -> Capture:
-    return replace(
-        capture,
-        images={name: image for name, image in capture.images.items() if name != camera},
-        backgrounds={name: plates for name, plates in capture.backgrounds.items() if name != camera},
-        masks={name: mask for name, mask in capture.masks.items() if name != camera},
-        features={
-            mark: {name: pixel for name, pixel in seen.items() if name != camera}
-            for mark, seen in capture.features.items()
-        },
-    )
-
-
-def colour_psnr(
-    camera: Camera,
-    image: UInt8[np.ndarray, "h w 3"],
-    mesh: Mesh,
-    colours: UInt8[np.ndarray, "v 3"],
-    face: Bool[np.ndarray, " v"],
-    mask: Bool[np.ndarray, "h w"],
-) -> float:
-    """Returns the PSNR (dB) between a photograph and the coloured mesh over the pixels of the face. One gain for each
-    channel is fitted, since cameras differ in exposure, and one that was left out has none."""
-    pixels, depths = camera.project(mesh.vertices), camera_depths(camera, mesh.vertices)
-    _, seen = rasterise(pixels, depths, mesh.faces, *image.shape[:2])
-    drawn = interpolate(seen, pixels, depths, mesh.faces, colours.astype(np.float32))
-    shown = (seen >= 0) & np.all(face[mesh.faces], axis=1)[np.maximum(seen, 0)] & mask
-    ours, theirs = drawn[shown].astype(float), image[shown].astype(float)
-    gain = (ours * theirs).sum(axis=0) / (ours**2).sum(axis=0)
-    return float(10.0 * np.log10(255.0**2 / ((gain * ours - theirs) ** 2).mean()))
-
-
 def figures(rows: list[Row]) -> dict[str, float]:
-    """Summarises the rows: values of each subject, and means and worst values over random heads, heads in the span, and
-    left-out cameras."""
+    """Summarises the rows: values of each subject, and means and worst values over random heads and heads in the
+    span."""
     values: dict[str, list[float]] = {}
     for row in rows:
         subject, _, label = row["name"].rpartition("_")
         kind = subject.split("-")[0]
-        group = {"draw": "draws", "inspan": "inspan", "heldout": "heldout"}.get(
-            kind if subject[-1].isdigit() else "", subject
-        )
+        group = {"draw": "draws", "inspan": "inspan"}.get(kind if subject[-1].isdigit() else "", subject)
         for level, quantities in row.items():
             if isinstance(quantities, Mapping):
                 for quantity, value in quantities.items():

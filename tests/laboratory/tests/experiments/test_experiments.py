@@ -20,7 +20,7 @@ from tests.support.scenes import ellipsoid
 from tests.support.shared_data import shared
 
 
-def test_a_stopped_run_goes_on_and_another_key_starts_anew(tmp_path: Path) -> None:
+def test_a_stopped_run_goes_on_and_another_key_of_sources_and_values_starts_anew(tmp_path: Path) -> None:
     computed = []
 
     def compute(value: int) -> dict[str, int]:
@@ -33,16 +33,15 @@ def test_a_stopped_run_goes_on_and_another_key_starts_anew(tmp_path: Path) -> No
     assert again.row("two", lambda: compute(3)) == {"value": 3}
     assert Records(tmp_path / "new", "rows", "b").row("one", lambda: compute(4)) == {"value": 4}
     assert computed == [1, 3, 4]
-
-
-def test_a_key_tells_sources_and_values_apart() -> None:
     assert key_of(records, 1) == key_of(records, 1)
     assert len({key_of(records, 1), key_of(markdown, 1), key_of(records, 2), key_of(records)}) == 4
 
 
-def test_a_table_shows_three_digits_whole_numbers_and_gaps() -> None:
+def test_a_table_shows_three_digits_whole_numbers_and_gaps_and_no_correlation_of_too_few_rows() -> None:
     text = markdown.table(("what", "value"), [["a", 0.123456], ["b", 7.0], ["c", 12345.6], ["d", None]])
     assert text.splitlines()[2:] == ["| a | 0.123 |", "| b | 7 |", "| c | 12346 |", "| d | - |"]
+    assert correlation([{"a": 1.0, "b": 2.0}] * 2, "a", "b") is None
+    assert correlation([{"a": x, "b": -2.0 * x} for x in (1.0, 2.0, 4.0)], "a", "b") == pytest.approx(-1.0)
 
 
 @pytest.mark.parametrize("adaptive", [False, True])
@@ -112,18 +111,10 @@ def test_a_optimal_views_are_the_informative_ones() -> None:
     assert views.a_optimal([(information, np.eye(3))], 3, 0.1 * np.eye(3)) == [0, 1, 2]
     weighed = np.diag([0.0, 1.0, 0.0])  # only the second unknown matters
     assert views.a_optimal([(information, weighed)], 1, 0.1 * np.eye(3)) == [1]
-
-
-def test_exchanges_repair_a_greedy_choice() -> None:
-    """The first pick, best alone, is worst beside the two that measure one unknown each."""
+    # Exchanges repair a greedy choice: the best alone is worst beside the two that measure one unknown each.
     information = np.stack([np.diag([3.0, 3.0]), np.diag([100.0, 0.0]), np.diag([0.0, 100.0])])
     assert views.a_optimal([(information, np.eye(2))], 1, 0.1 * np.eye(2)) == [0]
     assert views.a_optimal([(information, np.eye(2))], 2, 0.1 * np.eye(2)) == [1, 2]
-
-
-def test_correlation_of_too_few_rows_is_none() -> None:
-    assert correlation([{"a": 1.0, "b": 2.0}] * 2, "a", "b") is None
-    assert correlation([{"a": x, "b": -2.0 * x} for x in (1.0, 2.0, 4.0)], "a", "b") == pytest.approx(-1.0)
 
 
 def test_heads_stand_side_by_side() -> None:

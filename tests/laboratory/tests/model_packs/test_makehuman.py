@@ -83,13 +83,10 @@ def torus(around: int = 8, across: int = 6) -> np.ndarray:
     return np.stack([i * across + j, ahead * across + j, ahead * across + up, i * across + up], axis=1)
 
 
-def test_a_loop_goes_straight_on_until_it_closes() -> None:
+def test_a_loop_goes_straight_on_until_it_closes_and_one_that_meets_a_pole_is_another_mesh() -> None:
     topology = _Quads(torus())
     assert topology.loop(0, 6) == [6 * k for k in range(8)]
     assert topology.loop(3, 2) == [3, 2, 1, 0, 5, 4]
-
-
-def test_a_loop_that_meets_a_pole_is_another_mesh() -> None:
     cube = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     with pytest.raises(ValueError, match="not HM08"):
         _Quads(cube).loop(0, 1)

@@ -54,9 +54,7 @@ def test_left_and_right_share_most_of_their_value() -> None:
     left, right = np.array(values).T
     assert np.std(left) == pytest.approx(0.3, rel=0.05)
     assert np.corrcoef(left, right)[0, 1] == pytest.approx(0.75, abs=0.03)
-
-
-def test_no_weight_is_beyond_the_clip_and_none_is_negative() -> None:
+    # No weight is beyond the clip, and none is negative.
     sampling, rng = Sampling(clip=1.0, sidedness=0.0), np.random.default_rng(1)
     drawn = [w for _ in range(200) for w in local_weights(rng, [*SIDES, "nose-hump"], 0.3, sampling).values()]
     assert max(drawn) == pytest.approx(0.3)

@@ -9,6 +9,7 @@ from scipy.special import ellipe
 
 from pipeline.applications.clinic import fitting
 from pipeline.applications.clinic.fitting import UprightHead, fitting_measures, hull_perimeter, section
+from rig.studio.scene.anatomy import grid_faces
 from tests.support.measured_heads import mannequin
 from tests.support.visits import MOVED, moved, visit
 
@@ -25,9 +26,8 @@ def test_the_tape_around_an_ellipsoid_is_its_ellipse() -> None:
     head = body(ball.vertices * (side, front, up), ball.faces, glabella=(0.0, front, 0.0))
     found = fitting.head_circumference(head)
     assert found == pytest.approx(4.0 * front * ellipe(1.0 - (side / front) ** 2), rel=1e-3)
-    assert (
-        fitting.head_circumference(body(ball.vertices * (75, 20, 110), ball.faces, glabella=(0.0, 20.0, 0.0))) is None
-    )
+    flat = body(ball.vertices * (75, 20, 110), ball.faces, glabella=(0.0, 20.0, 0.0))
+    assert fitting.head_circumference(flat) is None
 
 
 def test_a_section_is_that_of_another_program_and_a_tape_spans_hollows() -> None:
@@ -48,9 +48,7 @@ def roof(splay_deg: float, frontal_deg: float) -> UprightHead:
     widening = np.tan(np.radians(frontal_deg)) * -down
     away = np.maximum(np.abs(across) - np.maximum(widening, 0.0), 0.0)
     vertices = np.stack([across, -away / np.tan(np.radians(splay_deg)), down], axis=2).reshape(-1, 3)
-    corner = np.arange(40 * 41).reshape(40, 41)[:, :-1].ravel()
-    faces = np.concatenate([np.stack([corner, corner + 1, corner + 41], axis=1),
-                            np.stack([corner + 1, corner + 42, corner + 41], axis=1)])  # fmt: skip
+    faces = grid_faces(41, 41, closed=False)[:, ::-1]
     corners = {"endocanthion_right": (18.0, -15.0, 0.0), "endocanthion_left": (-18.0, -15.0, 0.0)}
     return body(vertices, faces, nasion=(0.0, 0.0, 0.0), **corners)
 

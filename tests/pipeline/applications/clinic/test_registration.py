@@ -104,15 +104,11 @@ def test_another_surface_is_refused() -> None:
         register(HEAD, surface, {name: upright.apply(HEAD.measured.landmarks[name]) for name in names})
 
 
-def test_too_few_landmarks_are_refused(tmp_path: Path) -> None:
+def test_too_few_landmarks_and_a_mesh_of_another_ending_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "two.mrk.json"
     path.write_text(json.dumps(markups_document({"pronasale": MarkupPoint(np.zeros(3))}, "LPS")))
     with pytest.raises(InputError, match="names 1 of the 26 landmarks; at least 3"):
         read_surface_landmarks(path, "LPS")
-
-
-def test_a_mesh_of_another_ending_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "ct.vtk"
-    path.write_bytes(b"")
+    (tmp_path / "ct.vtk").write_bytes(b"")
     with pytest.raises(InputError, match=r"\.stl"):
-        read_surface(path)
+        read_surface(tmp_path / "ct.vtk")

@@ -26,6 +26,7 @@ from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.mesh import Mesh, vertex_normals
+from tests.pipeline.applications.templates.conftest import moves
 from tests.pipeline.applications.templates.test_contact import EVERY, dent, sheets
 
 NAMES = ("jawOpen", "eyeBlinkLeft", "mouthUpperUpLeft", "mouthFunnel")
@@ -120,19 +121,6 @@ def test_lips_are_shut_where_they_nearly_are(weight: float, shuts: bool) -> None
     assert np.linalg.norm(parted[(made != parted).any(axis=1)] - middle, axis=1).max() < 40.0
 
 
-@pytest.fixture(scope="module")
-def mean(model: HeadModel) -> np.ndarray:
-    return model.vertices(np.zeros(0))
-
-
-def moves(model: HeadModel) -> dict[str, np.ndarray]:
-    return {name: model.levels["full"].operator @ model.expressions.moved({name: 1.0}) for name in NAMES}
-
-
-def points_of(model: HeadModel, mean: np.ndarray) -> dict[str, np.ndarray]:
-    return {name: mean[row] for name, row in model.landmarks.items()}
-
-
 def coarse(model: HeadModel, mean: np.ndarray, *parts: trimesh.Trimesh) -> tuple[SurfaceBinding, np.ndarray]:
     """The model's 5 % level, skin but for what lies about the mouth's slit, and parts of their own; the first of them
     moves as a whole."""
@@ -155,14 +143,15 @@ def coarse(model: HeadModel, mean: np.ndarray, *parts: trimesh.Trimesh) -> tuple
 def carried(
     model: HeadModel, mean: np.ndarray, binding: SurfaceBinding, triangles: np.ndarray
 ) -> dict[str, np.ndarray]:
+    marks = {name: mean[row] for name, row in model.landmarks.items()}
     neutral = Neutral(mean, model.levels["full"].faces, binding.on(mean, model.levels["full"].faces))
-    return carried_shapes(binding, triangles, neutral, moves(model), points_of(model, mean))
+    return carried_shapes(binding, triangles, neutral, moves(model, *NAMES), marks)
 
 
 def test_the_insides_of_lips_move_with_their_own_lip(model: HeadModel, mean: np.ndarray) -> None:
     binding, triangles = coarse(model, mean)
     found, rows = carried(model, mean, binding, triangles), model.levels["p95"].rows
-    for name, shape in moves(model).items():
+    for name, shape in moves(model, *NAMES).items():
         true = shape[rows]
         error = np.linalg.norm(found[name] - true) / np.linalg.norm(true)
         smooth = binding.on(mean + shape, model.levels["full"].faces) - binding.on(mean, model.levels["full"].faces)
@@ -171,8 +160,10 @@ def test_the_insides_of_lips_move_with_their_own_lip(model: HeadModel, mean: np.
             assert np.linalg.norm(smooth - true) / np.linalg.norm(true) > 2.0 * error, name
 
 
-def test_eyeballs_stay_teeth_go_with_the_jaw_and_lashes_with_the_lid(model: HeadModel, mean: np.ndarray) -> None:
-    shapes, points = moves(model), points_of(model, mean)
+def test_eyeballs_stay_teeth_go_with_the_jaw_and_lashes_with_the_lid(
+    model: HeadModel, mean: np.ndarray, points: dict[str, np.ndarray]
+) -> None:
+    shapes = moves(model, *NAMES)
     lid = int(np.linalg.norm(shapes["eyeBlinkLeft"], axis=1).argmax())
     edge = mean[lid]
     eye = trimesh.creation.icosphere(subdivisions=2, radius=12.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from pipeline.applications.templates.carrying import Attachment, SurfaceBinding, bind_vertices, frames, surface_binding
+from pipeline.applications.templates.carrying import SurfaceBinding, bind_vertices, frames, surface_binding
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import vertex_normals
 
@@ -37,6 +37,9 @@ def test_points_come_back_where_they_were_attached() -> None:
     np.testing.assert_allclose(attachment.on(VERTICES, FACES), points, atol=1e-9)
     np.testing.assert_allclose(distances, np.linalg.norm(attachment.offsets, axis=1), atol=1e-9)
     assert cosine.min() > 0.98
+    on_it, distances, _ = bind_vertices(VERTICES, vertex_normals(VERTICES, FACES), VERTICES, FACES)
+    assert distances.max() < 1e-9
+    np.testing.assert_allclose(on_it.weights.sum(axis=1), 1.0)
 
 
 def test_sheets_that_touch_are_told_apart_by_the_way_they_face() -> None:
@@ -71,11 +74,3 @@ def test_the_anchors_are_skin_and_the_nearest_of_it_leads_a_whole() -> None:
     led = np.linalg.norm(found.rest[found.whole_anchors[0]] - (0.0, 0.0, 78.0), axis=1)
     others = np.linalg.norm(found.rest[np.setdiff1d(found.skin, found.whole_anchors[0])] - (0.0, 0.0, 78.0), axis=1)
     assert np.median(led) < 0.5 * np.median(others)
-
-
-def test_an_attachment_needs_no_normals_of_its_own() -> None:
-    normals = vertex_normals(VERTICES, FACES)
-    attachment, distances, _ = bind_vertices(VERTICES, normals, VERTICES, FACES)
-    assert distances.max() < 1e-9
-    assert isinstance(attachment, Attachment)
-    np.testing.assert_allclose(attachment.weights.sum(axis=1), 1.0)

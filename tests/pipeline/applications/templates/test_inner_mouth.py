@@ -21,16 +21,6 @@ from tests.support.glb import opened_glb
 from tests.support.ready_templates import parted_faces
 
 
-@pytest.fixture(scope="module")
-def mean(model: HeadModel) -> np.ndarray:
-    return model.vertices(np.zeros(0))
-
-
-@pytest.fixture(scope="module")
-def landmarks(model: HeadModel, mean: np.ndarray) -> dict[str, np.ndarray]:
-    return {name: mean[row] for name, row in model.landmarks.items()}
-
-
 def skin_of(model: HeadModel, mean: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """The 5 % level and how an open jaw moves it."""
     level = model.levels["p95"]
@@ -57,8 +47,8 @@ def placed(
 
 
 @pytest.fixture(scope="module")
-def inner(model: HeadModel, mean: np.ndarray, landmarks: dict[str, np.ndarray]) -> InnerMouth:
-    return placed(model, mean, landmarks, parted_faces(model))
+def inner(model: HeadModel, mean: np.ndarray, points: dict[str, np.ndarray]) -> InnerMouth:
+    return placed(model, mean, points, parted_faces(model))
 
 
 def test_the_shipped_parts_are_closed_and_cross_neither_themselves_nor_each_other() -> None:
@@ -82,7 +72,7 @@ def test_the_shipped_parts_are_closed_and_cross_neither_themselves_nor_each_othe
 
 
 def test_upper_teeth_stay_and_lower_ones_turn_about_the_jaws_hinge(
-    inner: InnerMouth, landmarks: dict[str, np.ndarray]
+    inner: InnerMouth, points: dict[str, np.ndarray]
 ) -> None:
     assert inner.absence is None
     assert inner.moves["teeth_upper"] == {}
@@ -90,7 +80,7 @@ def test_upper_teeth_stay_and_lower_ones_turn_about_the_jaws_hinge(
     assert "viseme_aa" in inner.moves["teeth_lower"]
     rest = inner.parts["teeth_lower"].vertices
     opened = inner.posed("jawOpen", 1.0)["teeth_lower"]
-    axis = hinge(landmarks)[1:]
+    axis = hinge(points)[1:]
     before, after = (np.linalg.norm(points[:, 1:] - axis, axis=1) for points in (rest, opened))
     np.testing.assert_allclose(after, before, atol=1e-6)
     assert (rest[:, 1] - opened[:, 1]).max() > 10.0
@@ -111,27 +101,27 @@ def test_an_opening_mouth_meets_neither_teeth_nor_tongue(
 
 
 def test_nothing_is_added_behind_sealed_lips_beside_own_teeth_or_where_there_is_no_room(
-    model: HeadModel, mean: np.ndarray, landmarks: dict[str, np.ndarray]
+    model: HeadModel, mean: np.ndarray, points: dict[str, np.ndarray]
 ) -> None:
     faces, count = parted_faces(model), model.levels["p95"].count
-    assert placed(model, mean, landmarks, np.asarray(model.levels["p95"].faces)).absence == "mouth-sealed"
-    middle = landmarks["stomion"]
+    assert placed(model, mean, points, np.asarray(model.levels["p95"].faces)).absence == "mouth-sealed"
+    middle = points["stomion"]
     teeth = middle + np.array([[-20.0, 3.0, -25.0], [20.0, 3.0, -25.0], [0.0, 3.0, -12.0]])
-    beside = placed(model, mean, landmarks, np.append(faces, [[count, count + 1, count + 2]], axis=0), more=teeth)
+    beside = placed(model, mean, points, np.append(faces, [[count, count + 1, count + 2]], axis=0), more=teeth)
     assert (beside.absence, beside.parts) == ("own-parts", {})
     wall = middle + np.array([[-15.0, -9.0, -28.0], [15.0, -9.0, -28.0], [0.0, 15.0, -28.0]])
     none = placed(
-        model, mean, landmarks, np.append(faces, [[count, count + 1, count + 2]], axis=0), more=wall, joined=True
+        model, mean, points, np.append(faces, [[count, count + 1, count + 2]], axis=0), more=wall, joined=True
     )
     assert none.absence == "no-room"
 
 
 def test_lips_that_are_pressed_in_keep_off_the_teeth(
-    model: HeadModel, mean: np.ndarray, inner: InnerMouth, landmarks: dict[str, np.ndarray]
+    model: HeadModel, mean: np.ndarray, inner: InnerMouth, points: dict[str, np.ndarray]
 ) -> None:
     skin, shapes = skin_of(model, mean)
     faces = parted_faces(model)
-    away = ((skin - landmarks["labiale_inferius"]) ** 2).sum(axis=1)
+    away = ((skin - points["labiale_inferius"]) ** 2).sum(axis=1)
     shapes["mouthPressLeft"] = np.exp(-0.5 * away / 10.0**2)[:, None] * np.array([0.0, 0.0, -18.0])
     shapes["browInnerUp"] = np.zeros_like(skin)
     name = "mouthPressLeft"
@@ -147,11 +137,11 @@ def test_lips_that_are_pressed_in_keep_off_the_teeth(
 
 
 def test_the_parts_are_nodes_under_what_they_move_with(
-    model: HeadModel, mean: np.ndarray, inner: InnerMouth, landmarks: dict[str, np.ndarray]
+    model: HeadModel, mean: np.ndarray, inner: InnerMouth, points: dict[str, np.ndarray]
 ) -> None:
     skin, shapes = skin_of(model, mean)
-    points = {"jaw": hinge(landmarks), "neck": np.array([0.0, -26.0, -11.0])}
-    animated = AnimatedMesh(skin, shapes, points, {}, {}, inner)
+    pivots = {"jaw": hinge(points), "neck": np.array([0.0, -26.0, -11.0])}
+    animated = AnimatedMesh(skin, shapes, pivots, {}, {}, inner)
     colours = np.full(skin.shape, 200, np.uint8)
     scene = animated_scene(animated, parted_faces(model), colours, {"jawOpen": 0.25})
     document, _ = opened_glb(scene_glb_bytes(scene))
@@ -163,8 +153,8 @@ def test_the_parts_are_nodes_under_what_they_move_with(
     targets = meshes["tongue"]["extras"]["targetNames"]
     assert {"jawOpen", "tongueOut"} <= set(targets)
     assert meshes["tongue"]["weights"][targets.index("jawOpen")] == 0.25
-    np.testing.assert_allclose(nodes["teeth_upper"]["translation"], -points["neck"] / 1000.0)
-    for name, pivot in (("teeth_upper", np.zeros(3)), ("teeth_lower", points["jaw"])):
+    np.testing.assert_allclose(nodes["teeth_upper"]["translation"], -pivots["neck"] / 1000.0)
+    for name, pivot in (("teeth_upper", np.zeros(3)), ("teeth_lower", pivots["jaw"])):
         position = document["accessors"][meshes[name]["primitives"][0]["attributes"]["POSITION"]]
         highest = (inner.parts[name].vertices - pivot).max(axis=0) / 1000.0
         np.testing.assert_allclose(position["max"], highest, atol=1e-6)

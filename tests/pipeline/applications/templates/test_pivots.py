@@ -1,27 +1,15 @@
 """Where jaw, eyes and neck turn."""
 
 import numpy as np
-import pytest
 
 from pipeline.applications.templates.pivots import EYE_RADIUS_MM, hinge, in_mouth, jaw_motions, pivots
 from pipeline.head_model.model import HeadModel
+from tests.pipeline.applications.templates.conftest import moves
+
+Points = dict[str, np.ndarray]
 
 
-@pytest.fixture(scope="module")
-def mean(model: HeadModel) -> np.ndarray:
-    return model.vertices(np.zeros(0))
-
-
-def landmarks(model: HeadModel, mean: np.ndarray) -> dict[str, np.ndarray]:
-    return {name: mean[row] for name, row in model.landmarks.items()}
-
-
-def moves(model: HeadModel, *names: str) -> dict[str, np.ndarray]:
-    return {name: model.levels["full"].operator @ model.expressions.moved({name: 1.0}) for name in names}
-
-
-def test_pivots_lie_where_anatomy_has_them(model: HeadModel, mean: np.ndarray) -> None:
-    points = landmarks(model, mean)
+def test_pivots_lie_where_anatomy_has_them(model: HeadModel, mean: np.ndarray, points: Points) -> None:
     found = pivots(points, mean, moves(model, "eyeBlinkRight", "eyeBlinkLeft"), [])
     assert set(found) == {"jaw", "eye_right", "eye_left", "neck"}
     assert abs(found["jaw"][0]) < 1.0
@@ -36,16 +24,14 @@ def test_pivots_lie_where_anatomy_has_them(model: HeadModel, mean: np.ndarray) -
     assert found["neck"][2] < found["jaw"][2]
 
 
-def test_an_eyeball_of_the_mesh_is_the_pivot(model: HeadModel, mean: np.ndarray) -> None:
-    points = landmarks(model, mean)
+def test_an_eyeball_of_the_mesh_is_the_pivot(mean: np.ndarray, points: Points) -> None:
     ball = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]) * 12.0 + (31.0, 12.0, 66.0)
     found = pivots(points, mean, {}, [ball])
     np.testing.assert_allclose(found["eye_left"], (31.0, 12.0, 66.0))
     assert found["eye_right"][0] < 0
 
 
-def test_the_jaw_opens_about_its_hinge_and_shifts_otherwise(model: HeadModel, mean: np.ndarray) -> None:
-    points = landmarks(model, mean)
+def test_the_jaw_opens_about_its_hinge_and_shifts_otherwise(model: HeadModel, mean: np.ndarray, points: Points) -> None:
     found = jaw_motions(points, mean, moves(model, "jawOpen", "jawLeft", "mouthLeft"))
     assert set(found) == {"jawOpen", "jawLeft"}
     np.testing.assert_allclose(found["jawOpen"].apply(hinge(points)), hinge(points), atol=1e-9)
@@ -56,8 +42,7 @@ def test_the_jaw_opens_about_its_hinge_and_shifts_otherwise(model: HeadModel, me
     assert found["jawLeft"].translation[0] > 3.0
 
 
-def test_lower_teeth_are_told_from_upper_ones_and_from_what_is_no_tooth(model: HeadModel, mean: np.ndarray) -> None:
-    points = landmarks(model, mean)
+def test_lower_teeth_are_told_from_upper_ones_and_from_what_is_no_tooth(points: Points) -> None:
     inside = points["stomion"] + (0.0, 0.0, -15.0)
     row = np.linspace(-15.0, 15.0, 7)[:, None] * (1.0, 0.0, 0.0)
     assert in_mouth(points, inside + row - (0.0, 5.0, 0.0))

@@ -55,19 +55,13 @@ def test_half_an_obj_is_named(tmp_path: Path) -> None:
         read_reference(tmp_path / "scan.obj")
 
 
-def test_units_are_named() -> None:
+def test_units_triangles_that_face_different_ways_and_landmarks_of_another_frame_are_named() -> None:
     assert "which is a head in m: scale it to mm" in refused(replace(mannequin(), vertices=mannequin().vertices / 1000))
     assert "which is a head in cm" in refused(replace(mannequin(), vertices=mannequin().vertices / 10))
     assert "scale it to mm" in refused(replace(mannequin(), vertices=mannequin().vertices * 1000))
-
-
-def test_triangles_that_look_different_ways_are_named() -> None:
     faces = mannequin().faces.copy()
     faces[::3] = faces[::3, ::-1]
     assert "face opposite ways" in refused(Mesh(mannequin().vertices, faces))
-
-
-def test_landmarks_of_another_frame_are_named_with_all_else() -> None:
     moved = {name: point + (0.0, 0.0, 50.0) for name, point in marks().items()}
     refusal = refused(replace(mannequin(), vertices=mannequin().vertices / 10), moved)
     assert "landmarks off the surface: " in refusal

@@ -17,12 +17,14 @@ def seated(vertices: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return RigidTransform(rotation_from_vector(rng.normal(0, 0.3, 3)), rng.normal(0, 40, 3)).apply(vertices)
 
 
-def test_poses_are_no_scatter() -> None:
+def test_poses_are_no_scatter_and_one_head_has_none() -> None:
     rng = np.random.default_rng(1)
     heads = np.stack([seated(HEAD.vertices, rng) for _ in range(5)])
     found = scatter(heads, HEAD.faces, EVERYWHERE)
     assert found.position_mm.max() < 1e-6
     np.testing.assert_allclose(found.mean, heads[0], atol=1e-6)
+    with pytest.raises(ValueError, match="two are needed"):
+        scatter(heads[:1], HEAD.faces, EVERYWHERE)
 
 
 def test_planted_scatter_is_found_and_compared_with_what_was_stated() -> None:
@@ -46,8 +48,3 @@ def test_a_size_that_changes_is_scatter() -> None:
     found = scatter(heads, HEAD.faces, EVERYWHERE)
     radius = np.linalg.norm(HEAD.vertices - HEAD.vertices.mean(axis=0), axis=1)
     np.testing.assert_allclose(found.position_mm, np.sqrt(2.0) * 0.01 * radius, rtol=1e-6)
-
-
-def test_one_head_has_no_scatter() -> None:
-    with pytest.raises(ValueError, match="two are needed"):
-        scatter(HEAD.vertices[None], HEAD.faces, EVERYWHERE)

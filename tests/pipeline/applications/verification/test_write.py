@@ -28,10 +28,9 @@ def test_a_missed_limit_is_on_both_papers(tmp_path: Path) -> None:
     assert kept["passed"] is False
     assert kept["checks"]["face_rms_mm"]["passed"] is False
     assert kept["checks"]["repeatability_mm"] == {"value": None, "limit": Limits().repeatability_mm, "passed": None}
-    assert (
-        kept["captures"]["wider"]["size_error_percent"] == kept["captures"]["wider"]["alignment"]["size_error_percent"]
-    )
-    assert abs(kept["captures"]["wider"]["size_error_percent"] - 0.4) < 0.01
+    captured = kept["captures"]["wider"]
+    assert captured["size_error_percent"] == captured["alignment"]["size_error_percent"]
+    assert abs(captured["size_error_percent"] - 0.4) < 0.01
     pdf = (tmp_path / "certificate.pdf").read_bytes()
     assert pdf.startswith(b"%PDF")
     assert pdf.count(b"/Type /Page\n") == 2

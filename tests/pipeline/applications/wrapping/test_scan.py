@@ -56,23 +56,19 @@ def split_ball() -> RawScan:
     return raw_scan(TexturedMesh(Mesh(corners, np.concatenate([faces, [[0, 0, 1]]]).astype(np.int32), colours)), "ball")
 
 
-def test_vertices_are_joined_and_keep_their_colours() -> None:
+def test_vertices_are_joined_keep_their_colours_and_turn_over_together() -> None:
     scan = split_ball()
     assert len(scan.mesh.vertices) == 642
     assert len(scan.mesh.faces) == len(scan.painted.mesh.faces) == 1280  # the degenerate one is dropped
     rows, weights = np.arange(1280), np.tile([1.0, 0.0, 0.0], (1280, 1))
     expected = 128 + 100 * scan.mesh.vertices[scan.mesh.faces[:, 0]]
     np.testing.assert_allclose(scan.colours_at(rows, weights), expected, atol=1.0)
-
-
-def test_triangles_turn_over_together() -> None:
-    scan = split_ball()
     turned = scan.turned_over()
     np.testing.assert_allclose(turned.mesh.normals(), -scan.mesh.normals(), atol=1e-9)
     np.testing.assert_array_equal(turned.painted.mesh.faces, scan.painted.mesh.faces[:, ::-1])
 
 
-def test_what_is_no_scan_is_refused_in_a_sentence(tmp_path: Path) -> None:
+def test_what_is_no_scan_is_refused_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ball = trimesh.creation.icosphere(4)
     hole = ball.copy()
     hole.vertices[7] = np.nan
@@ -90,10 +86,7 @@ def test_what_is_no_scan_is_refused_in_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "empty.ply").write_bytes(b"")
     with pytest.raises(InputError, match="cannot be read as a mesh"):
         read_raw_scan(tmp_path / "empty.ply")
-
-
-def test_a_huge_mesh_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.applications.wrapping.scan.MAX_TRIANGLES", 5000)
-    trimesh.creation.icosphere(4).export(tmp_path / "ball.ply")
+    ball.export(tmp_path / "ball.ply")
     with pytest.raises(InputError, match=r"has 5,120 triangles; at most 5,000 are wrapped: decimate it"):
         read_raw_scan(tmp_path / "ball.ply")

@@ -124,23 +124,20 @@ def test_landmarks_place_a_scan_in_any_unit(model: HeadModel, factor: float, uni
         surface.vertices[surface.faces], model.vertices(np.zeros(0), "p95")[level.faces], atol=1e-6
     )
     np.testing.assert_allclose(placed.marks.on(model.vertices(np.zeros(0))), placed.marks.points, atol=1e-6)
-
-
-def test_landmarks_that_are_too_few_are_refused(model: HeadModel) -> None:
-    mesh = Mesh(model.vertices(np.zeros(0), "p95"), model.levels["p95"].faces)
     with pytest.raises(InputError, match="landmarks"):
-        place_scan(raw_scan(TexturedMesh(mesh), "scan"), model, {"pronasale": np.zeros(3)})
+        place_scan(
+            raw_scan(TexturedMesh(Mesh(surface.vertices, surface.faces)), "scan"), model, {"pronasale": np.zeros(3)}
+        )
 
 
 @pytest.mark.parametrize(
-    ("scale", "expected"), [(1.1, ("mm", 1.0)), (0.09, ("cm", 10.0)), (0.04, ("in", 25.4)), (0.001, ("m", 1000.0))]
+    ("scale", "expected"),
+    [(1.1, ("mm", 1.0)), (0.09, ("cm", 10.0)), (0.04, ("in", 25.4)), (0.001, ("m", 1000.0)), (0.5, (None, 2.0))],
 )
-def test_a_faces_size_tells_the_unit(scale: float, expected: tuple[str, float]) -> None:
+def test_a_faces_size_tells_the_unit_and_one_of_no_unit_becomes_a_mean_adults(
+    scale: float, expected: tuple[str | None, float]
+) -> None:
     assert unit_of(scale) == expected
-
-
-def test_a_size_of_no_unit_becomes_a_mean_adults() -> None:
-    assert unit_of(0.5) == (None, 2.0)
 
 
 def test_marks_lie_where_landmarks_do(model: HeadModel) -> None:

@@ -56,22 +56,16 @@ def coarse_of(image: np.ndarray, away: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return small, cv2.resize(away, (320, 240), interpolation=cv2.INTER_AREA)
 
 
-def test_a_smooth_background_is_guessed_where_the_border_is() -> None:
-    image, plate, away = photograph(0.0)
-    small, from_edge = coarse_of(image, away)
-    guess = estimated_background(image, small, from_edge > 6)
-    rim = np.abs(away) < 4
+def test_a_smooth_background_is_guessed_where_the_border_is_and_texture_makes_the_guess_uncertain() -> None:
+    guesses = {}
+    for texture in (0.0, 12.0):
+        image, plate, away = photograph(texture)
+        small, from_edge = coarse_of(image, away)
+        guesses[texture] = estimated_background(image, small, from_edge > 6), plate, np.abs(away) < 4
+    guess, plate, rim = guesses[0.0]
     assert np.abs(guess.plates[0][rim].astype(float) - plate[rim]).max() < 3  # 12 px of 0.05 levels, and noise
     assert np.median(guess.noise) < 3
-
-
-def test_texture_makes_the_guess_uncertain() -> None:
-    noise = {}
-    for texture in (0.0, 12.0):
-        image, _, away = photograph(texture)
-        small, from_edge = coarse_of(image, away)
-        noise[texture] = np.median(estimated_background(image, small, from_edge > 6).noise)
-    assert noise[12.0] > 3 * noise[0.0]
+    assert np.median(guesses[12.0][0].noise) > 3 * np.median(guess.noise)
 
 
 def test_the_matting_finds_the_edge_to_a_fraction_of_a_pixel() -> None:
@@ -119,34 +113,24 @@ def table(rng: np.random.Generator, noise_mm: float, count: int = 200) -> np.nda
     return CENTRE + np.column_stack([flat[:, 0], -70 + rng.normal(0, noise_mm, count), flat[:, 1]])
 
 
-def test_a_table_is_found_under_a_head() -> None:
+def test_a_table_is_found_under_a_head_and_what_stands_on_it_has_the_heads_size() -> None:
     rng = np.random.default_rng(1)
-    points = np.vstack([head(rng), table(rng, 0.5), CENTRE + rng.uniform(-2000, 2000, size=(100, 3))])
+    head_and_table = np.vstack([head(rng), table(rng, 0.5)])
+    points = np.vstack([head_and_table, CENTRE + rng.uniform(-2000, 2000, size=(100, 3))])
     plane = standing_plane(points, CENTRE, BALL_RADIUS)
     assert plane is not None
     # 200 points of 0.5 mm over 250 mm: 0.035 mm of height, 0.02 degrees; ten of each.
     assert abs(plane[:3] @ CENTRE + plane[3] - 70) < 0.35
     assert plane[1] > np.cos(np.radians(0.2))
-
-
-def test_what_stands_on_it_has_the_heads_size() -> None:
-    rng = np.random.default_rng(2)
-    points = np.vstack([head(rng), table(rng, 0.5)])
-    plane = standing_plane(points, CENTRE, BALL_RADIUS)
-    assert plane is not None
-    middle, radius = ball_above(plane, points, CENTRE, BALL_RADIUS)
+    middle, radius = ball_above(plane, head_and_table, CENTRE, BALL_RADIUS)
     assert np.linalg.norm(middle - CENTRE) < 2 * NEAR * BALL_RADIUS + 5
     assert 70 < radius < 1.25 * 75
 
 
-def test_a_person_alone_stands_on_nothing() -> None:
+def test_a_person_alone_stands_on_nothing_nor_on_a_table_through_the_middle() -> None:
     rng = np.random.default_rng(3)
     assert standing_plane(head(rng), CENTRE, BALL_RADIUS) is None
     walls = CENTRE + rng.normal(size=(300, 3)) * 150  # a room with things in it everywhere
     assert standing_plane(np.vstack([head(rng), walls]), CENTRE, BALL_RADIUS) is None
-
-
-def test_a_table_through_the_subject_is_none() -> None:
-    rng = np.random.default_rng(4)
     half = table(rng, 0.5) + np.array([0.0, 30.0, 0.0])  # 40 mm below the middle: a tenth of the head is under it
     assert standing_plane(np.vstack([head(rng), half]), CENTRE, BALL_RADIUS) is None

@@ -39,7 +39,7 @@ def test_nothing_behind_the_camera_is_the_head() -> None:
     assert not beside_head(seed, camera, (240, 320)).any()
 
 
-def test_what_is_beside_the_head_holds_neither_head_nor_body() -> None:
+def test_what_is_beside_the_head_holds_neither_head_nor_body_and_clothes_alone_are_below_the_chin() -> None:
     camera = fan(640, 480).cameras[0]
     seed = seed_at(np.zeros(3), camera)
     beside, core = beside_head(seed, camera, (240, 320)), head_core(seed, camera, (240, 320))
@@ -47,11 +47,6 @@ def test_what_is_beside_the_head_holds_neither_head_nor_body() -> None:
     assert not (beside & core).any()
     below = camera.project(np.array([[0.0, 0.0, 0.0]]) - 200.0 * seed.up_world)[0] / 2
     assert below[1] >= 240 or not beside[int(below[1])].any()
-
-
-def test_clothes_are_below_the_chin_and_the_head_is_not() -> None:
-    camera = fan(640, 480).cameras[0]
-    seed = seed_at(np.zeros(3), camera)
     above, core = above_chin(seed, camera, (480, 640)), head_core(seed, camera, (480, 640))
     assert above[core].all()
     chest = camera.project(-120.0 * seed.up_world[None])[0]

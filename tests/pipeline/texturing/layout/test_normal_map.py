@@ -1,9 +1,6 @@
 """A bumpy ball's normals, known from its formula, against what a viewer makes of its reduced mesh and its map."""
 
-import json
-import struct
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,7 +12,7 @@ from pipeline.texturing.layout.uv_unwrap import Layout, unwrap
 from rig.formats.meshes.scene import Skin
 from rig.formats.pictures.images import encode_image
 from rig.mesh import Mesh
-from tests.support.glb import glb_bytes
+from tests.support.glb import glb_bytes, opened_glb
 
 RADIUS_MM, BUMP_MM, WAVES = 90.0, 0.5, 24.0
 
@@ -56,8 +53,7 @@ def ball() -> Ball:
 
 def opened(glb: bytes) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """What a viewer reads: attributes and faces, and the normal map (0 to 255)."""
-    (length,) = struct.unpack_from("<I", glb, 12)
-    document, payload = json.loads(glb[20 : 20 + length]), glb[28 + length :]
+    document, payload = opened_glb(glb)
     primitive = document["meshes"][0]["primitives"][0]
 
     def array(number: int) -> np.ndarray:
@@ -144,10 +140,3 @@ def test_tangents_point_where_u_grows_and_bitangents_up_in_the_image() -> None:
     np.testing.assert_allclose(bitangent, np.tile([0.0, 1.0, 0.0], (4, 1)), atol=1e-12)
     mirrored = vertex_tangents(vertices, normals, uv * (-1.0, 1.0) + (1.0, 0.0), faces)
     np.testing.assert_allclose(mirrored, np.tile([-1.0, 0.0, 0.0, -1.0], (4, 1)), atol=1e-12)
-
-
-def test_other_formats_carry_no_map(ball: Ball, tmp_path: Path) -> None:
-    skin = Skin(np.zeros((len(ball.mesh.vertices), 2)), b"\xff\xd8\xff")
-    plain = glb_bytes(ball.mesh, normals=true_normals(ball.unit), skin=skin)
-    assert b"normalTexture" not in plain
-    assert b"TANGENT" not in plain

@@ -158,23 +158,13 @@ def test_another_exposure_of_the_parallel_pictures_is_found_and_taken_out(shiny:
     assert np.median(np.abs(off)) < 0.004
 
 
-def test_exchanged_sets_are_told(shiny: Coloured) -> None:
+def test_one_set_alone_has_a_texture_and_sets_that_are_exchanged_or_unused_are_told(shiny: Coloured) -> None:
     sets = shiny.capture.texture_sets
+    one, warnings = shiny.by_sets({"ultraviolet": sets["cross"]})
+    assert (one.specular, one.diffuse, warnings) == (None, None, [])
+    assert set(one.atlases) == {"ultraviolet"}
     _, warnings = shiny.by_sets({"cross": sets["parallel"], "parallel": sets["cross"]})
     assert warnings == ["texture-sets-exchanged"]
-
-
-def test_one_set_alone_has_a_texture_and_no_specular_light(shiny: Coloured) -> None:
-    one, warnings = shiny.by_sets({"ultraviolet": shiny.capture.texture_sets["cross"]})
-    assert one.specular is None
-    assert one.diffuse is None
-    assert not warnings
-    assert set(one.atlases) == {"ultraviolet"}
-
-
-def test_sets_of_a_head_without_texture_are_told_to_be_unused(shiny: Coloured) -> None:
-    found, warnings = colour_by_sets(
-        shiny.capture.texture_sets, None, shiny.mesh, shiny.silhouettes, None, atlas=None, settings=SETTINGS
-    )
+    found, unused = colour_by_sets(sets, None, shiny.mesh, shiny.silhouettes, None, atlas=None, settings=SETTINGS)
     assert found is None
-    assert [warning.code for warning in warnings] == ["texture-sets-unused"]
+    assert [warning.code for warning in unused] == ["texture-sets-unused"]

@@ -12,7 +12,7 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_file import read_rig_file, write_rig_file
 from rig.formats.pictures.images import write_image
 from rig.messages.message import texts_of
-from rig.rig import Rig
+from tests.support.changed_rigs import relensed
 from tests.support.fan_rig import POINTS, fan
 
 METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
@@ -129,7 +129,7 @@ def test_blender_frames_tell_an_angle_and_no_size(tmp_path: Path) -> None:
 
 
 def test_blender_sees_what_the_camera_sees(tmp_path: Path) -> None:
-    rig = Rig(tuple(replace(c, intrinsics=replace(c.intrinsics, distortion=Distortion())) for c in fan()))
+    rig = relensed(fan(), lambda k: replace(k, distortion=Distortion()))
     write_rig_file(rig, tmp_path / "cameras.py", "blender")
     script = (tmp_path / "cameras.py").read_text()
     compile(script, "cameras.py", "exec")

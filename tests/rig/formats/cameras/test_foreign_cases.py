@@ -12,19 +12,16 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_file import read_cameras, write_rig_file
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
+from tests.support.changed_rigs import relensed
 from tests.support.fan_rig import fan
 from tests.support.planted_keys import base
 
 
-def with_lens(rig: Rig, coefficients: tuple[float, ...]) -> Rig:
-    lens = RecordedLens("kannala-brandt", coefficients)
-    straight = [replace(camera.intrinsics, distortion=Distortion()) for camera in rig]
-    return Rig(tuple(replace(c, recorded=lens, intrinsics=k) for c, k in zip(rig, straight, strict=True)))
-
-
 @pytest.mark.parametrize("place", ["top", "frame"])
 def test_instant_ngp_says_a_fisheye_by_its_flag(place: str, tmp_path: Path) -> None:
-    rig = with_lens(fan(3), (0.02, -0.01, 0.003, 1e-3))
+    lens = RecordedLens("kannala-brandt", (0.02, -0.01, 0.003, 1e-3))
+    straight = relensed(fan(3), lambda k: replace(k, distortion=Distortion()))
+    rig = Rig(tuple(replace(camera, recorded=lens) for camera in straight))
     write_rig_file(rig, tmp_path / "transforms.json", "nerfstudio")
     document = json.loads((tmp_path / "transforms.json").read_text())
     del document["camera_model"]
@@ -80,14 +77,11 @@ def test_cameras_that_are_not_aligned_are_told(tmp_path: Path) -> None:
     assert "cam02 not aligned in cameras.xml" in read.remarks[0].text
 
 
-def test_a_dot_in_a_label_belongs_to_the_name(tmp_path: Path) -> None:
+def test_a_dot_in_a_label_belongs_to_the_name_and_labels_that_repeat_take_their_groups(tmp_path: Path) -> None:
     read = read_cameras(metashape(tmp_path, (r'label="cam(\d\d)">', r'label="2024.11.25_cam.\1">')))
     assert read.rig.names[0] == "2024.11.25_cam.00"
     read = read_cameras(metashape(tmp_path, (r'label="cam(\d\d)">', r'label="shots\\\\cam.\1.TIF">')))
     assert read.rig.names[0] == "cam.00"
-
-
-def test_labels_that_repeat_take_their_groups(tmp_path: Path) -> None:
     grouped = (
         r'(<camera id="(\d+)" sensor_id="\d+" label=")(cam\d\d)(".*?</camera>)',
         r'<group id="\2" label="\3" type="folder">\1IMG_0001\4</group>',

@@ -20,7 +20,7 @@ PAGE = Path(__file__).parents[4] / "docs" / "foreign-cameras.md"
 ELSEWHERE = {("colmap", "sparse/1")}  # told by what reads the folder: tests/rig/formats/captures/test_shot_files.py
 # Read, and without effect for this value or in this place: what else the row says is in the test named.
 AS_IT_IS = {
-    ("metashape", "group@label"): "test_labels_that_repeat_take_their_groups",
+    ("metashape", "group@label"): "test_a_dot_in_a_label_belongs_to_the_name_and_labels_that_repeat_take_their_groups",
     ("metashape", "camera@component_id"): "test_cameras_of_two_components_are_refused",
     ("metashape", "chunk/components"): "test_cameras_of_two_components_are_refused",
     ("metashape", "component@id"): "test_cameras_of_two_components_are_refused",
@@ -92,10 +92,13 @@ def markdown_table(table: Table) -> str:
     return "\n".join(lines)
 
 
-def test_the_page_shows_the_table() -> None:
+def test_the_page_shows_the_table_and_names_the_files_of_cameras_that_are_not_read() -> None:
     text = PAGE.read_text(encoding="utf-8")
     for title, table in FOREIGN_KEYS.values():
         assert f"## {title}\n\n{markdown_table(table)}\n" in text
+    page = PAGE.read_text(encoding="utf-8").split("## Not read")[1]
+    assert [pattern for pattern, _ in PATTERNS if f"`{pattern}`" not in page] == []
+    assert [key for key in OPENCV_KEYS if key.strip("\n:").lower() not in page.lower()] == []
 
 
 def test_every_value_of_these_tests_belongs_to_a_row() -> None:
@@ -108,9 +111,3 @@ NOTHING = (None, 0, "0", "0.000", [0, 0.0, [0]], {"a": 0}, "", "0 0 0", False)
 @pytest.mark.parametrize("value", [*NOTHING, 1, "x", [0, 1e-9], "0 0 1", True, float("nan")])
 def test_values_that_say_nothing(value: object) -> None:
     assert says_nothing(value, ForeignKey("refused", "", (0,))) is any(value is nothing for nothing in NOTHING)
-
-
-def test_the_page_names_the_files_of_cameras_that_are_not_read() -> None:
-    page = PAGE.read_text(encoding="utf-8").split("## Not read")[1]
-    assert [pattern for pattern, _ in PATTERNS if f"`{pattern}`" not in page] == []
-    assert [key for key in OPENCV_KEYS if key.strip("\n:").lower() not in page.lower()] == []

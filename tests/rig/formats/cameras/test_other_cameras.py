@@ -13,10 +13,10 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_file import FORMATS, find_rig_file, read_rig_file, rig_file_parts, write_rig_file
 from rig.formats.cameras.colmap import write_colmap
 from rig.formats.cameras.opencv_yaml import write_aniposelib
-from rig.formats.pictures.images import write_image
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
-from tests.support.fan_rig import NAMES, POINTS, fan, square
+from tests.support.changed_rigs import relensed, reposed
+from tests.support.fan_rig import NAMES, POINTS, fan, find_cameras, square, write_blanks
 from tests.support.shared_data import shared
 
 
@@ -24,9 +24,7 @@ from tests.support.shared_data import shared
 def test_every_format_is_written_and_found_again(kind: str, tmp_path: Path) -> None:
     rig = square(fan()) if kind == "realitycapture-csv" else fan()
     write_rig_file(rig, tmp_path / NAMES[kind], kind)
-    for camera in rig:  # some formats leave the size to the pictures
-        pixels = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
-        write_image(tmp_path / "images" / f"{camera.name}.png", pixels)
+    write_blanks(rig, tmp_path)
     (tmp_path / "board.toml").write_text('kind = "checkerboard"\n')  # no rig: must not be taken for one
     file = find_rig_file(tmp_path)
     if kind == "blender":
@@ -53,45 +51,27 @@ def test_opencv_matrices_in_one_file(unit: float, vectors: bool, tmp_path: Path)
         file.write(f"dist_{camera.name}", camera.intrinsics.distortion.opencv())
         file.write(f"R_{camera.name}", cv2.Rodrigues(pose.rotation)[0] if vectors else pose.rotation)
         file.write(f"T_{camera.name}", pose.translation / unit)
-        pixels = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
-        write_image(tmp_path / "images" / f"{camera.name}.png", pixels)
     file.release()
+    write_blanks(rig, tmp_path)
     (tmp_path / "compose.yaml").write_text("services: {}\n")  # no rig, and before it by name
-    path = find_rig_file(tmp_path)
-    assert path == tmp_path / "studio.yaml"
+    assert find_rig_file(tmp_path) == tmp_path / "studio.yaml"
     back = read_rig_file(tmp_path / "studio.yaml")
     for camera in rig:
         np.testing.assert_allclose(back[camera.name].project(POINTS), camera.project(POINTS), atol=1e-6)
 
 
-def test_a_yaml_of_opencv_without_cameras_says_what_is_wanted(tmp_path: Path) -> None:
+def test_an_unknown_format_and_a_yaml_of_opencv_without_cameras_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'ply' is none of eigenhead, colmap"):
+        write_rig_file(fan(), tmp_path / "x", "ply")
     (tmp_path / "board.yml").write_text("%YAML:1.0\n---\nsquare: 25.\n")
     with pytest.raises(InputError, match=r"board\.yml: holds no camera; wanted are K_<name>, dist_<name>, R_<name>"):
         read_rig_file(tmp_path / "board.yml")
 
 
-def test_an_unknown_format_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="'ply' is none of eigenhead, colmap"):
-        write_rig_file(fan(), tmp_path / "x", "ply")
-
-
-@pytest.mark.parametrize("binary", [False, True])
-def test_pycolmap_loads_what_is_exported(binary: bool, tmp_path: Path) -> None:
-    rig = fan()
-    write_colmap(rig, tmp_path, binary=binary)
-    model = pycolmap.Reconstruction(str(tmp_path))
-    assert len(model.images) == len(rig)
-    for image in model.images.values():
-        camera = rig[Path(image.name).stem]
-        theirs = np.array([image.project_point(point) for point in POINTS])
-        np.testing.assert_allclose(theirs - 0.5, camera.project(POINTS), atol=1e-8)
-
-
 def bent(lens: RecordedLens) -> Rig:
     """The fan with a foreign lens before every camera."""
-    return Rig(
-        tuple(replace(c, intrinsics=replace(c.intrinsics, distortion=Distortion()), recorded=lens) for c in fan())
-    )
+    straight = relensed(fan(), lambda k: replace(k, distortion=Distortion()))
+    return Rig(tuple(replace(camera, recorded=lens) for camera in straight))
 
 
 FISHEYE = RecordedLens("kannala-brandt", (-0.02, 0.004, -0.001, 0.0002))
@@ -105,9 +85,7 @@ RATIONAL = RecordedLens("rational", (0.1, -0.02, 1e-3, -5e-4, 0.003, 0.2, 0.01, 
 )
 def test_foreign_lenses_go_out_and_in(lens: RecordedLens, kind: str, tmp_path: Path) -> None:
     write_rig_file(bent(lens), tmp_path / NAMES[kind], kind)
-    file = find_rig_file(tmp_path)
-    assert file is not None
-    for camera in read_rig_file(file):
+    for camera in read_rig_file(find_cameras(tmp_path)):
         assert camera.recorded is not None
         assert camera.recorded.model == lens.model
         np.testing.assert_allclose(camera.recorded.coefficients, lens.coefficients, rtol=1e-12)
@@ -123,15 +101,19 @@ def test_a_lens_that_a_format_does_not_have_is_refused(lens: RecordedLens, kind:
         write_rig_file(bent(lens), tmp_path / NAMES[kind], kind)
 
 
-@pytest.mark.parametrize("lens", [FISHEYE, RATIONAL], ids=["OPENCV_FISHEYE", "FULL_OPENCV"])
-def test_pycolmap_bends_foreign_lenses_alike(lens: RecordedLens, tmp_path: Path) -> None:
-    write_colmap(bent(lens), tmp_path)
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize("lens", [None, FISHEYE, RATIONAL], ids=["OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"])
+def test_pycolmap_loads_and_bends_what_is_exported(lens: RecordedLens | None, binary: bool, tmp_path: Path) -> None:
+    rig = fan() if lens is None else bent(lens)
+    write_colmap(rig, tmp_path, binary=binary)
     model = pycolmap.Reconstruction(str(tmp_path))
+    assert len(model.images) == len(rig)
     for image in model.images.values():
-        camera = bent(lens)[Path(image.name).stem]
+        camera = rig[Path(image.name).stem]
         theirs = np.array([image.project_point(point) for point in POINTS]) - 0.5
-        ours = lens.distorted(camera.project(POINTS), camera.intrinsics.matrix())
-        np.testing.assert_allclose(theirs, ours, atol=1e-7)
+        straight = camera.project(POINTS)
+        ours = straight if lens is None else lens.distorted(straight, camera.intrinsics.matrix())
+        np.testing.assert_allclose(theirs, ours, atol=1e-8 if lens is None else 1e-7)
 
 
 def test_simple_colmap_models_and_folders_of_images(tmp_path: Path) -> None:
@@ -154,13 +136,8 @@ def test_the_published_caliscope_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("unit", "scale"), [("", 1.0), ("", 1000.0), ('unit = "mm"', 1.0), ('unit = "m"', 1000.0)])
 def test_the_unit_of_an_aniposelib_file(unit: str, scale: float, tmp_path: Path) -> None:
-    rig = fan(3)
-    metres = tuple(
-        replace(c, camera_from_world=replace(c.camera_from_world, translation=c.camera_from_world.translation / scale))
-        for c in rig
-    )
-    path = tmp_path / "calibration.toml"
-    write_aniposelib(Rig(metres), path)
+    rig, path = fan(3), tmp_path / "calibration.toml"
+    write_aniposelib(reposed(rig, lambda pose: replace(pose, translation=pose.translation / scale)), path)
     path.write_text(path.read_text().replace('unit = "mm"', unit))
     back = read_rig_file(path)
     np.testing.assert_allclose(back["cam01"].camera_from_world.translation, rig["cam01"].camera_from_world.translation)
@@ -189,9 +166,7 @@ def test_opencv_yaml_of_plain_lists_is_read_and_words_in_place_of_numbers_are_na
 
 def test_a_csv_that_a_spreadsheet_saved_with_semicolons_is_read(tmp_path: Path) -> None:
     rig, path = square(fan()), tmp_path / "cameras.csv"
-    for camera in rig:
-        blank = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
-        write_image(tmp_path / "images" / f"{camera.name}.png", blank)
+    write_blanks(rig, tmp_path)
     write_rig_file(rig, path, "realitycapture-csv")
     plain = read_rig_file(path)
     path.write_text("\ufeff" + path.read_text().replace(",", ";").replace(".", ",").replace(",png", ".png"), "utf-8")

@@ -19,10 +19,15 @@ def test_a_long_value_keeps_its_quotation_marks(text: str) -> None:
     assert len(shown(text)) <= 42
 
 
-def test_faults_that_differ_in_more_than_names_are_all_said() -> None:
+def test_faults_that_differ_in_what_was_measured_alone_are_one_and_others_are_all_said() -> None:
     faults = ["images/cam00.png is black", "images/cam01.png is black", "images/cam02.png is 7 wide"]
     assert texts_of(say_once(faults, ["cam00", "cam01", "cam02"])) == faults
     assert texts_of(say_once(["a", "b", "c"], [])) == ["a", "b", "c"]
+    names = [f"cam{i:02}" for i in range(4)]
+    (sentence,) = texts_of(say_once([f"{n}: {27.5 + 0.1 * i:g} px is absurd" for i, n in enumerate(names)], names))
+    assert sentence == "cam00: 27.5 px is absurd; the same is true of 3 more (cam01, cam02, cam03)"
+    sizes = [f"{n} is {600 + i} x 400 pixels" for i, n in enumerate(names)]
+    assert texts_of(say_once(sizes, names)) == sizes
 
 
 def test_many_files_with_one_fault_are_one_sentence() -> None:
@@ -35,14 +40,6 @@ def test_many_files_with_one_fault_are_one_sentence() -> None:
     (sentence,) = texts_of(say_once(plates, names))
     assert "the same is true of 21 more (" in sentence
     assert say_once(["cam1 is a", "cam11 is a", "cam111 is a"], ["cam1", "cam11"])[0].text.startswith("cam1 is a")
-
-
-def test_faults_that_differ_in_what_was_measured_of_each_camera_are_one() -> None:
-    names = [f"cam{i:02}" for i in range(4)]
-    (sentence,) = texts_of(say_once([f"{n}: {27.5 + 0.1 * i:g} px is absurd" for i, n in enumerate(names)], names))
-    assert sentence == "cam00: 27.5 px is absurd; the same is true of 3 more (cam01, cam02, cam03)"
-    sizes = [f"{n} is {600 + i} x 400 pixels" for i, n in enumerate(names)]
-    assert texts_of(say_once(sizes, names)) == sizes
 
 
 def test_what_cameras_have_alike_is_said_once() -> None:

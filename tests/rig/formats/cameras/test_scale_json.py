@@ -14,14 +14,11 @@ POINT = {"cam00": [10, 20.5], "cam01": [11, 21]}
 OTHER = {"cam00": [10, 20.5], "cam01": [31, 21]}  # behind the first in one picture
 
 
-def test_two_points_are_read() -> None:
+def test_two_points_a_tag_and_a_pair_of_cameras_are_read() -> None:
     known = scale_from_document({"points": {"a": POINT, "b": OTHER}, "distance_mm": 62.0}, CAMERAS)
     assert isinstance(known, PointDistance)
     assert known.distance_mm == 62.0
     assert known.first["cam00"].tolist() == [10.0, 20.5]
-
-
-def test_a_tag_and_a_pair_of_cameras_are_read() -> None:
     tag = scale_from_document({"tag": {"dictionary": "DICT_4X4_50", "size_mm": 40}}, CAMERAS)
     assert tag == TagSize("DICT_4X4_50", 40.0)
     pair = scale_from_document({"cameras": ["cam00", "cam02"], "distance_mm": 410}, CAMERAS)

@@ -9,9 +9,7 @@ import pytest
 
 from rig.errors import InputError
 from rig.formats.captures.capture_folder import full_size_reader, read_capture, write_capture
-from rig.formats.captures.features_json import features_from_bytes
 from rig.formats.pictures.images import read_image, write_image
-from rig.messages.message import Message, texts_of
 from tests.support.shared_data import shared
 from tests.support.small_captures import (
     FEATURES,
@@ -62,6 +60,11 @@ def test_a_colmap_model_in_place_of_cameras_json(folder: Path) -> None:
     }
 
 
+def astray(folder: Path) -> None:
+    (folder / "images" / "a.png").unlink()
+    (folder / "images" / "a.png").symlink_to("/mnt/away/a.png")
+
+
 @pytest.mark.parametrize(
     ("harm", "words"),
     [
@@ -77,10 +80,17 @@ def test_a_colmap_model_in_place_of_cameras_json(folder: Path) -> None:
         (damage("background/b/001.png", b""), "background/b/001.png is damaged"),
         (damage("masks/c.png", png(np.zeros((HEIGHT, WIDTH), np.uint8))), "masks/c.png is empty"),
         (rename("masks/c.png", "masks/c.gif"), "masks/c.gif is not read: of GIF files nothing is"),
+        (astray, "images/a.png is a link to a file that is not there: /mnt/away/a.png"),
+        (rename("background", "backgrounds"), "backgrounds/ is not read: call it background/"),
+        (rename("masks", "mask"), "mask/ is not read: call it masks/"),
+        (rename("images", "image"), "image/ is not read: call it images/"),
+        (remove("cameras.json"), "holds no cameras.json"),
+        (rename("cameras.json", "inner.zip"), "holds an archive (inner.zip)"),
         (rename("background/a.png", "background/a.npy"), "background/a.npy is not read: of NumPy files nothing is"),
         (damage("features.json", b"{"), "features.json cannot be read as JSON"),
         (points([]), "features.json is no object"),
         (points({"points": {}}), "features.json: format is None"),
+        (points({"format": FEATURES, "points": {f"p{i}": {} for i in range(201)}}), "201 points, at most 200"),
         (feature([1, 2]), "'pronasale' is no object of camera"),
         (feature({"z": [1, 2]}), "names camera 'z', which the rig does not have"),
         (feature({"a": [1]}), "is no pair of finite pixels"),
@@ -106,20 +116,6 @@ def test_a_fault_is_named(folder: Path, harm: Callable[[Path], None], words: str
         read_capture(folder)
     assert len(caught.value.faults) == 1
     assert words in caught.value.faults[0].text
-
-
-def test_a_link_that_leads_nowhere_is_no_missing_picture(folder: Path) -> None:
-    (folder / "images" / "a.png").unlink()
-    (folder / "images" / "a.png").symlink_to("/mnt/away/a.png")
-    with pytest.raises(InputError, match=r"images/a\.png is a link to a file that is not there: /mnt/away/a\.png"):
-        read_capture(folder)
-
-
-def test_captures_in_a_folder_are_named(folder: Path) -> None:
-    for name in ("monday", "tuesday"):
-        write_capture(folder.parent / "week" / name, small_capture(), small_rig())
-    with pytest.raises(InputError, match="but monday, tuesday do: give one of these"):
-        read_capture(folder.parent / "week")
 
 
 def test_a_plate_and_a_folder_of_plates_go_together(folder: Path) -> None:
@@ -158,14 +154,6 @@ def test_two_spellings_of_one_name_are_no_guess(folder: Path) -> None:
     assert any("images/A.png is missing" in fault.text for fault in caught.value.faults)
 
 
-@pytest.mark.parametrize(("called", "meant"), [("backgrounds", "background"), ("mask", "masks"), ("image", "images")])
-def test_a_folder_that_nobody_would_read_is_named(folder: Path, called: str, meant: str) -> None:
-    (folder / meant).rename(folder / called)
-    with pytest.raises(InputError) as caught:
-        read_capture(folder)
-    assert texts_of(caught.value.faults) == [f"{called}/ is not read: call it {meant}/"]
-
-
 def test_all_faults_are_named_at_once(folder: Path) -> None:
     (folder / "images" / "a.png").unlink()
     (folder / "images" / "b.png").write_bytes(b"")
@@ -175,22 +163,16 @@ def test_all_faults_are_named_at_once(folder: Path) -> None:
     assert len(caught.value.faults) == 3
 
 
-def test_a_rig_s_faults_come_with_its_file_s_name(folder: Path) -> None:
+def test_a_rig_s_faults_come_with_its_file_s_name_and_captures_in_a_folder_are_named(folder: Path) -> None:
     (folder / "cameras.json").write_text("{}")
     with pytest.raises(InputError, match=r"capture: cameras\.json: "):
         read_capture(folder)
-    (folder / "cameras.json").unlink()
-    with pytest.raises(InputError, match=r"holds no cameras\.json"):
-        read_capture(folder)
     with pytest.raises(InputError, match="is no folder"):
         read_capture(folder / "absent")
-
-
-def test_too_many_points_are_refused() -> None:
-    faults: list[Message] = []
-    document = {"format": "eigenhead-features/1", "points": {f"p{i}": {} for i in range(201)}}
-    assert features_from_bytes(json.dumps(document).encode(), small_rig(), faults) == {}
-    assert "201 points, at most 200" in faults[0].text
+    for name in ("monday", "tuesday"):
+        write_capture(folder.parent / "week" / name, small_capture(), small_rig())
+    with pytest.raises(InputError, match="but monday, tuesday do: give one of these"):
+        read_capture(folder.parent / "week")
 
 
 def test_the_shared_capture_is_read() -> None:
@@ -198,13 +180,6 @@ def test_the_shared_capture_is_read() -> None:
     assert len(rig) == len(capture.images) == 11
     assert not any(camera.intrinsics.distortion.is_zero for camera in rig)
     assert len(capture.features) == 7
-
-
-def test_an_archive_in_place_of_a_capture_is_named(folder: Path) -> None:
-    (folder / "cameras.json").unlink()
-    (folder / "inner.zip").write_bytes(b"PK\3\4")
-    with pytest.raises(InputError, match=r"holds an archive \(inner\.zip\)"):
-        read_capture(folder)
 
 
 @pytest.mark.parametrize("locked", ["a.png", "cameras.json"])

@@ -19,8 +19,6 @@ from tests.support.small_captures import HEIGHT, WIDTH, picture, small_capture, 
 
 def test_an_exif_turn_is_not_obeyed(folder: Path) -> None:
     """The calibration holds for the sensor's rows and columns."""
-    from PIL import Image
-
     exif = Image.Exif()
     exif[0x0112] = 6  # rotate by 90 degrees to look at
     (folder / "images" / "a.png").unlink()

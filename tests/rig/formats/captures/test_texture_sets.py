@@ -109,15 +109,11 @@ def test_every_fault_of_a_set_is_one_sentence(polarised: Path, case: str) -> Non
     assert fault.startswith(sentence)
 
 
-def test_files_that_file_managers_add_are_passed_over(polarised: Path) -> None:
+def test_names_are_matched_as_those_of_photographs_are_and_junk_is_passed_over(polarised: Path) -> None:
+    place = polarised / "texture_sets" / "cross"
     (polarised / "texture_sets" / ".DS_Store").write_bytes(b"x")
-    (polarised / "texture_sets" / "cross" / "Thumbs.db").write_bytes(b"x")
-    assert len(read_capture(polarised)[0].texture_sets) == 2
-
-
-def test_names_are_matched_as_those_of_photographs_are(polarised: Path) -> None:
-    rig = small_rig()
-    for name in rig.names:
-        place = polarised / "texture_sets" / "cross"
+    (place / "Thumbs.db").write_bytes(b"x")
+    for name in small_rig().names:
         (place / f"{name}.png").rename(place / f"shot_{name.upper()}.png")
-    assert set(read_capture(polarised)[0].texture_sets["cross"]) == set("abc")
+    sets = read_capture(polarised)[0].texture_sets
+    assert (len(sets), set(sets["cross"])) == (2, set("abc"))

@@ -39,11 +39,6 @@ def test_normals_of_a_ball_point_outwards() -> None:
     assert area == pytest.approx(BALL.area)
 
 
-def test_a_face_without_area_gives_a_unit_normal_all_the_same() -> None:
-    flat = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32))
-    np.testing.assert_array_equal(flat.normals(), [[0, 0, 1]] * 3)
-
-
 def test_boundary_edges() -> None:
     assert len(boundary_edges(MESH.faces)) == 0
     opened = MESH.faces[1:]

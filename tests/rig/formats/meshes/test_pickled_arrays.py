@@ -58,6 +58,8 @@ def test_nothing_that_a_pickle_names_is_run(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="system"):
         read_pickled_arrays(written(tmp_path, {"v": np.zeros(3), "x": Runs(mark)}))
     assert not mark.exists()
+    with pytest.raises(InputError, match="no dictionary of arrays"):
+        read_pickled_arrays(written(tmp_path, {"v": Claims()}))
 
 
 class Claims:
@@ -66,11 +68,6 @@ class Claims:
     def __reduce__(self) -> tuple[object, ...]:
         made, arguments, _ = np.zeros(3).__reduce__()
         return made, arguments, (1, (3,), np.dtype(float), False, 1 << 40)
-
-
-def test_a_number_in_place_of_bytes_reserves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no dictionary of arrays"):
-        read_pickled_arrays(written(tmp_path, {"v": Claims()}))
 
 
 @pytest.mark.parametrize("content", [[1, 2], {}, {"name": "nothing but words"}, np.zeros(3)])

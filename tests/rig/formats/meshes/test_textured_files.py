@@ -46,7 +46,8 @@ def test_trimesh_reads_a_textured_glb(suffix: str, mime: str) -> None:
     assert header["asset"]["extras"] == extras
     assert header["images"][0]["mimeType"] == mime
     assert ("EXT_texture_webp" in header.get("extensionsRequired", [])) == (suffix == ".webp")
-    assert "COLOR_0" not in header["meshes"][0]["primitives"][0]["attributes"]
+    assert header["meshes"][0]["primitives"][0]["attributes"].keys() == {"POSITION", "NORMAL", "TEXCOORD_0"}
+    assert "normalTexture" not in header["materials"][0]
     assert 0 < header["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"] < 1
 
 

@@ -36,9 +36,13 @@ def test_signs_case_and_leading_zeros_do_not_count(pattern: str) -> None:
     assert found == {name: [pattern.format(i)] for i, name in enumerate(CAMERAS[:10])}
 
 
-def test_names_that_vary_are_filed_where_each_names_one_camera() -> None:
+def test_names_that_vary_are_filed_where_each_names_one_camera_or_several_may_be() -> None:
     names = [f"{name}_{1000 + 7 * i}.png" for i, name in enumerate(CAMERAS)]
     assert match_names(names, CAMERAS) == {name: [file] for name, file in zip(CAMERAS, names, strict=True)}
+    names = [f"{name}_{shot:03}.png" for name in CAMERAS for shot in (1, 2, 3)]
+    assert match_names(names, CAMERAS) == {}
+    found = match_names(names, CAMERAS, several=True)
+    assert found == {name: [f"{name}_{shot:03}.png" for shot in (1, 2, 3)] for name in CAMERAS}
 
 
 @pytest.mark.parametrize(
@@ -59,31 +63,23 @@ def test_what_leaves_a_doubt_is_nobody_s(names: list[str]) -> None:
     assert match_names(names, CAMERAS) == {}
 
 
-def test_a_camera_with_a_file_of_its_name_takes_no_other() -> None:
-    assert match_names(["cam01.png", "cam01_old.png", "cam02_new.png"], CAMERAS) == {"cam02": ["cam02_new.png"]}
-
-
-def test_several_files_of_a_camera_go_together_where_that_may_be() -> None:
-    names = [f"{name}_{shot:03}.png" for name in CAMERAS for shot in (1, 2, 3)]
-    assert match_names(names, CAMERAS) == {}
-    found = match_names(names, CAMERAS, several=True)
-    assert found == {name: [f"{name}_{shot:03}.png" for shot in (1, 2, 3)] for name in CAMERAS}
+@pytest.mark.parametrize(
+    ("names", "cameras", "found"),
+    [
+        (["cam01.png", "cam01_old.png", "cam02_new.png"], CAMERAS, {"cam02": ["cam02_new.png"]}),
+        (["IMG_2.png"], ["1", "2", "3", "11"], {}),  # may be a counter
+        (["CAM.png"], ["cam", "Cam"], {}),
+        (["a_left_top", "b_left"], ["left", "left top"], {"left top": ["a_left_top"], "left": ["b_left"]}),
+    ],
+    ids=["one has a file of its name", "a counter", "case alone", "the longest name"],
+)
+def test_a_name_is_one_camera_s_or_nobody_s(names: list[str], cameras: list[str], found: dict[str, list[str]]) -> None:
+    assert match_names(names, cameras) == found
 
 
 def test_numbers_for_names_are_found_by_what_they_stand_beside() -> None:
     cameras = ["1", "2", "3", "11"]
     assert match_names([f"shot_2_cam_{name}.png" for name in cameras], cameras)["2"] == ["shot_2_cam_2.png"]
-    assert match_names(["IMG_2.png"], cameras) == {}  # may be a counter
-
-
-def test_the_longest_name_that_is_said_is_meant() -> None:
-    cameras = ["left", "left top", "right"]
-    names = ["a_left_top.png", "b_left.png", "c_right.png"]
-    assert match_names(names, cameras) == {"left top": [names[0]], "left": [names[1]], "right": [names[2]]}
-
-
-def test_names_that_differ_in_case_alone_are_no_guess() -> None:
-    assert match_names(["CAM.png"], ["cam", "Cam"]) == {}
 
 
 def test_only_endings_of_pictures_are_taken_off() -> None:

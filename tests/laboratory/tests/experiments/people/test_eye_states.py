@@ -38,11 +38,8 @@ def test_the_eyes_are_those_that_the_warning_names() -> None:
     assert warned_sides([]) == frozenset()
 
 
-def test_every_fourth_head_moves_one_eye() -> None:
+def test_every_fourth_head_moves_one_eye_and_wrong_heads_are_counted_by_state() -> None:
     assert [len(closed_sides(number)) for number in range(8)] == [1, 2, 2, 2, 1, 2, 2, 2]
-
-
-def test_wrong_heads_are_counted_by_state() -> None:
     rows = [
         {"name": "a", "state": "open", "closed": [], "told": ["left"], "is_wrong": True},
         {"name": "b", "state": "half", "closed": [], "told": [], "is_wrong": False},

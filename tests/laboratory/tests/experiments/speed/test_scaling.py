@@ -18,15 +18,8 @@ MAIN, HELPER = 10, 11
 def span(kind: str, name: str, began: float, ended: float, *, thread: int = MAIN, **arguments: Any) -> dict[str, Any]:
     """A span in seconds; its thread works all the time, unless ``cpu_s`` says less."""
     args = {"cpu_s": ended - began, "process_cpu_s": ended - began} | arguments
-    return {
-        "ph": "X",
-        "cat": kind,
-        "name": name,
-        "tid": thread,
-        "ts": 1e6 * began,
-        "dur": 1e6 * (ended - began),
-        "args": args,
-    }
+    when = {"ts": 1e6 * began, "dur": 1e6 * (ended - began)}
+    return {"ph": "X", "cat": kind, "name": name, "tid": thread, "args": args, **when}
 
 
 def loop(
@@ -91,11 +84,8 @@ def test_fewer_cores_cut_a_loop_no_finer_than_they_do() -> None:
     work = work_of(document(span("stage", "a", 0, 4), *loop(0, 0, [1.0] * 4 + [0.0] * 28, count=64)))
     assert [work.seconds(cores) for cores in (1, 2, 4)] == [4, 4, 4]  # all in the first of 8 slices
     assert [work.seconds(cores) for cores in (8, 16)] == [2, 1]  # the first two of 16, four of 32
-
-
-def test_tasks_are_never_cut_together() -> None:
-    work = work_of(document(span("stage", "a", 0, 12), *loop(0, 0, [1.0] * 12, single=True)))
-    assert [work.seconds(cores) for cores in (1, 2, 8, 16)] == [12, 6, 2, 1]
+    tasks = work_of(document(span("stage", "a", 0, 12), *loop(0, 0, [1.0] * 12, single=True)))  # never cut together
+    assert [tasks.seconds(cores) for cores in (1, 2, 8, 16)] == [12, 6, 2, 1]
 
 
 def test_a_loop_within_a_slice_has_the_cores_that_are_left() -> None:
@@ -114,7 +104,7 @@ def test_a_loop_within_a_slice_has_the_cores_that_are_left() -> None:
     assert work.seconds(4) == 10  # x takes 3 + 8 / 2, y ten
 
 
-def test_parts_have_their_serial_seconds_and_loops() -> None:
+def test_parts_have_their_serial_seconds_and_loops_and_another_format_is_refused() -> None:
     spans = [
         span("stage", "a", 0, 10),
         span("part", "whole", 1, 9),
@@ -123,9 +113,6 @@ def test_parts_have_their_serial_seconds_and_loops() -> None:
     ]
     found = {each.name: (each.cpu_s, each.serial_s, each.seconds(4)) for each in work_of(document(*spans)).parts}
     assert found == {"a: whole": (8, 4, 5), "a: inner": (6, 2, 3)}
-
-
-def test_another_format_is_refused() -> None:
     with pytest.raises(ValueError, match="eigenhead-trace/0"):
         work_of({"format": "eigenhead-trace/0", "traceEvents": []})
 
@@ -135,7 +122,7 @@ def job_of(folder: Path, program: str) -> JobCommand:
     return JobCommand([sys.executable, str(folder / "job.py")], {"PATH": ""})
 
 
-def test_jobs_run_in_children_and_their_rows_are_kept(tmp_path: Path) -> None:
+def test_jobs_run_in_children_and_their_rows_are_kept_or_it_is_said_why_not(tmp_path: Path) -> None:
     trace = document(span("stage", "a", 0, 10), *loop(0, 2, [1.0] * 8))
     program = (
         "import os, sys\n"
@@ -153,9 +140,6 @@ def test_jobs_run_in_children_and_their_rows_are_kept(tmp_path: Path) -> None:
     assert figures["wall_s_threads_3"] > 0
     assert "| a | 2 | 10 | 6 | 4 | 3 | 3 |" in found.get("markdown", "")
     assert "| loop 0 | 1 | 8 | 4 | 2 | 1 | 1 |" in found.get("markdown", "")
-
-
-def test_a_job_that_fails_is_named_with_what_it_said(tmp_path: Path) -> None:
     command = job_of(tmp_path, "import sys\nsys.exit('eigenhead: no camera sees it')\n")
     with pytest.raises(JobFailed, match="scan could not be reconstructed: eigenhead: no camera sees it"):
         scaling([Path("scan")], command=command, bench=Bench(), threads=1)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,8 +21,6 @@ from tests.support.landmark_files import write_landmarks
 
 
 def sphere(radius: float) -> tuple[np.ndarray, np.ndarray]:
-    import trimesh
-
     ball = trimesh.creation.icosphere(subdivisions=4, radius=radius)
     return np.array(ball.vertices), np.array(ball.faces)
 
@@ -69,8 +68,6 @@ def test_warp_meets_landmarks_and_keeps_affine_motions() -> None:
 
 
 def test_closest_points_agree_with_an_independent_search() -> None:
-    import trimesh
-
     vertices, faces = sphere(50.0)
     vertices = vertices * [1.0, 1.4, 0.8]
     queries = np.random.default_rng(4).normal(0, 60, (200, 3))

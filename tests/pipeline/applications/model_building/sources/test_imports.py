@@ -21,6 +21,7 @@ from pipeline.applications.model_building.sources.imports import (
 from pipeline.head_model import landmarks
 from pipeline.head_model.model import HeadModel, load_model
 from pipeline.head_model.model_file import save_model
+from tests.pipeline.applications.model_building.sources.test_fetch import write_obj
 from tests.support.shared_data import shared
 
 
@@ -77,26 +78,19 @@ def test_plain_npz_with_unit_modes_and_sigma(tmp_path: Path, small: dict[str, np
 
 
 def test_statismo_file(tmp_path: Path, small: dict[str, np.ndarray]) -> None:
-    flat = small["modes"].reshape(6, -1)
+    flat, place = small["modes"].reshape(6, -1), small["landmark_names"].tolist().index("pronasale")
     length = np.linalg.norm(flat, axis=1)
     with h5py.File(tmp_path / "basel.h5", "w") as file:
         file["shape/model/mean"] = small["mean"].ravel()
         file["shape/model/pcaBasis"] = (flat / length[:, None]).T
         file["shape/model/pcaVariance"] = length**2
         file["shape/representer/cells"] = small["faces"].T
-        tip = small["mean"][small["landmark_vertices"][small["landmark_names"].tolist().index("pronasale")]]
+        tip = small["mean"][small["landmark_vertices"][place]]
         file["metadata/landmarks/json"] = f'[{{"id": "center.nose.tip", "coordinates": {tip.tolist()}}}]'
     got = read_statismo(tmp_path / "basel.h5")
     np.testing.assert_allclose(got.modes, small["modes"], atol=1e-4)
     np.testing.assert_array_equal(got.faces, small["faces"])
-    index = small["landmark_names"].tolist().index("pronasale")
-    assert got.landmarks == {"pronasale": small["landmark_vertices"][index]}
-
-
-def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    with path.open("w") as file:
-        file.writelines(f"v {x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in vertices)
-        file.writelines(f"f {a + 1}/1/1 {b + 1}/1/1 {c + 1}/1/1\n" for a, b, c in faces)
+    assert got.landmarks == {"pronasale": small["landmark_vertices"][place]}
 
 
 def test_ict_repository_layout(tmp_path: Path) -> None:
