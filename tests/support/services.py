@@ -145,7 +145,7 @@ def free_port() -> int:
         return sock.getsockname()[1]
 
 
-def await_state(client: httpx.Client, job: str, states: tuple[str, ...], timeout_s: float = 30.0) -> dict:
+def await_state(client: httpx.Client, job: str, states: tuple[str, ...], timeout_s: float = 120.0) -> dict:
     deadline = time.monotonic() + timeout_s
     while True:
         document = client.get(f"/v1/jobs/{job}").json()
@@ -163,7 +163,7 @@ def await_calibration(client: httpx.Client, calibration: str, timeout_s: float =
     return found
 
 
-def await_true(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
+def await_true(condition: Callable[[], object], timeout_s: float = 120.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, f"not true within {timeout_s:.0f} s"

@@ -5,6 +5,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import httpx
@@ -45,6 +46,21 @@ def children(service: RunningService) -> list[int]:
     return found
 
 
+def kill_while_it_is_asked(service: RunningService, client: httpx.Client) -> int:
+    """Kills the child so that this is said; one that dies between two looks is begun again without a word, as a busy
+    machine may have it. Returns the id of the one that was killed."""
+    for stopped_s in (1.5, 6.0, 24.0):
+        until(client, lambda answer: answer["head"] is not None)
+        (child,) = children(service)
+        os.kill(child, signal.SIGSTOP)
+        time.sleep(stopped_s)
+        os.kill(child, signal.SIGKILL)
+        with suppress(AssertionError):
+            until(client, lambda answer: "live-again" in said(answer), 10.0 + stopped_s)
+            return child
+    raise AssertionError("nobody was told that the head is followed anew")
+
+
 def test_a_head_is_followed_while_somebody_asks(rig: DrawnRig, tmp_path: Path) -> None:
     with served_client(tmp_path / "data", worker=False, rig=str(rig.toml)) as (service, client):
         first = client.get("/v1/rig/live").json()
@@ -65,18 +81,14 @@ def test_a_head_is_followed_while_somebody_asks(rig: DrawnRig, tmp_path: Path) -
         assert max(max(corners) for corners in seated["head"]["triangles"]) < len(seated["head"]["vertices"])
 
         rig.turn(30.0)
-        turned = until(client, lambda answer: "live-turn-right" in said(answer), 10.0)
+        turned = until(client, lambda answer: "live-turn-right" in said(answer))
         (word,) = (word for word in turned["words"] if word["code"] == "live-turn-right")
         assert word["message"]["parameters"]["angle_deg"] == pytest.approx(30.0, abs=8.0)
         assert word["text"] == word["message"]["message"]
         rig.turn(0.0)
-        until(client, lambda answer: "live-turn-right" not in said(answer), 10.0)
+        until(client, lambda answer: "live-turn-right" not in said(answer))
 
-        (child,) = children(service)
-        os.kill(child, signal.SIGSTOP)
-        time.sleep(1.5)  # until it has been asked: one that dies between two looks is begun again without a word
-        os.kill(child, signal.SIGKILL)
-        until(client, lambda answer: "live-again" in said(answer), 10.0)
+        child = kill_while_it_is_asked(service, client)
         until(client, lambda answer: answer["head"] is not None)
         assert children(service) not in ([], [child])
 
@@ -84,7 +96,7 @@ def test_a_head_is_followed_while_somebody_asks(rig: DrawnRig, tmp_path: Path) -
             events = [line for line in stream.iter_lines() if line.startswith("data: ")]
         assert json.loads(events[-1].removeprefix("data: "))["head"] is not None
 
-        deadline = time.monotonic() + IDLE_S + 10.0
+        deadline = time.monotonic() + IDLE_S + 60.0
         while children(service) and time.monotonic() < deadline:
             time.sleep(0.2)
         assert children(service) == []
@@ -96,5 +108,7 @@ def test_an_answer_never_waits_for_the_cameras(rig: DrawnRig, tmp_path: Path) ->
         for _ in range(30):
             begun = time.monotonic()
             client.get("/v1/rig/live").raise_for_status()
-            assert time.monotonic() - begun < 2.0
+            answered = time.monotonic()
+            client.get("/healthz").raise_for_status()
+            assert answered - begun < 2.0 + 10.0 * (time.monotonic() - answered)
             time.sleep(0.1)
