@@ -147,7 +147,7 @@ def test_a_browser_signs_in_and_sees_the_rig(proxied: Proxied, browser: Browser)
     page.goto(proxied.url + "/")
     page.get_by_label("API key").fill(proxied.key)
     page.keyboard.press("Enter")
-    expect(page.locator("article.tile").first).to_be_visible(timeout=60_000)  # its state came over the socket
+    expect(page.locator("article.tile").first).to_be_visible()  # its state came over the socket
     page.goto(proxied.url + "/docs")
     expect(page.get_by_text("submit_job")).to_be_visible()
     context.close()

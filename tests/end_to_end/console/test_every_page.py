@@ -128,16 +128,16 @@ def test_a_page_comes_back_after_the_service_was_killed(
     v = visit(browser, service.url)
     page = v.go("/captures")
     expect(page.locator(".row-button")).to_have_count(1)  # sent with the page
-    expect(page.get_by_text("GB free")).to_be_visible(timeout=20_000)  # over the socket, which is there now
+    expect(page.get_by_text("GB free")).to_be_visible()  # over the socket, which is there now
     service.kill()
-    expect(page.locator("#popup")).to_be_visible(timeout=20_000)
+    expect(page.locator("#popup")).to_be_visible()
     expect(page.locator(".rail .foot .line").first).to_have_text("Connection lost.")  # and not Ready beside it
     service.start()
     uploaded_capture(service, tmp_path, 2)
-    expect(page.locator(".row-button")).to_have_count(2, timeout=60_000)
+    expect(page.locator(".row-button")).to_have_count(2)
     expect(page.locator("#popup")).to_be_hidden()
     page.locator("#reconstruct").click()  # and it works again
-    expect(page.get_by_text("Queued job")).to_be_visible(timeout=30_000)
+    expect(page.get_by_text("Queued job")).to_be_visible()
 
 
 def test_a_key_is_asked_for_and_stays_out_of_every_address(
@@ -147,17 +147,17 @@ def test_a_key_is_asked_for_and_stays_out_of_every_address(
     (made,) = add_keys(service, "read")
     v = visit(browser, service.url)
     v.page.goto(service.url + "/jobs")
-    expect(v.page.get_by_label("API key")).to_be_visible(timeout=30_000)
+    expect(v.page.get_by_label("API key")).to_be_visible()
     assert v.page.url.endswith("/sign-in")
     keep_screenshots(v.page, screenshots, "sign-in")
     for path in ("/console/live", "/console/captures/x/cam00.jpg"):
         assert httpx.get(service.url + path).status_code == 401
     v.page.get_by_label("API key").fill("eh_0123456789ab_wrong")
     v.page.keyboard.press("Enter")
-    expect(v.page.get_by_text("No such key")).to_be_visible(timeout=20_000)
+    expect(v.page.get_by_text("No such key")).to_be_visible()
     v.page.get_by_label("API key").fill(made)
     v.page.keyboard.press("Enter")
-    expect(v.page.locator("article.tile")).to_have_count(11, timeout=30_000)
+    expect(v.page.locator("article.tile")).to_have_count(11)
     page = v.go("/captures")
     expect(page.locator(".thumb img").first).to_be_visible()
     page.locator("#reconstruct").click()
@@ -171,7 +171,7 @@ def test_a_key_is_asked_for_and_stays_out_of_every_address(
     service.stop()
     service.start()
     v.go("/captures")  # a restart signs nobody out
-    expect(v.page.locator(".thumb img").first).to_be_visible(timeout=30_000)
+    expect(v.page.locator(".thumb img").first).to_be_visible()
 
 
 def test_other_web_pages_reach_nothing(service: RunningService) -> None:
