@@ -8,7 +8,7 @@ import subprocess
 import sys
 import termios
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -98,13 +98,19 @@ class RunningService:
 
 @contextmanager
 def running_service(
-    data: Path, *, worker: bool = True, terminal: int | None = None, forked: bool = True, **settings: str
+    data: Path,
+    *,
+    worker: bool = True,
+    terminal: int | None = None,
+    forked: bool = True,
+    variables: Mapping[str, str] | None = None,
+    **settings: str,
 ) -> Iterator[RunningService]:
     """Without ``forked`` each process begins with exec, as an operator's does. ``settings`` become EIGENHEAD_<NAME>
-    variables; the work is the tiny one unless given, and there are no pages. A test that fails shows the end of the
-    logs of ``running``."""
+    variables beside other ``variables``; the work is the tiny one unless given, and there are no pages. A test that
+    fails shows the end of the logs of ``running``."""
     chosen = {"work": "tests.support.tiny:work", "heartbeat_s": "0.5", "poll_s": "0.1", "console": "false"} | settings
-    environment = {f"EIGENHEAD_{name.upper()}": value for name, value in chosen.items()}
+    environment = {f"EIGENHEAD_{name.upper()}": value for name, value in chosen.items()} | dict(variables or {})
     service = RunningService(data, environment, free_port(), worker, forked)
     running.append(service)
     try:

@@ -35,12 +35,12 @@ def hook() -> Iterator[Hook]:
 
 @pytest.fixture(scope="module")
 def service(way: Network, hook: Hook, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
-    folder, environment = tmp_path_factory.mktemp("service"), pytest.MonkeyPatch()
+    folder = tmp_path_factory.mktemp("service")
     (folder / "nas").mkdir()
-    for name, value in (KEYS | {"EIGENHEAD_TINY_S": "0.02"}).items():
-        environment.setenv(name, value)
     with running_service(
         folder / "data",
+        variables=KEYS,
+        tiny_s="0.02",
         deliver_prefixes=f'["s3://studio-out/heads/", "s3://nobody/", "file://{folder}/nas/"]',
         webhook_origins=f'["{hook.url}"]',
         store_endpoint=way.url,
@@ -48,7 +48,6 @@ def service(way: Network, hook: Hook, tmp_path_factory: pytest.TempPathFactory) 
         silent_s="3",
     ) as service:
         yield service
-    environment.undo()
 
 
 def submitted(client: httpx.Client, capture: str, to: str, **more: Any) -> str:

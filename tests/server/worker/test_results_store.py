@@ -37,11 +37,11 @@ def bucket(object_server: str) -> Any:
 
 @pytest.fixture(scope="module")
 def service(way: Network, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
-    environment = pytest.MonkeyPatch()
-    for name, value in (KEYS | {"EIGENHEAD_TINY_S": "0.02", "EIGENHEAD_TINY_BYTES": str(1 << 20)}).items():
-        environment.setenv(name, value)
     with running_service(
         tmp_path_factory.mktemp("service") / "data",
+        variables=KEYS,
+        tiny_s="0.02",
+        tiny_bytes=str(1 << 20),
         results_store="s3://results/of/",
         results_bytes="0",
         captures_store="s3://results/captures/",
@@ -52,7 +52,6 @@ def service(way: Network, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         store_timeout_s="1",
     ) as service:
         yield service
-    environment.undo()
 
 
 def submitted(client: httpx.Client, capture: str) -> str:
