@@ -80,15 +80,6 @@ def test_quiet_leaves_errors_alone_and_a_log_gets_lines_of_progress(
     assert run(*command, str(tmp_path / "no" / "\0"), "--quiet").returncode != 0
 
 
-def test_help_is_quick() -> None:
-    """It loads none of the libraries that take seconds."""
-    code = "import sys\nfrom server.cli.main import main\ntry:\n    main()\nfinally:\n    print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code, "--help"], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("Usage") or "Usage:" in done.stdout
-    heavy = {"numpy", "scipy", "numba", "cv2", "fastapi", "pydantic", "sqlalchemy", "dbos", "nicegui", "moderngl"}
-    assert not heavy & {*done.stdout.split()}
-
-
 @pytest.mark.parametrize(
     "arguments",
     [["--colour"], ["reconstruct"], ["reconstruct", "/nowhere", "--out", "x"], ["serve", "--port", "99999999"]],
