@@ -21,7 +21,7 @@ from rig.mesh import Mesh
 from rig.messages.message import compose, verbatim
 from rig.rig import Rig
 from server.console import comparison, coverage, guides, live
-from server.console.identity import cookie_secret, is_foreign, is_rebound
+from server.console.identity import caller_of, cookie_secret, is_foreign, is_rebound, permit
 from server.console.live import look_bytes
 from server.console.live_frame import LiveFrame
 from server.console.mount import path_below
@@ -34,6 +34,7 @@ from server.services.live.live import nothing
 from server.services.records import RigOut
 from server.services.work import ReconstructionRequest
 from server.settings import ServiceSettings
+from server.storage.database import open_database
 from server.storage.events import JobEvent
 from tests.support.services import await_true
 
@@ -308,10 +309,6 @@ def test_the_live_view_names_an_error_and_goes_on(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_session_is_worth_what_its_key_is(tmp_path: Path) -> None:
-    from server.console.identity import caller_of, permit
-    from server.settings import ServiceSettings
-    from server.storage.database import open_database
-
     settings = ServiceSettings(data=tmp_path)
     engine = open_database(settings)
     keys = Keys(engine)

@@ -155,14 +155,11 @@ def test_a_job_waits_for_the_store_and_goes_on(client: httpx.Client, capture: st
     assert listed(bucket, job) == NAMES
     way.fail("503", 10_000, "PUT")
     other = submitted(client, capture)
-    while not any(other in path for method, path in way.seen if method == "PUT"):
-        time.sleep(0.05)
+    await_true(lambda: any(other in path for method, path in way.seen if method == "PUT"))
     assert client.post(f"/v1/jobs/{other}/cancel").status_code == 200
     way.heal()
-    deadline = time.monotonic() + 30
-    while (service_folder := listed(bucket, other)) or client.get(f"/v1/jobs/{other}").json()["state"] != "cancelled":
-        assert time.monotonic() < deadline, service_folder
-        time.sleep(0.1)
+    await_state(client, other, ("cancelled",))
+    await_true(lambda: not listed(bucket, other))
 
 
 def test_a_result_is_fetched_from_the_store_itself(client: httpx.Client, bucket: Any, capture: str) -> None:

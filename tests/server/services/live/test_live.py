@@ -13,19 +13,13 @@ import pytest
 
 from server.services.live.live import IDLE_S, NICENESS
 from tests.server.services.live.conftest import DrawnRig
-from tests.support.services import RunningService, served_client
+from tests.support.services import RunningService, await_true, awaited, served_client
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]
 
 
-def until(client: httpx.Client, fits: Callable[[dict], bool], timeout_s: float = 60.0) -> dict:
-    deadline, answer = time.monotonic() + timeout_s, {}
-    while time.monotonic() < deadline:
-        answer = client.get("/v1/rig/live").raise_for_status().json()
-        if fits(answer):
-            return answer
-        time.sleep(0.1)
-    raise AssertionError(answer)
+def until(client: httpx.Client, fits: Callable[[dict], bool], timeout_s: float = 120.0) -> dict:
+    return awaited(lambda: client.get("/v1/rig/live").raise_for_status().json(), fits, timeout_s)
 
 
 def said(answer: dict) -> set[str]:
@@ -96,10 +90,7 @@ def test_a_head_is_followed_while_somebody_asks(rig: DrawnRig, tmp_path: Path) -
             events = [line for line in stream.iter_lines() if line.startswith("data: ")]
         assert json.loads(events[-1].removeprefix("data: "))["head"] is not None
 
-        deadline = time.monotonic() + IDLE_S + 60.0
-        while children(service) and time.monotonic() < deadline:
-            time.sleep(0.2)
-        assert children(service) == []
+        await_true(lambda: children(service) == [], IDLE_S + 60.0)
 
 
 def test_an_answer_never_waits_for_the_cameras(rig: DrawnRig, tmp_path: Path) -> None:
