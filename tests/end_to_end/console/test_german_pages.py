@@ -144,9 +144,12 @@ def test_pages_and_what_the_service_tells_are_in_the_browsers_language_until_one
     page.locator("#reconstruct").click()
     expect(page.get_by_text("ist eingereiht. Zu verfolgen auf der Seite Aufträge.")).to_be_visible()
     expect(page.get_by_text("GB frei")).to_be_visible()
-    told = [compose("disk-free", free_gb=12.34, spare_gb=2), verbatim("nobody translates what a camera's maker says")]
+    messages = [
+        compose("disk-free", free_gb=12.34, spare_gb=2),
+        verbatim("nobody translates what a camera's maker says"),
+    ]
     say = "(told) => import('/console/static/language.js').then(({ say }) => told.map((message) => say(message)))"
-    assert page.evaluate(say, documents_of(told)) == [
+    assert page.evaluate(say, documents_of(messages)) == [
         "12,3 GB frei; Hochladen und Aufträge lassen 2,0 GB übrig",
         "nobody translates what a camera's maker says",
     ]
