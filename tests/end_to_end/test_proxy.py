@@ -18,7 +18,7 @@ from playwright.sync_api import Browser, expect
 
 from rig.formats.captures.archive import pack_folder
 from server.cli.client import Client
-from tests.support.services import ROOT, RunningService, free_port, running_service, small_capture
+from tests.support.services import ROOT, RunningService, await_true, free_port, running_service, small_capture
 
 pytestmark = pytest.mark.slow
 
@@ -91,15 +91,12 @@ def nginx(program: str, folder: Path, port: int) -> Iterator[None]:
     with (folder / "nginx.log").open("wb") as log:
         process = subprocess.Popen([program, "-p", str(folder), "-c", str(folder / "nginx.conf")], stderr=log)
     try:
-        deadline = time.monotonic() + 20
-        while socket.socket().connect_ex(("127.0.0.1", port)) != 0:
-            assert process.poll() is None, (folder / "nginx.log").read_text()
-            assert time.monotonic() < deadline, "nginx does not listen"
-            time.sleep(0.05)
+        await_true(lambda: process.poll() is not None or socket.socket().connect_ex(("127.0.0.1", port)) == 0)
+        assert process.poll() is None, (folder / "nginx.log").read_text()
         yield
     finally:
         process.terminate()
-        process.wait(20)
+        process.wait(120)
 
 
 def test_the_api_answers_with_a_key_alone(proxied: Proxied) -> None:
@@ -147,7 +144,7 @@ def test_a_browser_signs_in_and_sees_the_rig(proxied: Proxied, browser: Browser)
     page.goto(proxied.url + "/")
     page.get_by_label("API key").fill(proxied.key)
     page.keyboard.press("Enter")
-    expect(page.locator("article.tile").first).to_be_visible(timeout=60_000)  # its state came over the socket
+    expect(page.locator("article.tile").first).to_be_visible()  # its state came over the socket
     page.goto(proxied.url + "/docs")
     expect(page.get_by_text("submit_job")).to_be_visible()
     context.close()

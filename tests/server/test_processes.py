@@ -37,14 +37,14 @@ def test_a_child_imports_nothing_from_the_working_directory_or_pythonpath(marker
 
 def test_a_worker_starts_beside_foreign_packages(marker: Path) -> None:
     command = python_command("cli", "worker", "--help")
-    done = subprocess.run(command, env=python_environment(), capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, env=python_environment(), capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     assert not marker.exists()
 
 
 def test_the_command_of_the_checkout_runs_beside_foreign_packages(marker: Path) -> None:
     command = Path(sys.executable).with_name("eigenhead")
-    done = subprocess.run([command, "--help"], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run([command, "--help"], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     assert not marker.exists()
 
@@ -77,7 +77,7 @@ def test_a_process_ends_with_the_one_that_started_it() -> None:
         time.sleep(0.3)
         parent.kill()
     await_true(lambda: process_started(child) == 0)
-    orphan = subprocess.run([sys.executable, "-c", CHILD.format(parent=1)], cwd=ROOT, timeout=20, check=False)
+    orphan = subprocess.run([sys.executable, "-c", CHILD.format(parent=1)], cwd=ROOT, timeout=120, check=False)
     assert orphan.returncode == 1
 
 
@@ -93,7 +93,7 @@ def thread_variable(context: WorkerContext, report: Progress) -> str:
 def test_freed_memory_is_given_back_when_a_stage_begins() -> None:
     """Below arrays that still live, where glibc keeps it."""
     done = subprocess.run(
-        [sys.executable, "-c", FREEING], cwd=ROOT, capture_output=True, text=True, timeout=20, check=True
+        [sys.executable, "-c", FREEING], cwd=ROOT, capture_output=True, text=True, timeout=120, check=True
     )
     before, within, after = map(int, done.stdout.split())
     assert within == pytest.approx(before, abs=1.0)

@@ -8,11 +8,11 @@ import subprocess
 import sys
 import termios
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import httpx
 import numpy as np
@@ -25,6 +25,7 @@ from rig.geometry import RigidTransform
 from rig.rig import Rig
 from tests.support import fork_server
 
+T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[2]
 running: "list[RunningService]" = []
 
@@ -98,13 +99,19 @@ class RunningService:
 
 @contextmanager
 def running_service(
-    data: Path, *, worker: bool = True, terminal: int | None = None, forked: bool = True, **settings: str
+    data: Path,
+    *,
+    worker: bool = True,
+    terminal: int | None = None,
+    forked: bool = True,
+    variables: Mapping[str, str] | None = None,
+    **settings: str,
 ) -> Iterator[RunningService]:
     """Without ``forked`` each process begins with exec, as an operator's does. ``settings`` become EIGENHEAD_<NAME>
-    variables; the work is the tiny one unless given, and there are no pages. A test that fails shows the end of the
-    logs of ``running``."""
+    variables beside other ``variables``; the work is the tiny one unless given, and there are no pages. A test that
+    fails shows the end of the logs of ``running``."""
     chosen = {"work": "tests.support.tiny:work", "heartbeat_s": "0.5", "poll_s": "0.1", "console": "false"} | settings
-    environment = {f"EIGENHEAD_{name.upper()}": value for name, value in chosen.items()}
+    environment = {f"EIGENHEAD_{name.upper()}": value for name, value in chosen.items()} | dict(variables or {})
     service = RunningService(data, environment, free_port(), worker, forked)
     running.append(service)
     try:
@@ -145,29 +152,26 @@ def free_port() -> int:
         return sock.getsockname()[1]
 
 
-def await_state(client: httpx.Client, job: str, states: tuple[str, ...], timeout_s: float = 30.0) -> dict:
+def awaited(read: Callable[[], T], fits: Callable[[T], object] = bool, timeout_s: float = 120.0) -> T:
+    """What ``read`` returns once it fits."""
     deadline = time.monotonic() + timeout_s
-    while True:
-        document = client.get(f"/v1/jobs/{job}").json()
-        if document["state"] in states:
-            return document
-        assert time.monotonic() < deadline, document
-        time.sleep(0.05)
-
-
-def await_calibration(client: httpx.Client, calibration: str, timeout_s: float = 200.0) -> dict:
-    deadline = time.monotonic() + timeout_s
-    while (found := client.get(f"/v1/calibrations/{calibration}").json())["state"] in ("queued", "running"):
+    while not fits(found := read()):
         assert time.monotonic() < deadline, found
-        time.sleep(0.1)
+        time.sleep(0.05)
     return found
 
 
-def await_true(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, f"not true within {timeout_s:.0f} s"
-        time.sleep(0.05)
+def await_state(client: httpx.Client, job: str, states: tuple[str, ...], timeout_s: float = 120.0) -> dict:
+    return awaited(lambda: client.get(f"/v1/jobs/{job}").json(), lambda found: found["state"] in states, timeout_s)
+
+
+def await_calibration(client: httpx.Client, calibration: str, timeout_s: float = 400.0) -> dict:
+    path, waiting = f"/v1/calibrations/{calibration}", ("queued", "running")
+    return awaited(lambda: client.get(path).json(), lambda found: found["state"] not in waiting, timeout_s)
+
+
+def await_true(condition: Callable[[], object], timeout_s: float = 120.0) -> None:
+    awaited(condition, timeout_s=timeout_s)
 
 
 def small_capture(folder: Path, seed: int = 0, cameras: int = 3, size: int = 24) -> Path:

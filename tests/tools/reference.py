@@ -32,6 +32,37 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 MADE = "<!-- Made of the program by `make reference`; changes belong there. -->\n"
 WIDTH = 100
 OF_ALL = re.compile(r"\n  (?:--json|--threads N|--quiet|-h, --help) [^\n]*(?:\n {6,}[^\n]*)*")
+COMMANDS = f"""# Commands
+
+{MADE}
+`eigenhead COMMAND --help` says the same as these pages. Exit status: 0 done,
+1 failed, with one line on standard error that says why and what to do, 2 wrong usage.
+
+All take `--threads N` (of compiled loops; all processors by default), `--quiet` (no progress and no warnings,
+errors alone) and `--help`; most take `--json` (one JSON object on stdout and nothing else).
+
+| command | does |
+|---|---|"""
+VARIABLES = f"""# Environment variables
+
+{MADE}
+A variable that is set to nothing counts as not set. One that begins
+with `EIGENHEAD_` and that nobody reads is named by `eigenhead doctor`. Lists are JSON:
+`{PREFIX}CORS_ORIGINS='["https://lab.example"]'`.
+"""
+SETTINGS = f"""# Settings of a reconstruction
+
+{MADE}
+A settings document is TOML or JSON: a file for `eigenhead
+reconstruct --settings`, or a job's `settings` over HTTP:
+`{{"detail": "photo", "outputs": {{"formats": ["glb"]}}}}`. Unknown fields and wrong values are refused,
+all at once, with what was meant. The default stands behind each name."""
+RIG_TOML = f"""# rig.toml
+
+{MADE}
+The real rig: cameras, trigger box, lamps, and what a shot must be like. `eigenhead rig
+check --rig rig.toml` names every fault of the file at once; `deploy/rig.example.toml` is one to begin
+with. Relative paths start at the file. What each driver needs: [the rig](rig.md#cameras-by-driver)."""
 OF_EVERY_COMMAND = {
     "CACHE": (
         "$XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead",
@@ -61,13 +92,7 @@ def pages() -> dict[str, str]:
 
 
 def _command_list(commands: TyperGroup) -> str:
-    lines = ["# Commands", "", MADE, "`eigenhead COMMAND --help` says the same as these pages. Exit status: 0 done,"]
-    lines += ["1 failed, with one line on standard error that says why and what to do, 2 wrong usage.", ""]
-    lines += [
-        "All take `--threads N` (of compiled loops; all processors by default), `--quiet` (no progress and no warnings,"
-    ]
-    lines += ["errors alone) and `--help`; most take `--json` (one JSON object on stdout and nothing else).", ""]
-    lines += ["| command | does |", "|---|---|"]
+    lines = [COMMANDS]
     for page, (_, names) in ROOMS.items():
         for path, command in (entry for name in names for entry in _leaves((name,), commands.commands[name])):
             words = " ".join(path)
@@ -111,14 +136,7 @@ def _context(path: tuple[str, ...], command: Any) -> typer.Context:
 
 
 def _variables() -> str:
-    lines = [
-        "# Environment variables",
-        "",
-        MADE,
-        "A variable that is set to nothing counts as not set. One that begins",
-    ]
-    lines += ["with `EIGENHEAD_` and that nobody reads is named by `eigenhead doctor`. Lists are JSON:"]
-    lines += [f"""`{PREFIX}CORS_ORIGINS='["https://lab.example"]'`.""", "", "## Of every command", ""]
+    lines = [VARIABLES, "## Of every command", ""]
     lines += _variable_rows(OF_EVERY_COMMAND)
     lines += ["", "Without these the data folder is `$XDG_DATA_HOME/eigenhead`, else `~/.local/share/eigenhead`."]
     lines += ["", "## Of the service and its workers", ""]
@@ -144,49 +162,30 @@ def _default_text(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int) and value >= 1 << 20:
-        return (
-            f"{value >> 30} GiB"
-            if value % (1 << 30) == 0
-            else f"{value:,}"
-            if value % (1 << 20)
-            else f"{value >> 20} MiB"
-        )
-    return (
-        ", ".join(map(str, value))
-        if isinstance(value, tuple)
-        else f"`{value}`"
-        if isinstance(value, str)
-        else str(value)
-    )
+        for size, unit in ((1 << 30, "GiB"), (1 << 20, "MiB")):
+            if value % size == 0:
+                return f"{value // size} {unit}"
+        return f"{value:,}"
+    if isinstance(value, tuple):
+        return ", ".join(map(str, value))
+    return f"`{value}`" if isinstance(value, str) else str(value)
 
 
 def _settings() -> str:
     """Every field of ``pipeline.settings.Settings`` with its default and the comment beside it."""
-    lines = ["# Settings of a reconstruction", "", MADE, "A settings document is TOML or JSON: a file for `eigenhead"]
-    lines += ["reconstruct --settings`, or a job's `settings` over HTTP:"]
-    lines += ['`{"detail": "photo", "outputs": {"formats": ["glb"]}}`. Unknown fields and wrong values are refused,']
-    lines += ["all at once, with what was meant. The default stands behind each name."]
     tables = {f"`{path}`" if path else "At the top": kind for path, kind in _tables("", Settings)}
-    return "\n".join([*lines, *_described(settings, tables)]) + "\n"
+    return "\n".join([SETTINGS, *_described(settings, tables)]) + "\n"
 
 
 def _rig_toml() -> str:
     """Every key of a rig.toml."""
-    lines = [
-        "# rig.toml",
-        "",
-        MADE,
-        "The real rig: cameras, trigger box, lamps, and what a shot must be like. `eigenhead rig",
-    ]
-    lines += ["check --rig rig.toml` names every fault of the file at once; `deploy/rig.example.toml` is one to begin"]
-    lines += ["with. Relative paths start at the file. What each driver needs: [the rig](rig.md#cameras-by-driver)."]
     tables = {"At the top": rig_toml.RigConfig, "`[[cameras]]`": rig_toml.CameraConfig}
     tables |= {
         "`[trigger]`": rig_toml.TriggerConfig,
         "`[lights]`": rig_toml.LightsConfig,
         "`[shot]`": rig_toml.ShotConfig,
     }
-    return "\n".join([*lines, *_described(rig_toml, tables)]) + "\n"
+    return "\n".join([RIG_TOML, *_described(rig_toml, tables)]) + "\n"
 
 
 def _described(module: ModuleType, tables: dict[str, type]) -> list[str]:

@@ -9,13 +9,13 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from pipeline.head_model.landmarks import SEVEN_POINTS
-from tests.support.browser import keep_screenshots, keep_widths, visit
+from tests.support.browser import Visit, keep_screenshots, keep_widths, visit
 from tests.support.services import RunningService, await_state, packed, running_service, upload
 from tests.support.shared_data import shared
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-SLOW_MS = 90_000  # a machine that does other things, too
+SLOW_MS = 240_000  # a machine that does other things, too
 HIDDEN = "cam04"  # 40 degrees beside the front; what it shows is its clean plate
 
 
@@ -40,11 +40,10 @@ def uploaded(service: RunningService, folder: Path, name: str, *, hidden: str = 
 
 
 def test_found_faces_lie_over_the_pictures(
-    browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
+    v: Visit, service: RunningService, screenshots: Path, tmp_path: Path
 ) -> None:
     capture = uploaded(service, tmp_path, "beard-smile")
     assert not any(warning["code"].startswith("face-") for warning in capture["warnings"])
-    v = visit(browser, service.url)
     page = v.go(f"/captures?capture={capture['id']}")
     expect(page.locator(".thumb img").first).to_be_visible(timeout=SLOW_MS)
     expect(page.locator("svg.face-marks")).to_have_count(0)
@@ -66,14 +65,12 @@ def test_found_faces_lie_over_the_pictures(
     page.keyboard.press("Escape")
     page.locator("#faces").click()
     expect(page.locator("svg.face-marks")).to_have_count(0)
-    v.check_clean()
 
 
 def test_the_verdict_says_who_lacks_the_face(
-    browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
+    v: Visit, service: RunningService, screenshots: Path, tmp_path: Path
 ) -> None:
     capture = uploaded(service, tmp_path, "beard-smile", hidden=HIDDEN)
-    v = visit(browser, service.url)
     page = v.go(f"/captures?capture={capture['id']}")
     expect(page.locator("[data-warning=face-missing]")).to_contain_text(f"no face in {HIDDEN}", timeout=SLOW_MS)
     expect(page.locator("[data-warning^=face-]")).to_have_count(1)
@@ -82,15 +79,13 @@ def test_the_verdict_says_who_lacks_the_face(
     expect(page.locator("[data-warning=face-missing]")).to_contain_text(
         f"kein Gesicht in {HIDDEN}, obwohl die Person dorthin blickt", timeout=SLOW_MS
     )
-    v.check_clean()
 
 
 def test_all_points_are_suggested_and_stored_only_when_taken(
-    browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
+    v: Visit, service: RunningService, screenshots: Path, tmp_path: Path
 ) -> None:
     capture = uploaded(service, tmp_path, "beard-smile")["id"]
     address = f"{service.url}/v1/captures/{capture}/features"
-    v = visit(browser, service.url)
     page = v.go(f"/features/{capture}")
     page.locator("#suggest").click()
     expect(page.locator("#suggestions")).to_contain_text("places are suggested", timeout=SLOW_MS)
@@ -111,7 +106,6 @@ def test_all_points_are_suggested_and_stored_only_when_taken(
     assert points.keys() == set(SEVEN_POINTS)
     assert sum(len(views) for views in points.values()) >= 40
     assert 2 <= len(points["exocanthion_right"]) < len(points["pronasale"]), "what was rejected stays out"
-    v.check_clean()
 
 
 def reject_take_and_drag(page: Page) -> None:

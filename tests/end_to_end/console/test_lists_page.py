@@ -43,7 +43,7 @@ def check_jobs(page: Page, jobs: list[str], screenshots: Path) -> None:
     expect(rows).to_have_count(10)
     keep_widths(page, screenshots, "jobs-list")
     page.reload()
-    expect(page.locator("#state")).to_have_value("queued", timeout=30_000)
+    expect(page.locator("#state")).to_have_value("queued")
     expect(rows).to_have_count(10)
     page.locator("#pick").click()
     page.get_by_role("button", name="All of this page").click()
@@ -59,7 +59,7 @@ def check_jobs(page: Page, jobs: list[str], screenshots: Path) -> None:
     listed.evaluate("list => list.scrollTo(0, 700)")
     page.wait_for_timeout(300)
     page.reload()
-    page.wait_for_function("document.querySelector('[data-scroll=jobs]')?.scrollTop === 700", timeout=30_000)
+    page.wait_for_function("document.querySelector('[data-scroll=jobs]')?.scrollTop === 700")
     expect(rows.nth(3)).to_have_attribute("aria-current", "true")
 
 
@@ -71,7 +71,7 @@ def check_captures(page: Page, service: RunningService, captures: list[str], scr
     page.get_by_label("Subject").fill("Anna")
     page.get_by_label("Consent").fill("signed")
     page.reload()
-    expect(page.get_by_label("Subject")).to_have_value("Anna", timeout=30_000)  # what was typed outlives a reload
+    expect(page.get_by_label("Subject")).to_have_value("Anna")  # what was typed outlives a reload
     page.get_by_role("button", name="Begin").click()
     expect(page.locator("#session option:checked")).to_have_text("Anna (0)")
     page.locator("#session").select_option("")
@@ -94,7 +94,7 @@ def check_captures(page: Page, service: RunningService, captures: list[str], scr
     expect(rows.first).to_contain_text("#Beard #study 4")
     keep_widths(page, screenshots, "captures-tagged")
     page.reload()
-    expect(page.locator("#tag")).to_have_value("Beard", timeout=30_000)
+    expect(page.locator("#tag")).to_have_value("Beard")
     page.locator("#tags").fill("study 4")
     page.keyboard.press("Tab")
     expect(rows).to_have_count(1)
@@ -106,12 +106,12 @@ def check_captures(page: Page, service: RunningService, captures: list[str], scr
     expect(page.get_by_text("2 captures moved.")).to_be_visible()
     expect(page.locator("#session option", has_text="Anna (2)")).to_have_count(1)
     page.locator("#bulk-remove").click()
-    expect(rows).to_have_count(1, timeout=30_000)
+    expect(rows).to_have_count(1)
     page.get_by_role("button", name="Undo").click()
-    expect(rows).to_have_count(3, timeout=30_000)
+    expect(rows).to_have_count(3)
     page.get_by_role("button", name="All of this page").click()
     page.locator("#bulk-erase").click()
     page.locator("#bulk-erase-for-good").click()
-    expect(page.get_by_text("No captures yet")).to_be_visible(timeout=30_000)
+    expect(page.get_by_text("No captures yet")).to_be_visible()
     assert httpx.get(service.url + "/v1/captures").json()["total"] == 0
     assert httpx.get(service.url + "/v1/jobs").json()["total"] == 0

@@ -26,23 +26,23 @@ def test_keys_are_made_and_revoked_and_what_goes_is_told(browser: Browser, scree
         expect(page.get_by_text("The first key is made by eigenhead keys add")).to_be_visible()
         expect(page.locator("#new-key")).to_have_count(0)
         (secret,) = add_keys(service, "admin")
-        page.wait_for_url("**/sign-in", timeout=30_000)
+        page.wait_for_url("**/sign-in")
         page.get_by_label("API key").fill(secret)
         page.keyboard.press("Enter")
-        expect(page.locator("article.tile")).to_have_count(11, timeout=30_000)
+        expect(page.locator("article.tile")).to_have_count(11)
         page = v.go("/service")
         keep_widths(page, screenshots, "service")
         assert service_answers(service, secret) == 200
         assert service_answers(service, None) == 401
         page.reload()
-        expect(page.locator("[data-key]")).to_contain_text("yours", timeout=30_000)  # the browser goes on with it
+        expect(page.locator("[data-key]")).to_contain_text("yours")  # the browser goes on with it
         assert secret.split("_", 2)[2] not in page.content()
         reader = make(page, "reader", "read")
         other = visit(browser, service.url)
         other.page.goto(service.url + "/service")
         other.page.get_by_label("API key").fill(reader)
         other.page.keyboard.press("Enter")
-        expect(other.page.locator("article.tile")).to_have_count(11, timeout=30_000)
+        expect(other.page.locator("article.tile")).to_have_count(11)
         shown = other.go("/service")
         expect(shown.get_by_text("Your key has no scope admin")).to_be_visible()
         expect(shown.locator("[data-key]")).to_have_count(0)
@@ -50,7 +50,7 @@ def test_keys_are_made_and_revoked_and_what_goes_is_told(browser: Browser, scree
         page.get_by_role("button", name="Revoke reader").click()
         page.get_by_role("button", name="Revoke for good").click()
         expect(page.locator("[data-key]")).to_have_count(1)
-        shown.wait_for_url("**/sign-in", timeout=30_000)
+        shown.wait_for_url("**/sign-in")
         assert service_answers(service, reader) == 401
         v.check_clean()
         other.check_clean()
@@ -76,7 +76,7 @@ def check_storage(page: Page, service: RunningService, capture: str, jobs: list[
     files = service.data / "captures"
     size = sum(path.stat().st_size for path in files.rglob("*") if path.is_file())
     row = page.get_by_label("Bytes by kind").locator("tr", has_text="photographs and clean plates")
-    expect(row.locator("td").nth(2)).to_have_text(f"{-(-size // 1000)} kB", timeout=30_000)
+    expect(row.locator("td").nth(2)).to_have_text(f"{-(-size // 1000)} kB")
     expect(row.locator("td").nth(3)).to_have_text("1")
     following = page.locator("#goes-next tr")
     expect(following).to_have_count(3)

@@ -44,9 +44,9 @@ def test_plates_are_judged_and_a_shot_is_kept_retaken_or_reconstructed(
     studio.inject(DeviceFault("bumped", "cam03"))
     page.keyboard.press("Space")
     expect(page.locator(".countdown")).to_be_visible()
-    expect(page.get_by_text("Capturing ...")).to_be_visible(timeout=10_000)
+    expect(page.get_by_text("Capturing ...")).to_be_visible()
     began = time.monotonic()
-    expect(page.locator("[data-verdict=usable]")).to_be_visible(timeout=60_000)
+    expect(page.locator("[data-verdict=usable]")).to_be_visible()
     record_property("seconds from the shutter to the verdict, streams of 320 x 240", round(time.monotonic() - began, 2))
     moved = page.locator("[data-fault=moved]")
     expect(moved).to_contain_text("cam03: moved")
@@ -56,12 +56,12 @@ def test_plates_are_judged_and_a_shot_is_kept_retaken_or_reconstructed(
     keep_screenshots(page, screenshots, "shot-usable")
     studio.clear()
     page.keyboard.press("r")
-    expect(page.locator(".countdown")).to_be_visible(timeout=10_000)
+    expect(page.locator(".countdown")).to_be_visible()
     expect(page.get_by_text("Removed: the 4 pictures of capture")).to_be_visible()
-    expect(page.locator("[data-verdict=good]")).to_be_visible(timeout=60_000)
+    expect(page.locator("[data-verdict=good]")).to_be_visible()
     keep_screenshots(page, screenshots, "shot-good")
     page.keyboard.press("Enter")
-    expect(page.get_by_text("Queued job")).to_be_visible(timeout=20_000)
+    expect(page.get_by_text("Queued job")).to_be_visible()
     expect(page.locator("[data-shot]")).to_have_count(0)
     captures = httpx.get(rig_service.url + "/v1/captures").json()["captures"]
     assert [capture["verdict"] for capture in captures if capture["verdict"] != "usable"] == ["good"]
@@ -69,9 +69,9 @@ def test_plates_are_judged_and_a_shot_is_kept_retaken_or_reconstructed(
 
 
 def take_plates(page: Page, studio: StudioDevices) -> None:
-    live_rate(page, 0.1)
+    live_rate(page)
     page.keyboard.press("b")
-    expect(page.get_by_text(f"5 clean plates of {len(NAMES)} cameras")).to_be_visible(timeout=60_000)
+    expect(page.get_by_text(f"5 clean plates of {len(NAMES)} cameras")).to_be_visible()
     studio.seat(True)
 
 
@@ -79,12 +79,12 @@ def refuse_plates(page: Page, studio: StudioDevices, screenshots: Path) -> None:
     """The sitter stays in the seat while B is pressed."""
     page.keyboard.press("b")
     dialog = page.locator("#refused-plates")
-    expect(dialog).to_contain_text("Somebody seems to be in the new clean plates", timeout=60_000)
+    expect(dialog).to_contain_text("Somebody seems to be in the new clean plates")
     expect(dialog.locator("summary")).to_have_text(f"{len(NAMES)} cameras differ")
     keep_screenshots(page, screenshots, "plates-refused")
     page.locator("#use-refused").click()
-    expect(dialog).to_have_count(0, timeout=30_000)
+    expect(dialog).to_have_count(0)
     page.locator("#undo-plates").click()
-    expect(page.get_by_text("These clean plates are in use now")).to_have_count(2, timeout=30_000)
+    expect(page.get_by_text("These clean plates are in use now")).to_have_count(2)
     dialog.get_by_role("button", name="Keep the old ones").click()
     expect(dialog).to_have_count(0)

@@ -28,8 +28,8 @@ def test_a_head_opens_where_it_was_begun_and_never_over_what_is_typed(
         page, elsewhere = mine.go("/captures"), other.go("/captures")
         page.locator("#reconstruct").click()
         expect(page).to_have_title(re.compile(r"^\d+ % Captures - eigenhead$"))
-        page.wait_for_url("**/result/*", timeout=30_000)
-        page.wait_for_selector("canvas[data-loaded$=head]", timeout=30_000)
+        page.wait_for_url("**/result/*")
+        page.wait_for_selector("canvas[data-loaded$=head]")
         head = page.url.rpartition("/")[2]
         assert (service.data / "jobs" / head / "first-view.jpg").is_file(), "the service draws it before it is asked"
         assert page.locator("link[rel=preload]").count() == 2
@@ -40,7 +40,7 @@ def test_a_head_opens_where_it_was_begun_and_never_over_what_is_typed(
         expect(page).to_have_title(re.compile("% Captures"))
         page.get_by_label("Expression").type("smi")
         message = page.locator(".message", has_text="A head is ready.")
-        expect(message).to_be_visible(timeout=30_000)
+        expect(message).to_be_visible()
         expect(page).to_have_title("Head ready - eigenhead")
         page.keyboard.type("le")  # who has read it, goes on
         expect(page).to_have_title("Captures - eigenhead")
@@ -48,6 +48,6 @@ def test_a_head_opens_where_it_was_begun_and_never_over_what_is_typed(
         assert page.evaluate("tones") == 2
         keep_widths(page, screenshots, "head-ready")
         message.get_by_role("link").click()
-        page.wait_for_selector("canvas[data-loaded$=head]", timeout=30_000)
+        page.wait_for_selector("canvas[data-loaded$=head]")
         mine.check_clean()
         other.check_clean()

@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.support.ball_results import RADIUS_MM
 from tests.support.browser import Visit, keep_screenshots, keep_widths, visit
-from tests.support.services import RunningService, await_state, packed_capture, running_service
+from tests.support.services import RunningService, await_state, await_true, packed_capture, running_service
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -48,10 +48,14 @@ def pixels(page: Page, half: float = 0.16) -> np.ndarray:
     return shown[height // 2 - reach : height // 2 + reach, width // 2 - reach : width // 2 + reach]
 
 
-def off_the_ramp(colours: np.ndarray) -> np.ndarray:
-    """How far colours lie from the legend's (levels)."""
-    steps = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(RAMP)])
-    return np.min(np.linalg.norm(colours.reshape(-1, 1, 3) - steps, axis=2), axis=1)
+def off_colours(shown: np.ndarray, colours: np.ndarray) -> np.ndarray:
+    """How far each pixel lies from the nearest of ``colours`` (levels)."""
+    return np.min(np.linalg.norm(shown.reshape(-1, 1, 3) - colours, axis=2), axis=1)
+
+
+def off_the_ramp(shown: np.ndarray) -> np.ndarray:
+    """How far pixels lie from the legend's colours (levels)."""
+    return off_colours(shown, np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(RAMP)]))
 
 
 def test_what_is_shown_is_what_the_files_hold(
@@ -59,21 +63,17 @@ def test_what_is_shown_is_what_the_files_hold(
 ) -> None:
     v = visit(browser, heads.url)
     page = v.go("/result")
-    page.wait_for_selector("canvas[data-loaded$=head]", timeout=60_000)
+    page.wait_for_selector("canvas[data-loaded$=head]")
     page.keyboard.press("u")
     expect(page.locator(".view3d").get_by_text("Standard deviation")).to_be_visible()
-    page.wait_for_timeout(500)
-    # 2 of 255 are rounding of the colours and of their interpolation; light would add tens.
-    assert off_the_ramp(pixels(page)).max() < 6, "data are not lit"
+    # 2 of 255 are rounding of the colours and of their interpolation; light would add tens: data are not lit.
+    await_true(lambda: off_the_ramp(pixels(page)).max() < 6)
     page.keyboard.press("b")
-    page.wait_for_selector("canvas[data-loaded$=bust]", timeout=60_000)
+    page.wait_for_selector("canvas[data-loaded$=bust]")
     page.keyboard.press("p")
     expect(page.get_by_label("Parts")).to_contain_text("hair")
-    page.wait_for_timeout(500)
-    found = pixels(page).reshape(-1, 1, 3)
-    nearest = np.linalg.norm(found - PARTS, axis=2).min(axis=1)
     # edges of 3 mm: a row of triangles between the parts is an eighth of the 40 mm that are looked at, at most
-    assert np.mean(nearest < 3) > 7 / 8
+    await_true(lambda: np.mean(off_colours(pixels(page), PARTS) < 3) > 7 / 8)
     keep_screenshots(page, screenshots, "viewer-parts")
     check_comparison(page)
     check_exports(page, tmp_path)
@@ -88,7 +88,7 @@ def test_views_from_fixed_sides_fit_the_head(browser: Browser, heads: RunningSer
     the half at the right of the picture is brighter. The ball keeps off the rims from every side, on either surface."""
     v = visit(browser, heads.url)
     page = v.go("/result")
-    page.wait_for_selector("canvas[data-loaded$=head]", timeout=60_000)
+    page.wait_for_selector("canvas[data-loaded$=head]")
     page.get_by_label("Light").select_option("side")
     page.locator("canvas").focus()
     page.keyboard.press("g")
@@ -104,10 +104,9 @@ def test_views_from_fixed_sides_fit_the_head(browser: Browser, heads: RunningSer
     assert min(halves["front"], halves["top"]) > 5
     page.locator("[data-side=left]").click()
     page.keyboard.press("b")
-    page.wait_for_selector("canvas[data-loaded$=bust]", timeout=60_000)
-    page.wait_for_timeout(500)
+    page.wait_for_selector("canvas[data-loaded$=bust]")
+    await_true(lambda: abs(pixels(page).mean() - level["left"]) < 5)  # the other surface, seen from the same side
     assert_clear_of_rims(page)
-    assert abs(pixels(page).mean() - level["left"]) < 5, "the other surface is seen from the same side"
     page.keyboard.press("ArrowLeft")  # on a button: the page stays as it is
     page.locator("canvas").focus()
     page.keyboard.press("ArrowLeft")
@@ -134,7 +133,7 @@ def test_a_picture_of_the_head_stands_where_the_browser_will_draw_it(browser: Br
     before = np.asarray(Image.open(io.BytesIO(page.locator(".view3d").screenshot())).convert("RGB"), float)
     for route in held:
         route.continue_()
-    page.wait_for_selector("canvas[data-loaded$=head]", timeout=60_000)
+    page.wait_for_selector("canvas[data-loaded$=head]")
     expect(first).to_have_count(0)
     after = np.asarray(Image.open(io.BytesIO(page.locator(".view3d").screenshot())).convert("RGB"), float)
     height, width = after.shape[:2]
@@ -159,7 +158,7 @@ def test_a_head_and_its_comparison_outlive_a_reload_and_its_files_bear_its_name(
 ) -> None:
     v = visit(browser, heads.url)
     page = v.go("/result")
-    page.wait_for_selector("canvas[data-loaded$=head]", timeout=60_000)
+    page.wait_for_selector("canvas[data-loaded$=head]")
     job = page.url.rpartition("/")[2]
     with page.expect_download() as download:
         page.locator("#all").click()
@@ -169,15 +168,15 @@ def test_a_head_and_its_comparison_outlive_a_reload_and_its_files_bear_its_name(
     assert download.value.suggested_filename == f"head-Anna-{job[-6:]}.png"
     page.locator("#strangers").check()
     page.get_by_label("Compare with").select_option(index=2)
-    expect(page.get_by_text("Distance to a head of ANOTHER SUBJECT")).to_be_visible(timeout=30_000)
+    expect(page.get_by_text("Distance to a head of ANOTHER SUBJECT")).to_be_visible()
     page.reload()
-    expect(page.get_by_text("Distance to a head of ANOTHER SUBJECT")).to_be_visible(timeout=60_000)
+    expect(page.get_by_text("Distance to a head of ANOTHER SUBJECT")).to_be_visible()
     assert page.url.startswith(f"{heads.url}/result/{job}?other=")
     capture = httpx.get(heads.url + "/v1/captures").json()["captures"][0]["id"]
     made = httpx.post(heads.url + "/v1/jobs", json={"capture_id": capture}).json()["id"]
     with httpx.Client(base_url=heads.url, timeout=60) as http:
         await_state(http, made, ("succeeded",))
-    expect(page.get_by_label("Compare with").locator("option")).to_have_count(4, timeout=30_000)
+    expect(page.get_by_label("Compare with").locator("option")).to_have_count(4)
     expect(page.locator("canvas")).to_have_attribute(
         "data-loaded", f"{job} head"
     )  # a newer one does not take its place
@@ -197,7 +196,7 @@ def check_subjects(v: Visit, screenshots: Path) -> None:
     page.locator("#find").fill("bert")
     expect(cards).to_have_count(1)
     cards.get_by_role("link", name="Head", exact=True).click()
-    expect(page.get_by_label("Head", exact=True).locator("option:checked")).to_contain_text("Bert", timeout=30_000)
+    expect(page.get_by_label("Head", exact=True).locator("option:checked")).to_contain_text("Bert")
 
 
 def check_comparison(page: Page) -> None:
@@ -209,7 +208,7 @@ def check_comparison(page: Page) -> None:
     expect(options).to_have_count(3)
     expect(options.nth(2)).to_contain_text("perhaps another person: Bert")
     page.get_by_label("Compare with").select_option(index=2)
-    expect(page.get_by_text("Distance to a head of ANOTHER SUBJECT")).to_be_visible(timeout=30_000)
+    expect(page.get_by_text("Distance to a head of ANOTHER SUBJECT")).to_be_visible()
     page.get_by_label("Compare with").select_option("")
 
 
@@ -234,7 +233,7 @@ def check_exports(page: Page, tmp_path: Path) -> None:
     page.locator("canvas").focus()
     page.keyboard.press("g")
     page.get_by_label("Light").select_option("side")
-    with page.expect_download(timeout=60_000) as download:
+    with page.expect_download() as download:
         page.locator("#turntable").click()
     download.value.save_as(tmp_path / "turn.webm")
     sides = bright_sides(tmp_path / "turn.webm")
@@ -272,7 +271,7 @@ def check_side_by_side(page: Page, screenshots: Path) -> None:
         before = await_halves(page, before)
     keep_widths(page, screenshots, "side-by-side")
     page.locator("#beside").uncheck()
-    expect(page.get_by_text("Distance to the other head")).to_be_visible(timeout=30_000)
+    expect(page.get_by_text("Distance to the other head")).to_be_visible()
     page.get_by_label("Compare with").select_option("")
 
 

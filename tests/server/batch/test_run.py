@@ -172,8 +172,5 @@ def test_a_schedulers_limit_counts_where_it_is_less(tmp_path: Path) -> None:
     (tmp_path / "memory.max").write_text(f"{8 * GB}\n")
     assert free_memory(meminfo, tmp_path) == 5 * GB
     assert free_memory(tmp_path / "none", tmp_path) == WORKER_BYTES
-
-
-def test_this_machine_has_some_of_both() -> None:
     assert usable_cores() >= 1
     assert 0 < free_memory() < 1 << 60

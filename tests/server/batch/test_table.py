@@ -59,7 +59,7 @@ def test_what_failed_and_what_is_missing_have_rows_too() -> None:
     assert missing["state"] == "missing"
 
 
-def test_each_value_is_of_its_columns_kind() -> None:
+def test_each_value_is_of_its_columns_kind_and_lengths_say_their_unit() -> None:
     kinds = {"text": str, "number": float, "count": int, "flag": bool}
     row = row_of(Outcome(CAPTURE, Path(), "", pinned_report(4, {}), FROM), COLUMNS)
     for column in COLUMNS:
@@ -67,9 +67,6 @@ def test_each_value_is_of_its_columns_kind() -> None:
         assert value is None or type(value) is kinds[column.kind], column.name
         assert column.words
     assert len({column.name for column in COLUMNS}) == len(COLUMNS)
-
-
-def test_lengths_say_their_unit() -> None:
     for column in columns_of(expression_names(model_path("default"))):
         assert column.name.endswith(f"_{column.unit}") or column.unit in ("", "s"), column.name
 

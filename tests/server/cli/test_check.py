@@ -14,7 +14,7 @@ from pipeline.head_model.model import load_model
 from rig.capture import Capture, reassign_images
 from rig.errors import EigenheadError, InputError, WrongVariable
 from rig.formats.cameras.cameras_file import write_rig_file
-from rig.formats.captures.archive import ArchiveLimits, pack_folder
+from rig.formats.captures.archive import pack_folder
 from rig.formats.captures.capture_folder import read_capture, write_capture
 from rig.formats.pictures.images import read_image, write_image
 from rig.messages.message import texts_of
@@ -23,11 +23,10 @@ from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from server.cli.check import checked, lines
 from server.cli.reconstruct_local import reconstruct_locally
-from server.tasks.child import WorkerContext
-from server.tasks.ingest import ingest_archive
 from server.tasks.settings_file import settings_document
 from tests.server.cli.test_main import run
 from tests.server.http.test_hostile import SPOILT
+from tests.server.tasks.test_ingest import kept_of
 from tests.support.services import small_capture
 from tests.support.silhouette_subjects import dressed_head
 
@@ -116,10 +115,8 @@ def test_mirrored_pictures_are_refused_by_an_upload_in_the_same_words(
     kinds = capture.images, capture.masks
     images, masks = ({name: np.ascontiguousarray(p[:, ::-1]) for name, p in of.items()} for of in kinds)
     write_capture(tmp_path / "shot", replace(capture, images=images, masks=masks), rig)
-    pack_folder(tmp_path / "shot", tmp_path / "shot.tar")
-    archive = {"archive": str(tmp_path / "shot.tar"), "folder": str(tmp_path / "kept"), "limits": ArchiveLimits()}
     with pytest.raises(InputError) as refusal:
-        ingest_archive(WorkerContext(), lambda stage, share: None, **archive, image_pixels=10**8)
+        kept_of(tmp_path / "shot", tmp_path)
     assert texts_of(refusal.value.faults) == found_in(tmp_path / "shot")["faults"] != []
 
 
@@ -137,7 +134,7 @@ HARMS = {
 @pytest.mark.parametrize("words", HARMS)
 def test_one_bad_picture_costs_a_view_and_is_named(masked: tuple[Capture, Rig], words: str, tmp_path: Path) -> None:
     """By check, upload and job alike; with ``--strict`` it costs the capture."""
-    folder, kept = tmp_path / "shot", tmp_path / "kept"
+    folder = tmp_path / "shot"
     write_capture(folder, *masked)
     HARMS[words](folder / "images" / "cam03.png")
     found = found_in(folder)
@@ -146,9 +143,7 @@ def test_one_bad_picture_costs_a_view_and_is_named(masked: tuple[Capture, Rig], 
     assert words in sentence
     assert sentence.endswith("; mend that, or go on without cam03, which takes no part")
     assert (found["faults"], len(found["cameras"])) == ([], len(masked[1]) - 1)
-    pack_folder(folder, tmp_path / "shot.tar")
-    archive = {"archive": str(tmp_path / "shot.tar"), "folder": str(kept), "limits": ArchiveLimits()}
-    content = ingest_archive(WorkerContext(), lambda stage, share: None, **archive, image_pixels=10**8)
+    content, kept = kept_of(folder, tmp_path)
     assert [warning["message"] for warning in found["warnings"]] == texts_of(content.warnings)
     for root in (folder, kept):  # as eigenhead reconstruct, a batch and the service's job read it
         capture, rig = read_capture(root)

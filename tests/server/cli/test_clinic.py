@@ -65,6 +65,9 @@ def test_a_hospital_s_file_has_a_pseudonym_of_letters_and_digits(result: Path, t
     done = CliRunner().invoke(app, [*words, "P017"])
     assert done.exit_code == 0, done.output
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"frame.json", "sub-P017_desc-head_mask.nii.gz"}
+    done = CliRunner().invoke(app, ["export", str(result), "--as", "slicer", "--axes", "XYZ", "--out", str(tmp_path)])
+    assert done.exit_code == 2
+    assert "not one of 'LPS', 'RAS'" in done.output
 
 
 def test_a_folder_that_is_no_result_is_refused(tmp_path: Path) -> None:
@@ -73,12 +76,6 @@ def test_a_folder_that_is_no_result_is_refused(tmp_path: Path) -> None:
         assert done.exit_code == 1
         assert "report.json: is not there: name the folder of a result" in str(done.exception)
         assert not (tmp_path / "out").exists()
-
-
-def test_axes_that_nobody_knows_are_wrong_usage(result: Path, tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["export", str(result), "--as", "slicer", "--axes", "XYZ", "--out", str(tmp_path)])
-    assert done.exit_code == 2
-    assert "not one of 'LPS', 'RAS'" in done.output
 
 
 def test_a_comparison_that_is_there_is_not_written_over(result: Path, tmp_path: Path) -> None:

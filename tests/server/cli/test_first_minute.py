@@ -98,13 +98,13 @@ def test_no_summary_of_a_command_is_cut_off(run: Run, group: list[str]) -> None:
     assert "..." not in listed
 
 
-def test_help_names_every_fault(run: Run) -> None:
+def test_help_version_and_a_model_are_told_in_words(run: Run) -> None:
     text = " ".join(run("simulate", "--help").out.split())
     assert all(kind in text.replace("- ", "-") for kind in KINDS)
-
-
-def test_it_names_its_version(run: Run) -> None:
     assert run("--version").out == f"eigenhead {version('eigenhead')}\n"
+    text = run("model", "info").out
+    assert not any(sign in text for sign in "{}[]'\"")
+    assert "female: 41; male: 97; total: 138" in text
 
 
 @pytest.mark.parametrize(
@@ -125,19 +125,10 @@ def test_a_shell_completes_commands_options_and_what_they_may_be(line: str, offe
     assert completed.stdout.split() == offered
 
 
-def test_what_a_model_is_made_of_is_told_in_words(run: Run) -> None:
-    text = run("model", "info").out
-    assert not any(sign in text for sign in "{}[]'\"")
-    assert "female: 41; male: 97; total: 138" in text
-
-
-def test_serve_says_in_one_line_that_its_rig_file_is_missing(run: Run, tmp_path: Path) -> None:
+def test_serve_says_in_one_line_that_its_rig_file_is_missing_or_its_port_is_taken(run: Run, tmp_path: Path) -> None:
     done = run("serve", "--rig", tmp_path / "rig.toml")
     assert (done.status, done.err.count("\n")) == (1, 1)
     assert "rig.toml: cannot be read (No such file or directory)" in done.err
-
-
-def test_serve_says_in_one_line_that_its_port_is_taken(run: Run) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()

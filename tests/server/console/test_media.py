@@ -29,15 +29,12 @@ def scope_of(route: APIRoute) -> str:
     return inspect.getclosurevars(authenticate).nonlocals["scope"]
 
 
-def test_every_address_asks_for_a_session_and_what_sends_pictures_for_more() -> None:
+def test_every_address_asks_for_a_session_and_hides_no_other() -> None:
     assert len(ROUTES) >= 20
     for route in ROUTES:
         assert route.path.startswith("/console/")
         assert scope_of(route) == ("capture" if route.methods == {"POST"} else "read"), route.path
-
-
-def test_no_address_hides_another() -> None:
-    """`/console/jobs/{job}/{name}` takes what no other takes, so that it comes last of its kind."""
+    # `/console/jobs/{job}/{name}` takes what no other takes, so that it comes last of its kind.
     of_jobs = [route.path for route in ROUTES if route.path.startswith("/console/jobs/{job_id}/")]
     assert of_jobs[-1] == "/console/jobs/{job_id}/{name}"
     assert len(of_jobs) == len(set(of_jobs)) > 6

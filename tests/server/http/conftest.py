@@ -1,7 +1,6 @@
 """The service that the tests of HTTP speak to."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import httpx
 import pytest
@@ -29,12 +28,6 @@ def client(service: RunningService) -> Iterator[Client]:
         yield client
 
 
-@pytest.fixture
-def archive(tmp_path: Path) -> bytes:
-    return packed(small_capture(tmp_path / "capture"))
-
-
 @pytest.fixture(scope="session")
-def archive_of_all(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """For fixtures that outlive a test."""
+def archive(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return packed(small_capture(tmp_path_factory.mktemp("archive") / "capture"))

@@ -12,12 +12,20 @@ from typing import Any
 import httpx
 import pytest
 
-from rig.formats.captures.archive import pack_folder
 from server.services.keys import SCOPES, Keys
 from server.settings import ServiceSettings
 from server.storage.database import open_database
 from tests.support.loopback import hooked
-from tests.support.services import RunningService, await_state, await_true, packed, running_service, small_capture
+from tests.support.services import (
+    RunningService,
+    await_state,
+    await_true,
+    packed,
+    running_service,
+    served_client,
+    small_capture,
+    upload,
+)
 
 
 @pytest.fixture(scope="module")
@@ -120,9 +128,8 @@ def test_a_webhook_at_no_address_is_refused(guarded: tuple[RunningService, dict[
 
 def test_a_key_has_a_limit_of_jobs(guarded: tuple[RunningService, dict[str, str]], tmp_path: Path) -> None:
     service, keys = guarded
-    pack_folder(small_capture(tmp_path / "capture"), tmp_path / "capture.tar")
     with client_of(service, keys["admin"]) as client:
-        capture = client.post("/v1/captures/uploads", files={"file": (tmp_path / "capture.tar").read_bytes()}).json()
+        capture = upload(client, packed(small_capture(tmp_path / "capture"))).json()
         job = {"capture_id": capture["id"], "settings": {"front": "long"}}
         jobs = [client.post("/v1/jobs", json=job) for _ in range(4)]
         assert [response.status_code for response in jobs] == [202, 202, 202, 429]
@@ -133,15 +140,10 @@ def test_a_key_has_a_limit_of_jobs(guarded: tuple[RunningService, dict[str, str]
 
 @pytest.mark.slow
 def test_webhooks_are_signed_and_tried_again(tmp_path: Path) -> None:
-    with (
-        hooked(fails_first=True) as receiver,
-        running_service(tmp_path / "data") as service,
-        client_of(service, None) as client,
-    ):
+    with hooked(fails_first=True) as receiver, served_client(tmp_path / "data") as (_, client):
         hook = client.post("/v1/webhooks", json={"url": receiver.url + "/hook"}).json()
         assert "secret" not in client.get("/v1/webhooks").json()["webhooks"][0]
-        pack_folder(small_capture(tmp_path / "capture"), tmp_path / "capture.tar")
-        capture = client.post("/v1/captures/uploads", files={"file": (tmp_path / "capture.tar").read_bytes()}).json()
+        capture = upload(client, packed(small_capture(tmp_path / "capture"))).json()
         job = client.post("/v1/jobs", json={"capture_id": capture["id"]}).json()
         await_state(client, job["id"], ("succeeded",))
         await_true(lambda: len(receiver.received) == 2)

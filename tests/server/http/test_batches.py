@@ -19,6 +19,7 @@ from tests.support.services import (
     RunningService,
     await_state,
     await_true,
+    awaited,
     running_service,
     served_client,
     uploaded_capture,
@@ -29,23 +30,17 @@ URN = "urn:eigenhead:problem:"
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
     """Its jobs take 0.2 s, one after the other."""
     with running_service(tmp_path_factory.mktemp("batches") / "data", batch_captures="8") as running:
         yield running
 
 
 @pytest.fixture(scope="module")
-def captures(served: RunningService, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+def captures(service: RunningService, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Labelled "subject 0" to "subject 4"."""
     folder = tmp_path_factory.mktemp("captures")
-    return [uploaded_capture(served, folder, seed) for seed in range(5)]
-
-
-@pytest.fixture
-def http(served: RunningService) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=served.url, timeout=30) as client:
-        yield client
+    return [uploaded_capture(service, folder, seed) for seed in range(5)]
 
 
 def begin(http: httpx.Client, **wanted: object) -> dict[str, Any]:
@@ -55,14 +50,8 @@ def begin(http: httpx.Client, **wanted: object) -> dict[str, Any]:
     return answer.json()
 
 
-def awaited(
-    http: httpx.Client, batch: str, reached: Callable[[dict[str, Any]], bool], timeout_s: float = 60.0
-) -> dict[str, Any]:
-    deadline = time.monotonic() + timeout_s
-    while not reached(found := http.get(f"/v1/batches/{batch}").json()):
-        assert time.monotonic() < deadline, found
-        time.sleep(0.05)
-    return found
+def batch_once(http: httpx.Client, batch: str, reached: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    return awaited(lambda: http.get(f"/v1/batches/{batch}").json(), reached)
 
 
 def finished(batch: dict[str, Any]) -> bool:
@@ -76,9 +65,9 @@ def counted(batch: dict[str, Any]) -> dict[str, int]:
 def test_a_batch_makes_a_job_of_each_capture_and_says_how_far_it_is(http: httpx.Client, captures: list[str]) -> None:
     batch = begin(http, captures=captures[:3], label="walk", settings={"detail": "span"})
     assert (batch["state"], batch["total"], batch["priority"], batch["queue"]) == ("running", 3, 500, "cpu")
-    halfway = awaited(http, batch["id"], lambda b: 0 < b["counts"]["succeeded"] < 3)
+    halfway = batch_once(http, batch["id"], lambda b: 0 < b["counts"]["succeeded"] < 3)
     assert 0 <= halfway["eta_s"] < 60  # on SQLite the engine's moments are whole seconds, and these jobs shorter
-    done = awaited(http, batch["id"], finished)
+    done = batch_once(http, batch["id"], finished)
     assert (done["state"], counted(done), done["eta_s"]) == ("finished", {"succeeded": 3}, None)
     jobs = http.get("/v1/jobs", params={"batch": batch["id"], "sort": "created"}).json()
     assert jobs["total"] == 3
@@ -91,11 +80,11 @@ def test_a_batch_makes_a_job_of_each_capture_and_says_how_far_it_is(http: httpx.
 def test_captures_are_named_by_session_or_by_how_their_labels_begin(http: httpx.Client, captures: list[str]) -> None:
     session = http.post("/v1/sessions", json={"label": "Wanda"}).json()["id"]
     http.post("/v1/captures/bulk", json={"action": "move", "ids": captures[:2], "session": session})
-    of_session = awaited(http, begin(http, session=session)["id"], finished)
+    of_session = batch_once(http, begin(http, session=session)["id"], finished)
     jobs = http.get("/v1/jobs", params={"batch": of_session["id"]}).json()["jobs"]
     assert {job["capture_id"] for job in jobs} == set(captures[:2])
-    assert awaited(http, begin(http, prefix="SUBJECT ")["id"], finished)["total"] == len(captures)
-    assert awaited(http, begin(http, prefix="subject 3")["id"], finished)["total"] == 1
+    assert batch_once(http, begin(http, prefix="SUBJECT ")["id"], finished)["total"] == len(captures)
+    assert batch_once(http, begin(http, prefix="subject 3")["id"], finished)["total"] == 1
     http.post("/v1/captures/bulk", json={"action": "move", "ids": captures[:2], "session": None})
 
 
@@ -153,9 +142,9 @@ def test_a_batch_that_is_not_there_is_not_found(http: httpx.Client, action: str)
 
 def test_a_paused_batch_takes_back_what_waits_and_goes_on_later(http: httpx.Client, captures: list[str]) -> None:
     batch = begin(http, captures=captures, label="pause")["id"]
-    awaited(http, batch, lambda b: b["counts"]["succeeded"] >= 1)
+    batch_once(http, batch, lambda b: b["counts"]["succeeded"] >= 1)
     assert http.post(f"/v1/batches/{batch}/pause").json()["state"] == "paused"
-    still = awaited(http, batch, lambda b: not b["counts"]["queued"] and not b["counts"]["running"])
+    still = batch_once(http, batch, lambda b: not b["counts"]["queued"] and not b["counts"]["running"])
     assert still["counts"]["waiting"] + still["counts"]["succeeded"] == 5
     assert still["counts"]["waiting"] >= 1
     time.sleep(1.0)
@@ -163,7 +152,7 @@ def test_a_paused_batch_takes_back_what_waits_and_goes_on_later(http: httpx.Clie
     assert http.get("/v1/jobs", params={"batch": batch}).json()["total"] == still["counts"]["succeeded"]
     assert http.get("/v1/jobs", params={"state": "cancelled", "q": "pause"}).json()["total"] == 0
     assert http.post(f"/v1/batches/{batch}/resume").json()["state"] == "running"
-    assert counted(awaited(http, batch, finished)) == {"succeeded": 5}
+    assert counted(batch_once(http, batch, finished)) == {"succeeded": 5}
     for action in ("pause", "resume"):
         answer = http.post(f"/v1/batches/{batch}/{action}")
         assert (answer.status_code, answer.json()["type"]) == (409, URN + "batch-ended")
@@ -171,11 +160,11 @@ def test_a_paused_batch_takes_back_what_waits_and_goes_on_later(http: httpx.Clie
 
 def test_a_cancelled_batch_keeps_its_heads_and_ends_for_good(http: httpx.Client, captures: list[str]) -> None:
     batch = begin(http, captures=captures, settings={"front": "long"})["id"]
-    awaited(http, batch, lambda b: b["counts"]["running"] == 1)
+    batch_once(http, batch, lambda b: b["counts"]["running"] == 1)
     answer = http.delete(f"/v1/batches/{batch}")
     assert (answer.status_code, answer.json()["type"]) == (409, URN + "batch-active")
     assert http.post(f"/v1/batches/{batch}/cancel").json()["state"] == "cancelled"
-    ended = awaited(http, batch, finished)
+    ended = batch_once(http, batch, finished)
     assert (ended["state"], counted(ended)) == ("cancelled", {"cancelled": 5})
     assert http.post(f"/v1/batches/{batch}/cancel").json()["state"] == "cancelled"
     for action in ("retry", "resume", "pause"):
@@ -188,49 +177,49 @@ def test_a_cancelled_batch_keeps_its_heads_and_ends_for_good(http: httpx.Client,
 
 def test_failed_captures_are_tried_again_and_no_others(http: httpx.Client, captures: list[str]) -> None:
     batch = begin(http, captures=captures[:2], settings={"front": "fail"})["id"]
-    assert counted(awaited(http, batch, finished)) == {"failed": 2}
+    assert counted(batch_once(http, batch, finished)) == {"failed": 2}
     shown = http.get("/metrics").text
     assert 'eigenhead_failures{kind="invalid-capture"} 2.0' in shown
     assert 'eigenhead_worker_slots{queue="cpu"} 1.0' in shown
     failed = {job["id"] for job in http.get("/v1/jobs", params={"batch": batch}).json()["jobs"]}
     again = http.post(f"/v1/batches/{batch}/retry").json()
     assert (again["state"], again["finished"]) == ("running", None)
-    awaited(http, batch, finished)
+    batch_once(http, batch, finished)
     jobs = {job["id"] for job in http.get("/v1/jobs", params={"batch": batch}).json()["jobs"]}
     assert len(jobs) == 2
     assert not jobs & failed
-    good = awaited(http, begin(http, captures=captures[:1])["id"], finished)["id"]
+    good = batch_once(http, begin(http, captures=captures[:1])["id"], finished)["id"]
     answer = http.post(f"/v1/batches/{good}/retry")
     assert (answer.status_code, answer.json()["type"]) == (409, URN + "none-failed")
 
 
 def test_what_is_erased_meanwhile_is_counted_and_leaves_nothing(
-    served: RunningService, http: httpx.Client, tmp_path: Path
+    service: RunningService, http: httpx.Client, tmp_path: Path
 ) -> None:
     """Captures that wait, one whose job runs, and one that is done."""
     session = http.post("/v1/sessions", json={"label": "Erased Elif"}).json()["id"]
-    theirs = [uploaded_capture(served, tmp_path, seed) for seed in range(20, 24)]
+    theirs = [uploaded_capture(service, tmp_path, seed) for seed in range(20, 24)]
     http.post("/v1/captures/bulk", json={"action": "move", "ids": theirs, "session": session})
     batch = begin(http, captures=theirs)["id"]
-    awaited(http, batch, lambda b: b["counts"]["succeeded"] >= 1)
+    batch_once(http, batch, lambda b: b["counts"]["succeeded"] >= 1)
     assert http.delete(f"/v1/sessions/{session}").status_code == 204
-    ended = awaited(http, batch, finished)
+    ended = batch_once(http, batch, finished)
     assert counted(ended) == {"removed": 4}
     table = http.get(f"/v1/batches/{batch}/table").text
     assert not any(capture in table for capture in theirs)
     assert http.get("/v1/jobs", params={"batch": batch}).json()["total"] == 0
 
 
-def test_a_removed_capture_holds_no_other_up(served: RunningService, http: httpx.Client, tmp_path: Path) -> None:
-    theirs = [uploaded_capture(served, tmp_path, seed) for seed in range(30, 33)]
+def test_a_removed_capture_holds_no_other_up(service: RunningService, http: httpx.Client, tmp_path: Path) -> None:
+    theirs = [uploaded_capture(service, tmp_path, seed) for seed in range(30, 33)]
     batch = begin(http, captures=theirs)["id"]
     http.post(f"/v1/batches/{batch}/pause")
-    awaited(http, batch, lambda b: not b["counts"]["queued"] and not b["counts"]["running"])
+    batch_once(http, batch, lambda b: not b["counts"]["queued"] and not b["counts"]["running"])
     before = http.get(f"/v1/batches/{batch}").json()["counts"]
     assert before["waiting"] >= 1, "the last of them waits"
     assert http.delete(f"/v1/captures/{theirs[2]}").status_code == 204
     http.post(f"/v1/batches/{batch}/resume")
-    assert counted(awaited(http, batch, finished)) == {"succeeded": 2, "removed": 1}
+    assert counted(batch_once(http, batch, finished)) == {"succeeded": 2, "removed": 1}
 
 
 def test_the_table_and_the_sheet_are_those_of_the_command_line(tmp_path: Path) -> None:
@@ -240,7 +229,7 @@ def test_the_table_and_the_sheet_are_those_of_the_command_line(tmp_path: Path) -
         batch = begin(http, captures=captures, label="Study <4>")["id"]
         waiting = http.get(f"/v1/batches/{batch}/table")
         assert [row["state"] for row in csv.DictReader(io.StringIO(waiting.text))] != ["done", "done"]
-        awaited(http, batch, finished)
+        batch_once(http, batch, finished)
         answer = http.get(f"/v1/batches/{batch}/table")
         assert answer.headers["content-type"].startswith("text/csv")
         rows = [*csv.DictReader(io.StringIO(answer.text, newline=""))]
@@ -271,7 +260,7 @@ def test_webhooks_hear_once_of_each_end_of_a_batch(http: httpx.Client, captures:
         hook = http.post("/v1/webhooks", json={"url": receiver.url}).json()["id"]
         batch = begin(http, captures=captures[:1], settings={"front": "fail"})["id"]
         for times in (1, 2):
-            awaited(http, batch, finished)
+            batch_once(http, batch, finished)
             await_true(lambda: len(receiver.data_of("batch.finished")) >= times)  # noqa: B023
             time.sleep(0.5)
             assert receiver.data_of("batch.finished") == times * [{"batch_id": batch}]
@@ -282,23 +271,21 @@ def test_webhooks_hear_once_of_each_end_of_a_batch(http: httpx.Client, captures:
 
 def test_an_operators_shot_goes_before_the_batch(http: httpx.Client, captures: list[str]) -> None:
     batch = begin(http, captures=captures)["id"]
-    awaited(http, batch, lambda b: b["counts"]["running"] == 1)
+    batch_once(http, batch, lambda b: b["counts"]["running"] == 1)
     job = http.post("/v1/jobs", json={"capture_id": captures[0]}).json()
     assert job["ahead"] <= 1, "only the one that runs"
     done = await_state(http, job["id"], ("succeeded",))
     assert http.get(f"/v1/batches/{batch}").json()["counts"]["succeeded"] <= 3
     assert done["priority"] == 100
-    awaited(http, batch, finished)
+    batch_once(http, batch, finished)
 
 
 def test_batches_of_a_key_have_a_limit_and_their_jobs_none(tmp_path: Path) -> None:
-    with (
-        running_service(tmp_path / "data", worker=False, batches_per_key="1", jobs_per_key="1") as service,
-        httpx.Client(base_url=service.url, timeout=30) as http,
-    ):
+    bounds = {"batches_per_key": "1", "jobs_per_key": "1"}
+    with served_client(tmp_path / "data", worker=False, **bounds) as (service, http):
         captures = [uploaded_capture(service, tmp_path, seed) for seed in (1, 2)]
         batch = begin(http, captures=captures)
-        assert awaited(http, batch["id"], lambda b: b["counts"]["queued"] == 2)["state"] == "running"
+        assert batch_once(http, batch["id"], lambda b: b["counts"]["queued"] == 2)["state"] == "running"
         assert http.post("/v1/jobs", json={"capture_id": captures[0]}).status_code == 202
         answer = http.post("/v1/batches", json={"captures": captures})
         assert (answer.status_code, answer.json()["type"]) == (429, URN + "too-many-batches")
@@ -308,11 +295,11 @@ def test_batches_of_a_key_have_a_limit_and_their_jobs_none(tmp_path: Path) -> No
 def test_a_queue_that_nobody_serves_is_said(http: httpx.Client, captures: list[str]) -> None:
     batch = begin(http, captures=captures[:2], queue="gpu")
     assert "No worker serves the queue 'gpu'" in batch["notice"]
-    awaited(http, batch["id"], lambda b: b["counts"]["queued"] == 2)
+    batch_once(http, batch["id"], lambda b: b["counts"]["queued"] == 2)
     check = http.get("/readyz").json()["checks"]["queues"]
     assert (check["ok"], check["detail"]) == (True, "2 jobs wait where no worker is: gpu")
     http.post(f"/v1/batches/{batch['id']}/cancel")
-    awaited(http, batch["id"], finished)
+    batch_once(http, batch["id"], finished)
     assert http.get("/readyz").json()["checks"]["queues"]["detail"] == "workers serve all in which jobs wait"
 
 
@@ -330,7 +317,7 @@ def test_batches_are_listed_by_pages_newest_first(http: httpx.Client, captures: 
     for query in ({"cursor": "x"}, {"limit": 0}, {"state": "fine"}):
         assert http.get("/v1/batches", params=query).status_code == 422
     for batch in made:
-        awaited(http, batch, finished)
+        batch_once(http, batch, finished)
     assert http.get("/v1/batches", params={"q": "listed", "state": "finished"}).json()["total"] == 3
     assert http.get("/v1/batches", params={"q": "listed", "state": "running"}).json()["total"] == 0
 
@@ -339,10 +326,7 @@ def test_batches_are_listed_by_pages_newest_first(http: httpx.Client, captures: 
 @pytest.mark.timeout(300)
 def test_a_capture_that_kills_workers_is_set_aside_and_the_others_are_made(tmp_path: Path) -> None:
     """Each time the first capture's job runs its worker is killed, as by the kernel's out-of-memory killer."""
-    with (
-        running_service(tmp_path / "data", attempts="2", tiny_s="1.5", silent_s="5") as service,
-        httpx.Client(base_url=service.url, timeout=30) as http,
-    ):
+    with served_client(tmp_path / "data", attempts="2", tiny_s="1.5", silent_s="5") as (service, http):
         captures = [uploaded_capture(service, tmp_path, seed) for seed in range(3)]
         batch = begin(http, captures=captures)["id"]
         deadline, kills = time.monotonic() + 200, 0
@@ -357,4 +341,4 @@ def test_a_capture_that_kills_workers_is_set_aside_and_the_others_are_made(tmp_p
             assert time.monotonic() < deadline
             time.sleep(0.2)
         assert (jobs[0]["state"], jobs[0]["error"]["type"]) == ("failed", URN + "worker-died")
-        assert counted(awaited(http, batch, finished, 120)) == {"failed": 1, "succeeded": 2}
+        assert counted(batch_once(http, batch, finished)) == {"failed": 1, "succeeded": 2}

@@ -10,6 +10,7 @@ import httpx
 import pytest
 
 from server.cli.client import Client, ServiceError
+from tests.server.http.test_hostile import SPOILT, removes
 from tests.support.services import RunningService, await_state, packed, small_capture, stored, upload
 
 
@@ -38,39 +39,21 @@ def test_a_form_field_that_nobody_knows_is_named(
     assert stored(service) == before
 
 
-@pytest.mark.parametrize(
-    ("fault", "word"),
-    [
-        ("damaged", "damaged or cut off"),
-        ("missing image", "images/cam01.png is missing"),
-        ("nan", "cam02.camera_from_world.translation holds a value that is no finite number"),
-        ("no cameras", "holds no cameras.json"),
-        ("wrong size", "is 30 x 30 pixels, but its camera is 24 x 24"),
-        ("truncated image", "images/cam00.png is damaged"),
-    ],
-)
+BAD = {case: SPOILT[case] for case in ("missing image", "NaN in a rotation", "image of another size")}
+BAD |= {"cut off": (bool, "damaged or cut off"), "no cameras": (removes("cameras.json"), "holds no cameras.json")}
+
+
+@pytest.mark.parametrize("case", BAD)
 def test_a_bad_capture_gets_422_by_name_and_leaves_nothing(
-    service: RunningService, http: httpx.Client, tmp_path: Path, fault: str, word: str
+    service: RunningService, http: httpx.Client, tmp_path: Path, case: str
 ) -> None:
-    folder = small_capture(tmp_path / "capture")
-    if fault == "missing image":
-        (folder / "images" / "cam01.png").unlink()
-    if fault == "nan":
-        document = json.loads((folder / "cameras.json").read_text())
-        document["cameras"][2]["camera_from_world"]["translation"][1] = float("nan")
-        (folder / "cameras.json").write_text(json.dumps(document))
-    if fault == "no cameras":
-        (folder / "cameras.json").unlink()
-    if fault == "wrong size":
-        small_capture(tmp_path / "other", size=30)
-        shutil.copy(tmp_path / "other" / "images" / "cam02.png", folder / "images")
-    if fault == "truncated image":
-        path = folder / "images" / "cam00.png"
-        path.write_bytes(path.read_bytes()[:-300])
+    """Eighty more, as captures alone, in ``test_hostile``."""
+    (spoil, word), folder = BAD[case], small_capture(tmp_path / "capture")
+    spoil(folder)
     data = packed(folder)
     before = stored(service)
     for path in ("/v1/captures/uploads", "/v1/reconstructions"):
-        response = upload(http, data[:5000] if fault == "damaged" else data, path)
+        response = upload(http, data[:5000] if case == "cut off" else data, path)
         assert response.status_code == 422
         assert response.headers["content-type"] == "application/problem+json"
         assert any(word in error for error in response.json()["errors"])

@@ -14,15 +14,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 
-from rig.formats.captures.archive import pack_folder
 from tests.rig.formats.captures.test_archive import HOSTILE
 from tests.support.attacks import process_tree
 from tests.support.disks import small_disk
-from tests.support.services import RunningService, await_state, packed, running_service, served_client, small_capture
+from tests.support.services import RunningService, await_state, packed, served_client, small_capture, upload
 
 MEMORY_MOST = 1 << 30
 
@@ -181,17 +179,14 @@ def test_eighty_hostile_uploads(tmp_path: Path) -> None:
 
         before, count = disk(), 0
         for case, data, word in bodies(tmp_path):
-            response = client.post("/v1/captures/uploads", files={"file": data})
+            response = upload(client, data)
             assert 400 <= response.status_code < 500, case
             assert word in " ".join(response.json()["errors"]), (case, response.text)
             assert disk() == before, case
             count += 1
         assert count >= 80
         assert peak_memory(service) < MEMORY_MOST
-        honest = small_capture(tmp_path / "honest")
-        pack_folder(honest, tmp_path / "honest.tar")
-        done = client.post("/v1/captures/uploads", files={"file": (tmp_path / "honest.tar").read_bytes()})
-        assert done.status_code == 201
+        assert upload(client, packed(small_capture(tmp_path / "honest"))).status_code == 201
 
 
 def fill(disk: Path, leave: int) -> Path:
@@ -220,7 +215,7 @@ def test_a_disk_that_fills_at_any_moment_of_a_job_changes_no_byte(tmp_path: Path
         small_disk(tmp_path / "disk", 48) as disk,
         served_client(disk / "data", free_bytes="0", tiny_s="1.5", tiny_bytes=str(1 << 20)) as (_, client),
     ):
-        capture = client.post("/v1/captures/uploads", files={"file": data}).json()["id"]
+        capture = upload(client, data).json()["id"]
         first = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
         undisturbed = await_state(client, first, ("succeeded",))["files"]
         for moment in range(moments):
@@ -245,16 +240,11 @@ def test_a_full_disk_is_said_and_survived(tmp_path: Path) -> None:
     data = packed(small_capture(tmp_path / "capture", size=200))
     with (
         small_disk(tmp_path / "disk", 48) as disk,
-        running_service(disk / "data", free_bytes="0", tiny_s="1.5", tiny_bytes=str(6 << 20)) as service,
-        httpx.Client(base_url=service.url, timeout=60) as client,
+        served_client(disk / "data", free_bytes="0", tiny_s="1.5", tiny_bytes=str(6 << 20)) as (_, client),
     ):
-
-        def upload() -> httpx.Response:
-            return client.post("/v1/captures/uploads", files={"file": data})
-
-        kept = upload().json()["id"]
+        kept = upload(client, data).json()["id"]
         ballast = fill(disk, leave=len(data) // 2)
-        for response in (upload(), client.post("/v1/reconstructions", files={"file": data})):
+        for response in (upload(client, data), upload(client, data, "/v1/reconstructions")):
             assert response.status_code == 507
             assert "disk" in response.json()["detail"]
         ballast.unlink()
@@ -271,6 +261,6 @@ def test_a_full_disk_is_said_and_survived(tmp_path: Path) -> None:
         assert client.delete(f"/v1/captures/{kept}").status_code == 204
         assert client.delete(f"/v1/jobs/{job}").status_code == 204
         ballast.unlink()
-        again = upload().json()["id"]
+        again = upload(client, data).json()["id"]
         job = client.post("/v1/jobs", json={"capture_id": again}).json()["id"]
         assert await_state(client, job, ("succeeded", "failed"), 60)["state"] == "succeeded"

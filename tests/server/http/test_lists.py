@@ -9,10 +9,10 @@ from tests.support.services import RunningService, await_state, upload
 
 
 @pytest.fixture(scope="module")
-def captures(service: RunningService, archive_of_all: bytes) -> list[str]:
+def captures(service: RunningService, archive: bytes) -> list[str]:
     """Five captures that a word finds and no other test's."""
     with httpx.Client(base_url=service.url, timeout=30) as http:
-        return [upload(http, archive_of_all, label=f"walnut {number}").json()["id"] for number in range(5)]
+        return [upload(http, archive, label=f"walnut {number}").json()["id"] for number in range(5)]
 
 
 def test_captures_come_in_pages_that_a_cursor_goes_on_with(http: httpx.Client, captures: list[str]) -> None:

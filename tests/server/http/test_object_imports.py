@@ -35,19 +35,16 @@ def way(studio: Any, object_server: str) -> Iterator[Network]:
 def service(way: Network, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
     folder = tmp_path_factory.mktemp("service")
     packed_capture(folder)
-    environment = pytest.MonkeyPatch()
-    for name, value in KEYS.items():
-        environment.setenv(name, value)
     with running_service(
         folder / "data",
         worker=False,
+        variables=KEYS,
         import_prefixes=f'["s3://studio-in/in/", "file://{folder}/"]',
         store_endpoint=way.url,
         store_timeout_s="0.6",
         body_bytes=str(1 << 20),
     ) as service:
         yield service
-    environment.undo()
 
 
 def imported(service: RunningService, url: str) -> httpx.Response:

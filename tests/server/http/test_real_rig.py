@@ -139,7 +139,7 @@ def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> 
         refused = client.post("/v1/captures", json={})
         assert (refused.status_code, refused.json()["type"].split(":")[-1]) == (503, "not-calibrated")
         captures = []
-        for shot in range(26):
+        for shot in range(0, 26, 2):
             board.hold(studio, shot)
             if shot == 0:
                 studio.inject(DeviceFault("hung", "cam_2"))
@@ -150,7 +150,7 @@ def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> 
                     break
             studio.clear()
             captures.append(taken.json())
-        assert [len(capture["cameras"]) for capture in captures if capture["board"]] == [3, *[4] * 25], captures
+        assert [len(capture["cameras"]) for capture in captures if capture["board"]] == [3, *[4] * 12], captures
         of_board = captures[1]["id"]
         assert client.post("/v1/jobs", json={"capture_id": of_board}).status_code == 409
         assert client.put(f"/v1/captures/{of_board}/features", json={"points": {}}).status_code == 409
@@ -159,7 +159,7 @@ def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> 
         assert made.status_code == 202, made.text
         done = await_calibration(client, made.json()["id"])
         assert done["state"] == "succeeded", done["error"]
-        assert done["pictures"] == {"cam_0": 26, "cam_1": 26, "cam_2": 25, "cam_3": 26}
+        assert done["pictures"] == {"cam_0": 13, "cam_1": 13, "cam_2": 12, "cam_3": 13}
         assert done["figures"]["rms_px"] <= 1.1
         used = client.put("/v1/rig/calibration", json={"calibration_id": done["id"]}).json()
         assert (used["calibration"], used["ready"]) == ("own", True)

@@ -4,12 +4,10 @@ import json
 from pathlib import Path
 
 import cv2
-import httpx
 import numpy as np
 import pytest
 
-from rig.formats.captures.archive import pack_folder
-from tests.support.services import await_calibration, running_service
+from tests.support.services import await_calibration, packed, served_client
 from tests.support.shared_data import shared
 
 
@@ -17,7 +15,7 @@ from tests.support.shared_data import shared
 @pytest.mark.gl
 @pytest.mark.timeout(400)
 def test_the_simulated_rig_takes_captures_previews_and_a_calibration(tmp_path: Path) -> None:
-    with running_service(tmp_path / "data") as service, httpx.Client(base_url=service.url, timeout=200) as client:
+    with served_client(tmp_path / "data") as (_, client):
         rig = client.get("/v1/rig").json()
         assert (rig["kind"], rig["ready"], len(rig["cameras"])) == ("simulated", True, 11)
         preview = client.get("/v1/rig/cameras/cam00/preview.jpg")
@@ -44,10 +42,8 @@ def test_an_archive_of_board_pictures_becomes_a_calibration(tmp_path: Path) -> N
         for path in (board / camera).iterdir():
             (folder / "IMAGES" / camera / path.name).write_bytes(path.read_bytes())
     (folder / "board.toml").write_bytes((board / "board.toml").read_bytes())
-    pack_folder(folder, tmp_path / "board.tar")
-    with running_service(tmp_path / "data") as service, httpx.Client(base_url=service.url, timeout=200) as client:
-        data = (tmp_path / "board.tar").read_bytes()
-        made = client.post("/v1/calibrations", files={"file": data}, data={"label": "Monday" * 100})
+    with served_client(tmp_path / "data") as (_, client):
+        made = client.post("/v1/calibrations", files={"file": packed(folder)}, data={"label": "Monday" * 100})
         assert made.status_code == 202, made.text
         done = await_calibration(client, made.json()["id"])
         assert done["state"] == "succeeded", done["error"]
@@ -59,8 +55,7 @@ def test_an_archive_of_board_pictures_becomes_a_calibration(tmp_path: Path) -> N
         other = client.put("/v1/rig/calibration", json={"calibration_id": done["id"]})
         assert other.status_code == 409  # the studio has eleven other cameras
         (folder / "board.toml").write_text('kind = "checkerboard"\ncolumns = 1\n')
-        pack_folder(folder, tmp_path / "bad.tar")
-        bad = client.post("/v1/calibrations", files={"file": (tmp_path / "bad.tar").read_bytes()})
+        bad = client.post("/v1/calibrations", files={"file": packed(folder)})
         assert bad.status_code == 422
         assert any("rows is missing" in error for error in bad.json()["errors"])
         assert [c["id"] for c in client.get("/v1/calibrations").json()["calibrations"]] == [done["id"]]

@@ -96,13 +96,15 @@ def test_an_upload_of_what_is_announced_too_large_is_refused_unread(service: Run
         assert connection.recv(100).startswith(b"HTTP/1.1 413")
 
 
-def test_health_metrics_models(http: httpx.Client) -> None:
+def test_health_metrics_models_and_the_page_of_the_api(http: httpx.Client) -> None:
     assert http.get("/healthz").json()["status"] == "ok"
     ready = http.get("/readyz")
     assert (http.head("/healthz").status_code, http.head("/readyz").status_code) == (200, ready.status_code)
     assert {"egl", "disk", "database", "rig", "worker"} <= set(ready.json()["checks"])
     assert "eigenhead_requests_total" in http.get("/metrics").text
     assert any(model["default"] for model in http.get("/v1/models").json()["models"])
+    assert "openapi.json" in http.get("/docs").text
+    assert http.get("/openapi.json").json()["paths"]["/v1/jobs"]["post"]["operationId"] == "submit_job"
 
 
 def test_templates_are_listed_and_a_job_may_name_those_of_its_model(
@@ -151,8 +153,3 @@ def test_info_tells_limits_waiting_jobs_and_default_settings(http: httpx.Client,
     assert busy["queued"] + busy["running"] >= 1
     assert await_state(http, job, ("succeeded", "failed"))["state"] == "succeeded"
     assert await_state(http, job, ("succeeded",))["settings"] == info["settings"]
-
-
-def test_the_page_of_the_api_is_there(http: httpx.Client) -> None:
-    assert "openapi.json" in http.get("/docs").text
-    assert http.get("/openapi.json").json()["paths"]["/v1/jobs"]["post"]["operationId"] == "submit_job"

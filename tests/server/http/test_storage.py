@@ -1,9 +1,8 @@
 """What is kept, how large it is and what goes next, over HTTP."""
 
-import time
 from pathlib import Path
 
-from tests.support.services import packed, served_client, small_capture, upload
+from tests.support.services import awaited, packed, served_client, small_capture, upload
 
 
 def test_storage_and_retention_are_told(tmp_path: Path) -> None:
@@ -24,9 +23,7 @@ def test_storage_and_retention_are_told(tmp_path: Path) -> None:
         ]
         assert retention["upcoming"][2]["id"] == capture["id"]
         assert (retention["upcoming"][0]["goes"] is None, retention["upcoming"][1]["goes"] is None) == (False, True)
-        deadline = time.monotonic() + 30.0
-        while (use := http.get("/v1/storage").json())["kinds"] is None and time.monotonic() < deadline:
-            time.sleep(0.05)  # the first look through the folder
+        use = awaited(lambda: http.get("/v1/storage").json(), lambda use: use["kinds"] is not None)  # the first look
         held = {kind["kind"]: kind for kind in use["kinds"]}
         files = [path for path in (service.data / "captures").rglob("*") if path.is_file()]
         assert held["captures"] == {"kind": "captures", "bytes": sum(p.stat().st_size for p in files), "things": 1}

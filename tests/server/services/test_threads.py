@@ -15,7 +15,7 @@ def test_one_key_leaves_a_place_for_others() -> None:
         threads, release, ended = Threads(checks=2), threading.Event(), list[str]()
 
         def work(name: str) -> None:
-            release.wait(10)
+            release.wait(60)
             ended.append(name)
 
         busy = [asyncio.create_task(threads.check(work, "busy", key="a")) for _ in range(3)]
@@ -31,11 +31,11 @@ def test_one_key_leaves_a_place_for_others() -> None:
 def test_more_than_a_line_of_one_key_is_refused() -> None:
     async def run() -> None:
         threads, release = Threads(checks=2), threading.Event()
-        line = [asyncio.create_task(threads.check(partial(release.wait, 10), key="a")) for _ in range(IN_LINE_MOST)]
+        line = [asyncio.create_task(threads.check(partial(release.wait, 60), key="a")) for _ in range(IN_LINE_MOST)]
         await asyncio.sleep(0.05)
         try:
             with pytest.raises(TooMany) as refused:
-                await threads.check(release.wait, 10, key="a")
+                await threads.check(release.wait, 60, key="a")
             assert refused.value.retry_after_s
         finally:
             release.set()

@@ -17,7 +17,7 @@ from server.storage.object_places import key_faults, locate, open_objects
 from server.storage.objects import ObjectMissing, ObjectStore, StoreDenied, StoreUnavailable
 from server.wire.problems import problem_from
 from tests.support.object_server import Network, client_of, with_keys
-from tests.support.services import ROOT
+from tests.support.services import ROOT, await_true
 
 
 @pytest.fixture(scope="module")
@@ -213,9 +213,7 @@ def test_a_kill_between_two_parts_shows_nothing(
     network.plan = lambda method, path: "silent" if "partNumber=2" in path else None
     command = [sys.executable, "-c", PUT, f"s3://studio/{below}", network.url, str(head)]
     process = subprocess.Popen(command, cwd=ROOT, env=with_keys())
-    deadline = time.monotonic() + 60
-    while not any("partNumber=2" in path for _, path in network.seen) and time.monotonic() < deadline:
-        time.sleep(0.02)
+    await_true(lambda: any("partNumber=2" in path for _, path in network.seen))
     process.kill()
     assert process.wait() == -9
     network.heal()

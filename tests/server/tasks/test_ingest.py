@@ -24,7 +24,6 @@ from server.tasks import ingest
 from server.tasks.child import WorkerContext
 from server.tasks.ingest import check_capture, ingest_archive, ingest_folder
 from tests.rig.acquisition.test_session import flat_rig
-from tests.server.http.test_hostile import SPOILT
 from tests.support.drawn_studio import write_drawn_capture
 from tests.support.services import small_capture
 from tests.support.textured_studio import NAMES, FlatStudio
@@ -34,16 +33,6 @@ PIXELS_MOST = 100_000_000
 
 def checked(folder: Path) -> CaptureContent:
     return check_capture(folder, PIXELS_MOST, lambda stage, share: None)
-
-
-def test_faults_of_cameras_files_and_features_are_told_at_once(tmp_path: Path) -> None:
-    folder = small_capture(tmp_path / "capture")
-    for case in ("every camera at one place", "features of a third eye"):
-        SPOILT[case][0](folder)
-    with pytest.raises(InputError) as refusal:
-        checked(folder)
-    for word in ("at one place", "'third_eye' is no landmark"):
-        assert any(word in fault.text for fault in refusal.value.faults)
 
 
 def test_feature_points_are_part_of_what_an_upload_holds(tmp_path: Path) -> None:
@@ -110,15 +99,11 @@ def test_damaged_networks_keep_no_capture_out(tmp_path: Path, monkeypatch: pytes
     ],
 )
 def test_an_upload_keeps_every_file_of_another_programs_cameras(tmp_path: Path, kind: str, place: str) -> None:
-    folder, kept = small_capture(tmp_path / "capture"), tmp_path / "kept"
+    folder = small_capture(tmp_path / "capture")
     rig = read_rig(folder / "cameras.json")
     write_rig_file(rig, folder / place, kind)
     (folder / "cameras.json").unlink()
-    pack_folder(folder, tmp_path / "capture.tar")
-    kept.mkdir()
-    archive = {"archive": str(tmp_path / "capture.tar"), "folder": str(kept), "limits": ArchiveLimits()}
-    ingest_archive(WorkerContext(), lambda stage, share: None, **archive, image_pixels=PIXELS_MOST)
-    _, read = read_capture(kept)  # as a job reads it
+    _, read = read_capture(kept_of(folder, tmp_path)[1])  # as a job reads it
     assert sorted(read.names) == sorted(rig.names)
 
 

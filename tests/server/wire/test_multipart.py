@@ -139,25 +139,27 @@ def test_a_body_that_announced_nothing_leaves_the_spare_room(tmp_path: Path, mon
     assert 2 * BLOCK_BYTES < written.stat().st_size <= 3 * BLOCK_BYTES
 
 
-def test_names_and_values_that_are_no_utf_8_are_taken_with_a_mark(tmp_path: Path) -> None:
-    named = b'--edge\r\nContent-Disposition: form-data; name="l\xffabel"\r\n\r\n\xfeAnna\r\n'
-    assert received(tmp_path, body(named, part("file", DATA)))[1] == {"l\ufffdabel": "\ufffdAnna"}
-
-
-def test_a_part_without_a_name_is_no_file(tmp_path: Path) -> None:
-    nameless = b"--edge\r\nContent-Disposition: form-data\r\n\r\nx\r\n--edge\r\nContent-Type: text/plain\r\n\r\ny\r\n"
-    assert received(tmp_path, body(nameless, part("file", DATA))) == (DATA, {"": "y"})
-
-
-def test_headers_beside_the_disposition_name_nothing(tmp_path: Path) -> None:
-    other = b'--edge\r\nX-First: a; name="b"\r\nContent-Disposition: form-data; name="label"\r\n'
-    sent = body(other + b'X-Last: c; name="d"\r\n\r\nAnna\r\n', part("file", DATA))
-    assert received(tmp_path, sent, piece=3)[1] == {"label": "Anna"}
-
-
-def test_a_field_may_be_as_long_as_the_limit(tmp_path: Path) -> None:
-    sent = body(part("file", DATA), part("label", b"x" * FIELD_BYTES))
-    assert received(tmp_path, sent)[1] == {"label": "x" * FIELD_BYTES}
+@pytest.mark.parametrize(
+    ("sent", "fields"),
+    [
+        (  # no UTF-8: taken with a mark
+            b'--edge\r\nContent-Disposition: form-data; name="l\xffabel"\r\n\r\n\xfeAnna\r\n',
+            {"l\ufffdabel": "\ufffdAnna"},
+        ),
+        (  # without a name it is no file
+            b"--edge\r\nContent-Disposition: form-data\r\n\r\nx\r\n--edge\r\nContent-Type: text/plain\r\n\r\ny\r\n",
+            {"": "y"},
+        ),
+        (  # headers beside the disposition name nothing
+            b'--edge\r\nX-First: a; name="b"\r\nContent-Disposition: form-data; name="label"\r\n'
+            b'X-Last: c; name="d"\r\n\r\nAnna\r\n',
+            {"label": "Anna"},
+        ),
+        (part("label", b"x" * FIELD_BYTES), {"label": "x" * FIELD_BYTES}),  # as long as the limit
+    ],
+)
+def test_fields_are_named_by_their_disposition_alone(tmp_path: Path, sent: bytes, fields: dict[str, str]) -> None:
+    assert received(tmp_path, body(sent, part("file", DATA)), piece=3) == (DATA, fields)
 
 
 def test_a_body_may_have_as_many_bytes_as_the_limit_and_no_more(tmp_path: Path) -> None:

@@ -15,7 +15,15 @@ import pytest
 
 from tests.support.loopback import Hook, hooked
 from tests.support.object_server import KEYS, Network, client_of
-from tests.support.services import RunningService, await_state, await_true, packed_capture, running_service, worker_pids
+from tests.support.services import (
+    RunningService,
+    await_state,
+    await_true,
+    awaited,
+    packed_capture,
+    running_service,
+    worker_pids,
+)
 
 NAMES = {"head.glb", "head.ply", "overlays/cam00.png"}
 
@@ -35,12 +43,12 @@ def hook() -> Iterator[Hook]:
 
 @pytest.fixture(scope="module")
 def service(way: Network, hook: Hook, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
-    folder, environment = tmp_path_factory.mktemp("service"), pytest.MonkeyPatch()
+    folder = tmp_path_factory.mktemp("service")
     (folder / "nas").mkdir()
-    for name, value in (KEYS | {"EIGENHEAD_TINY_S": "0.02"}).items():
-        environment.setenv(name, value)
     with running_service(
         folder / "data",
+        variables=KEYS,
+        tiny_s="0.02",
         deliver_prefixes=f'["s3://studio-out/heads/", "s3://nobody/", "file://{folder}/nas/"]',
         webhook_origins=f'["{hook.url}"]',
         store_endpoint=way.url,
@@ -48,7 +56,6 @@ def service(way: Network, hook: Hook, tmp_path_factory: pytest.TempPathFactory) 
         silent_s="3",
     ) as service:
         yield service
-    environment.undo()
 
 
 def submitted(client: httpx.Client, capture: str, to: str, **more: Any) -> str:
@@ -57,13 +64,9 @@ def submitted(client: httpx.Client, capture: str, to: str, **more: Any) -> str:
     return answer.json()["id"]
 
 
-def awaited(client: httpx.Client, job: str, state: str, timeout_s: float = 60.0) -> dict[str, Any]:
+def delivery_in(client: httpx.Client, job: str, state: str) -> dict[str, Any]:
     """The job, once its delivery is in that state."""
-    deadline = time.monotonic() + timeout_s
-    while (document := client.get(f"/v1/jobs/{job}").json())["delivery"]["state"] != state:
-        assert time.monotonic() < deadline, document
-        time.sleep(0.05)
-    return document
+    return awaited(lambda: client.get(f"/v1/jobs/{job}").json(), lambda found: found["delivery"]["state"] == state)
 
 
 def delivered(bucket: Any, job: str, below: str = "heads/") -> dict[str, bytes]:
@@ -78,7 +81,7 @@ def test_a_result_is_delivered_and_the_webhook_says_where(
 ) -> None:
     way.seen.clear()
     job = submitted(client, capture, "s3://studio-out/heads/study 4", webhook={"url": hook.url})
-    document = awaited(client, job, "delivered")
+    document = delivery_in(client, job, "delivered")
     place = f"s3://studio-out/heads/study 4/{job}/"
     assert document["delivery"] == {"to": place, "state": "delivered", "error": None}
     await_true(lambda: hook.data_of("job.delivered", job))
@@ -114,7 +117,7 @@ def test_a_delivery_waits_for_the_store_and_other_jobs_go_on(
     assert client.post(f"/v1/jobs/{job}/delivery").status_code == 409
     assert delivered(bucket, job) == {}
     way.heal()
-    awaited(client, job, "delivered")
+    delivery_in(client, job, "delivered")
     assert {*delivered(bucket, job)} == NAMES | {"delivery.json"}
 
 
@@ -129,7 +132,7 @@ def test_a_killed_worker_leaves_a_delivery_that_another_ends(
         os.kill(pid, signal.SIGKILL)
     assert "delivery.json" not in delivered(bucket, job)
     way.heal()
-    document = awaited(client, job, "delivered", 120)
+    document = delivery_in(client, job, "delivered")
     files = delivered(bucket, job)
     del files["delivery.json"]
     assert {name: len(data) for name, data in files.items()} == {n: f["bytes"] for n, f in document["files"].items()}
@@ -141,7 +144,7 @@ def test_what_the_store_refuses_fails_and_is_delivered_elsewhere(
     client: httpx.Client, capture: str, service: RunningService, hook: Hook
 ) -> None:
     job = submitted(client, capture, "s3://nobody/", webhook={"url": hook.url})
-    document = awaited(client, job, "failed")
+    document = delivery_in(client, job, "failed")
     assert document["state"] == "succeeded"
     assert document["delivery"]["error"]["type"] == "urn:eigenhead:problem:store-denied"
     assert "NoSuchBucket" in document["delivery"]["error"]["detail"]
@@ -149,7 +152,7 @@ def test_what_the_store_refuses_fails_and_is_delivered_elsewhere(
     nas = service.data.parent / "nas"
     again = client.post(f"/v1/jobs/{job}/delivery", json={"to": f"file://{nas}/heads"})
     assert again.status_code == 202, again.text
-    awaited(client, job, "delivered")
+    delivery_in(client, job, "delivered")
     there = {path.relative_to(nas / "heads" / job).as_posix() for path in (nas / "heads").rglob("*") if path.is_file()}
     assert there == NAMES | {"delivery.json"}
 
@@ -164,7 +167,7 @@ def test_a_job_that_is_removed_meanwhile_is_not_delivered(
     assert client.delete(f"/v1/jobs/{job}").status_code == 204
     way.heal()
     other = submitted(client, capture, "s3://studio-out/heads/")
-    awaited(client, other, "delivered")
+    delivery_in(client, other, "delivered")
     time.sleep(1.5)  # the first pause of one that waits
     await_true(lambda: not delivered(bucket, job))  # a file that was on its way is taken back
 
@@ -175,7 +178,7 @@ def test_a_batch_delivers_each_of_its_results(client: httpx.Client, capture: str
     assert batch["deliver_to"] == "s3://studio-out/heads/batch/"
     await_true(lambda: client.get("/v1/jobs", params={"batch": batch["id"]}).json()["total"])
     (job,) = client.get("/v1/jobs", params={"batch": batch["id"]}).json()["jobs"]
-    awaited(client, job["id"], "delivered")
+    delivery_in(client, job["id"], "delivered")
     assert {*delivered(bucket, job["id"], "heads/batch/")} == NAMES | {"delivery.json"}
 
 
@@ -186,7 +189,7 @@ def test_an_upload_with_its_job_says_where_to(
     away = client.post("/v1/reconstructions", files=files, data={"deliver_to": "s3://studio-out/"})
     assert (away.status_code, away.json()["type"]) == (422, "urn:eigenhead:problem:url-refused")
     made = client.post("/v1/reconstructions", files=files, data={"deliver_to": "s3://studio-out/heads/"}).json()
-    awaited(client, made["id"], "delivered")
+    delivery_in(client, made["id"], "delivered")
     assert "delivery.json" in delivered(bucket, made["id"])
 
 

@@ -37,11 +37,11 @@ def bucket(object_server: str) -> Any:
 
 @pytest.fixture(scope="module")
 def service(way: Network, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
-    environment = pytest.MonkeyPatch()
-    for name, value in (KEYS | {"EIGENHEAD_TINY_S": "0.02", "EIGENHEAD_TINY_BYTES": str(1 << 20)}).items():
-        environment.setenv(name, value)
     with running_service(
         tmp_path_factory.mktemp("service") / "data",
+        variables=KEYS,
+        tiny_s="0.02",
+        tiny_bytes=str(1 << 20),
         results_store="s3://results/of/",
         results_bytes="0",
         captures_store="s3://results/captures/",
@@ -52,7 +52,6 @@ def service(way: Network, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         store_timeout_s="1",
     ) as service:
         yield service
-    environment.undo()
 
 
 def submitted(client: httpx.Client, capture: str) -> str:
@@ -156,14 +155,11 @@ def test_a_job_waits_for_the_store_and_goes_on(client: httpx.Client, capture: st
     assert listed(bucket, job) == NAMES
     way.fail("503", 10_000, "PUT")
     other = submitted(client, capture)
-    while not any(other in path for method, path in way.seen if method == "PUT"):
-        time.sleep(0.05)
+    await_true(lambda: any(other in path for method, path in way.seen if method == "PUT"))
     assert client.post(f"/v1/jobs/{other}/cancel").status_code == 200
     way.heal()
-    deadline = time.monotonic() + 30
-    while (service_folder := listed(bucket, other)) or client.get(f"/v1/jobs/{other}").json()["state"] != "cancelled":
-        assert time.monotonic() < deadline, service_folder
-        time.sleep(0.1)
+    await_state(client, other, ("cancelled",))
+    await_true(lambda: not listed(bucket, other))
 
 
 def test_a_result_is_fetched_from_the_store_itself(client: httpx.Client, bucket: Any, capture: str) -> None:

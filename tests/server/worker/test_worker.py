@@ -275,7 +275,7 @@ def test_a_worker_that_stops_ends_what_waits_and_fails_nothing(
     time.sleep(0.2)
     assert not ended
     stopping.stop()
-    thread.join(2.0)
+    thread.join(60.0)
     assert not thread.is_alive()
     assert not isinstance(ended[0], Exception), "the engine would note it as a failure"
 
