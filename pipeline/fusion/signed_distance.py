@@ -20,9 +20,10 @@ from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion import grid_kernels
 from pipeline.fusion.grid import Grid, at_points, everywhere, marked_box, refined, whole_box
-from pipeline.fusion.grid_kernels import Membrane, doubled, relax
+from pipeline.fusion.grid_kernels import Membrane, relax
 from pipeline.fusion.hair import Places, distance_to_shell
 from pipeline.fusion.prior import SeenSurface, distance_to_subject, near_rim
+from pipeline.fusion.rim import rim_of
 from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE, ViewStack
 from pipeline.fusion.vote_kernels import CENTRE, vote
 from pipeline.geometry.nearest import PointTree, nearest
@@ -32,12 +33,12 @@ from rig.mesh import Mesh
 from rig.messages.message import compose
 
 ROUND_MM = 12.0  # standard deviation of the blur that rounds the edges between photographs' ends
-THIN_MM, SPARED_MM = 6.0, 4.0  # radius, and by how much a place must stand out: a step of the grid is no rag
-BASE_QUANTILE = 0.7  # of the seen points below the head, by height: what lies lower is the base
+SPARED_MM = 4.0  # outside of photographs' ends that the bust may reach: the blur takes about as much off
 FAR_MM = 100.0  # distances count up to this one
 ONE_SIDED = 0.3  # length of the mean direction to the cameras above which nobody stands behind the subject
 BEHIND_QUANTILE, THICK_QUANTILE = 0.998, 0.9  # of seen points (to the front, too), and of their heights: the hair
-RAG_EVERY = 4  # vertices of the head stand for the others
+MIN_ENDED = 0.4  # of the rim, ended by outlines: people16's masks .67 and .70; where photographs end the bust, .15
+HEAD_EVERY = 4  # vertices of the head stand for the others
 Field = Float32[np.ndarray, " n"]
 Points = Float[np.ndarray, "m 3"]
 
@@ -65,44 +66,18 @@ class Cut:
 
     box: Grid
     beyond_mm: Float[np.ndarray, " n"]
-    base: Bool[np.ndarray, " n"]  # nodes in the lowest part of what is seen below the head
     before_mm: Float[np.ndarray, " n"] | None = None  # how far nodes below the head lie before its chest; else -inf
 
     def distance_mm(self, places: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
         """Returns how far (mm, negative inside) points lie beyond the bust's end."""
         return at_points(self.box, self.beyond_mm, places)
 
-    def without_rags(self, box: Grid, field: Float[np.ndarray, "nx ny nz"]) -> "Cut":
-        """Returns the cut at half the step, which also takes off what is too thin for a ball of radius ``THIN_MM`` at
-        the base of the bust: there the depth of few views frays. ``field`` (mm, negative inside) is the signed distance
-        over the whole of ``box``."""
-        from scipy.ndimage import distance_transform_edt, gaussian_filter  # 0.3 s, and only a bust needs it
-
-        shape = self.box.shape
-        beyond, base = (doubled(each.astype(np.float32).reshape(shape)) for each in (self.beyond_mm, self.base))
-        core = eroded(field < 0.0, THIN_MM / box.step_mm)
-        thin = gaussian_filter(box.step_mm * np.asarray(distance_transform_edt(~core)), 1.0) - THIN_MM - SPARED_MM
-        return Cut(box, np.where(base > 0.5, np.maximum(beyond, thin), beyond).ravel(), base.ravel() > 0.5)
-
-
-def eroded(solid: Bool[np.ndarray, "nx ny nz"], radius: float) -> Bool[np.ndarray, "nx ny nz"]:
-    """Returns the nodes that have none outside the solid within ``radius`` (in steps). The box's own end is no
-    outside."""
-    out, reach = solid.copy(), int(radius)
-    for steps in np.ndindex((2 * reach + 1,) * 3):
-        step = np.array(steps) - reach
-        if 0 < step @ step <= radius**2:
-            here = tuple(slice(max(-n, 0), size - max(n, 0)) for n, size in zip(step, solid.shape, strict=True))
-            there = tuple(slice(max(n, 0), size - max(-n, 0)) for n, size in zip(step, solid.shape, strict=True))
-            out[here] &= solid[there]
-    return out
-
 
 @traced
 def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_world: Mesh | None) -> Cut:
-    """Determines where the bust ends: along a smooth surface where photographs end, and at a plane behind what cameras
-    see. Photographs of several cameras end at several planes, whose edges nobody wants to see in a shoulder; and behind
-    neck and shoulders, where no camera looks, outlines alone leave hoods and slabs.
+    """Determines where the bust ends: along a smooth surface where photographs or outlines end it, and at a plane
+    behind what cameras see. Photographs of several cameras end at several planes, whose edges nobody wants to see in a
+    shoulder; and behind neck and shoulders, where no camera looks, outlines alone leave hoods and slabs.
 
     Args:
         box: a whole box of nodes.
@@ -117,15 +92,17 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
     frames = np.clip(edges_mm[min(1, len(edges_mm) - 1)], -FAR_MM, FAR_MM)  # of all cameras but one
     beyond = gaussian_filter(frames.reshape(box.shape), ROUND_MM / box.step_mm).ravel() - SPARED_MM
     if head_world is None:
-        return Cut(box, beyond, np.zeros(len(beyond), bool))
-    vertices = head_world.vertices[::RAG_EVERY]
+        return Cut(box, beyond)
+    vertices = head_world.vertices[::HEAD_EVERY]
     tree, low = PointTree.of(vertices), near_rim(head_world, vertices)
     far, near = nearest(tree, seen)
     if low[near].all() or not low[near].any():
-        return Cut(box, beyond, np.zeros(len(beyond), bool))
+        return Cut(box, beyond)
     below, down = low[near], vertices[low].mean(axis=0) - vertices.mean(axis=0)
-    base = places @ down > np.quantile(seen[below] @ down, BASE_QUANTILE)
-    base[base] = low[nearest(tree, places[base])[1]]
+    under = low[nearest(tree, places)[1]]
+    rim = rim_of(seen[below], vertices.mean(axis=0), down / np.linalg.norm(down))
+    if rim is not None and rim.share_ended(views) > MIN_ENDED:
+        beyond = np.maximum(beyond, np.where(under, rim.beyond_mm(places), -np.inf))
     towards = views.cameras[:, CENTRE:] - np.median(seen, axis=0)
     before = None
     back = -(towards / np.linalg.norm(towards, axis=1, keepdims=True)).mean(axis=0)
@@ -133,11 +110,10 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
         back /= np.linalg.norm(back)
         end = max(np.quantile(seen[below] @ back, BEHIND_QUANTILE), (vertices[low] @ back).max())
         head_end = (vertices @ back).max() + np.quantile(far[~below], THICK_QUANTILE)
-        under = low[nearest(tree, places)[1]]
         beyond = np.maximum(beyond, places @ back - np.where(under, end, head_end))
         chest = min(np.quantile(seen[below] @ back, 1.0 - BEHIND_QUANTILE), (vertices[low] @ back).min())
         before = np.where(under, chest - places @ back, -np.inf)
-    return Cut(box, beyond, base, before)
+    return Cut(box, beyond, before)
 
 
 class NoSurface(EigenheadError):
@@ -245,7 +221,6 @@ def solve(
         level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views, cut)
         if halving < halvings - 1:
             box = everywhere(level.grid, level.field, box)
-            cut = cut.without_rags(level.grid, box)
     return level, cut
 
 

@@ -1,10 +1,11 @@
-"""The bust ends smoothly where photographs end, and nothing of it lies behind what cameras see."""
+"""The bust ends smoothly where photographs or masks end, and nothing of it lies behind what cameras see."""
 
 import numpy as np
 import pytest
 import trimesh
 
 from pipeline.fusion.grid import whole_box
+from pipeline.fusion.rim import rim_of
 from pipeline.fusion.signed_distance import FAR_MM, find_cut
 from pipeline.fusion.view_stack import ViewStack, stack_views
 from pipeline.geometry.nearest import PointTree, nearest
@@ -19,8 +20,11 @@ def views() -> ViewStack:
     return stack_views(made.maps, made.silhouettes, made.rig)
 
 
-def test_nothing_lies_behind_what_cameras_see_and_the_end_is_a_plane(views: ViewStack) -> None:
-    """A head of 50 mm without what is lower than -30, before cameras from +z; points of it and of a chest are seen."""
+def test_nothing_lies_behind_what_cameras_see_and_the_end_is_a_plane() -> None:
+    """A head of 50 mm without what is lower than -30, before cameras from +z; points of it and of a chest are seen, and
+    masks hold both."""
+    made = scene([Ellipsoid((0, -40, 0), (60, 130, 60))], fan(200, 150))
+    views = stack_views(made.maps, made.silhouettes, made.rig)
     sphere = trimesh.creation.icosphere(5, 50.0)
     kept = (sphere.vertices[sphere.faces][..., 1] > -30.0).all(axis=1)
     head = Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces[kept], np.int32))
@@ -43,3 +47,21 @@ def test_bust_ends_where_all_photographs_but_one_end(views: ViewStack) -> None:
     second = np.sort(views.outside(places)[0], axis=0)[1]
     assert (np.abs(second) < FAR_MM / 2).all()
     assert find_cut(box, views, np.zeros((9, 3)), None).distance_mm(places) == pytest.approx(second, abs=12.0)
+
+
+def test_a_frayed_rim_that_masks_end_becomes_smooth(views: ViewStack) -> None:
+    """Points of a collar end between 50 and 62 mm from the head's centre; a ball of 60 mm, or one of 150, is in the
+    masks."""
+    rng = np.random.default_rng(0)
+    angle, far = rng.uniform(-np.pi, np.pi, 9000), rng.uniform(30.0, 56.0, 9000)
+    far += 6.0 * np.sin(40.0 * angle) * (far > 50.0)
+    collar = far[:, None] * np.stack([0.8 * np.cos(angle), np.full(9000, -0.6), 0.8 * np.sin(angle)], axis=1)
+    rim = rim_of(collar, np.zeros(3), np.array([0.0, -1.0, 0.0]))
+    assert rim is not None
+    large = scene([Ellipsoid((0, 0, 0), (150, 150, 150))], fan(200, 150))
+    assert rim.share_ended(views) > 0.9
+    assert rim.share_ended(stack_views(large.maps, large.silhouettes, large.rig)) == 0.0
+    around = np.linspace(-np.pi, np.pi, 400)
+    ring = 50.0 * np.stack([0.8 * np.cos(around), np.full(400, -0.6), 0.8 * np.sin(around)], axis=1)
+    assert np.ptp(rim.beyond_mm(ring)) < 3.0
+    assert 0.05 < (rim.beyond_mm(collar) > 0.0).mean() < 0.4

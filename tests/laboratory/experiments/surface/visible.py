@@ -126,7 +126,7 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
     faces = {"head": found.mesh_world, "bust": bust.mesh_world}
     seen = score_visible(subject.visible, seen_of(bust))
     return {
-        **{key: value for key, value in whole.flat().items() if key.endswith(("within_2mm", "median", "closed"))},
+        **{k: value for k, value in whole.flat().items() if k.endswith(("within_2mm", "median", "closed", "_p95"))},
         **{f"precision_seen_{part}_within_2mm": figures["within_2mm"] for part, figures in seen.precision.items()},
         **{f"{k}_face_{key}": v for k, mesh in faces.items() for key, v in surface_error(subject, mesh).items()},
         **{f"{k}_{key}": v for k, mesh in faces.items() for key, v in normal_figures(places, mesh).items()},

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 from scipy.spatial import KDTree
 
-from rig.mesh import Mesh, boundary_edges
+from rig.mesh import Mesh, boundary_edges, vertex_normals
 from rig.studio.scene.visible import PARTS, VisiblePoints, sample_surface
 
 Distances = Float[np.ndarray, " n"]
@@ -22,21 +22,24 @@ MISSING_MM = 50.0  # counted for a true point that has no such sample
 REACH_MM = 25.0  # surface farther from every true point is where nobody looked
 PLANE_MM = {"recall": 1.0, "precision": 2.0}  # sideways, within which a sample's tangent plane stands for the surface
 MAX_COUNTED = 200_000  # points of the surface for precision: shares are then good to 0.001
+NORMALS_WITHIN_MM = 3.0  # where the surface is farther from the truth, its normal is of something else
 MIN_POINTS = 100  # of a part, for figures of its own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisibleScore:
     """Holds ``recall`` and ``precision`` by part: median and 95th percentile (mm), and the shares within 1, 2 and 5 mm.
-    Recall has "all", too."""
+    Recall has "all", too. ``normals``: median and 95th percentile (degrees) by part, between the normal of a true point
+    and that of the nearest vertex, where the surface is within 3 mm."""
 
     recall: dict[str, dict[str, float]]
     precision: dict[str, dict[str, float]]
+    normals: dict[str, dict[str, float]]
     closed: bool
 
     def flat(self) -> dict[str, float]:
         """Returns one number for each key, for tables: ``recall_hair_within_2mm``."""
-        kinds = {"recall": self.recall, "precision": self.precision}
+        kinds = {"recall": self.recall, "precision": self.precision, "normals": self.normals}
         named = ((f"{kind}_{part}_{key}", value) for kind, parts in kinds.items() for part, figures in parts.items()
                  for key, value in figures.items())  # fmt: skip
         return dict(named) | {"closed": float(self.closed)}
@@ -58,6 +61,11 @@ def score_visible(truth: VisiblePoints, mesh: Mesh) -> VisibleScore:
     agree = np.einsum("nkx,nx->nk", normals[near], true_normals) > 0
     recall = np.where(agree, missed, np.inf).min(axis=1)
     recall[np.isinf(recall)] = MISSING_MM
+    close = recall < NORMALS_WITHIN_MM
+    nearest = KDTree(mesh.vertices).query(true_points[close])[1]
+    cosine = np.einsum("nx,nx->n", vertex_normals(mesh.vertices, mesh.faces)[nearest], true_normals[close])
+    turned = np.full(len(recall), np.nan)
+    turned[close] = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     counted = rng.choice(len(points), min(len(points), MAX_COUNTED), replace=False)
     far, near = KDTree(true_points).query(points[counted])
     comparable = (far < REACH_MM) & (np.einsum("nx,nx->n", normals[counted], true_normals[near]) > 0)
@@ -66,6 +74,11 @@ def score_visible(truth: VisiblePoints, mesh: Mesh) -> VisibleScore:
     return VisibleScore(
         _by_part(recall, truth.part, np.ones(len(recall), bool)) | of_all,
         _by_part(precision, truth.part[near], comparable),
+        {
+            name: {"median": float(np.median(turned[of])), "p95": float(np.percentile(turned[of], 95))}
+            for code, name in enumerate(PARTS)
+            if (of := close & (truth.part == code)).sum() > MIN_POINTS
+        },
         len(boundary_edges(mesh.faces)) == 0,
     )
 
@@ -94,8 +107,3 @@ def _by_part(
 ) -> dict[str, dict[str, float]]:
     chosen = {name: counted & (part == code) for code, name in enumerate(PARTS)}
     return {name: figures_of(distances[of]) for name, of in chosen.items() if of.sum() > MIN_POINTS}
-
-
-def document(score: VisibleScore) -> dict[str, object]:
-    """Returns the score as JSON types."""
-    return {"recall": score.recall, "precision": score.precision, "closed": score.closed}
