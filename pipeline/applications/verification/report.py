@@ -1,4 +1,4 @@
-"""``report.json`` of a verification (format ``eigenhead-verification/1``)."""
+"""Builds ``report.json`` of a verification (format ``eigenhead-verification/1``)."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -15,7 +15,7 @@ FORMAT = "eigenhead-verification/1"
 
 
 class RegionReport(TypedDict):
-    """Describes the errors of a region of the head (mm); ``covered`` is its area's share in the reference."""
+    """Describes the errors of a region of the head (mm); ``covered`` is the fraction of its area in the reference."""
 
     covered: float
     mean_mm: float
@@ -25,7 +25,7 @@ class RegionReport(TypedDict):
 
 
 class AlignmentReport(TypedDict):
-    """Describes the motion ``x_reference = rotation @ x_world + translation`` (mm), and how it was found."""
+    """Describes the motion ``x_reference = rotation @ x_world + translation`` (mm), and its method."""
 
     method: str
     start: str
@@ -47,7 +47,7 @@ class DistanceReport(TypedDict):
 
 
 class CaptureReport(TypedDict):
-    """Describes the judgement of one capture. ``warnings`` are the codes of its result."""
+    """Describes the judgement of one capture. ``warnings`` are the warning codes of its result."""
 
     alignment: AlignmentReport
     probing_form_mm: float
@@ -68,7 +68,7 @@ class CheckReport(TypedDict):
 
 
 class ReferenceReport(TypedDict):
-    """Describes the scan that was the reference: its name and digest, its size, and the names of its landmarks."""
+    """Describes the reference scan: its name and digest, its size, and the names of its landmarks."""
 
     name: str
     sha256: str
@@ -95,7 +95,7 @@ class VerificationReport(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Occasion:
-    """Holds what a report says besides the judgement: the day of the test (ISO 8601), the model, and the limits."""
+    """Holds the report's content besides the judgement: the day of the test (ISO 8601), the model, and the limits."""
 
     date: str
     model: ResultIdentity

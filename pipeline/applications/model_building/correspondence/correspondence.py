@@ -1,21 +1,21 @@
 """Brings raw scans into correspondence (section 3.2): landmark warp, cylindrical resampling, second pass, refinement.
 
 Every scan is first moved rigidly (by its landmarks) into the head frame. The reference is the scan nearest to the mean.
-Its surface gets the default model's connectivity, because modes on a scan's own hundred thousand vertices would take a
-hundred megabytes (the paper keeps the scan's vertices). Then the paper's steps follow unchanged. Landmarks alone leave
-the surface free to slide between them, so by default a refinement follows: the most probable head under a prior of
-heads, given the scan's landmarks and surface, and from there a smooth displacement along the normals onto the scan.
+Its surface gets the default model's connectivity. (The paper keeps the scan's vertices, but modes on a hundred thousand
+vertices would take a hundred megabytes.) Then the paper's steps follow unchanged. Landmarks alone let the surface slide
+between them, so by default a refinement follows. It computes the most probable head under a prior, given the scan's
+landmarks and surface, and then a smooth displacement along the normals onto the scan.
 
-The prior allows more heads than a model's own span. A PCA of 138 heads has 137 directions, and a new head needs others:
-alone, on heads outside its span, it pulls vertices to wrong positions. Two facts are known besides the sample. A head
-and its mirror image are equally likely, so the covariance is averaged with its mirror image. And distant parts of a
-head are nearly independent, so the covariance is multiplied by a Gaussian of the distance between vertices, which keeps
-the correlation of neighbours and frees the rest (localised Gaussian process morphable models, Luethi et al. 2018,
-*Gaussian Process Morphable Models*, section 3.3). The prior is a mixture of the plain and the localised covariance.
+The prior allows more heads than the span of a model. A PCA of 138 heads has 137 directions, and a new head needs
+others: on heads outside its span, the PCA alone pulls vertices to wrong positions. Two facts extend the sample. A head
+and its mirror image are equally likely, so the covariance is averaged with its mirror image. Distant parts of a head
+are nearly independent, so the covariance is also multiplied by a Gaussian of the distance between vertices. This
+retains the correlation of neighbours only (localised Gaussian process morphable models, Luethi et al. 2018, *Gaussian
+Process Morphable Models*, section 3.3). The prior is a mixture of the plain and the localised covariance.
 
-Rays are cast from the vertical axis through the head outwards. A ray is (angle, height): angle 0 looks along +z (out of
-the face), pi/2 along +x (the subject's left); height is y. Scans are worked on in several processes, for SuperLU and
-numpy hold the interpreter."""
+Rays are cast from the vertical axis through the head outwards. A ray is (angle, height): angle 0 points along +z (out
+of the face), pi/2 along +x (the subject's left); height is y. Scans are processed in several processes, because SuperLU
+and numpy hold the interpreter lock."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -108,8 +108,7 @@ def workers(count: int, items: int) -> Iterator[Workers]:
 
 @contextmanager
 def _single_threaded_children() -> Iterator[None]:
-    """Makes processes that are started in the block use one thread for linear algebra, as there is one process for each
-    core."""
+    """Makes processes started in the block use one thread for linear algebra, as there is one process for each core."""
     before = os.environ.get(_BLAS_THREADS)
     os.environ[_BLAS_THREADS] = "1"
     try:
@@ -123,7 +122,7 @@ def _single_threaded_children() -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cast:
-    """Holds where rays meet a surface: radius (mm) and triangle, NaN and -1 where they do not."""
+    """Holds the hits of rays on a surface: radius (mm) and triangle, NaN and -1 without a hit."""
 
     radii: PerVertex
     triangles: Int[np.ndarray, " N"]
@@ -150,7 +149,7 @@ class CylinderIndex:
         self._start, self._members = bin_triangles(self._vertices, self._faces, self._low, self._rows)
 
     def cast(self, angles: PerVertex, heights: PerVertex, near: PerVertex | None = None) -> Cast:
-        """Returns each ray's hit whose radius is nearest to ``near`` (mm), or without ``near`` the outermost hit."""
+        """Returns each ray's hit with the radius nearest to ``near`` (mm); without ``near``, the outermost hit."""
         wanted = np.full(len(angles), np.inf) if near is None else np.asarray(near, float)
         found, triangles = cast_rays(
             self._vertices, self._faces, self._low, self._rows, self._start, self._members, angles, heights, wanted
@@ -184,8 +183,8 @@ def registration_prior(
 def mirror_images(mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " V"] | None:
     """Returns for each vertex its counterpart across the median plane x = 0; None if the mesh is not symmetric.
 
-    It is the cheapest one-to-one assignment. A mean head is not quite symmetric, so the nearest mirrored vertex would
-    be used twice for some."""
+    It is the cheapest one-to-one assignment. A mean head is not exactly symmetric, so taking the nearest mirrored
+    vertex would use some vertices twice."""
     opposite = linear_sum_assignment(cdist(mean, mean * _MIRROR, "sqeuclidean"))[1]
     edges = edges_of(faces)[0].astype(np.int64)
     across = np.sort(opposite[edges], 1)
@@ -332,7 +331,7 @@ def warp_and_resample(
     matching: Matching,
 ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
     """Warps the reference to the target's landmarks and resamples it on the target's surface (steps 3 and 4 of section
-    3.2). Returns the warped reference, its resampling, and where the target has no surface; such vertices keep the
+    3.2). Returns the warped reference, its resampling, and where the target has no surface; such vertices stay at the
     warped position."""
     warped = landmark_warp(shape[index], marks, shape, smoothing=matching.landmark_smoothing_mm)
     angles, heights, radii = coordinates(warped)
@@ -392,8 +391,9 @@ def statistical(
     """Returns the most probable head under the prior, given the scan's landmarks and surface: first with broad modes,
     then with all.
 
-    Smoothness cannot determine where on a plain cheek a vertex belongs; statistics of other heads can. Residuals are
-    point-to-plane and count per cm2 of surface, landmarks along all three axes; six columns are the pose."""
+    On a plain cheek smoothness cannot determine where a vertex belongs; statistics of other heads can. Residuals are
+    point-to-plane and are weighted per cm2 of surface; landmarks count along all three axes; six columns are the
+    pose."""
     mean, areas = prior.mean, vertex_areas(prior.mean, faces)
     shape = landmark_warp(mean[index], target.marks, mean, smoothing=20.0)
     points = np.concatenate([mean, np.repeat(mean[index], 3, axis=0)])  # a landmark is three planes

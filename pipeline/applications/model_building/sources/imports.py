@@ -1,10 +1,10 @@
 """Imports models of other formats: ICT-FaceKit, statismo and Basel HDF5 files, plain npz.
 
 Every reader returns a ``Foreign`` model in millimetres and head axes; ``adopt`` converts it to a model of this project.
-Its vertices are kept. Modes that are not orthogonal become the principal axes of the same Gaussian
-(pca.orthogonalised), so that the probability of every head stays. Landmarks that the source does not name are taken
-from the default model, fitted to the mean and then warped. The face region follows from the landmarks. Openings of eyes
-and mouth are closed with triangles between existing vertices, so that the head hides what is behind it."""
+The model's own vertices stay. Modes that are not orthogonal become the principal axes of the same Gaussian
+(pca.orthogonalised), so the probability of every head stays the same. Landmarks missing in the source come from the
+default model, which is fitted to the mean and then warped. The face region follows from the landmarks. Triangles
+between existing vertices close the openings of eyes and mouth, so that the head hides what is behind it."""
 
 import json
 import re
@@ -48,8 +48,8 @@ class CannotImport(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Foreign:
-    """Holds a model as its file describes it, in mm and the axes of the head frame (x to the subject's left, y up, z
-    out of the face)."""
+    """Holds a model in the form of its file, in mm and the axes of the head frame (x to the subject's left, y up, z out
+    of the face)."""
 
     name: str
     licence: str
@@ -109,7 +109,7 @@ _BASEL_NAMES = {
 def import_model(path: Path, *, name: str | None = None, report: Progress | None = None) -> ModelParts:
     """Reads a model of another format and converts it; a model file of this project is only renamed.
 
-    A folder with exactly one model file stands for that file. Raises CannotImport."""
+    A folder with exactly one model file is read as that file. Raises CannotImport."""
     files = [f for f in path.iterdir() if f.suffix.lower() in (".npz", ".h5", ".hdf5")] if path.is_dir() else []
     files = [f for f in files if not f.name.endswith(ICT_EXPRESSIONS)]  # read with the identities beside it
     path = files[0] if len(files) == 1 else path
@@ -144,7 +144,7 @@ def read_ict_compact(path: Path) -> Foreign:
 
 
 def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
-    """Returns the expressions from the file beside that of identities: names, and shapes in mm on the same vertices."""
+    """Returns the expressions from the file beside the identities': names, and shapes in mm on the same vertices."""
     beside = path.with_name(path.stem.removesuffix("_light") + ICT_EXPRESSIONS)
     if not beside.is_file():
         return None
@@ -180,7 +180,7 @@ def read_ict_repository(folder: Path, *, report: Progress | None = None) -> Fore
 
 
 def _repository_expressions(folder: Path, neutral: Vertices, report: Progress | None) -> Expressions | None:
-    """Returns the expressions from meshes named after them: browDown_L.obj and so on. Raises CannotImport."""
+    """Returns the expressions from meshes with their names: browDown_L.obj and so on. Raises CannotImport."""
     paths = [path for path in sorted(folder.glob("*.obj")) if ICT_EXPRESSION.fullmatch(path.stem)]
     shapes = []
     for k, path in enumerate(paths):
@@ -326,8 +326,8 @@ def largest_miss(
     *,
     draws: int = 10,
 ) -> float:
-    """Returns the largest distance (mm) between vertices of random heads of the original and their best fits by the
-    converted model."""
+    """Returns the largest distance (mm) between vertices of random heads of the original model and their best fits by
+    the converted model."""
     theirs, ours = (m.reshape(len(m), -1).astype(float) for m in (original, rounded(modes)))
     heads = np.random.default_rng(11).standard_normal((draws, len(theirs))) @ theirs
     missed = heads - (heads @ ours.T / sigma**2) @ ours
@@ -386,8 +386,8 @@ def _symmetric(at: Float[np.ndarray, "26 3"], mean: Vertices, surface: SurfaceIn
 
 
 def _start(default: HeadModel, mean: Vertices, known: Mapping[str, int]) -> RigidTransform:
-    """Returns the start of the fit of the default model to a mean head: by shared landmarks, otherwise by the tip of
-    the nose."""
+    """Returns the starting pose for fitting the default model to a mean head: from shared landmarks, otherwise from the
+    tip of the nose."""
     ours = default.vertices(np.zeros(0))
     if len(known) >= 3:
         source = ours[[default.landmarks[name] for name in known]]
@@ -397,7 +397,7 @@ def _start(default: HeadModel, mean: Vertices, known: Mapping[str, int]) -> Rigi
 
 
 def _likeness(default: HeadModel, mean: Vertices, faces: Int[np.ndarray, "F 3"], start: RigidTransform) -> Vertices:
-    """Returns the default model's head that fits the mean head best, its neck left out."""
+    """Returns the default model's head that best fits the mean head without its neck."""
     areas = vertex_areas(mean, faces)
     placed = start.apply(default.vertices(np.zeros(0)))
     chin = placed[default.landmarks["gnathion"]]
@@ -425,7 +425,7 @@ class SurfaceFit:
         return self.target_from_head.apply(model.vertices(self.coefficients, level))
 
     def measured(self, model: HeadModel, points: Float[np.ndarray, "N 3"], level: str = "full") -> "SurfaceFit":
-        """Returns the same fit with the distances of other points."""
+        """Returns the same fit with its distances to other points."""
         index = SurfaceIndex(self.vertices(model, level), model.levels[level].faces)
         return replace(self, distances=index.closest(points).distances)
 
@@ -444,9 +444,9 @@ def fit_surface(
 ) -> SurfaceFit:
     """Estimates the pose and ``count`` coefficients that bring the model's surface to the points, under the prior.
 
-    ``weights`` are the areas (mm²) that the points represent. Residuals of neighbouring points are not independent, so
-    one residual of standard deviation ``sigma_mm`` counts per ``spread_mm`` squared of surface. The first iterations
-    fit only the pose and few modes and downweight distant points (Geman and McClure), so that a rough start does not
+    ``weights`` are the areas (mm²) that the points represent. Residuals of neighbouring points are not independent: an
+    area of ``spread_mm`` squared counts as one residual of standard deviation ``sigma_mm``. The first iterations fit
+    only the pose and few modes and downweight distant points (Geman and McClure), so that a rough start does not
     distort the head."""
     basis = model.basis(level, count)
     faces = model.levels[level].faces

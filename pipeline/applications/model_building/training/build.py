@@ -26,7 +26,7 @@ _SHARPENINGS = 4  # steps of the iteration in ``cages_through``
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Built:
-    """Holds a model built from scans, and the names of the scans that were used, repaired or skipped."""
+    """Holds a model built from scans, and the names of the used, repaired and skipped scans."""
 
     parts: ModelParts
     used: tuple[str, ...]
@@ -78,7 +78,7 @@ def build_model(
 def read_checked(
     folder: Path, template: HeadModel, *, report: Progress | None = None
 ) -> tuple[list[Checked], dict[str, str]]:
-    """Returns the sound scans of a folder, and the others' faults by name. Raises InputError for an empty folder."""
+    """Returns a folder's sound scans, and the faults of the others by name. Raises InputError for an empty folder."""
     paths = find_scans(folder)
     with workers(2, len(paths)) as crew:
         found = crew.over(partial(_read_and_check, template), paths, "checking scans", report)
@@ -104,9 +104,9 @@ def corresponded_cages(
 def cages_through(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> Float[np.ndarray, "N V0 3"]:
     """Computes cages (mm) whose subdivided surface passes through the points at the cage's vertices.
 
-    The subdivided surface lies inside of the cage. So the cage C must solve S C = P, where S are the rows of the
+    The subdivided surface lies inside the cage. So the cage C must solve S C = P, where S are the rows of the
     subdivision matrix for the cage vertices. S nearly removes detail as fine as the cage itself, so its inverse would
-    amplify noise. A few steps C += P - S C, started with the template's own detail, stop before that."""
+    amplify noise. A few steps C += P - S C, starting from the template's own detail, end before that happens."""
     rows = template.levels["full"].operator[: len(template.mean)]
     mean = template.mean.astype(float)
     away = points - rows @ mean

@@ -1,7 +1,7 @@
 """Draws a model: its first modes (figure 2), correspondence step by step (figure 3), and curves of its quality.
 
-Everything is shaded and drawn in software, so that machines without graphics card and plotting library show the
-same."""
+All shading and drawing is in software, so that machines without graphics card and plotting library give the same
+pictures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -137,7 +137,7 @@ _BEHIND_RAD = 2.4
 
 
 def show_model(model: HeadModel, folder: Path, *, modes: int = 5, report: Progress | None = None) -> list[Path]:
-    """Writes modes.png, correspondence.png and curves.png (the last where training heads are known) into a folder."""
+    """Writes modes.png, correspondence.png and curves.png (only if the training heads are known) into a folder."""
     say = report or (lambda stage, fraction: None)
     say("drawing modes", 0.0)
     pictures = {"modes.png": modes_figure(model, modes)}
