@@ -26,8 +26,7 @@ CELLS = (4, 3)  # of a picture, across and down
 
 
 class CalibrationRefused(EigenheadError):
-    """Reports that the pictures were understood but determine no rig that may be used. ``calibration`` is kept for the
-    report."""
+    """Reports that the pictures were readable but determine no usable rig. ``calibration`` is there for the report."""
 
     def __init__(self, reasons: Iterable[Message | str], calibration: "Calibration | None" = None) -> None:
         self.reasons = tuple(message_of(reason) for reason in reasons)
@@ -36,9 +35,9 @@ class CalibrationRefused(EigenheadError):
 
 
 class CameraFigures(TypedDict):
-    """Describes how well one camera is calibrated: reprojection errors in the joint solution and by its own lens alone
-    (RMS, px), its views and corners, the standard deviations of pose and focal length, and the share of the picture
-    with corners."""
+    """Describes how well one camera is calibrated: reprojection errors in the joint solution and with its own lens
+    alone (RMS, px), its views and corners, the standard deviations of pose and focal length, and the fraction of the
+    picture with corners."""
 
     rms_px: float
     alone_rms_px: float
@@ -51,8 +50,8 @@ class CameraFigures(TypedDict):
 
 
 class Figures(TypedDict):
-    """Describes the numbers of ``calibrate --json``. ``sync_px`` is the part of the corners' noise that all cameras
-    share, a sign that they were not simultaneous."""
+    """Describes the numbers of ``calibrate --json``. ``sync_px`` is the part of the corners' noise that is common to
+    all cameras, a sign that they were not simultaneous."""
 
     rms_px: float
     used_share: float
@@ -73,7 +72,7 @@ class CheckDocument(TypedDict):
 
 
 class DroppedDocument(TypedDict):
-    """Describes a view that was left out, and why; ``camera`` is null for a whole shot."""
+    """Describes an excluded view and the reason; ``camera`` is null for a whole shot."""
 
     shot: str
     camera: str | None
@@ -161,7 +160,7 @@ class Calibration:
         }
 
     def _covered(self, camera: Camera) -> float:
-        """Returns the share of the picture's cells that hold a corner."""
+        """Returns the fraction of the picture's cells with at least one corner."""
         size = (camera.intrinsics.width, camera.intrinsics.height)
         pixels = np.concatenate(
             [observed for (name, _), (_, observed, _) in self.misses.items() if name == camera.name]
@@ -170,7 +169,7 @@ class Calibration:
         return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
 
     def verdict(self) -> Verdict:
-        """Judges whether the calibration is worth using, and what it lacks."""
+        """Judges whether the calibration is usable, and what it lacks."""
         cameras = self.figures()["cameras"]
         evidence = {
             name: CameraEvidence(c["views"], c["focal_share"], c["pose_sigma_px"], c["covered"])

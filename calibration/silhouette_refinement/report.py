@@ -18,7 +18,7 @@ BINS, HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT = 24, 420.0, 160.0
 
 
 class HeldOut(TypedDict):
-    """Holds the residuals (robust RMS, px) of captures held out, before and after, and the number of equations."""
+    """Holds the residuals (robust RMS, px) of held-out captures, before and after, and the number of equations."""
 
     before_px: float
     after_px: float
@@ -27,7 +27,7 @@ class HeldOut(TypedDict):
 
 
 class RefinedCamera(TypedDict):
-    """Holds the residuals of one camera's tangencies (px) before and after, and how far it was moved."""
+    """Holds the residuals of one camera's tangencies (px) before and after, and the camera's motion."""
 
     before_px: float
     after_px: float
@@ -39,7 +39,7 @@ class RefinedCamera(TypedDict):
 
 
 class RefinementDocument(TypedDict):
-    """Describes what ``refine --json`` prints."""
+    """Describes the output of ``refine --json``."""
 
     kept: bool
     reason: str
@@ -54,7 +54,7 @@ class RefinementDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinementRun:
-    """Holds a refinement together with the rig it started from, the names of its captures, and warnings."""
+    """Holds a refinement together with its starting rig, the names of its captures, and warnings."""
 
     refinement: Refinement
     start: Rig
@@ -62,7 +62,7 @@ class RefinementRun:
     warnings: tuple[Message, ...] = ()
 
     def document(self) -> RefinementDocument:
-        """Returns what ``refine --json`` prints."""
+        """Returns the output of ``refine --json``."""
         refinement = self.refinement
         return {
             "kept": refinement.kept,

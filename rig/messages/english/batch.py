@@ -1,4 +1,4 @@
-"""Sentences of batches, and of files of settings."""
+"""Messages about batches, and about files of settings."""
 
 TEMPLATES = {
     "settings-unreadable": "cannot be read ({reason})",

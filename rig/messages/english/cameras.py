@@ -1,4 +1,4 @@
-"""What is said of files of cameras: cameras.json, and those of other programs."""
+"""Messages about files of cameras: cameras.json, and those of other programs."""
 
 TEMPLATES = {
     "key-slave-camera": "slave of a rig: export its cameras as single sensors",

@@ -1,4 +1,4 @@
-"""What is said of files: archives, pictures, masks, feature points, cameras."""
+"""Messages about files: archives, pictures, masks, feature points, cameras."""
 
 TEMPLATES = {
     "same-of-members": "{fault}; the same is true of {count} more members",

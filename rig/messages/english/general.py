@@ -1,4 +1,4 @@
-"""Sentences that belong to no area: what any error says of itself, and pieces that others are made of."""
+"""Messages of no particular area: general errors, and pieces of other messages."""
 
 TEMPLATES = {
     "verbatim": "{text}",

@@ -1,4 +1,4 @@
-"""Sentences of the live head: what is to do before a shot. They speak to the subject, or name a camera."""
+"""Messages of the live head: instructions before a shot. They address the subject, or name a camera."""
 
 TEMPLATES = {
     "live-starting": "looking for a head ...",
