@@ -1,4 +1,4 @@
-"""Collects metrics for Prometheus: requests are counted as they end, all else is measured when metrics are read."""
+"""Collects metrics for Prometheus: requests are counted as they end, other metrics are measured when they are read."""
 
 import resource
 import time
@@ -23,8 +23,8 @@ class QueueFigures:
 
 @dataclass(frozen=True, slots=True)
 class StoreFigures:
-    """Holds whether the store of results answered when it was last asked, and what this process asked of it: the number
-    of operations by name and outcome, and their seconds by name."""
+    """Holds whether the store of results answered the last request, and this process's requests to it: the number of
+    operations by name and outcome, and their seconds by name."""
 
     answers: bool
     operations: Mapping[tuple[str, str], int]

@@ -53,8 +53,8 @@ def capture_line(record: CaptureRecord, jobs: list[JsonObject]) -> JsonObject:
 
 
 def sync_line(shot: Mapping[str, object]) -> JsonObject:
-    """Makes a sentence on how nearly the pictures of a shot show the same moment, and tells whether they do (``good``).
-    ``shot`` is its certificate."""
+    """Returns a sentence on how nearly the pictures of a shot show the same moment, and whether they do (``good``).
+    ``shot`` is the shot's certificate."""
     lines = sync_of(shot)
     late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
     if late:

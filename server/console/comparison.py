@@ -31,8 +31,8 @@ def vertex_numbers(path: Path, name: str) -> Float[np.ndarray, " v"]:
 def to_surface(result: Path, other: Path, *, align: bool = False) -> Float[np.ndarray, " v"]:
     """Computes the distance (mm) of every vertex of a result's head to the surface of the mesh ``other``.
 
-    With ``align`` the result's head is first moved rigidly onto the other one, since heads of different captures stand
-    in different places. Raises FileNotFoundError.
+    With ``align`` the result's head is first moved rigidly onto the other one, since each capture has its own world
+    frame. Raises FileNotFoundError.
     """
     mine, theirs = read_mesh(result / "head.ply"), read_mesh(other)
     points = moved_onto(mine, theirs) if align else mine.vertices

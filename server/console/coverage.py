@@ -24,10 +24,10 @@ Corners = dict[str, list[list[float]]]  # of a shot, by camera: shares of the im
 
 
 class Coverage(TypedDict):
-    """Holds how much of one camera's picture the board has covered so far.
+    """Holds the fraction of one camera's picture that the board has covered so far.
 
-    ``views``: pictures that show the board; ``covered``: share of the picture; ``corners`` and ``last``: corners of
-    earlier shots and of the last one, as shares of width and height.
+    ``views``: pictures that show the board; ``covered``: fraction of the picture; ``corners`` and ``last``: corners of
+    earlier shots and of the last one, as fractions of width and height.
     """
 
     name: str
@@ -39,8 +39,8 @@ class Coverage(TypedDict):
 
 
 def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: Mapping[str, object]) -> Corners:
-    """Finds the corners of the board in each image of a capture, in a child process. Returns them by camera, as shares
-    of width and height; the list is empty if the board is not seen. Raises InputError for an impossible board."""
+    """Finds the corners of the board in each image of a capture, in a child process. Returns them by camera, as
+    fractions of width and height; without a board the list is empty. Raises InputError for an impossible board."""
     described = board_from_document(board)
     corners = {}
     for number, path in enumerate(sorted((Path(files) / "images").iterdir())):
@@ -55,8 +55,8 @@ def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: 
 
 
 def covered(corners: Float[np.ndarray, "n 2"]) -> float:
-    """Computes the share of a picture's ``CELLS`` that hold a corner of the board. Corners are shares of width and
-    height."""
+    """Computes the fraction of a picture's ``CELLS`` that hold a corner of the board. Corners are fractions of width
+    and height."""
     if len(corners) == 0:
         return 0.0
     cells = np.clip((corners * CELLS).astype(int), 0, np.array(CELLS) - 1)
@@ -64,8 +64,8 @@ def covered(corners: Float[np.ndarray, "n 2"]) -> float:
 
 
 def summary(cameras: list[str], shots: list[Corners]) -> list[Coverage]:
-    """Computes the coverage of each camera by the shots so far: pictures that show the board, covered share, corners,
-    and whether that is enough."""
+    """Computes the coverage of each camera by the shots so far: pictures that show the board, covered fraction,
+    corners, and whether that is enough."""
     lines: list[Coverage] = []
     for name in cameras:
         seen = [shot[name] for shot in shots if shot.get(name)]

@@ -1,4 +1,4 @@
-"""Finds the faces of a capture in a child process and caches them beside its silhouettes. A caller waits no longer than
+"""Finds the faces of a capture in a child process and caches them beside its silhouettes. A caller waits at most
 ``PATIENCE_S`` seconds."""
 
 import threading

@@ -1,4 +1,4 @@
-"""The live view: one thread takes pictures while somebody watches, and every open page gets them."""
+"""Provides the live view: one thread takes pictures while somebody watches, and every open page gets them."""
 
 import asyncio
 import json
@@ -35,7 +35,7 @@ class StudioSource:
         self._child, self._looks = Child(), 0
 
     def frames(self) -> list[LiveFrame]:
-        """Returns the present picture of each simulated camera, with its measurements."""
+        """Returns the current picture of each simulated camera, with its measurements."""
         self._looks += 1
         return self._child.remote(frames)(look=self._looks)
 
@@ -45,14 +45,14 @@ class StudioSource:
 
 
 class RigSource:
-    """Takes pictures of real cameras, all at once. Each time the sharpness of one camera's picture is measured, in
-    turn, since that needs the full size."""
+    """Takes pictures of all real cameras at once. Each time it measures the sharpness of one camera only, since that
+    needs the full size; the cameras take turns."""
 
     def __init__(self, rig: RigBackend) -> None:
         self._rig, self._looks = rig, 0
 
     def frames(self) -> list[LiveFrame]:
-        """Returns the present picture of each camera, with its measurements. Raises Unavailable if the rig cannot be
+        """Returns the current picture of each camera, with its measurements. Raises Unavailable if the rig cannot be
         opened."""
         pictures = self._rig.look()
         names = [camera.name for camera in self._rig.describe().cameras]
@@ -60,7 +60,7 @@ class RigSource:
         return [_frame(name, pictures.get(name), self._looks % len(names) == i) for i, name in enumerate(names)]
 
     def close(self) -> None:
-        """Does nothing: the rig stays open for shots."""
+        """Does nothing: the rig stays open for later shots."""
 
 
 def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
@@ -156,7 +156,7 @@ def look_bytes(frames: list[LiveFrame], fault: Message | None, head: object = No
 
 
 def frames(context: WorkerContext, report: Progress, *, look: int) -> list[LiveFrame]:
-    """Returns the present picture of each camera of the simulated studio, drawn in a child process. ``look`` counts the
+    """Returns the current picture of each camera of the simulated studio, drawn in a child process. ``look`` counts the
     calls."""
     from server.console import studio_drawing
 

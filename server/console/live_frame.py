@@ -8,8 +8,8 @@ from rig.messages.message import MessageDocument
 
 
 class LiveFrame(TypedDict):
-    """Holds a camera's picture as a JPEG file (None: it delivers none) and what was measured on it: ``mean`` (0 to
-    255), share of ``clipped`` pixels, ``blur_px``."""
+    """Holds a camera's picture as a JPEG file (None: it delivers none) and its measurements: ``mean`` (0 to 255),
+    ``clipped`` (fraction of pixels), ``blur_px``."""
 
     name: str
     jpeg: bytes | None
@@ -20,8 +20,8 @@ class LiveFrame(TypedDict):
 
 
 def measured_frame(name: str, picture: ImageRgb, data: bytes, large: ImageRgb | None) -> LiveFrame:
-    """Returns a camera's frame: ``data`` is its ``picture`` as a JPEG file, and in ``large``, the picture in full size,
-    its sharpness is measured."""
+    """Returns a camera's frame: ``data`` is its ``picture`` as a JPEG file; sharpness is measured in ``large``, the
+    picture at full size."""
     level = exposure(picture)
     frame: LiveFrame = {
         "name": name,

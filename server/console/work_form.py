@@ -1,6 +1,6 @@
-"""Converts what a form asks before a job is queued (model, preset, template) to a request, and lists the choices.
+"""Converts the fields of a form (model, preset, template) to a request for a job, and lists the choices.
 
-A preset is a named choice of a job's settings. Whoever needs other settings writes a settings document."""
+A preset is a named choice of a job's settings. Other settings need a settings document."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -53,7 +53,7 @@ def settings_of(preset: str | None) -> Mapping[str, object]:
 
 
 class WorkForm(Chosen):
-    """Holds what a form asks before a job is queued. ``method``: id of a preset."""
+    """Holds the fields of a form for a new job. ``method``: id of a preset."""
 
     model: NotRequired[str | None]
     method: NotRequired[str | None]
@@ -73,8 +73,8 @@ def template_lines() -> list[JsonObject]:
 
 
 def chosen_work(event: WorkForm) -> ReconstructionRequest:
-    """Returns the request that a form describes: model, preset and template. What is not chosen is left to the
-    service's defaults."""
+    """Returns the request that a form describes: model, preset and template. Fields without a choice have the service's
+    defaults."""
     settings, template = dict(settings_of(event.get("method"))), event.get("template")
     if template:
         settings["outputs"] = cast(dict[str, object], settings.get("outputs", {})) | {"template": template}

@@ -28,8 +28,8 @@ def operation_name(route: APIRoute) -> str:
 
 
 def describe(app: FastAPI, address: str | None) -> None:
-    """Replaces ``app.openapi`` by a function that returns the completed document, which is made once. ``address``: what
-    the service is known as; None where it is that of the request."""
+    """Replaces ``app.openapi`` by a function that returns the completed document, which is made once. ``address``: the
+    service's public address; None: the address of the request."""
     original = app.openapi
 
     def openapi() -> JsonObject:
@@ -63,7 +63,7 @@ def _name_problems(document: JsonObject) -> None:
 
 
 def _name_conditions(document: JsonObject) -> None:
-    """Adds ``If-Match`` to what changes or removes something that can be got, and ``ETag`` to what gets it."""
+    """Adds ``If-Match`` to operations that change or remove a readable resource, and ``ETag`` to those that read it."""
     text = {"schema": {"type": "string"}}
     tag = {"description": "of this state; If-Match takes it", **text}
     for path in document["paths"].values():

@@ -39,8 +39,8 @@ POINTS = TypeAdapter(Points)
 
 @dataclass(frozen=True, slots=True)
 class CaptureMetadata:
-    """Holds what people write about a capture: its session, label, the subject's expression, and tags. Raises
-    InputError for texts that are too long or hold control characters."""
+    """Holds people's notes on a capture: its session, label, the subject's expression, and tags. Raises InputError for
+    texts that are too long or hold control characters."""
 
     session: str | None = None
     label: str = ""
@@ -77,7 +77,7 @@ class Captures:
         """Takes a shot with the rig, checks its pictures in a child process and stores it as a capture.
 
         ``board``: the shot shows the calibration board; it needs no consent and gets no verdict. ``seed`` chooses the
-        subject of the simulated studio. Raises DiskFull, Unavailable naming what the shot lacks, InputError for a seed
+        subject of the simulated studio. Raises DiskFull, Unavailable naming the missing pictures, InputError for a seed
         of a real rig, NotFound for an unknown session, and Conflict if consent is missing.
         """
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
@@ -249,7 +249,7 @@ class Captures:
         self._store.remove_capture(identity)
 
     def holdings(self, identity: str) -> HoldingsOut:
-        """Returns what removing a capture would take away and what would stay. Raises NotFound."""
+        """Returns which data a removal of the capture would delete and which would stay. Raises NotFound."""
         return holdings(self._store, self._jobs, identity)
 
     def erase(self, identity: str) -> None:
@@ -263,8 +263,8 @@ class Captures:
         self._library.scrub()
 
     def _check_consent(self, session: str | None, *, board: bool = False) -> None:
-        """Raises NotFound; Conflict where the service asks for consent and the session has no note of it: a ``board``
-        needs none."""
+        """Raises NotFound for an unknown session, and Conflict if the service requires consent and the session has no
+        note of it; a ``board`` needs none."""
         consent = "" if session is None else self._store.session(session).consent
         if self._settings.ask_consent and not consent.strip() and not board:
             detail = compose("consent-missing")
@@ -322,7 +322,7 @@ def shot_faults(shot: Mapping[str, object] | None) -> tuple[Fault, ...]:
 
 
 def all_checks(shot: Mapping[str, object] | None, content: CaptureContent) -> dict[str, ViewDocument]:
-    """Merges what was measured of each camera's picture at the shot (``shot``) and when the files were checked
-    (``content``). The latter counts where both measured the same."""
+    """Merges the measurements of each camera's picture at the shot (``shot``) and at the check of the files
+    (``content``). If both measured the same, ``content`` counts."""
     taken = cast(Mapping[str, ViewDocument], {} if shot is None else shot.get("checks", {}))
     return {name: {**taken.get(name, {}), **view} for name, view in content.checks.items()}

@@ -1,4 +1,4 @@
-"""Captures from object stores: an archive under one key, or the files below a prefix."""
+"""Imports captures from object stores: an archive under one key, or the files below a prefix."""
 
 import tarfile
 import time
@@ -15,12 +15,11 @@ from server.storage.store import Store
 
 
 def fetch_stored_capture(url: str, folder: Path, store: Store, settings: ServiceSettings) -> Path:
-    """Fetches the capture at an object store's ``url`` into ``folder`` and returns its archive: the object itself, or
-    where the URL ends with a slash one of all objects below it.
+    """Fetches the capture at an object store's ``url`` into ``folder`` and returns its archive: the object itself or,
+    if the URL ends with a slash, an archive of all objects below it.
 
-    Raises InvalidInput for a place that is not allowed ("url-refused"), where there is nothing ("object-missing") and
-    for a store that is slow ("import-failed"), TooLarge, DiskFull, and Unavailable where the store does not do its
-    part."""
+    Raises InvalidInput for a place that is not allowed ("url-refused"), for one without objects ("object-missing") and
+    for a store that is slow ("import-failed"), TooLarge, DiskFull, and Unavailable if the store fails."""
     prefix, key = locate(url, settings.import_prefixes)
     objects, archive = open_objects(prefix, settings), folder / "upload"
 
@@ -54,7 +53,7 @@ def _listed(url: str, objects: ObjectStore, prefix: str, settings: ServiceSettin
 def _pack(
     objects: ObjectStore, entries: Mapping[str, StoredObject], archive: Path, admit: Admission, most_s: float
 ) -> None:
-    """Packs objects as an archive. Their names are judged when it is unpacked, as those of any upload."""
+    """Packs objects as an archive. Their names are checked when it is unpacked, as in any upload."""
     ends, part = time.monotonic() + most_s, archive.with_suffix(".part")
     with tarfile.open(archive, "w") as packed:
         for name, entry in entries.items():

@@ -1,4 +1,4 @@
-"""Jobs as the job engine keeps them: names of its workflows, and what its rows say in our words."""
+"""Translates the job engine's rows of jobs: names of its workflows, and the contents of its rows in our terms."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -31,7 +31,7 @@ FINISHED = ("succeeded", "failed", "cancelled")
 
 
 def enqueue_options(job_id: str, queue: str, priority: int, attributes: dict[str, str | None]) -> EnqueueOptions:
-    """Returns how the job engine is to queue a job."""
+    """Returns the options with which the job engine queues a job."""
     return {
         "workflow_name": WORKFLOW,
         "queue_name": queue,
@@ -55,7 +55,7 @@ def by_state(query: JobQuery) -> JobQuery:
 
 
 def request_of(row: WorkflowStatus) -> JobRequest | None:
-    """Returns a copy of what the job was asked for; None where its input cannot be read."""
+    """Returns a copy of a job's request; None if its input cannot be read."""
     return cast(JobRequest, dict(row.input["args"][0])) if row.input else None
 
 

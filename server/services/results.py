@@ -1,8 +1,8 @@
-"""Results of jobs in an object store, and what of them lies in the data folder.
+"""Manages results of jobs in an object store, and the copies in the data folder.
 
-Where a store is configured, a job has succeeded only once its result is there, too, and the data folder is a cache: its
-large files go, those unused longest first, and come back when somebody asks for them. Small ones (reports, pictures of
-tables and sheets) stay. Without a store everything lies in the data folder, as it was made.
+If a store is configured, a job has succeeded only once its result is also there, and the data folder is a cache: large
+files that were unused longest are removed first, and fetched again on request. Small ones (reports, pictures of tables
+and sheets) stay. Without a store the data folder holds everything.
 """
 
 import os
@@ -44,7 +44,7 @@ class _LargeFile:
 
 
 class Results:
-    """Keeps the results of jobs. Methods block."""
+    """Stores the results of jobs. Methods block."""
 
     def __init__(self, store: Store, settings: ServiceSettings) -> None:
         place = settings.results_store
@@ -55,16 +55,16 @@ class Results:
 
     @property
     def elsewhere(self) -> bool:
-        """Tells whether results lie in a store, whatever lies in the data folder."""
+        """Returns whether results lie in a store, whatever lies in the data folder."""
         return self._objects is not None
 
     @property
     def tally(self) -> StoreTally | None:
-        """Returns what this process asked of the store; None without one."""
+        """Returns the counts of this process's requests to the store; None without one."""
         return None if self._objects is None else self._objects.tally
 
     def probe(self) -> None:
-        """Asks the store for a list of nothing. Raises StoreUnavailable and StoreDenied."""
+        """Asks the store for an empty list. Raises StoreUnavailable and StoreDenied."""
         if self._objects is not None:
             next(self._objects.entries("none/"), None)
 
@@ -75,8 +75,8 @@ class Results:
         wanted: Callable[[], bool],
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Stores a result, and waits for a store that is away. Raises Cancelled once the job is not ``wanted``,
-        and what ``pause`` raises."""
+        """Stores a result, and waits for a store that does not answer. Raises Cancelled if the job is not ``wanted``
+        any more, and what ``pause`` raises."""
         if self._objects is None:
             return
         pause_s = FIRST_PAUSE_S
@@ -93,8 +93,8 @@ class Results:
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
     def file(self, job_id: str, name: str, entry: FileEntry) -> StoredFile:
-        """Returns a file of a result, which is fetched where the data folder lacks it. Raises Unavailable where the
-        store does not give it, Conflict where it is not there, and DiskFull."""
+        """Returns a file of a result, fetched from the store if the data folder lacks it. Raises Unavailable if the
+        store fails, Conflict if it lacks the file, and DiskFull."""
         path = self._path(job_id, name)
         try:
             if time.time() - path.stat().st_mtime > UNUSED_S:
@@ -105,7 +105,7 @@ class Results:
         return StoredFile(path, entry["sha256"])
 
     def compare(self, job_id: str, files: Mapping[str, FileEntry]) -> None:
-        """Reads a job's files anew and notes those in ``damaged`` whose content is not what the job made."""
+        """Reads a job's files anew and adds to ``damaged`` those whose content has changed."""
         for name, entry in files.items():
             path, said = self._path(job_id, name), f"{job_id}/{name}"
             self.damaged.discard(said)
@@ -115,8 +115,8 @@ class Results:
                 self.damaged.add(said)
 
     def link(self, job_id: str, name: str) -> str | None:
-        """Returns a signed address of a file of a result, for ``LINK_S`` seconds; None where the store has no such
-        addresses, or does not have the file yet. Raises Unavailable."""
+        """Returns a signed address of a file of a result, for ``LINK_S`` seconds; None if the store has no such
+        addresses, or lacks the file. Raises Unavailable."""
         if self._objects is None:
             return None
         with suppress(ObjectMissing):
@@ -129,13 +129,13 @@ class Results:
         return self._store.folder("jobs", job_id) / "result"
 
     def erase(self, job_id: str) -> None:
-        """Removes a result, in the store with every version. Raises Unavailable where the store does not do it."""
+        """Removes a result, in the store with every version. Raises Unavailable if the store fails."""
         if self._objects is not None:
             self._objects.erase(f"{job_id}/")
         self._store.remove(self._store.folder("jobs", job_id))
 
     def discard(self, job_id: str) -> None:
-        """Removes what a cancelled job has made; a store that is away keeps it until the job is removed."""
+        """Removes the files of a cancelled job; if the store does not answer, they stay until the job is removed."""
         if self._objects is not None:
             with suppress(Refused):
                 self._objects.erase(f"{job_id}/")
@@ -143,7 +143,7 @@ class Results:
 
     def bound(self, most: int, files_of: Callable[[str], Mapping[str, FileEntry]]) -> int:
         """Removes large files from the data folder that were not used for long, until all of them take ``most`` bytes.
-        Each is compared with its object before, and stored where it lacks one. Returns how many went."""
+        Each is first compared with its object, or stored if the store lacks it. Returns how many files were removed."""
         if self._objects is None:
             return 0
         found, removed = sorted(self._large(), key=lambda file: file.used), 0
@@ -163,8 +163,8 @@ class Results:
         return removed
 
     def collect(self, owner: str, known: Callable[[Collection[str]], set[str]], days: float | None) -> int:
-        """Removes results from the store that no job claims, as in ``unclaimed``, a few times a day. Returns of
-        how many jobs."""
+        """Removes results without a job from the store, as in ``unclaimed``, a few times a day. Returns the number of
+        their jobs."""
         if self._objects is None or days is None:
             return 0
         if time.monotonic() - self._collected < min(COLLECT_S, days * DAY_S):

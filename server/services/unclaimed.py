@@ -1,9 +1,9 @@
-"""Removes what nothing claims from an object store: results of jobs that were removed while a worker still wrote, and
-results and captures' files that a restored database lacks.
+"""Removes unclaimed objects from a store: results of jobs that were removed while a worker still wrote, and results and
+captures' files that a restored database lacks.
 
 Several services may do this at once. The row of a job is written before its result, and the store is listed before the
-rows are read, so that a result is never taken for one without a job. A database collects only where its own results
-lie, which an object at the root of the store says.
+rows are read, so a result with a job is never removed. A database collects only at the place of its own results, which
+an object at the root of the store names.
 """
 
 import time
@@ -35,8 +35,8 @@ def collect(
     is_name: Callable[[str], object] = is_id,
 ) -> int:
     """Removes the results of jobs that are not known and were written more than ``days`` ago. ``owner`` names the
-    database, ``known`` returns those of the ids that are jobs of it, ``is_name`` tells what may be an id. Returns of
-    how many jobs. A store that is away ends it; the next call goes on."""
+    database, ``known`` returns the ids that are its jobs, ``is_name`` returns whether a text may be an id. Returns the
+    number of their jobs. If the store does not answer, the next call continues."""
     removed = 0
     try:
         if not _owns(objects, owner, scratch):
@@ -53,7 +53,7 @@ def collect(
 
 
 def _owns(objects: ObjectStore, owner: str, scratch: Path) -> bool:
-    """Tells whether the store's results are this database's; the first database that looks becomes their owner."""
+    """Returns whether the store's results are this database's; the first database that asks becomes their owner."""
     with TemporaryDirectory(dir=scratch) as folder:
         path = Path(folder) / OWNER
         try:

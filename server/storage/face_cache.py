@@ -1,8 +1,8 @@
 """Caches the faces found in a capture on disk, so that the pages search each capture once.
 
 A file's name is the SHA-256 of everything that its content depends on: the capture's files, the program's version and
-code. It describes a face, so it lies where ``Store.remove_capture`` erases it with its capture, even while a search
-runs. A file that cannot be read is made anew. One that cannot be written is not kept.
+code. It describes a face, so it lies in a folder that ``Store.remove_capture`` erases with its capture, even while a
+search runs. A file that cannot be read is made anew. A result that cannot be written is not cached.
 """
 
 import hashlib
@@ -26,8 +26,8 @@ PixelsOfPoints = dict[str, dict[str, list[float]]]  # by landmark and camera, as
 
 
 class FoundFace(TypedDict):
-    """Holds one face, in pixels of the picture's file. ``is_subject``: the views agree that it is the subject's;
-    ``roll_deg``: how far the face is turned clockwise in the picture."""
+    """Holds one face, in pixels of the picture's file. ``is_subject``: the views agree that it is the subject's face;
+    ``roll_deg``: clockwise rotation of the face in the picture."""
 
     box_px: list[float]
     roll_deg: float
@@ -37,8 +37,8 @@ class FoundFace(TypedDict):
 
 
 class FacesDocument(TypedDict):
-    """Holds the faces of every picture that was searched, and the pixels suggested for the seven feature points (none
-    where no face is certain)."""
+    """Holds the faces of every searched picture, and the pixels suggested for the seven feature points (none if no face
+    is certain)."""
 
     faces: dict[str, list[FoundFace]]
     suggested: PixelsOfPoints

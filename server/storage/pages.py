@@ -1,4 +1,4 @@
-"""Pages of a list: the query, a cursor that marks where a page ended, and the condition for rows that come after.
+"""Reads pages of a list: the query, a cursor that marks where a page ended, and the condition for rows that come after.
 
 A list continues after the *place* of its last row (the value it is sorted by and, between equal values, the id), not
 after a number of rows. So rows that are added or removed meanwhile neither repeat nor drop others, and the last page is
@@ -33,7 +33,7 @@ class Page(Generic[T]):
     total: int
 
     def of(self, items: Iterable[V]) -> "Page[V]":
-        """Returns the page with these items in place of its own."""
+        """Returns the page with these items instead of its own."""
         return Page(tuple(items), self.next, self.total)
 
 
@@ -81,7 +81,7 @@ def cursor_of(value: Value, identity: str, total: int) -> str:
 
 
 def place_of(cursor: str) -> Place:
-    """Decodes a cursor. Raises InputError for a text that is none."""
+    """Decodes a cursor. Raises InputError for any other text."""
     try:
         value, identity, total = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
         text = f"{value}{identity}".encode()  # half of a surrogate pair is JSON and nothing that a database takes

@@ -1,4 +1,4 @@
-"""Counts what is asked of an object store, how each request ended, and how long they took."""
+"""Counts the requests to an object store, their outcomes, and their seconds."""
 
 import threading
 import time
@@ -28,8 +28,8 @@ class StoreTally:
         self._operations, self._seconds = Counter[tuple[str, str]](), Counter[str]()
 
     def operations(self) -> dict[tuple[str, str], int]:
-        """Returns how many operations ended how. An outcome is done, missing, unavailable, denied or refused (of a full
-        disk, say)."""
+        """Returns the number of operations by name and outcome. An outcome is done, missing, unavailable, denied or
+        refused (for example by a full disk)."""
         with self._lock:
             return dict(self._operations)
 
@@ -40,7 +40,7 @@ class StoreTally:
 
     @contextmanager
     def counting(self, operation: str) -> Iterator[None]:
-        """Counts what happens in its block as one operation."""
+        """Counts the block as one operation."""
         began, outcome = time.monotonic(), "refused"
         try:
             yield
@@ -58,7 +58,7 @@ class StoreTally:
 
 
 class WatchedObjects:
-    """Passes everything on to an object store, and counts it."""
+    """Passes every call on to an object store, and counts it."""
 
     def __init__(self, objects: ObjectStore) -> None:
         self._objects, self.tally = objects, StoreTally()

@@ -1,5 +1,5 @@
-"""The task of the command line: reconstructs a capture on a user's disk. Archives are unpacked; cameras and masks that
-are missing are estimated and kept.
+"""Implements the task of the command line: reconstructs a capture on a user's disk. Archives are unpacked; cameras and
+masks that are missing are estimated and kept.
 
 A job of the service has its capture checked and stored before (``server.tasks.ingest``).
 """

@@ -55,7 +55,7 @@ def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: in
 
 
 def describe(taken: "SimulatedCapture") -> SimulatedCertificate:
-    """Returns the sync certificate of a simulated shot, all of whose pictures show the same moment."""
+    """Returns the sync certificate of a simulated shot; all of its pictures show the same moment."""
     cameras: dict[str, SimulatedSync] = {name: {"status": "in sync", "skew_ms": 0.0} for name in taken.rig.names}
     faults = [f.kind if f.camera is None else f"{f.kind} in {f.camera}" for f in taken.faults]
     return {"kind": "simulated", "subject": taken.scene.name, "cameras": cameras, "faults": faults}

@@ -1,4 +1,5 @@
-"""The page Calibration: shots of the board with live coverage, reports, the calibration in use, and earlier ones."""
+"""Implements the page Calibration: shots of the board with live coverage, reports, the calibration in use, and earlier
+ones."""
 
 import threading
 from collections.abc import Mapping
@@ -69,8 +70,7 @@ class CalibrateForm(TypedDict):
 
 
 class UseForm(Chosen):
-    """Holds the request to use a calibration. ``poor``: the operator has read what it lacks and uses it
-    nevertheless."""
+    """Holds the request to use a calibration. ``poor``: the operator has read its faults and uses it nevertheless."""
 
     poor: NotRequired[bool]
 

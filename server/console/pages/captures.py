@@ -1,4 +1,4 @@
-"""The page Captures: the list, uploads, outlines over the images, jobs to start, and removal with undo."""
+"""Implements the page Captures: the list, uploads, outlines over the images, jobs to start, and removal with undo."""
 
 from collections.abc import Mapping
 from typing import NotRequired, TypedDict, cast, get_args
@@ -30,7 +30,7 @@ ASKED = ("find", "session", "verdict", "tag", "sort", "after", "capture")
 
 
 class EditForm(Chosen):
-    """Holds changes to a capture. Fields that are left out stay; ``tags`` are separated by commas."""
+    """Holds changes to a capture. Fields that are left out keep their values; ``tags`` are separated by commas."""
 
     label: NotRequired[str]
     expression: NotRequired[str]
@@ -46,7 +46,7 @@ class SessionForm(TypedDict):
 
 
 class SessionEditForm(Chosen, SessionForm):
-    """Holds changes to a session. Fields that are left out stay."""
+    """Holds changes to a session. Fields that are left out keep their values."""
 
 
 class BulkForm(WorkForm):
@@ -62,8 +62,8 @@ class CapturesPage(Page, component="captures.js"):
     """Shows the list of captures, and the selected one with its pictures, outlines and jobs."""
 
     def look(self) -> JsonObject:
-        """Returns the state of the page. The selected capture stays selected when others arrive, so that nobody removes
-        a capture other than the one shown."""
+        """Returns the state of the page. The selection stays when other captures arrive, so the operator always removes
+        the capture that is shown."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
         state: JsonObject = shared.get(
             ("captures", *requested.values()), 0.3, lambda: captures_state(self.service, requested)
@@ -75,7 +75,7 @@ class CapturesPage(Page, component="captures.js"):
 
 def captures_state(service: Service, requested: Mapping[str, str | None]) -> JsonObject:
     """Returns one page of the captures that match what is requested, each with its jobs. Captures that are being
-    removed are left out. ``chosen``: the selected capture, which may be on another page of the list."""
+    removed are left out. ``chosen``: the selected capture, even if it is on another page of the list."""
     order = cast(CaptureOrder, requested["sort"] if requested["sort"] in get_args(CaptureOrder) else "-created")
     query = CaptureQuery(
         requested["find"] or "", requested["session"], requested["verdict"], tag=requested["tag"], order=order
@@ -144,22 +144,22 @@ def edit_consent(page: Page, event: SessionEditForm) -> None:
 
 
 def erase(page: Page, event: Chosen) -> Message:
-    """Erases a session for good, without undo, as ``Sessions.erase`` does. Raises NotFound and Unavailable."""
+    """Erases a session permanently, without undo, as ``Sessions.erase`` does. Raises NotFound and Unavailable."""
     page.service.sessions.erase(event["id"])
     shared.clear()  # reports of its heads among them
     return compose("session-erased")
 
 
 def erase_capture(page: Page, event: Chosen) -> Message:
-    """Erases a capture for good, without undo, as ``Captures.erase`` does. Raises NotFound and Unavailable."""
+    """Erases a capture permanently, without undo, as ``Captures.erase`` does. Raises NotFound and Unavailable."""
     page.service.captures.erase(event["id"])
     shared.clear()
     return compose("capture-erased")
 
 
 def discard(page: Page, event: Chosen) -> None:
-    """Removes a capture after the time to undo that has passed; the message says how many heads stay. Raises NotFound,
-    and Conflict while a queued or running job needs it."""
+    """Removes a capture after the time to undo that has passed; the message states how many heads stay. Raises
+    NotFound, and Conflict while a queued or running job needs it."""
     service, identity = page.service, event["id"]
     record = service.captures.check_unused(identity)
     heads = len(service.captures.holdings(identity).heads)
@@ -170,8 +170,8 @@ def discard(page: Page, event: Chosen) -> None:
 
 
 def bulk(page: Page, event: BulkForm) -> Message | None:
-    """Does one action to all ticked captures. Where it is refused for some, the others are done, and InvalidInput is
-    raised with the reasons."""
+    """Applies one action to all ticked captures. If some refuse it, it is still applied to the others, and InvalidInput
+    is raised with the reasons."""
     service, ids, action = page.service, event["ids"], event["action"]
     if action == "reconstruct":
         permit(page.caller, "submit")
@@ -202,7 +202,7 @@ def bulk(page: Page, event: BulkForm) -> Message | None:
 
 
 def said_of(action: str, count: int) -> Message:
-    """Returns the message that says what was done to ``count`` captures."""
+    """Returns the message that ``action`` was applied to ``count`` captures."""
     said = {
         "reconstruct": compose("captures-queued", count=count),
         "move": compose("captures-moved", count=count),

@@ -1,4 +1,4 @@
-"""The page about the service itself: API keys, what is kept and removed next, and what lies on the disk."""
+"""Implements the page about the service itself: API keys, retention, and the use of the disk."""
 
 from datetime import UTC, datetime
 from typing import TypedDict
@@ -46,7 +46,7 @@ class ServicePage(Page, component="service.js"):
 
     def look(self) -> JsonObject:
         """Returns the state of the page. Only callers with the scope admin see the keys. ``open``: there are no API
-        keys, so that whoever sits at this machine may do everything."""
+        keys, so anybody at this machine may do everything."""
         admin, service = self.caller.may("admin"), self.service
         return {
             "keys": [*key_lines(service, self.caller)] if admin else None,
@@ -71,7 +71,7 @@ def storage_shown(service: Service) -> JsonObject:
 
 
 def key_lines(service: Service, caller: Caller) -> list[JsonObject]:
-    """Converts all API keys to entries of the page's list, oldest first. ``caller`` decides which key is yours."""
+    """Converts all API keys to entries of the list, oldest first. ``caller``: to mark the caller's key."""
     return [
         {
             "id": key.id,
@@ -106,7 +106,7 @@ def _days(days: float | None) -> Message:
 
 
 def add_key(page: ServicePage, event: KeyForm) -> Message:
-    """Makes an API key. Raises InputError naming every fault of the form, and Forbidden where no key exists."""
+    """Makes an API key. Raises InputError naming every fault of the form, and Forbidden if no key exists."""
     name, scopes = event["label"].strip(), [scope for scope in SCOPES if scope in event["scopes"]]
     faults = []
     if not name or len(name) > NAME_MOST:
@@ -149,7 +149,7 @@ def remove_failed(page: ServicePage, event: object) -> Message:
 
 
 def sweep_now(page: ServicePage, event: object) -> Message:
-    """Removes now what retention would remove at its next turn. The message says how much that was."""
+    """Removes now what retention would remove at its next turn. The message states how much that was."""
     gone = {kind: count for kind, count in sweep(page.service).items() if count}
     forget_storage(page.service)
     removed = [compose("gone-of-kind", count=count, kind=kind) for kind, count in gone.items()]
