@@ -105,8 +105,7 @@ def _start_lenses(path: Path, lens: Float[np.ndarray, " 5"] | None) -> None:
 
 
 def _pipeline_options() -> "pycolmap.IncrementalPipelineOptions":
-    """Returns options that keep lenses undistorted while views join: k1 and k2 of three views would exclude a
-    fourth."""
+    """Returns options that keep lenses undistorted while views join: three views' k1 and k2 would exclude a fourth."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()

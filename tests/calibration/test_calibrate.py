@@ -207,7 +207,7 @@ def zoomed(rig: Rig) -> Rig:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda rig: renamed(rig, {"cam01": "cam02", "cam02": "cam01"}), "cam01 stands where cam02 stood"),
+        (lambda rig: renamed(rig, {"cam01": "cam02", "cam02": "cam01"}), "stands at the former position of cam02"),
         (mirrored, "mirror image of the earlier one"),
         (larger, "check square_mm"),
         (zoomed, "cam00 by -[56]"),

@@ -145,7 +145,7 @@ def test_translations_that_are_too_large_are_named_with_the_remedy(factor, remed
     (fault,) = rig_faults(
         posed(default_layout(), lambda pose: RigidTransform(pose.rotation, pose.translation * factor))
     )
-    assert fault.text.endswith(f"translations are wanted in millimetres; {remedy}")
+    assert fault.text.endswith(f"translations must be in millimetres: {remedy}")
 
 
 def test_cameras_far_from_the_origin_are_named_since_meshes_hold_24_bits():
@@ -173,7 +173,7 @@ def test_metres_are_recognised():
 @pytest.mark.parametrize(
     ("written", "word"),
     [
-        (lambda pose: pose.inverse(), "world_from_camera: "),
+        (lambda pose: pose.inverse(), "world_from_camera "),
         (lambda pose: RigidTransform(pose.rotation, pose.inverse().translation), "place in translation"),
         (lambda pose: RigidTransform(GL @ pose.rotation, GL @ pose.translation), "y up and z backwards"),
         (

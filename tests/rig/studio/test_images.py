@@ -348,7 +348,7 @@ def test_every_kind_of_fault_says_what_it_is():
 def test_fault_text():
     assert fault_from_text("dark:cam03=0.1") == Fault("dark", "cam03", 0.1)
     assert fault_from_text("frozen") == Fault("frozen")
-    with pytest.raises(InputError, match="is none of"):
+    with pytest.raises(InputError, match="is not one of"):
         fault_from_text("gremlins")
     with pytest.raises(InputError, match="no number"):
         fault_from_text("dark=very")

@@ -90,7 +90,7 @@ def test_a_realism_that_nobody_knows_is_wrong_usage_and_the_known_ones_are_named
     done = CliRunner().invoke(app, ["simulate", str(tmp_path / "shot"), "--realism", "oily,shiny"])
     assert done.exit_code == 2
     text = " ".join(done.stderr.replace("│", " ").split())
-    assert "shiny is none of smooth, oily, scattering, mosaic, jpeg" in text
+    assert "shiny is not one of smooth, oily, scattering, mosaic, jpeg" in text
 
 
 @pytest.mark.parametrize("enclosed", [False, True])

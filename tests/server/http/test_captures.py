@@ -44,7 +44,7 @@ def test_a_form_field_that_nobody_knows_is_named(
         ("damaged", "damaged or cut off"),
         ("missing image", "images/cam01.png is missing"),
         ("nan", "cam02.camera_from_world.translation holds a value that is no finite number"),
-        ("no cameras", "holds no cameras.json"),
+        ("no cameras", "contains no cameras.json"),
         ("wrong size", "is 30 x 30 pixels, but its camera is 24 x 24"),
         ("truncated image", "images/cam00.png is damaged"),
     ],
@@ -83,7 +83,7 @@ def test_photographs_too_few_to_do_without_cameras_say_what_is_missing(http: htt
         (folder / name).unlink()
     shutil.rmtree(folder / "background")
     errors = upload(http, packed(folder)).json()["errors"]
-    assert "holds no cameras.json" in errors[0]
+    assert "contains no cameras.json" in errors[0]
     assert errors[1].startswith("1 photograph; at least 3")
 
 

@@ -133,7 +133,7 @@ def test_a_worker_that_loads_is_no_fault(tmp_path: Path) -> None:
     jobs = SimpleNamespace(worker_may_start=lambda: True)
     service = SimpleNamespace(engine=engine, settings=ServiceSettings(data=tmp_path), jobs=jobs)
     early = health._workers(service)  # type: ignore[arg-type]
-    assert (early.ok, early.starting, "being started" in early.detail.text) == (False, True, True)
+    assert (early.ok, early.starting, "is starting" in early.detail.text) == (False, True, True)
     jobs.worker_may_start = lambda: False
     late = health._workers(service)  # type: ignore[arg-type]
     assert (late.ok, late.starting) == (False, False)

@@ -71,7 +71,7 @@ def test_a_yaml_of_opencv_without_cameras_says_what_is_wanted(tmp_path: Path) ->
 
 
 def test_an_unknown_format_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="'ply' is none of eigenhead, colmap"):
+    with pytest.raises(InputError, match="'ply' is not one of eigenhead, colmap"):
         write_rig_file(fan(), tmp_path / "x", "ply")
 
 

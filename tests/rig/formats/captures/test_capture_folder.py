@@ -76,8 +76,8 @@ def test_a_colmap_model_in_place_of_cameras_json(folder: Path) -> None:
         (damage("images/b.jpg", png(picture())), "images/ holds b.jpg, b.png: which one is meant?"),
         (damage("background/b/001.png", b""), "background/b/001.png is damaged"),
         (damage("masks/c.png", png(np.zeros((HEIGHT, WIDTH), np.uint8))), "masks/c.png is empty"),
-        (rename("masks/c.png", "masks/c.gif"), "masks/c.gif is not read: of GIF files nothing is"),
-        (rename("background/a.png", "background/a.npy"), "background/a.npy is not read: of NumPy files nothing is"),
+        (rename("masks/c.png", "masks/c.gif"), "masks/c.gif is not read: GIF files are not supported"),
+        (rename("background/a.png", "background/a.npy"), "background/a.npy is not read: NumPy files are not supported"),
         (damage("features.json", b"{"), "features.json cannot be read as JSON"),
         (points([]), "features.json is no object"),
         (points({"points": {}}), "features.json: format is None"),
@@ -180,7 +180,7 @@ def test_a_rig_s_faults_come_with_its_file_s_name(folder: Path) -> None:
     with pytest.raises(InputError, match=r"capture: cameras\.json: "):
         read_capture(folder)
     (folder / "cameras.json").unlink()
-    with pytest.raises(InputError, match=r"holds no cameras\.json"):
+    with pytest.raises(InputError, match=r"contains no cameras\.json"):
         read_capture(folder)
     with pytest.raises(InputError, match="is no folder"):
         read_capture(folder / "absent")
