@@ -102,7 +102,7 @@ def _difference(filed: Filed) -> float:
 
 
 def _spread(things: Sequence[_Thing]) -> list[_Thing]:
-    """Returns some of the things, evenly from the first to the last."""
+    """Returns a few elements of ``things``, at even steps from first to last."""
     return [things[k] for k in np.unique(np.linspace(0, len(things) - 1, COMPARED).round().astype(int))]
 
 

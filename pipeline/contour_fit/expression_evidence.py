@@ -1,6 +1,6 @@
 """Separates expression from shape once everything else has been fitted.
 
-The shape modes can imitate a smile. Whether they may do so depends on how strongly the rest of this head needs them.
+The shape modes can imitate a smile. How far they may depends on the size that this head's other deviations give them.
 The prior variance of each group of modes (eigenheads, kernel, fine kernel) is therefore estimated from the fit itself
 (MacKay 1992, as in ``posterior``). If the head hardly deviates from its population, the variance is small, and the
 expression has to explain the smile. Expression weights keep their prior and their bounds. The images are not read

@@ -48,8 +48,8 @@ def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RimTerm:
-    """Computes the cost of the silhouettes' outlines. ``scale_px`` is the robust scale. The cost is scaled to an
-    outline of ``reference_px``, so that hiding a part of the rim does not lower it; None means no scaling."""
+    """Computes the cost of the silhouettes' outlines. ``scale_px`` is the robust scale. The cost is normalised to an
+    outline of ``reference_px``, so that hiding a part of the rim does not lower it; None means no normalisation."""
 
     problem: ContourProblem
     evidence: StageEvidence

@@ -10,8 +10,8 @@ same point on the deformed head and n the normal there,
 
 robustly. The variance of the kernel's modes is estimated here, since all eigenheads leave little for them; the
 expression weights have the prior and bounds of the fit (``prior_term``). Sliding along the surface is free: the closest
-points are searched anew on the deformed head. Only the weights change, not the head. A head outside the population
-would need expressions in place of eigenheads; then the weights of the fit stay.
+points are searched anew on the deformed head. Only the weights change, not the head. If a head is outside the
+population, expressions would replace missing eigenheads, so the weights of the fit stay.
 """
 
 from dataclasses import dataclass, replace

@@ -166,8 +166,8 @@ def sideburn_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
 
 
 def lower_face(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Marks the cells of the beard zone that are evenly lit skin if there is no beard: without the lips, and without
-    the underside of jaw and chin, which is always dark."""
+    """Marks the cells of the beard zone that show evenly lit skin on a face without a beard. Lips are excluded, and so
+    is the underside of jaw and chin, which is always dark."""
     return beard_zone(view) & (np.maximum(view.feature, view.underside) < PLAIN)
 
 

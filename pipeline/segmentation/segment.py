@@ -297,7 +297,7 @@ def _quality(
 
 def _crown_side(mask: Bool[np.ndarray, "h w"]) -> str:
     """Returns the image border next to the crown: the one opposite the border through which the body leaves the
-    picture. Cameras may be mounted on their side. The body fills nearly all of a border; a cut crown fills less."""
+    picture. Cameras may be mounted on their side. The body fills nearly all of one border; a cut crown does not."""
     across, down = mask.sum(axis=0), mask.sum(axis=1)
     widest = {"top": down.max(), "bottom": down.max(), "left": across.max(), "right": across.max()}
     touched = {"top": mask[0].sum(), "bottom": mask[-1].sum(), "left": mask[:, 0].sum(), "right": mask[:, -1].sum()}

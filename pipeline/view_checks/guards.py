@@ -126,7 +126,7 @@ FindFace = Callable[[Mapping[str, ImageRgb], Rig], FaceEvidence | None]
 
 @dataclass(frozen=True, slots=True)
 class Guards:
-    """Refuses captures on behalf of all checks. With ``anyway``, a refusal becomes a warning of a doubtful pose."""
+    """Decides whether a capture is refused. With ``anyway``, a refusal becomes a warning of a doubtful pose."""
 
     anyway: bool = False
     find_face: FindFace = find_face_evidence

@@ -2,8 +2,8 @@
 
 NAME/             a result as ``eigenhead reconstruct`` writes it, and batch.json: what it was made from
 heads.csv heads.parquet sheet.html sheet.pdf
-.batch/           K-of-N.lock (a share at work), attempts/K-of-N.0 (a result in the making), failures/: gone when
-                  nothing is at work and none failed
+.batch/           K-of-N.lock (of a running process), attempts/K-of-N.0 (an unfinished result), failures/: removed
+                  when no process runs and no capture failed
 """
 
 import fcntl

@@ -149,7 +149,7 @@ class Library:
         return [row.id for row in rows if folded(row.label).startswith(begun)]
 
     def sessions_of(self, subject: str) -> list[str]:
-        """Lists the ids of the sessions of one subject, who is given by what ``subject_of`` returns."""
+        """Lists the ids of the sessions of one ``subject``, which is a value of ``subject_of``."""
         with self._engine.connect() as connection:
             return [*connection.scalars(sa.select(session_index.c.id).where(session_index.c.subject == subject))]
 

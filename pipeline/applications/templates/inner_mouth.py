@@ -273,7 +273,7 @@ def _lift(
 def _spread(
     rest: Float[np.ndarray, "m 3"], motion: Float[np.ndarray, " m"], need: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, " m"]:
-    """Spreads the shift that each vertex needs, decreasing, to its surroundings, but only where the shape moves."""
+    """Spreads each vertex's needed shift to its neighbours, with decreasing weight, but only to moving vertices."""
     pressed = np.flatnonzero(need)
     near = KDTree(rest[pressed]).sparse_distance_matrix(KDTree(rest), 2.5 * SPREAD_MM, output_type="coo_matrix")
     source, row = pressed[near.row], near.col

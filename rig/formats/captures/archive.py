@@ -361,7 +361,7 @@ def _judge(
     limits: ArchiveLimits,
 ) -> str | None:
     """Returns the relative name to write a member to; None if there is nothing to write. Adds its faults to ``faults``.
-    Faults of a part of its name count only if that part is written; they go to ``odd`` under the part's path."""
+    ``odd``: faults of folder names, by path, which count only if the folder is written."""
     if member.kind not in ("file", "folder"):
         faults.add(compose("member-no-file", member=member.shown, kind=_NO_FILES[member.kind]))
         return None
