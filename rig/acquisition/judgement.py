@@ -1,6 +1,6 @@
 """Judges the pictures of a shot: light, focus, and the cameras' views. All functions are pure functions of pictures,
-clean plates and settings. New clean plates must show an empty studio before they replace the old ones. Motion while
-they are taken, their light, and a comparison with the plates in use decide that."""
+clean plates and settings. New clean plates replace the old ones only if they show an empty studio: they are tested
+for motion while they are taken, for light, and by comparison with the plates in use."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

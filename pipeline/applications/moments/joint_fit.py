@@ -85,7 +85,7 @@ class JointTerm:
     common: float
 
     def at(self, states: States) -> "LinearisedJointTerm":
-        """Returns the term linearised at one state for each moment."""
+        """Returns the linearised term; ``states`` has one state for each moment."""
         parts = tuple(problem.at(state) for problem, state in zip(self.problems, states, strict=True))
         counts = np.zeros(self.layout.identity + 1)  # priors too many
         values = np.zeros(self.layout.identity + 1)

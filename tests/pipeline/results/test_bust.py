@@ -162,5 +162,5 @@ def test_a_head_is_written_pushed_out_to_the_hair(
 
 def test_spacing_has_bounds() -> None:
     assert settings_from_document({"bust": {"spacing_mm": 0.5}}).bust.spacing_mm == 0.5
-    with pytest.raises(InputError, match=r"bust\.spacing_mm is 0\.4, wanted 0\.5 to 3"):
+    with pytest.raises(InputError, match=r"bust\.spacing_mm is 0\.4, expected 0\.5 to 3"):
         settings_from_document({"bust": {"spacing_mm": 0.4}})

@@ -36,7 +36,7 @@ def test_requests_that_make_no_sense_are_4xx_problems(http: httpx.Client, archiv
         assert response.headers["content-type"] == "application/problem+json"
         assert response.json()["type"].startswith("urn:eigenhead:problem:")
         assert response.json()["detail"]
-    assert "takes GET, POST, and not PUT" in http.put("/v1/jobs").json()["detail"]
+    assert "accepts GET, POST, but not PUT" in http.put("/v1/jobs").json()["detail"]
     misplaced = http.post("/v1/captures", files={"file": b"x"})
     assert (misplaced.status_code, "POST /v1/captures/uploads" in misplaced.json()["detail"]) == (415, True)
     form = http.post("/v1/captures", data={"label": "x"})
