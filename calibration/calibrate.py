@@ -60,15 +60,15 @@ def calibrate(
     workers: int = 2,
     report: Progress = discard_progress,
 ) -> Calibration:
-    """Calibrates the cameras of ``IMAGES/<camera>/<shot>.<ext>``. Pictures with the same name of a shot were taken at
-    the same moment.
+    """Calibrates the cameras of ``IMAGES/<camera>/<shot>.<ext>``. Pictures with the same shot name must be
+    simultaneous.
 
     ``images``: the folder IMAGES. ``board``: the calibration board. ``front``: the camera that the subject faces; None
     takes the middle one. ``previous``: the rig's last calibration, against which names, layout, scale and lenses are
-    checked. ``cache``: folder that keeps detections by the pictures' content. ``workers``: processes that search the
+    checked. ``cache``: folder for detections, by the pictures' content. ``workers``: processes that search the
     pictures. ``report``: progress.
 
-    Raises InputError for damaged pictures, and WrongBoard, PoseGraphError or CalibrationRefused, each with what to do.
+    Raises InputError for damaged pictures, and WrongBoard, PoseGraphError or CalibrationRefused, with a remedy.
     """
     detections = detect_folder(images, board, cache=cache, workers=workers, report=report)
     calibration = calibrate_detections(detections, front=front, previous=previous, report=report)
@@ -178,7 +178,7 @@ def _finish(
     dropped: tuple[Dropped, ...],
     report: Progress,
 ) -> _Fit:
-    """Leaves out single corners, fits with Huber's cost, and adds time offsets where they reduce the residuals."""
+    """Removes single corners, fits with Huber's cost, and adds time offsets if they reduce the residuals."""
     names = graph.names
     contradicting = _contradicting_cameras(names, views, dropped)
     if contradicting:
@@ -231,8 +231,8 @@ def _take_shots(state: BundleState, shots: Sequence[str], used: set[str]) -> tup
 
 
 def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped: Sequence[Dropped]) -> list[Message]:
-    """Returns a reason for each camera of which no view is left, or more were left out as contradictory than are left:
-    one that is mirrored fits the others in any single shot."""
+    """Returns a reason for each camera that has no view left, or more contradictory views than valid ones. (A mirrored
+    camera can agree with the others in any single shot.)"""
     left, lost = Counter(view.camera for view in views), Counter(drop.camera for drop in dropped)
     return [
         compose("views-contradict", camera=name, count=lost[name], all=lost[name] + left[name])
@@ -244,9 +244,9 @@ def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped:
 def _prior(
     weak: LensPrior, names: Sequence[str], lenses: dict[str, Lens], noise: Float[np.ndarray, " c"], sigma: np.ndarray
 ) -> LensPrior:
-    """Returns a prior of each lens from its own calibration. Where views err as a whole (their moments differ), the
-    joint fit overestimates the noise of corners, and would bend the lenses to explain the rest. The prior's weight is
-    the share of the noise that corners of one view have in common."""
+    """Returns a prior of each lens from its own calibration. If views have errors as a whole (their moments differ),
+    the joint fit overestimates the noise of corners, and would bend the lenses to explain the rest. The prior's weight
+    is the fraction of the noise that the corners of one view share."""
     share = 1.0 - noise**2 / sigma**2
     mean = np.stack([lenses[name].intrinsics.values() for name in names])
     information = np.stack([np.linalg.inv(lenses[name].covariance) for name in names])
@@ -328,12 +328,12 @@ def _judged(
 def _covariances(
     fit: _Fit, rig: Rig
 ) -> tuple[Float[np.ndarray, "p p"], dict[str, Float[np.ndarray, " 9"]], Float[np.ndarray, " c"]]:
-    """Returns the poses' joint covariance in the subject's gauge, standard deviations of the intrinsics, and what both
-    amount to in pixels at the subject. The uncertainty of the lenses is contained in that of the poses
-    (``effective_pose``), for a fit takes the intrinsics as they are.
+    """Returns the poses' joint covariance in the subject's gauge, standard deviations of the intrinsics, and the effect
+    of both in pixels at the subject. The covariance of the poses includes the uncertainty of the lenses
+    (``effective_pose``), because a fit treats the intrinsics as exact.
 
-    Corners of one view err together where moments differ or the board bends; the covariance of independent corners is
-    raised by how much more the views' means scatter than their corners would let them."""
+    Corners of one view share an error if moments differ or the board bends. So the covariance for independent corners
+    is multiplied by a factor: the scatter of the views' means, relative to that expected from independent corners."""
     full = fit.solution.covariance() * _design_effect(fit)
     cameras = len(fit.names)
     block = full[: cameras * PER_CAMERA, : cameras * PER_CAMERA].reshape(cameras, PER_CAMERA, cameras, PER_CAMERA)
@@ -347,7 +347,7 @@ def _covariances(
 
 
 def _design_effect(fit: _Fit) -> float:
-    """Returns the variance of the views' mean residuals over that of independent corners, at least 1."""
+    """Returns the variance of the views' mean residuals divided by that for independent corners, at least 1."""
     misses = residuals(fit.solution.state, fit.seen)
     counts = np.bincount(fit.seen.view_of, minlength=len(fit.seen.camera))
     filled = counts > 0
@@ -358,7 +358,7 @@ def _design_effect(fit: _Fit) -> float:
 
 
 def _misses(fit: _Fit) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Returns of each view the numbers, pixels and residuals of its used corners."""
+    """Returns, for each view, the numbers, pixels and residuals of its used corners."""
     every = residuals(fit.solution.state, fit.seen)
     table, first = {}, 0
     for index, view in enumerate(fit.views):

@@ -70,7 +70,7 @@ def _checks(calibration: Calibration) -> str:
 
 
 def listed(title: str, lines: Iterable[Message | str]) -> str:
-    """Returns an HTML list with a heading; nothing for no lines."""
+    """Returns an HTML list with a heading; empty if there are no lines."""
     items = "".join(f"<li>{escape(str(line))}</li>" for line in lines)
     return f"<h2>{title}</h2><ul>{items}</ul>" if items else ""
 

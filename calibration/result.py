@@ -26,8 +26,7 @@ CELLS = (4, 3)  # of a picture, across and down
 
 
 class CalibrationRefused(EigenheadError):
-    """Reports that the pictures were understood but determine no rig that may be used. ``calibration`` is kept for the
-    report."""
+    """Reports that the pictures were readable but determine no usable rig. ``calibration`` is there for the report."""
 
     def __init__(self, reasons: Iterable[Message | str], calibration: "Calibration | None" = None) -> None:
         self.reasons = tuple(message_of(reason) for reason in reasons)
@@ -88,7 +87,7 @@ class Calibration:
         }
 
     def _covered(self, camera: Camera) -> float:
-        """Returns the share of the picture's cells that hold a corner."""
+        """Returns the fraction of the picture's cells with at least one corner."""
         size = (camera.intrinsics.width, camera.intrinsics.height)
         pixels = np.concatenate(
             [observed for (name, _), (_, observed, _) in self.misses.items() if name == camera.name]
@@ -97,7 +96,7 @@ class Calibration:
         return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
 
     def verdict(self) -> Verdict:
-        """Judges whether the calibration is worth using, and what it lacks."""
+        """Judges whether the calibration is usable, and what it lacks."""
         cameras = self.figures()["cameras"]
         evidence = {
             name: CameraEvidence(c["views"], c["focal_share"], c["pose_sigma_px"], c["covered"])

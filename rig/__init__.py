@@ -1,4 +1,4 @@
-"""Models the rig: what the cameras are and what they see.
+"""Models the rig: its cameras and their pictures.
 
 Frames. ``world`` is the frame of the rig, ``camera`` that of one camera, ``head`` that of the subject. ``b_from_a``
 takes coordinates in frame a to frame b. Lengths are millimetres, angles radians; any other unit is in the name

@@ -1,4 +1,4 @@
-"""Writes files so that neither a reader nor a crash ever meets a half-written one."""
+"""Writes files so that neither a reader nor a crash leaves or sees a half-written one."""
 
 import os
 import tempfile
@@ -11,7 +11,7 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, parents: boo
     permissions.
 
     Makes the folder if it is missing. With ``parents`` false it raises FileNotFoundError instead, so that a late write
-    cannot make a removed folder again."""
+    does not recreate a removed folder."""
     if parents:
         path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
@@ -28,6 +28,6 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, parents: boo
 
 
 def unfinished(folder: Path, name: str = "*") -> Iterator[Path]:
-    """Yields the temporary files in ``folder`` of writes to ``name``: those going on, and those cut short by a kill or
-    a power failure. ``*`` stands for any text, as in ``Path.glob``."""
+    """Yields the temporary files in ``folder`` from writes to ``name``: writes in progress, and writes interrupted by a
+    kill or a power failure. ``*`` stands for any text, as in ``Path.glob``."""
     return folder.glob(f".{name}.*.part")

@@ -1,5 +1,4 @@
-"""Names the folder in which this machine keeps what can be computed again: compiled loops, arrays of models,
-durations."""
+"""Names this machine's folder for data that can be recomputed: compiled loops, arrays of models, durations."""
 
 import os
 from pathlib import Path
@@ -8,7 +7,8 @@ CACHE = "EIGENHEAD_CACHE"
 
 
 def cache_folder() -> Path:
-    """Returns EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead. It need not exist."""
+    """Returns EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead. The folder may not exist
+    yet."""
     configured = os.environ.get(CACHE)
     if configured:
         return Path(configured)

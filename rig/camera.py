@@ -45,8 +45,8 @@ class Distortion:
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
     def max_valid_radius(self) -> float:
-        """Returns the radius (of ``X / Z``) up to which distortion is one to one; beyond it the radial model folds
-        points back."""
+        """Returns the radius (of ``X / Z``) up to which distortion is one to one; beyond it the radial model maps
+        points back inwards."""
         return _turning_radius(self.k1, self.k2, self.k3)
 
     def apply(self, normalised: Pixels) -> Pixels:
@@ -87,7 +87,7 @@ class Intrinsics:
     distortion: Distortion = field(default_factory=Distortion)
 
     def values(self) -> Float[np.ndarray, " 9"]:
-        """Returns fx fy cx cy k1 k2 p1 p2 k3, as ``lens_image`` takes them."""
+        """Returns fx fy cx cy k1 k2 p1 p2 k3, the argument of ``lens_image``."""
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion.opencv()])
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -111,8 +111,8 @@ class Camera:
     """Describes a calibrated camera.
 
     ``covariance`` is that of a left perturbation of ``camera_from_world``: 6 x 6, rotation (rad) then translation (mm).
-    ``recorded`` is the lens with which the picture files were taken, if ``intrinsics`` is the pinhole to which they are
-    undistorted. ``serial`` is the serial number of the camera body, as picture files state it."""
+    ``recorded`` is the lens of the picture files, if ``intrinsics`` is the pinhole to which they are undistorted.
+    ``serial`` is the serial number of the camera body, from the picture files."""
 
     name: str
     intrinsics: Intrinsics
@@ -128,7 +128,7 @@ class Camera:
 
     @property
     def axis_world(self) -> Float[np.ndarray, " 3"]:
-        """Returns the unit vector along which the camera looks."""
+        """Returns the unit vector of the camera's viewing direction."""
         return self.camera_from_world.rotation[2]
 
     def project(self, points_world: Points) -> Pixels:

@@ -23,10 +23,10 @@ Features = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """Holds the pictures of one shot, and what was read beside them.
+    """Holds the pictures of one shot, and the data read with them.
 
     ``images`` are the photographs by camera (RGB), ``backgrounds`` the clean plates, ``masks`` ready-made masks (True =
-    subject); ``soft_masks`` give the subject's share of each pixel, 0 to 255, for masks with soft edges. ``features``
+    subject). ``soft_masks`` hold the subject's share of each pixel, 0 to 255, for masks with soft edges. ``features``
     are feature points (px) by landmark and camera. ``digests`` are the sha256 of all files read, ``remarks`` the
     warnings of the reader. ``texture_sets`` are further photographs by the same cameras, by set and camera."""
 
@@ -85,7 +85,7 @@ def turn_masks(capture: Capture, ways: Mapping[str, tuple[slice, slice]]) -> Cap
 
 
 def _renamed(digests: Mapping[str, str], sources: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
-    """Returns the digests under the names that the files should have."""
+    """Returns the digests under the files' correct names."""
     renamed = {}
     for file, digest in digests.items():
         path = PurePosixPath(file)

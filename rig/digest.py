@@ -1,4 +1,4 @@
-"""Computes the digests by which files and documents are told apart."""
+"""Computes digests that identify files and documents."""
 
 import hashlib
 import json

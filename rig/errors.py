@@ -6,7 +6,7 @@ from rig.messages.message import Message, compose, message_of
 
 
 class EigenheadError(Exception):
-    """Is the base of all errors that this project raises deliberately. ``message`` can be shown to an operator."""
+    """Is the base class of all errors that this project raises. ``message`` can be shown to an operator."""
 
     def __init__(self, message: Message | str) -> None:
         self.message = message_of(message)
@@ -14,7 +14,7 @@ class EigenheadError(Exception):
 
 
 class Cancelled(EigenheadError):
-    """Ends work that its owner has cancelled. It is raised by the function that receives progress."""
+    """Ends work that its owner has cancelled. The function that receives progress raises it."""
 
     def __init__(self) -> None:
         super().__init__(compose("cancelled"))

@@ -1,4 +1,4 @@
-"""Defines the type of pictures in memory, and tells grey pictures from coloured ones."""
+"""Defines the type of pictures in memory, and distinguishes grey pictures from coloured ones."""
 
 from collections.abc import Sequence
 

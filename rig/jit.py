@@ -1,17 +1,17 @@
-"""Caches compiled loops under a hash of their content, for all later processes of this machine.
+"""Caches compiled loops under a hash of their content, for later processes on this machine.
 
-``njit`` here is Numba's, with another place for what it compiles. Numba's own cache (an index for each function, beside
-the sources) begins anew in every checkout, does not see that a loop in another file changed that it calls, loses or
-mixes entries where two processes write one index at once, and takes a job down where the disk is full or a file is
-damaged. Here each compiled function is one file in ``cache_folder()/kernels``, written atomically and named by the
-sha256 of all that it follows from: the byte code and constants of the function and of all that it calls, the types of
-its arguments, the processor, and the versions of Python, Numba and LLVM.
+``njit`` here is Numba's, with another cache for compiled code. Numba's own cache (an index for each function, next to
+the sources) starts empty in every checkout. It misses changes to a called loop in another file, loses or mixes entries
+when two processes write one index, and breaks a job if the disk is full or a file is damaged. Here each compiled
+function is one file in ``cache_folder()/kernels``, written atomically. Its name is the sha256 of everything it depends
+on: the byte code and constants of the function and of all that it calls, the types of its arguments, the processor, and
+the versions of Python, Numba and LLVM.
 
-The processor is the same for every x86-64 machine since 2013 (``PORTABLE_CPU``), so that what one machine compiled
-runs on the next: in a container, from a wheel, out of a CI's cache. Code for the very processor was no faster: on one
-with AVX-512 a job took as many processor seconds.
+Code is compiled for a common subset of all x86-64 processors since 2013 (``PORTABLE_CPU``), so that one machine's code
+runs on the next: in a container, from a wheel, from a CI's cache. Code for the specific processor was no faster: with
+AVX-512 a job took as many CPU seconds.
 
-Numba has no public interface for that. What is used of its inside: ``Dispatcher._cache`` (an object with
+Numba has no public interface for this. The internal parts used are: ``Dispatcher._cache`` (an object with
 ``load_overload`` and ``save_overload``), ``CompileResult._reduce`` and ``_rebuild``, ``serialize.dumps``, the option
 ``_nrt``, the flag ``noalias``.
 """
@@ -71,7 +71,7 @@ _target_options.noalias = TargetOptions.Mapping("noalias")  # a flag of Numba's 
 def njit(
     *, cache: bool = True, allocates: bool = True, overlaps: bool = True, **options: Any
 ) -> Callable[[Callable[..., Any]], Any]:
-    """Compiles a function as ``numba.njit`` does, and keeps the machine code in ``cache_folder()`` for later processes.
+    """Compiles a function like ``numba.njit``, and stores the machine code in ``cache_folder()`` for later processes.
 
     Args:
         cache: whether to keep it.
@@ -98,8 +98,8 @@ def njit(
 
 
 class KeptFunction:
-    """Stores and finds the machine code of one function on disk. It takes the place of Numba's own cache object, whose
-    methods it has."""
+    """Stores and finds the machine code of one function on disk. It replaces Numba's own cache object and has the same
+    methods."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher
@@ -107,7 +107,7 @@ class KeptFunction:
 
     @property
     def cache_path(self) -> str:
-        """Returns the folder that new files are written to."""
+        """Returns the folder for new files."""
         return str(cache_folder() / "kernels")
 
     def file(self, signature: Any) -> Path:
@@ -141,7 +141,7 @@ class KeptFunction:
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Writes a compiled function to its file. If that fails, logs it once for each process and goes on."""
+        """Writes a compiled function to its file. If that fails, logs it once for each process and continues."""
         if any(not lifted.can_cache for lifted in result.lifted) or result.library.has_dynamic_globals:
             return
         data = serialize.dumps(result._reduce())
@@ -175,8 +175,8 @@ def say_not_kept(error: OSError) -> None:
 
 @cache
 def machine() -> str:
-    """Returns a text of what machine code depends on besides its source: versions of Python, Numba and LLVM, compiler
-    options, and the processor's features."""
+    """Returns a text with everything that machine code depends on besides its source: versions of Python, Numba and
+    LLVM, compiler options, and the processor's features."""
     options: Any = config
     target: Any = cpu_target.target_context
     versions = (numba.__version__, llvmlite.__version__, sys.implementation.cache_tag)
@@ -193,8 +193,8 @@ def function_digest(dispatcher: Dispatcher) -> str:
 
 
 def code_size(dispatcher: Dispatcher) -> int:
-    """Returns the size (bytes) of all code that the compiled function depends on; compiling takes about proportionally
-    long."""
+    """Returns the size (bytes) of all code that the compiled function depends on; compile time is roughly proportional
+    to it."""
     return sum(map(len, _function_parts(dispatcher, set())))
 
 
@@ -233,8 +233,7 @@ def _code_parts(code: CodeType) -> Iterator[bytes]:
 
 
 def _value_parts(value: Any, names: list[str], visited: set[int]) -> Iterator[bytes]:
-    """Yields what a compiled function takes over from a global name: the bytes of a value, or the parts of another
-    function."""
+    """Yields what a compiled function uses of a global name: the bytes of a value, or the parts of another function."""
     if isinstance(value, Dispatcher):
         yield from _function_parts(value, visited)
     elif isinstance(value, ModuleType):

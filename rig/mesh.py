@@ -8,7 +8,7 @@ from jaxtyping import Float, Int, UInt8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Holds vertices (mm) and triangles, whose corners run counter-clockwise seen from outside. ``colours`` are the
+    """Holds vertices (mm) and triangles, whose corners are counter-clockwise seen from outside. ``colours`` are the
     sRGB colours of the vertices."""
 
     vertices: Float[np.ndarray, "v 3"]

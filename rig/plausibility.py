@@ -34,10 +34,10 @@ CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras whose picture co
 
 
 def rig_faults(rig: Rig, *, any_unit: bool = False) -> list[Message]:
-    """Returns the faults of a rig that its cameras alone show: impossible lenses, poses in another convention or unit,
-    and cameras at one place.
+    """Returns the faults of a rig that are visible from its cameras alone: impossible lenses, poses in another
+    convention or unit, and cameras at one place.
 
-    ``any_unit`` skips the check of the unit, because a known length (scale.json) will give it."""
+    ``any_unit`` skips the check of the unit, because a known length (scale.json) will define it."""
     of_all = _principal_point_faults(rig)
     if of_all:  # other faults would only follow from this one
         return of_all
@@ -65,11 +65,11 @@ def _lens_fault(camera: Camera) -> Message | None:
 
 
 def _principal_point_faults(rig: Rig) -> list[Message]:
-    """Returns a fault if the intrinsics belong to pictures of another size, are shares of the size, or lack principal
-    points.
+    """Returns a fault if the intrinsics belong to pictures of another size, are fractions of the size, or lack
+    principal points.
 
-    For pictures of another size all principal points are off the middle by the same factor, across and down. A crop
-    shifts them by pixels instead, and a shifted lens in one direction."""
+    For pictures of another size all principal points are off the middle by the same factor, horizontally and
+    vertically. A crop shifts them by a number of pixels instead, and a shifted lens in one direction."""
     sizes = np.array([(camera.intrinsics.width, camera.intrinsics.height) for camera in rig], float)
     points = np.array([(camera.intrinsics.cx, camera.intrinsics.cy) for camera in rig])
     focal = np.array([(camera.intrinsics.fx, camera.intrinsics.fy) for camera in rig])
@@ -91,8 +91,8 @@ def _through_lens(camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.nd
     """Returns ``X / Z, Y / Z`` without and with the lens, for a grid over the middle of the picture; NaN where no ray
     meets a pixel.
 
-    For a recorded lens the grid covers the pinhole's picture. Pixels of a fisheye outside of it are never used, so its
-    model need not be right there."""
+    For a recorded lens the grid covers the pinhole's picture. A fisheye's pixels outside the grid are never used, so
+    its model need not be valid there."""
     k = camera.intrinsics
     edge = 0.5 * (1.0 - MIDDLE)
     sides = zip((k.width, k.height), GRID, strict=True)
@@ -133,8 +133,8 @@ def _spread_faults(rig: Rig) -> list[Message]:
 
 
 def _unit_fault(frame: float) -> Message:
-    """Returns a fault that names the unit in which a head would fit into the pictures. If two units fit both are named,
-    since only the file's author knows."""
+    """Returns a fault that names the unit in which a head would fit into the pictures. If two units fit, both are
+    named, because only the file's author knows."""
     fitting = [unit for unit in UNITS if FRAME_LEAST_MM <= frame * unit <= UNIT_FRAME_MOST_MM]
     usual = sorted(fitting, key=lambda unit: abs(np.log(frame * unit / FRAME_USUAL_MM)))
     if len(usual) < 2:
@@ -152,8 +152,8 @@ def _unit_fault(frame: float) -> Message:
 
 
 def frame_mm(rig: Rig) -> float:
-    """Returns how much (mm) the longer side of a picture shows at the point nearest to all optical axes: the median of
-    the cameras."""
+    """Returns the length (mm) that the longer side of a picture covers at the point nearest to all optical axes: the
+    median over the cameras."""
     sides = []
     for camera in rig:
         k, distance = camera.intrinsics, float(np.linalg.norm(camera.centre_world - rig.centre_world()))
@@ -162,7 +162,7 @@ def frame_mm(rig: Rig) -> float:
 
 
 def _convention_fault(rig: Rig) -> Message | None:
-    """Returns a fault if the cameras look at no common point, but would if their poses were read in another
+    """Returns a fault if the cameras point at no common point, but would if their poses were read in another
     convention."""
     if _share_looking_at_one_point(rig) > DIVERGING_MOST:
         return None
@@ -181,7 +181,7 @@ def _convention_fault(rig: Rig) -> Message | None:
 
 
 def alternative_conventions(rig: Rig) -> list[tuple[Message, Rig, Message]]:
-    """Reads the poses in other conventions. Returns for each a description of what the poses would be, the rig, and the
+    """Reads the poses in other conventions. Returns, for each, a description of the poses' meaning, the rig, and the
     remedy."""
     return [
         (other, Rig(tuple(replace(c, camera_from_world=read(c.camera_from_world)) for c in rig)), remedy)
@@ -190,7 +190,7 @@ def alternative_conventions(rig: Rig) -> list[tuple[Message, Rig, Message]]:
 
 
 def _share_looking_at_one_point(rig: Rig) -> float:
-    """Returns the share of the cameras whose picture contains the point nearest to all optical axes."""
+    """Returns the fraction of the cameras whose picture contains the point nearest to all optical axes."""
     point: Float[np.ndarray, "1 3"] = rig.centre_world()[None]
     inside = 0
     for camera in rig:

@@ -8,4 +8,4 @@ Progress = Callable[[str, float], None]
 
 
 def discard_progress(stage: str, fraction: float) -> None:
-    """Does nothing. It receives the progress of work that nobody watches."""
+    """Does nothing. Use it for work that nobody watches."""

@@ -1,8 +1,8 @@
 """Models lenses that Brown-Conrady cannot represent; their pictures are undistorted when they are read.
 
-A camera with such a lens is a pinhole everywhere in the program (``Camera.intrinsics`` has no distortion), and its
-``recorded`` is the lens with which the files were taken. Both share focal lengths, principal point and size, so that
-the middle of the picture keeps its resolution. Pixels of a fisheye outside the pinhole's frame are dropped.
+A camera with such a lens is a pinhole everywhere in the program (``Camera.intrinsics`` has no distortion); its
+``recorded`` is the lens of the picture files. Both have the same focal lengths, principal point and size, so the
+resolution in the middle of the picture stays the same. Pixels of a fisheye outside the pinhole's frame are dropped.
 
 Kannala-Brandt: ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`` with ``theta`` the angle to
 the axis (https://docs.opencv.org/4.x/db/d58/group__calib3d__fisheye.html). Rational: OpenCV's eight coefficients k1 k2
@@ -26,15 +26,14 @@ ROUNDS, EXACT = 100, 1e-12  # iterations and tolerance of the inverse of either 
 @dataclass(frozen=True, slots=True)
 class RecordedLens:
     """Holds a lens model, its coefficients in the order of ``COEFFICIENTS[model]``, and the skew of its pixels: entry
-    (0, 1) of the camera matrix, in focal lengths fx. The pinhole has none."""
+    (0, 1) of the camera matrix, in focal lengths fx. The pinhole has no skew."""
 
     model: LensModel
     coefficients: tuple[float, ...]
     skew: float = 0.0
 
     def distorted(self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 2"]:
-        """Returns where the pinhole's ``pixels`` lie in the recorded picture. ``matrix`` is the camera matrix of
-        both."""
+        """Converts the pinhole's ``pixels`` to the recorded picture. ``matrix`` is the camera matrix of both."""
         import cv2  # here and below: 0.1 s that most starts do without
 
         rays = np.ones((len(pixels), 3))
@@ -50,8 +49,8 @@ class RecordedLens:
     def undistorted(
         self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]
     ) -> Float[np.ndarray, "n 2"]:
-        """Returns where the recorded picture's ``pixels`` lie in the pinhole's picture. ``matrix`` is the camera matrix
-        of both."""
+        """Converts the recorded picture's ``pixels`` to the pinhole's picture. ``matrix`` is the camera matrix of
+        both."""
         import cv2
 
         straight = pixels - np.outer(_rows(pixels, matrix), [self.skew * matrix[0, 0], 0.0])
@@ -78,7 +77,7 @@ class RecordedLens:
 
 
 def _rows(pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " n"]:
-    """Returns ``Y / Z`` of pixels, by which a skew shifts them across."""
+    """Returns ``Y / Z`` of pixels; a skew shifts them sideways in proportion to it."""
     return (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1]
 
 

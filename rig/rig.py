@@ -38,7 +38,7 @@ class Rig:
         return iter(self.cameras)
 
     def __getitem__(self, name: str) -> Camera:
-        """Returns the camera of that name. Raises UnknownCamera if there is none."""
+        """Returns the camera with that name. Raises UnknownCamera if there is none."""
         for camera in self.cameras:
             if camera.name == name:
                 return camera
@@ -67,12 +67,12 @@ class Rig:
         return replace(self, cameras=tuple(cameras))
 
     def centre_world(self) -> Float[np.ndarray, " 3"]:
-        """Returns the point (mm) nearest to all optical axes by least squares, near which the subject should be."""
+        """Returns the point (mm) nearest to all optical axes by least squares; the subject should be near it."""
         centres = np.stack([camera.centre_world for camera in self.cameras])
         return nearest_to_rays(centres, np.stack([camera.axis_world for camera in self.cameras]))
 
     def front_camera(self) -> str:
-        """Returns the name of the camera in the middle of the rig: that whose direction is nearest to the mean of all
+        """Returns the name of the camera in the middle of the rig, whose direction is nearest to the mean of all
         directions."""
         directions = np.stack([camera.centre_world for camera in self.cameras]) - self.centre_world()
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -80,8 +80,8 @@ class Rig:
 
 
 def spread_views(rig: Rig, count: int) -> list[str]:
-    """Returns the names of at most ``count`` cameras that stand well apart: the front one first, then always the one
-    whose direction from the subject is farthest from all chosen (Gonzalez, *Clustering to minimize the maximum
+    """Returns the names of at most ``count`` cameras that stand well apart: first the front one, then repeatedly the
+    one whose direction from the subject is farthest from all chosen (Gonzalez, *Clustering to minimize the maximum
     intercluster distance*, 1985)."""
     away = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     away /= np.linalg.norm(away, axis=1, keepdims=True)

@@ -41,7 +41,7 @@ def suggest(word: str, known: Iterable[str], *, most: int = 1, min_likeness: flo
 
 
 def as_utf8(data: bytes) -> bytes:
-    """Returns the bytes of a text without the mark of its encoding, in UTF-8 if the mark says UTF-16 or UTF-32."""
+    """Returns a text without its byte order mark, converted to UTF-8 if the mark means UTF-16 or UTF-32."""
     for mark, encoding in MARKS:
         if data.startswith(mark):
             return data.removeprefix(mark).decode(encoding).encode()

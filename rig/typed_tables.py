@@ -25,8 +25,8 @@ def read_table(kind: type[T], document: Mapping[str, Any], subject: str) -> T:
 
 
 def read_fields(kind: type[T], document: Any, where: str, faults: list[Message]) -> T:
-    """Returns the dataclass ``kind`` from decoded JSON or TOML, with its defaults where a key is missing or wrong, and
-    adds what is wrong to ``faults``: then it may be an ellipsis. ``where`` comes before the names in them."""
+    """Returns the dataclass ``kind`` from decoded JSON or TOML. A missing or wrong key gets its default, or an ellipsis
+    if it has none. Faults are added to ``faults``. ``where`` precedes the keys' names in the faults."""
     if not isinstance(document, Mapping):
         faults.append(compose("setting-no-object", where=where.rstrip(".") or "settings"))
         return typing.cast(T, ...)
@@ -50,7 +50,7 @@ def read_fields(kind: type[T], document: Any, where: str, faults: list[Message])
 
 
 def _sections_with(key: str, hints: Mapping[str, Any]) -> list[str]:
-    """Returns ``section.key`` for each table in a table that has the key."""
+    """Returns ``section.key`` for each subtable that has the key."""
     tables = {name: dataclasses.fields(hint) for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
     return [f"{name}.{key}" for name, fields in tables.items() if key in (field.name for field in fields)]
 
@@ -80,7 +80,7 @@ def _value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:
 
 
 def _number(value: Any) -> float | None:
-    """Returns a finite number, else None; a whole number of JSON may be larger than any float."""
+    """Returns a finite number, else None; a JSON integer may exceed the range of float."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         return None
     try:
@@ -96,7 +96,7 @@ def _item(where: str, value: Any, index: int) -> str:
 
 
 def _shown(value: Any) -> Message | str:
-    """Returns the text of a wrong value. Python prints no number of thousands of digits and no deeply nested value."""
+    """Returns the text of a wrong value. Python does not print numbers of thousands of digits."""
     try:
         return f"{value!r:.80}"
     except (ValueError, RecursionError):

@@ -1,5 +1,5 @@
-"""Makes heads available to users: HTTP service with its pages, workers, command line.
+"""Makes heads available to users by an HTTP service with pages, workers and a command line.
 
-It is the only package that imports the web framework and the job engine. Everything that it does for a head is one call
-of ``pipeline.reconstruct.reconstruct``.
+It is the only package that imports the web framework and the job engine. For each head it calls
+``pipeline.reconstruct.reconstruct`` once.
 """

@@ -8,7 +8,7 @@ from rig.errors import EigenheadError
 
 
 class AddressTaken(EigenheadError):
-    """Reports that the service cannot listen at an address: another program does, or it is not this machine's."""
+    """Reports that the service cannot listen at an address: another program uses it, or it is not this machine's."""
 
     def __init__(self, host: str, port: int, error: OSError) -> None:
         who = "another program listens there" if error.errno == errno.EADDRINUSE else error.strerror or str(error)
@@ -30,7 +30,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def is_loopback(host: str) -> bool:
-    """Returns whether a host name or address is reached from this machine only."""
+    """Returns whether only this machine can reach a host name or address."""
     if host == "localhost":
         return True
     try:

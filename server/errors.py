@@ -1,7 +1,7 @@
-"""The errors with which the service refuses something, whether it was requested over HTTP, on a page, on the command
-line or by a worker.
+"""Defines the errors by which the service refuses a request, whether over HTTP, on a page, on the command line or by a
+worker.
 
-``kind`` is a stable name, ``detail`` says what is wrong and what to do, ``errors`` lists every fault found.
+``kind`` is a stable name, ``detail`` describes the fault and the remedy, ``errors`` lists every fault found.
 ``server.wire.problems`` gives each class its HTTP status.
 """
 
@@ -16,7 +16,7 @@ UNWRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM)
 
 
 class Refused(EigenheadError):
-    """Refuses a request. It is the base of all refusals; ``retry_after_s`` says when to try again."""
+    """Refuses a request. It is the base of all refusals; ``retry_after_s`` is the time after which to try again."""
 
     def __init__(
         self,
@@ -36,11 +36,11 @@ class Unauthenticated(Refused):
 
 
 class Forbidden(Refused):
-    """Refuses what this caller may not do."""
+    """Refuses an action for which the caller lacks the scope."""
 
 
 class NotFound(Refused):
-    """Refuses what does not exist."""
+    """Refuses a request for a thing that does not exist."""
 
     def __init__(self, what: Message, identity: str, hint: Message | None = None) -> None:
         """Words the refusal. ``what``: the kind of thing, a message of the catalogue; ``hint``: where to look for what
@@ -50,11 +50,11 @@ class NotFound(Refused):
 
 
 class Conflict(Refused):
-    """Refuses what the present state of a thing does not allow."""
+    """Refuses an action that the current state of a thing does not allow."""
 
 
 class Gone(Refused):
-    """Refuses what existed and was removed."""
+    """Refuses a request for a thing that existed and was removed."""
 
 
 class TooLarge(Refused):
@@ -77,19 +77,19 @@ class TooMany(Refused):
 
 
 class Unavailable(Refused):
-    """Refuses what cannot be done now and may succeed later, for lack of a rig or worker, say."""
+    """Refuses an action that cannot be done now and may succeed later, for example without a rig or worker."""
 
 
 class DiskFull(Refused):
-    """Refuses what would leave less free disk space than the settings demand."""
+    """Refuses an action that would leave less free disk space than the settings demand."""
 
     def __init__(self) -> None:
         super().__init__("disk-full", compose("service-disk-full"))
 
 
 class DataUnwritable(Unavailable):
-    """Refuses what would be stored while the data folder cannot be written: mounted read-only after an error of the
-    disk, say, or another user's."""
+    """Refuses an action that must write while the data folder cannot be written, for example because the disk was
+    mounted read-only after an error."""
 
     def __init__(self) -> None:
         super().__init__("data-unwritable", compose("service-data-unwritable"))

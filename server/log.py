@@ -1,7 +1,7 @@
 """Writes log lines to standard error, for people or as JSON. Each carries the id of its request or job.
 
-Lines of libraries are written in the same form. How a job failed or was cancelled is said in one line; the job engine's
-own traceback of it is left out.
+Lines of libraries are written in the same form. A job that failed or was cancelled gets one line; the job engine's own
+traceback of it is left out.
 """
 
 import logging
@@ -43,8 +43,8 @@ class JobLog:
 
 
 class _OnStandardError(structlog.PrintLogger):
-    """Work goes on where a line cannot be written, as the standard library's handlers let it: the disk that holds the
-    lines is full, or whoever read them has gone."""
+    """Ignores errors of writing a line, as the standard library's handlers do: the disk may be full, or the reader
+    gone."""
 
     def msg(self, message: str) -> None:
         with suppress(OSError):
@@ -87,7 +87,7 @@ def set_up(as_json: bool, level: str = "info", jobs: Path | None = None) -> None
 
 def is_no_known_failure(record: logging.LogRecord) -> bool:
     """Returns False for a log record with the traceback of a job that failed for a known reason or was cancelled, or of
-    a webhook that did not answer, which is said in a line of its own; True for all others."""
+    a webhook that did not answer, since each has its own log line; True for all others."""
     error = record.exc_info[1] if record.exc_info else None
     if error is None:
         return True

@@ -1,9 +1,9 @@
-"""Decides which servers elsewhere this service may call on behalf of a caller, and at which address.
+"""Decides which other servers this service may call on behalf of a caller, and at which address.
 
 A caller who names an address must not turn the service against its own network (server-side request forgery). Only
 origins that the operator listed are called; ``https://*`` stands for every public one. A name is looked up once and
-each of its addresses is judged. The connection then goes to a judged address, so it does not matter if the name means
-another machine a moment later. Whoever follows a redirection must judge the new address in the same way.
+each of its addresses is judged. The connection then goes to a judged address, so a later change of the name's address
+has no effect. Code that follows a redirection must judge the new address in the same way.
 """
 
 import ipaddress
@@ -36,8 +36,8 @@ class Target:
 
 
 def target(url: str, origins: Collection[str]) -> Target:
-    """Judges ``url`` and returns where to connect. ``origins``: those that the operator allows. Blocks on the name
-    service.
+    """Judges ``url`` and returns where to connect. ``origins``: the origins that the operator allows. Blocks on the
+    name service.
 
     Raises InvalidInput ("url-refused") for an address that is malformed, not allowed, or not public.
     """

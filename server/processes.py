@@ -1,8 +1,8 @@
 """Starts Python processes that run this package's own code, and identifies processes: the worker beside the service,
 and the children that do heavy work.
 
-They must run the code of this installation and no other, even if a folder named like one of the packages lies in the
-working directory or on PYTHONPATH.
+They must run the code of this installation only, even if a folder named like one of the packages lies in the working
+directory or on PYTHONPATH.
 """
 
 import gc
@@ -43,8 +43,8 @@ def share_one_heap() -> None:
     """Makes all threads of this process share one heap, if the C library is glibc. To be called before there are
     threads.
 
-    By default each thread has a heap and gives nothing it has freed to the others. A default job then uses 150 MB more
-    and is no faster. And Python then looks for garbage so often that it takes 1.5 of 31 CPU s.
+    By default each thread has a heap of its own, and other threads cannot reuse its freed memory. A default job then
+    needs 150 MB more and is no faster. In addition Python then collects garbage so often that it takes 1.5 of 31 CPU s.
     """
     import ctypes
 
@@ -57,7 +57,7 @@ def tidied(report: Progress) -> Progress:
     """Returns ``report`` as a job takes it that gives the system, whenever a stage begins, the pages of this process's
     heap that nothing uses any more, if the C library is glibc, in milliseconds.
 
-    By itself glibc keeps what arrays have freed below others that still live: 110 MB after a default job's depth maps.
+    Without this call glibc keeps freed memory below arrays that still exist: 110 MB after a default job's depth maps.
     """
     import ctypes
 

@@ -1,4 +1,4 @@
-"""Settings of the service: from the command line, from EIGENHEAD_* variables, or these defaults."""
+"""Defines the settings of the service: from the command line, from EIGENHEAD_* variables, or these defaults."""
 
 import json
 import re
@@ -20,7 +20,7 @@ MOVED: dict[str, str] = {"server.work:reconstruct_capture": RECONSTRUCT}
 
 
 class ServiceSettings(BaseSettings):
-    """Holds what an operator may set. Each field is also the environment variable ``EIGENHEAD_<FIELD>``."""
+    """Holds the settings of an operator. Each field is also the environment variable ``EIGENHEAD_<FIELD>``."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, env_ignore_empty=True, frozen=True, extra="forbid")
 
@@ -128,7 +128,7 @@ class ServiceSettings(BaseSettings):
     @field_validator("work")
     @classmethod
     def _present_place(cls, address: str) -> str:
-        """Returns the present place of a folder that a variable of an older version names."""
+        """Returns the current name of a folder that a variable of an older version names."""
         return MOVED.get(address, address)
 
     @field_validator("database_url")
@@ -166,7 +166,7 @@ class ServiceSettings(BaseSettings):
 
     @property
     def public_host(self) -> str | None:
-        """Returns host and port of ``public_url``; None without one."""
+        """Returns host and port of ``public_url``; None if it is not set."""
         return None if self.public_url is None else self.public_url.partition("://")[2]
 
     @property
@@ -178,7 +178,7 @@ class ServiceSettings(BaseSettings):
     def url(self) -> str:
         """Returns the database's URL in SQLAlchemy's form.
 
-        PostgreSQL is set to end a session that idles inside a transaction: a worker that vanished there would keep its
+        PostgreSQL is set to end a session that idles inside a transaction: otherwise a vanished worker would keep its
         row locks, and no other worker could take over its job.
         """
         if self.database_url is None:
@@ -193,7 +193,7 @@ class ServiceSettings(BaseSettings):
 
     @property
     def place(self) -> str:
-        """Returns where keys and jobs are kept, for people to read: the data folder, or the database's URL without
+        """Returns the place of keys and jobs in readable form: the data folder, or the database's URL without
         password."""
         if self.database_url is None:
             return str(self.data.resolve())

@@ -1,11 +1,11 @@
-"""Adjusts everything at once, robustly: intrinsics with distortion, camera poses, board poses.
+"""Adjusts all parameters together, robustly: intrinsics with distortion, camera poses, board poses.
 
 It uses the project's Levenberg-Marquardt on blocks of the normal equations (``CornerTerm``). Eleven cameras and thirty
-shots have 339 unknowns, which a dense Cholesky factor solves in ten milliseconds, so sparse methods would bring nothing
+shots have 339 unknowns. A dense Cholesky factor solves these in ten milliseconds, so sparse methods would gain nothing
 (tests/laboratory/notes/calibration.md compares the times with scipy's and Ceres's).
 
-Cost: ``sum rho(|r|^2 / sigma_c^2) + priors``. rho is Cauchy's while outliers are sought and Huber's at the end; sigma_c
-is each camera's own noise."""
+Cost: ``sum rho(|r|^2 / sigma_c^2) + priors``. rho is Cauchy's during the search for outliers and Huber's at the end;
+sigma_c is each camera's own noise."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -128,8 +128,8 @@ class Free:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleSolution:
-    """Holds the state in which the adjustment ended, and the normal matrix there (over the parameters that it changed,
-    which ``free`` marks)."""
+    """Holds the final state of the adjustment, and the normal matrix there (over the adjusted parameters, which
+    ``free`` marks)."""
 
     state: BundleState
     normal: Float[np.ndarray, "p p"]  # of the free parameters, at the solution, residuals in sigmas
@@ -159,12 +159,12 @@ class BundleSolution:
 def corner_sigma(
     state: BundleState, observed: Observations, lens_noise: Float[np.ndarray, " c"]
 ) -> tuple[Float[np.ndarray, " c"], float]:
-    """Estimates the noise (px) of each camera's corners in the joint solution, and the part of it that all cameras
-    share.
+    """Estimates the noise (px) of each camera's corners in the joint solution, and the part of it that is common to all
+    cameras.
 
-    The noise of each camera alone is known from ``lens_noise``. Larger residuals of the joint solution come from
-    cameras that were not exactly simultaneous, or from a board that bends. That part is one variance for all cameras:
-    with one for each, the fit could call one camera noisy and follow the others exactly."""
+    The noise of each camera alone is known from ``lens_noise``. Residuals of the joint solution are larger if cameras
+    were not exactly simultaneous, or if the board bends. That excess is one variance for all cameras; with one for
+    each, the fit could declare one camera noisy and follow the others exactly."""
     squares = (residuals(state, observed) ** 2).sum(axis=1)
     typical = float(np.median(squares)) / 1.1774**2
     shared = max(0.0, typical - float(np.median(lens_noise[observed.camera[observed.view_of]] ** 2)))
@@ -184,10 +184,10 @@ def adjust(
 ) -> BundleSolution:
     """Minimises the cost of the bundle adjustment, starting from ``state``.
 
-    ``state``: where to start. ``observed``: the corners of all views. ``prior``: of the intrinsics. ``sigma``: noise of
-    a corner's coordinate by camera, px. ``free``: which parameters change; by default all but the time offsets.
-    ``loss``: robust loss of |r|^2 / sigma^2; least squares by default. ``steps``: how many steps are taken at most.
-    ``tick``: called before every step; an exception that it raises ends the adjustment.
+    ``state``: start of the search. ``observed``: the corners of all views. ``prior``: prior of the intrinsics.
+    ``sigma``: noise of a corner's coordinate by camera, px. ``free``: which parameters change; by default all but the
+    time offsets. ``loss``: robust loss of |r|^2 / sigma^2; least squares by default. ``steps``: largest number of
+    steps. ``tick``: called before every step; an exception that it raises ends the adjustment.
     """
     problem = bundle_problem(state, CornerTerm(observed, sigma, loss or LeastSquares()), prior, free or Free())
     limits = Limits(steps=steps, tolerance=TOLERANCE, tries=6, first_damping=1e-4)

@@ -1,11 +1,11 @@
-"""Computes errors of cameras without the part that no image can show: the free choice of the world frame.
+"""Computes errors of cameras without the part that no image can determine: the arbitrary choice of the world frame.
 
-A rig moved as a whole is the same rig. So two calibrations are compared, and covariances stated, in the gauge in which
-the images of the subject's region move least. Let ``W`` (6 C x 6 C, block-diagonal) be the sum of ``J^T J`` over points
-on a sphere of the subject's size, with ``J`` the derivative of a pixel by a left perturbation of camera_from_world, and
-let ``A`` (6 C x 6) be the motions of all cameras under a motion of the world. Then the projection is ``S = I - A (A^T W
-A)^-1 A^T W`` (an S-transformation: W. Baarda, 1973; Triggs et al., "Bundle Adjustment: A Modern Synthesis", section
-9).
+A rig that moves as a whole stays the same rig. So two calibrations are compared, and covariances stated, in the gauge
+in which the images of the subject's region move least. Let ``W`` (6 C x 6 C, block-diagonal) be the sum of ``J^T J``
+over points on a sphere of the subject's size, with ``J`` the derivative of a pixel by a left perturbation of
+camera_from_world, and let ``A`` (6 C x 6) be the motions of all cameras under a motion of the world. Then the
+projection is ``S = I - A (A^T W A)^-1 A^T W`` (an S-transformation: W. Baarda, 1973; Triggs et al., "Bundle Adjustment:
+A Modern Synthesis", section 9).
 
 The world frame of a calibrated rig has x to the subject's left, y up, z towards the front camera. Up is the direction
 perpendicular to the cameras' image rows: a camera that is not rolled has a horizontal x axis at any elevation. The
@@ -36,7 +36,7 @@ def subject_points(rig: Rig, radius_mm: float = SUBJECT_RADIUS_MM, count: int = 
 
 
 def moved(camera: Camera, step: Float[np.ndarray, " 6"]) -> Camera:
-    """Returns the camera with its pose perturbed from the left by a rotation (rad) and a translation (mm): x' = R(w) x
+    """Returns the camera after a left perturbation of its pose by a rotation (rad) and a translation (mm): x' = R(w) x
     + v in the camera's frame."""
     motion = RigidTransform(rotation_from_vector(step[:3]), step[3:])
     return replace(camera, camera_from_world=motion @ camera.camera_from_world)
@@ -78,7 +78,7 @@ def world_motions(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p g"]:
 
 
 def gauge_projection(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p p"]:
-    """Returns the projection S that the module's docstring defines. With ``scale`` the world's scale is free too."""
+    """Returns the projection S, defined in the module's docstring. With ``scale`` the world's scale is free too."""
     weights = _block_diagonal(image_metric(rig, subject_points(rig)))
     motions = world_motions(rig, scale=scale)
     normal = motions.T @ weights @ motions
@@ -93,8 +93,8 @@ def _block_diagonal(blocks: Float[np.ndarray, "c 6 6"]) -> Float[np.ndarray, "p 
 
 
 def align_world(rig: Rig, reference: Rig, *, scale: bool = False) -> Rig:
-    """Returns ``rig`` with its world moved, and with ``scale`` also scaled, so that its cameras see the subject's
-    region as nearly as possible where those of ``reference`` see it.
+    """Returns ``rig`` with its world moved (and scaled, with ``scale``) so that its images of the subject's region are
+    as near as possible to those of ``reference``.
 
     The distances in the images are minimised, starting from the mean motion between the cameras' frames."""
     points = subject_points(reference)
@@ -107,7 +107,7 @@ def align_world(rig: Rig, reference: Rig, *, scale: bool = False) -> Rig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ImageTerm:
-    """Computes how far from ``target`` (px) the cameras of a rig see the points; what a lens does not show counts 0."""
+    """Computes the distances (px) of the rig's images of the points from ``target``; 0 outside a lens's valid area."""
 
     points: Float[np.ndarray, "n 3"]
     target: Float[np.ndarray, "m 2"]
@@ -146,11 +146,11 @@ def _brought_together(rig: Rig, reference: Rig) -> Rig:
 
 
 def image_distance(rig: Rig, reference: Rig, *, scale: bool = False) -> Float[np.ndarray, " c"]:
-    """Computes for each camera the RMS distance (px) between where ``rig`` and ``reference`` see the subject's region,
-    worlds aligned.
+    """Computes, for each camera, the RMS distance (px) between the images of the subject's region in ``rig`` and in
+    ``reference``, with aligned worlds.
 
     It measures a calibration error by its effect on a fit to silhouettes. Each rig projects with its own lenses, so
-    errors of principal point and rotation that cancel each other do not count."""
+    errors of principal point and rotation that cancel do not count."""
     points = subject_points(reference)
     aligned = align_world(rig, reference, scale=scale)
     misses = [camera.project(points) - reference[camera.name].project(points) for camera in aligned]
@@ -166,8 +166,8 @@ def effective_pose(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Fl
     """Returns the matrix that converts an error of the intrinsics (first nine) and pose of a camera to the pose
     perturbation with the most similar effect on the subject's image.
 
-    A reader who takes the intrinsics as exact must allow the pose that much error: a principal point that is 10 px off,
-    for example, acts almost like a rotation."""
+    Whoever treats the intrinsics as exact must allow the pose that error: a principal point that is 10 px off, for
+    example, acts almost like a rotation."""
     by_pose = pose_jacobian(camera, points_world).reshape(-1, 6)
     by_lens = intrinsics_jacobian(camera, points_world).reshape(-1, 9)
     good = np.isfinite(by_pose).all(axis=1) & np.isfinite(by_lens).all(axis=1)
@@ -176,9 +176,9 @@ def effective_pose(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Fl
 
 
 def image_sigma(rig: Rig, covariance: Float[np.ndarray, "c 15 c 15"]) -> Float[np.ndarray, " c"]:
-    """Computes for each camera the standard deviation (px, 2D) of where it sees the subject's region, worlds aligned,
-    under the joint covariance of all intrinsics (first nine) and poses. It estimates
-    ``image_distance(rig, true rig)``."""
+    """Computes, for each camera, the standard deviation (px, 2D) of its image of the subject's region, with aligned
+    worlds, under the joint covariance of all intrinsics (first nine) and poses. It estimates ``image_distance(rig, true
+    rig)``."""
     points, count = subject_points(rig), len(rig)
     by_pose = [pose_jacobian(camera, points).reshape(-1, 6) for camera in rig]
     by_lens = [intrinsics_jacobian(camera, points).reshape(-1, 9) for camera in rig]
@@ -196,7 +196,7 @@ def image_sigma(rig: Rig, covariance: Float[np.ndarray, "c 15 c 15"]) -> Float[n
 
 
 def up_direction(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """Returns the unit vector that points up, in the rig's present frame."""
+    """Returns the upward unit vector, in the rig's present frame."""
     rights = np.stack([camera.camera_from_world.rotation[0] for camera in rig])
     ups = -np.stack([camera.camera_from_world.rotation[1] for camera in rig])
     values, vectors = np.linalg.eigh(rights.T @ rights)

@@ -1,9 +1,9 @@
-"""Estimates each camera's lens from its own views of the board, as a start for the bundle and as a check.
+"""Estimates each camera's lens from its own views of the board, as the bundle's start and as a check.
 
-Cameras are not compared, so shots need not be synchronised. The focal length starts from a scan of candidates; for each
-the board's pose follows by IPPE (T. Collins, A. Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 2014). The
-bundle of ``bundle.py`` over the one camera completes the estimate, and its covariance tells whether the views
-suffice."""
+Cameras are treated separately, so shots need not be synchronised. The focal length starts from a scan of candidates;
+for each the board's pose follows by IPPE (T. Collins, A. Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV
+2014). The bundle of ``bundle.py`` over the one camera completes the estimate, and its covariance tells whether the
+views suffice."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

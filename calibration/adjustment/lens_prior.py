@@ -1,6 +1,6 @@
-"""Defines Gaussian priors of the intrinsics: what is known of lenses independently of the corners.
+"""Defines Gaussian priors of the intrinsics: knowledge about lenses that is independent of the corners.
 
-The default priors are weak; they only hold parameters that the views do not determine."""
+The default priors are weak; they only constrain parameters that the views do not determine."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,10 +1,10 @@
-"""Estimates where cameras and boards stand (the pose graph), as a start for the bundle adjustment.
+"""Estimates the poses of cameras and boards (the pose graph), as a start for the bundle adjustment.
 
 Each view gives camera_from_board with two ambiguities: the image of a plane allows two poses (IPPE), and a checkerboard
 may be turned (``Board.turns``). Two cameras that share shots resolve both, since their relative pose must be the same
 in every shot: each shot's candidates are tested on all other shots, and the one with the most support wins. Pairs are
-joined by a maximum spanning tree. Ambiguities that remain are refused: a tie between turns, cameras that share no shot,
-and a camera whose views agree with no other's (its pictures are mirrored, or its shots are named wrongly)."""
+joined by a maximum spanning tree. Remaining ambiguities are refused: a tie between turns, cameras without common shots,
+and a camera whose views agree with no other camera's (its pictures are mirrored, or its shots are misnamed)."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -31,8 +31,8 @@ SAME_DEG = 15.0  # candidates whose rotations differ by less are one hypothesis
 
 
 class PoseGraphError(EigenheadError):
-    """Reports that the views do not determine how the cameras stand to each other. ``reasons`` are messages that name
-    the cameras."""
+    """Reports that the views do not determine the relative poses of the cameras. ``reasons`` are messages that name the
+    cameras."""
 
     def __init__(self, reasons: Iterable[Message]) -> None:
         self.reasons = tuple(reasons)
@@ -41,8 +41,8 @@ class PoseGraphError(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Holds the possible camera_from_board of one view: each pose with each turn of the board. ``turns`` are indices
-    into ``Board.turns()``."""
+    """Holds the possible camera_from_board of one view: each pose combined with each turn of the board. ``turns`` are
+    indices into ``Board.turns()``."""
 
     poses: tuple[RigidTransform, ...]
     turns: tuple[int, ...]
@@ -52,8 +52,8 @@ class Candidates:
 class Edge:
     """Holds the relative pose of two cameras with common shots.
 
-    ``a_from_b`` is the best candidate, ``support`` the number of the ``shared`` shots in which it holds; ``ambiguous``
-    tells that another pose holds equally well."""
+    ``a_from_b`` is the best candidate, ``support`` the number of the ``shared`` shots in which it is correct;
+    ``ambiguous`` tells that another pose has equal support."""
 
     a: str
     b: str
@@ -64,13 +64,13 @@ class Edge:
 
     @property
     def consistent(self) -> bool:
-        """Tells whether the relative pose holds in at least half of the shared shots."""
+        """Tells whether the relative pose is correct in at least half of the shared shots."""
         return self.support >= max(1, self.shared / 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Graph:
-    """Holds all cameras and boards in the frame of ``names[0]``. The boards' turns are applied to ``views`` already;
+    """Holds all cameras and boards in the frame of ``names[0]``. The boards' turns are already applied to ``views``;
     ``strays`` are views that fit in no turn."""
 
     names: tuple[str, ...]
@@ -123,7 +123,7 @@ def _candidates(view: View, lens: Lens, board: Board) -> Candidates:
 
 
 def _turn_motions(board: Board) -> list[RigidTransform]:
-    """Returns the motions of the board that take corner i to corner turn[i], one for each turn."""
+    """Returns the motions of the board that move corner i to corner turn[i], one for each turn."""
     corners = board.corners()
     return [rigid_fit(corners, corners[turn]) for turn in board.turns()]
 
@@ -156,8 +156,8 @@ def _disagreement(
     of_b: Sequence[Sequence[RigidTransform]],
     board: Board,
 ) -> Float[np.ndarray, " s"]:
-    """Returns for each shot the smallest distance (squares) between the board as a sees it and as b sees it, in the
-    frame of a."""
+    """Returns, for each shot, the smallest distance (squares) between the board in camera a's view and in camera b's,
+    in the frame of a."""
     corners = _outline(board)
     values = []
     for poses_a, poses_b in zip(of_a, of_b, strict=True):
@@ -170,7 +170,7 @@ def _disagreement(
 def _squares_apart(
     corners_world: Float[np.ndarray, "*k n 3"], put: Float[np.ndarray, "*j n 3"], board: Board
 ) -> Float[np.ndarray, "*b"]:
-    """Returns the distance in the image, in sides of a square as the camera sees it; large where ``put`` is behind the
+    """Returns the distance in the image, in sides of a square of that view; large where ``put`` is behind the
     camera."""
     depth = corners_world[..., 2:]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -233,7 +233,7 @@ def _fits(
     corners: np.ndarray,
     board: Board,
 ) -> list[tuple[float, int]]:
-    """Returns for each view the distance (squares) of the board so placed in its best turn, and that turn."""
+    """Returns, for each view, the distance (squares) of the board at this pose in its best turn, and that turn."""
     table = []
     for view in views:
         option = options[view.camera, view.shot]
@@ -310,7 +310,7 @@ def _fits_when_mirrored(
 
 
 def _mirror(detection: Found, board: Board, width: int) -> Found:
-    """Returns the detection in the picture mirrored left to right, with its corners in an order that keeps the board's
+    """Returns the detection in the picture mirrored left to right, with its corners ordered according to the board's
     colours."""
     columns, rows = board.grid
     index = np.arange(board.corner_count).reshape(rows, columns)

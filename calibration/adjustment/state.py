@@ -1,6 +1,6 @@
-"""Defines what a bundle adjustment estimates (the state) and what it observes, and projects the corners of a state.
+"""Defines the unknowns of a bundle adjustment (the state) and its observations, and projects the corners of a state.
 
-Poses are perturbed from the left, as for ``Camera.covariance``."""
+Poses are perturbed from the left, as in ``Camera.covariance``."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,8 +21,8 @@ DEPTH_LEAST_MM = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Holds the detected corners of all views, sorted by view. ``camera`` and ``shot`` are, for each view, indices into
-    the state; ``starts`` are the first corner of each view, and the end."""
+    """Holds the detected corners of all views, sorted by view. ``camera`` and ``shot`` are each view's indices into the
+    state; ``starts`` are the first corner of each view, and the end."""
 
     camera: Int[np.ndarray, " v"]
     shot: Int[np.ndarray, " v"]
@@ -83,7 +83,7 @@ def intrinsics_of(values: Float[np.ndarray, " 9"], size: tuple[int, int]) -> Int
 
 
 def camera_of(state: BundleState, index: int, name: str, size: tuple[int, int]) -> Camera:
-    """Returns the camera at ``index`` as the adjustment has it, camera_from_world in mm."""
+    """Returns the camera at ``index`` of a state, camera_from_world in mm."""
     return Camera(name, intrinsics_of(state.intrinsics[index], size), state.camera_pose(index))
 
 
@@ -143,5 +143,5 @@ def residuals(state: BundleState, observed: Observations) -> Float[np.ndarray, "
 
 
 def rms(misses: Float[np.ndarray, "n 2"]) -> float:
-    """Returns the root mean square length of misses (px); 0 for none."""
+    """Returns the root mean square length of residuals (px); 0 if there are none."""
     return float(np.sqrt((misses**2).sum(axis=1).mean())) if len(misses) else 0.0

@@ -1,7 +1,7 @@
-"""Estimates whether the cameras were synchronous: one time offset a camera, by how residuals follow the board's motion.
+"""Estimates whether the cameras were synchronous: a time offset for each, from how residuals follow the board's motion.
 
 The board's velocity in a shot is the central difference of its poses in the shots before and after. So offsets are in
-units of the time between shots, and are meaningful only if the shots are frames of one recording. They are estimated
+units of the time between shots; they are meaningful only if the shots are frames of one recording. They are estimated
 jointly with all other parameters; the first camera's offset is zero."""
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Describes the calibration board: what is printed, where its corners lie, and how a camera sees it.
+"""Describes the calibration board: its print, the positions of its corners, and its picture in a camera.
 
 Board frame: origin at the outer corner of the first square, x along a row of squares, y down its columns, z *into* the
 board (away from the viewer), so that a camera in front of the board sees x to the right when y points down. The frame
@@ -86,7 +86,7 @@ class Board:
 
     def turns(self) -> list[Int[np.ndarray, " _"]]:
         """Returns the orders of the corners that no picture can distinguish: for each rotation of the board that leaves
-        its colours unchanged, ``order[i]`` is the corner that then looks like corner i. A ChArUco board has only one
+        its colours unchanged, ``order[i]`` is the corner that then appears at corner i. A ChArUco board has only one
         order, because its markers differ."""
         index = np.arange(self.corner_count).reshape(self.rows - 1, self.columns - 1)
         if self.kind == "charuco":
@@ -102,8 +102,8 @@ class Board:
 
     @property
     def is_chiral(self) -> bool:
-        """Tells whether a picture of the pattern differs from every picture of its mirror image; only then do pictures
-        show that a camera is mirrored. A checkerboard that is square or has an odd side equals its mirror image."""
+        """Tells whether a picture of the pattern differs from every picture of its mirror image; only such a board
+        reveals a mirrored camera. A checkerboard that is square or has an odd side equals its mirror image."""
         if self.kind == "charuco":
             return True
         return self.columns % 2 == 0 and self.rows % 2 == 0 and self.columns != self.rows
@@ -134,7 +134,7 @@ def read_board(path: Path) -> Board:
 
 
 def board_from_document(document: Mapping[str, Any], subject: str = "board.toml") -> Board:
-    """Returns the board that a decoded ``board.toml`` describes. Raises InputError that names every fault."""
+    """Returns the board described by a decoded ``board.toml``. Raises InputError that names every fault."""
     known = set(Board.__dataclass_fields__)
     strange = [key for key in document if key not in known]
     faults = [compose("board-key-unknown", key=f"{key!r}", known=sorted(known)) for key in strange]
@@ -202,7 +202,7 @@ def _side(board: Board, key: str) -> int:
 
 
 def write_board_pdf(board: Board, path: Path) -> tuple[float, float]:
-    """Writes the board as a PDF at true scale, with a ruler, on the smallest paper that holds it: returned, mm."""
+    """Writes the board as a PDF at true scale, with a ruler, on the smallest paper that fits; returns its size (mm)."""
     width, height = board.columns * board.square_mm, board.rows * board.square_mm
     page = _paper(width, height)
     pdf = FPDF(unit="mm", format=page)
@@ -261,7 +261,7 @@ def _marker(board: Board, number: int, x: float, y: float) -> list[tuple[float, 
 
 
 def _runs(cells: Bool[np.ndarray, "n n"]) -> list[tuple[int, int, int]]:
-    """Returns (line, first, one past the last) of every run of True."""
+    """Returns (line, first, one past the last) for every run of True."""
     padded = np.pad(cells, ((0, 0), (1, 1))).astype(np.int8)
     steps = np.diff(padded, axis=1)
     starts, ends = np.argwhere(steps == 1), np.argwhere(steps == -1)
@@ -290,8 +290,8 @@ def _draw_foot(pdf: FPDF, board: Board, page: tuple[float, float]) -> None:
 
 
 def board_poses(board: Board, count: int, rng: np.random.Generator) -> list[RigidTransform]:
-    """Draws world_from_board (mm) of a board that somebody turns from one side of the rig to the other, tilted and
-    rolled, about the world's origin."""
+    """Draws world_from_board (mm) of a board that a person turns from one side of the rig to the other, tilted and
+    rolled, around the world's origin."""
     poses = []
     for azimuth in np.radians(FAN_DEG * ((np.arange(count) + 0.5) / count - 0.5)):
         # The board's z points away from the viewer: for a viewer on +z of the world, x right is world x, y down is -y.
@@ -306,7 +306,7 @@ def photograph_board(
     board: Board, world_from_board: RigidTransform, camera: Camera, rng: np.random.Generator, *, blur_px: float = 0.6
 ) -> UInt8[np.ndarray, "h w"]:
     """Simulates a picture of the board before a plain wall, with noise. A camera behind the board sees white paper.
-    OpenCV draws the pattern, not the code that prints it."""
+    OpenCV draws the pattern, so that the program's own drawing is not used to test itself."""
     from scipy.interpolate import RectBivariateSpline
 
     k, side = camera.intrinsics, 2  # samples of a pixel's side

@@ -1,12 +1,11 @@
-"""Finds the corners of a board in one grey picture: which they are, and where, to a fraction of a pixel.
+"""Finds the corners of a board in one grey picture: their numbers, and their positions to a fraction of a pixel.
 
 Checkerboards: ``findChessboardCornersSB`` (A. Duda, U. Frese, "Accurate Detection and Localization of Checkerboard
 Corners for Calibration", BMVC 2018), first plain, then exhaustive; if it finds nothing, the classic detector with
 ``cornerSubPix``. ChArUco: ``CharucoDetector``. Every result is checked. The corners must be the image of a flat grid
-seen from its front, a checkerboard must end where the described one ends, and its corners are put into the board's
-order by handedness and colour. Rotations that colours cannot determine (``Board.turns``) are left to the pose graph,
-which compares cameras. CALIB_CB_LARGER would report a larger board as such but, on real pictures, adds rows that are
-not there.
+seen from its front. A checkerboard must have the described size, and its corners are ordered by handedness and colour.
+The pose graph, which compares cameras, decides between rotations that colours cannot distinguish (``Board.turns``).
+CALIB_CB_LARGER would detect a larger board but, on real pictures, adds rows that do not exist.
 """
 
 from dataclasses import dataclass
@@ -59,8 +58,8 @@ def is_flat_grid(board: Board, ids: Int[np.ndarray, " n"], corners: Float[np.nda
 
 def rise(grey: UInt8[np.ndarray, "h w"], board: Board, found: Corners) -> float:
     """Computes the width (px) of the board's edges, from 10 to 90 % of their height, in the blurrier of the board's two
-    directions. Infinite if no edge rises within the space that the pattern leaves (half a square, or the border around
-    a marker)."""
+    directions. It is infinite if no edge rises within the available space (half a square, or the border around a
+    marker)."""
     ids, corners = found
     flat = board.corners()[ids, :2] / board.square_mm
     homography = _homography(flat, corners)
@@ -126,7 +125,7 @@ def in_board_order(grey: np.ndarray, corners: np.ndarray, board: Board) -> Float
 
 
 def _contrast(grey: np.ndarray, grid: Float[np.ndarray, "rows columns 2"]) -> float:
-    """Returns the mean grey of the board's white squares less that of the black ones."""
+    """Returns the mean grey of the board's white squares minus that of the black ones."""
     middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     row, column = np.indices(middles.shape[:2])
     black = (row + column) % 2 == 0  # the square between the first four inner corners is (1, 1): black

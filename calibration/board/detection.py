@@ -1,10 +1,10 @@
 """Finds the board in many pictures, in parallel, and caches the results by the pictures' content. ``corners`` examines
-one picture. If the described board is not found, its markers tell which board the pictures show.
+one picture. If the described board is not found, its markers tell which board is in the pictures.
 
-A ChArUco board's markers are numbered row by row over its white squares. The description may be wrong in several ways:
+A ChArUco board's markers are numbered row by row over its white squares. The description may be wrong in several ways.
 OpenCV before 4.6 and calib.io begin an even number of rows with a white square; the second board of a pair begins with
-another number; squares may be miscounted, the marker's side mismeasured, the dictionary another. In each case a
-homography maps the markers' centres onto another layout, which shows the cause. A marker's side is measured in units of
+another number; squares may be miscounted, the marker's side mismeasured, or the dictionary wrong. In each case a
+homography maps the markers' centres to another layout, which reveals the cause. A marker's side is measured in units of
 the squares.
 """
 
@@ -45,7 +45,7 @@ RATIO_OFF = 0.05  # of the square, between the told and the measured side of mar
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Holds what one camera saw of the board in one shot."""
+    """Holds one camera's corners of the board in one shot."""
 
     camera: str
     shot: str
@@ -54,7 +54,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class PictureNote:
-    """Holds why the board was not found in a picture of a camera."""
+    """Holds the reason why the board was not found in a picture of a camera."""
 
     camera: str
     picture: str
@@ -67,7 +67,7 @@ class PictureNote:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
-    """Holds where the board was found in all pictures.
+    """Holds the detections of the board in all pictures.
 
     Attributes:
         board: as it is, perhaps corrected.
@@ -92,14 +92,14 @@ class Detections:
 
 
 class WrongBoard(EigenheadError):
-    """Reports that the pictures show another board than the one that was described."""
+    """Reports that the pictures show a board other than the described one."""
 
     def __init__(self, reasons: Iterable[Message]) -> None:
         super().__init__(compose("wrong-board", notes=tuple(reasons)))
 
 
 def reasons_of(notes: Iterable[PictureNote]) -> list[Message]:
-    """Returns each reason once, with the pictures that it holds for."""
+    """Returns each reason once, with its pictures."""
     pictures: dict[Message, list[str]] = {}
     for note in notes:
         pictures.setdefault(note.reason, []).append(f"{note.camera}/{note.picture}")
@@ -124,9 +124,9 @@ def detect_folder(
     report: Progress = discard_progress,
 ) -> Detections:
     """Finds the board in every picture of ``folder``. A ChArUco board is also found if its first square is white, or if
-    its markers begin at another number than described.
+    its markers begin at a number other than described.
 
-    ``cache`` is a folder that keeps results by the pictures' SHA-256; ``together``: cameras must share shots. Raises
+    ``cache`` is a folder for results by the pictures' SHA-256; ``together``: cameras must share shots. Raises
     InputError for damaged input, and WrongBoard if no picture shows the board and some show another.
     """
     pictures = list_pictures(folder, together=together)
@@ -150,8 +150,8 @@ def _with_measured_pattern(
     workers: int,
     report: Progress,
 ) -> Detections:
-    """Returns the board with the pattern that its markers have, if it is not found as described. Raises WrongBoard
-    where its markers are not as wide as described: their edges then pass for blur."""
+    """Returns the board with its pattern read from its markers, if it is not found as described. Raises WrongBoard if
+    its markers are not as wide as described, because their edges would then seem blurred."""
     board = detections.board
     found_share = len(detections.views) / sum(map(len, pictures.values()))
     greys = _sample(pictures, MEASURED)
@@ -277,7 +277,7 @@ def _from_cache(path: Path) -> Found | None:
 def _explain_missing(
     pictures: dict[str, dict[str, Path]], sizes: dict[str, tuple[int, int]], views: list[View], board: Board
 ) -> list[PictureNote]:
-    """Returns what the pictures of cameras that never see the board show instead, if that is recognised."""
+    """Returns notes on cameras that never see the board: what their pictures show instead, if it is recognised."""
     notes = []
     cameras_with_board = {view.camera for view in views}
     for camera in (camera for camera in sizes if camera not in cameras_with_board):
@@ -292,8 +292,7 @@ def _explain_missing(
 
 
 def explain(grey: UInt8[np.ndarray, "h w"], board: Board) -> Message | None:
-    """Explains why ``detect`` finds no board in a picture that does show a pattern; None if no pattern is
-    recognised."""
+    """Explains why ``detect`` finds no board in a picture with a pattern; None if no pattern is recognised."""
     inverse = replace(board, inverted=not board.inverted)
     mirrored = detect(np.ascontiguousarray(grey[:, ::-1]), board) is not None
     inverted = detect(grey, inverse) is not None
@@ -331,7 +330,7 @@ def _explain_checkerboard(grey: np.ndarray, board: Board) -> Message | None:
 
 
 def _explain_charuco(grey: np.ndarray, board: Board) -> Message | None:
-    """Explains by a picture's markers why the board was not found."""
+    """Explains, from a picture's markers, why the board was not found."""
     markers = find_markers(grey, board.dictionary)
     mirrored = find_markers(np.ascontiguousarray(grey[:, ::-1]), board.dictionary)
     if len(mirrored) > len(markers) + 2:
@@ -348,8 +347,8 @@ def _explain_charuco(grey: np.ndarray, board: Board) -> Message | None:
 
 
 def explain_markers(pictures: Sequence[Markers], board: Board) -> Message | None:
-    """Explains how the board in the pictures differs from ``board``, from the markers that they show; None if it does
-    not differ."""
+    """Explains how the board in the pictures differs from ``board``, according to their markers; None if it does not
+    differ."""
     layout = find_layout(pictures, board)
     if layout is None:
         if any(map(is_april_grid, pictures)):
@@ -393,7 +392,7 @@ def _detected(grey: np.ndarray, dictionary: cv2.aruco.Dictionary) -> dict[int, F
 
 def find_layout(pictures: Sequence[Markers], board: Board) -> Layout | None:
     """Finds the layout that explains the markers in most pictures, preferring one with as many columns as ``board``;
-    None if no layout does."""
+    None if there is none."""
     shown = [markers for markers in pictures if len(markers) >= MARKERS_LEAST]
     if not shown:
         return None
@@ -408,8 +407,8 @@ def find_layout(pictures: Sequence[Markers], board: Board) -> Layout | None:
 
 
 def _first_markers(shown: Sequence[Markers], board: Board | None) -> list[int]:
-    """Returns possible numbers of the first marker: 0 or the board's own if possible, else the least observed one, or a
-    lower one if the board has more markers than were observed."""
+    """Returns possible numbers of the first marker: 0 or the board's own if possible. Otherwise it is the least
+    observed one, or a lower one if the board has more markers than were observed."""
     least, most = min(min(markers) for markers in shown), max(max(markers) for markers in shown)
     if board is None:
         return [0] if least == 0 else [0, least]
@@ -436,7 +435,7 @@ def _explaining(shown: Sequence[Markers], columns: int, first: int, *, legacy: b
 
 
 def _layout_corners(columns: int, *, legacy: bool) -> Float[np.ndarray, "m 4 2"]:
-    """Returns the markers' corners in squares, as if as wide as a square, for as many rows as any board has."""
+    """Returns the markers' corners in squares, with markers as wide as a square, for as many rows as any board has."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
     rows = min(60, 2 * (len(dictionary.bytesList) // columns))
     board = cv2.aruco.CharucoBoard((columns, rows), 1.0, 0.999, dictionary)
@@ -445,7 +444,8 @@ def _layout_corners(columns: int, *, legacy: bool) -> Float[np.ndarray, "m 4 2"]
 
 
 def _fit(flat: Float[np.ndarray, "m 4 2"], observed: Float[np.ndarray, "m 4 2"]) -> tuple[float, float]:
-    """Returns how far (squares, RMS) centres of markers miss their layout, and a marker's measured side (squares)."""
+    """Returns the RMS distance (squares) of the markers' centres from their layout, and a marker's measured side
+    (squares)."""
     homography, _ = cv2.findHomography(observed.mean(axis=1), flat.mean(axis=1), 0)
     if homography is None or np.linalg.det(homography) <= 0:
         return np.inf, 0.0
@@ -457,8 +457,8 @@ def _fit(flat: Float[np.ndarray, "m 4 2"], observed: Float[np.ndarray, "m 4 2"])
 
 
 def other_dictionary(greys: Iterable[UInt8[np.ndarray, "h w"]], dictionary: str) -> str | None:
-    """Finds another of OpenCV's dictionaries whose markers a picture shows, the smallest that has them; None if there
-    is none."""
+    """Finds another of OpenCV's dictionaries that fits a picture's markers, the smallest of these; None if there is
+    none."""
     names = sorted(
         (name for name in dir(cv2.aruco) if name.startswith("DICT_") and name != dictionary), key=_dictionary_size
     )
@@ -494,8 +494,8 @@ def is_april_grid(markers: Markers) -> bool:
 
 
 def board_of(layout: Layout, board: Board) -> Board | None:
-    """Returns ``board`` with the first marker number and the colour of the first square that ``layout`` has; None if
-    the layout differs in the number of squares or in the size of markers."""
+    """Returns ``board`` with the first marker number and the first square's colour from ``layout``; None if the layout
+    has another number of squares or another size of markers."""
     if layout.columns != board.columns or abs(layout.ratio - board.marker_ratio) > RATIO_OFF:
         return None
     return replace(board, legacy=layout.legacy, first_marker=layout.first_marker)

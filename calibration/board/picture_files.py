@@ -1,7 +1,7 @@
 """Lists the board pictures of a folder by camera and shot: ``IMAGES/<camera>/<shot>.<ext>``.
 
-Many programs save a folder for each shot instead, with a file for each camera in it. That is recognised by the names
-or, if these do not show it, by the pictures: a camera that stands still sees the same room in every shot.
+Many programs instead make a folder for each shot, with a file for each camera in it. The names reveal that or, if they
+do not, the pictures: a camera that does not move sees the same room in every shot.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,7 +53,7 @@ def list_pictures(folder: Path, *, together: bool = True) -> dict[str, dict[str,
 
 
 def _named_apart(cameras: Filed) -> list[Message]:
-    """Returns a fault if no two cameras have a shot of the same name, as where each numbers its own files."""
+    """Returns a fault if no two cameras have a shot of the same name, as when each camera numbers its own files."""
     shots = [shot for files in cameras.values() for shot in files]
     if len(cameras) < 2 or len(set(shots)) < len(shots):
         return []
@@ -62,7 +62,7 @@ def _named_apart(cameras: Filed) -> list[Message]:
 
 
 def filed_by_shot(pictures: Filed) -> bool:
-    """Tells whether the pictures that ``list_pictures`` returned lie in folders of shots instead of cameras."""
+    """Tells whether the pictures from ``list_pictures`` lie in folders of shots instead of cameras."""
     return any(path.parent.name != camera for camera, shots in pictures.items() for path in shots.values())
 
 
@@ -92,7 +92,7 @@ def _names_camera(name: str) -> bool:
 
 
 def _difference(filed: Filed) -> float:
-    """Returns how far apart (levels, in the median) the pictures of a group are; infinite where their sizes differ."""
+    """Returns the median difference (levels) between the pictures of a group; infinite if their sizes differ."""
     differences = []
     for files in _spread([*filed.values()]):
         pictures = [picture for path in _spread([*files.values()]) if (picture := _small(path)) is not None]
@@ -102,7 +102,7 @@ def _difference(filed: Filed) -> float:
 
 
 def _spread(things: Sequence[_Thing]) -> list[_Thing]:
-    """Returns some of the things, from the first to the last."""
+    """Returns a few elements of ``things``, at even steps from first to last."""
     return [things[k] for k in np.unique(np.linspace(0, len(things) - 1, COMPARED).round().astype(int))]
 
 

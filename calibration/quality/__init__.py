@@ -1,1 +1,1 @@
-"""Judges a calibration: which corners are wrong, and what the operator is told."""
+"""Judges a calibration: finds wrong corners, and writes the operator's messages."""

@@ -1,5 +1,5 @@
-"""Checks what a low reprojection error does not imply. A calibration that fails a check is refused, with what to do.
-Shots may pass every check and still determine too little: the verdict says what a calibration lacks.
+"""Checks properties that a low reprojection error does not imply. A calibration that fails a check is refused, with a
+remedy. Shots may pass every check and still determine too little: the verdict states what a calibration lacks.
 
 The verdict's limits were chosen on simulated sessions of 4 to 30 shots (``tests.support.board_sessions``); no command
 prints them.
@@ -38,8 +38,8 @@ LOOSE_PX = 2.0  # a camera whose pose is looser than this, seen at the subject, 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Holds the result of one check. ``passed`` is None if there was nothing to check against; ``advice`` says what to
-    do on failure."""
+    """Holds the result of one check. ``passed`` is None if there was nothing to check against; ``advice`` is the remedy
+    for a failure."""
 
     name: str
     passed: bool | None
@@ -67,7 +67,7 @@ def check_cheirality(state: BundleState, observed: Observations, board: Board) -
 def check_held_out(
     state: BundleState, observed: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"], free: Free
 ) -> Check:
-    """Checks that cameras estimated without every fifth shot fit the boards of those shots as well as others."""
+    """Checks that cameras estimated without every fifth shot fit the boards of those shots as well as the others."""
     several = np.flatnonzero(np.bincount(observed.shot, minlength=len(state.board_rotations)) >= 2)
     held = several[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
     if len(held) < 2 or len(several) - len(held) < 4:
@@ -86,8 +86,8 @@ def check_held_out(
 
 
 def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
-    """Checks the size of the squares against the measured size of the print, and the print's height over width against
-    the value that the cameras measured."""
+    """Checks the size of the squares against the measured size of the print, and the print's ratio of height to width
+    against the cameras' measurement."""
     pairs = [("width", board.measured_width_mm, board.columns), ("height", board.measured_height_mm, board.rows)]
     ratios = {name: value / (count * board.square_mm) for name, value, count in pairs if value is not None}
     off = [
@@ -105,15 +105,15 @@ def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
 
 
 def check_frame(rig: Rig, board: Board) -> Check:
-    """Checks that the frame where the cameras look is as large as a head needs; if ``square_mm`` is in another unit, it
-    is far too small."""
+    """Checks that the visible area at the cameras' common point is large enough for a head; it is far too small if
+    ``square_mm`` is in another unit."""
     frame = frame_mm(rig)
     advice = compose("advice-square-unit", square_mm=board.square_mm)
     return Check("frame", frame >= FRAME_LEAST_MM, compose("frame-shown", frame_mm=frame), advice)
 
 
 def check_determined(rig: Rig, pose_sigma_px: Float[np.ndarray, " c"]) -> Check:
-    """Checks that the uncertainty of every camera's pose, seen at the subject, is below ``LOOSE_PX`` pixels."""
+    """Checks that the uncertainty of every camera's pose, in its image of the subject, is below ``LOOSE_PX`` pixels."""
     loose = [name for name, value in zip(rig.names, pose_sigma_px, strict=True) if not value < LOOSE_PX]
     worst = int(np.argmax(pose_sigma_px))
     detail = compose("poses-determined", px=pose_sigma_px.max(), camera=rig.names[worst])
@@ -165,8 +165,8 @@ def _check_layout(now: Rig, then: Rig) -> Check:
 
 
 def _assignment(now: Rig, then: Rig) -> tuple[list[int], float, float]:
-    """Returns, for each camera, the earlier camera that lies where it does, the mean distance (mm) of this assignment,
-    and that of the assignment by names."""
+    """Returns, for each camera, the earlier camera at its position, the mean distance (mm) of this assignment, and that
+    of the assignment by names."""
     here, there = (np.stack([camera.centre_world for camera in rig]) for rig in (now, then))
     best: tuple[list[int], float] | None = None
     for camera, other in ((c, o) for c in now for o in then):
@@ -241,7 +241,7 @@ class CameraEvidence:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Holds the verdict on a calibration: good, usable or poor. ``missing`` lists what would improve it, the most
+    """Holds the verdict on a calibration: good, usable or poor. ``missing`` lists possible improvements, the most
     urgent first; empty if it is good."""
 
     word: Word
@@ -249,7 +249,7 @@ class Verdict:
 
 
 def judge(cameras: Mapping[str, CameraEvidence], checks: Sequence[Check]) -> Verdict:
-    """Judges a calibration by its weakest camera, and by whether held-out shots could be checked."""
+    """Judges a calibration by its weakest camera, and by whether there were held-out shots to check."""
     severe, mild = [], []
 
     def of(test: str, least: float, most: float) -> list[str]:

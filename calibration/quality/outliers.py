@@ -1,5 +1,5 @@
-"""Finds views and shots that contradict the rest of the rig, and why. Each is named; none is only given less weight in
-silence."""
+"""Finds views and shots that contradict the rest of the rig, and why. Each of them is reported; none is silently given
+less weight."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ MATCH_RATIO = 3.0  # an explanation must bring a view this much closer than it w
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """Holds a view that was left out, and the reason; ``camera`` None stands for the whole shot."""
+    """Holds an excluded view and the reason; ``camera`` None means the whole shot."""
 
     shot: str
     camera: str | None
@@ -57,7 +57,7 @@ def drop_blurred(detections: Detections) -> tuple[Detections, list[Dropped]]:
 
 
 def square_side_px(view: View, board: Board) -> float:
-    """Returns the median side (px) of the board's squares in a view; 0 if no two neighbouring corners are seen."""
+    """Returns the median side (px) of the board's squares in a view; 0 without two neighbouring corners."""
     columns = board.grid[0]
     corner_of = dict(zip(view.found.ids.tolist(), view.found.corners, strict=True))
     sides = [
@@ -93,8 +93,8 @@ def view_rms(state: BundleState, observed: Observations) -> Float[np.ndarray, " 
 
 
 def bad_views(state: BundleState, observed: Observations) -> np.ndarray:
-    """Tells which views the joint solution does not fit. A robust solution may fit one camera of a shot and let the
-    others fail; ``explain_shot`` finds out what is wrong with such a shot."""
+    """Tells which views the joint solution does not fit. A robust solution may fit one camera of a shot at the others'
+    expense; ``explain_shot`` finds the fault of such a shot."""
     rms = view_rms(state, observed)
     return rms > max(VIEW_RATIO * float(np.median(rms)), VIEW_LEAST_PX)
 
@@ -110,7 +110,7 @@ def explain_shot(
     boards: dict[str, RigidTransform],
     noise_px: float,
 ) -> list[Dropped]:
-    """Decides which views of a shot to leave out, and why, given the ``bad`` views that contradict the rig."""
+    """Decides which views of a shot to exclude, and why; the ``bad`` views contradict the rig."""
     cameras = {
         name: Camera(name, intrinsics_of(state.intrinsics[i], detections.sizes[name]), state.camera_pose(i))
         for i, name in enumerate(names)
@@ -130,8 +130,8 @@ def explain_shot(
 def _why(
     view: View, cameras: dict[str, Camera], detections: Detections, boards: dict[str, RigidTransform], noise_px: float
 ) -> Message:
-    """Returns the reason why a view contradicts the rig: its picture belongs to another camera or another shot, or
-    neither is found."""
+    """Returns why a view contradicts the rig: its picture belongs to another camera or another shot, or the cause is
+    unknown."""
     limit = max(10 * noise_px, 3.0)
     for name, camera in cameras.items():
         alike = name != view.camera and detections.sizes[name] == detections.sizes[view.camera]

@@ -3,11 +3,11 @@ adjustment.
 
 With U, V and W the blocks of the normal equations of cameras, of points, and between both, eliminating the points
 leaves ``S = U - W V^-1 W^T`` (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 1999, section 6.1). It is
-singular along the seven motions of the world (rotation, translation, scale). The covariance is therefore given in the
-subject's gauge of ``calibration.adjustment.gauge``, in which these are no error of a camera. Parameters of a lens that
-were not estimated (with few views the principal point, taken to be the picture's middle; with a lens for each camera
-also its distortion) have an assumed spread that is propagated ("consider" covariance: Tapley et al., Statistical Orbit
-Determination, 2004, 6.3).
+singular along the seven motions of the world (rotation, translation, scale). The covariance is therefore stated in the
+subject's gauge of ``calibration.adjustment.gauge``, where these motions are no error of a camera. Lens parameters that
+were not estimated get an assumed standard deviation, which is propagated ("consider" covariance: Tapley et al.,
+Statistical Orbit Determination, 2004, 6.3). With few views that is the principal point (the picture's middle); with a
+lens for each camera it is also the distortion.
 """
 
 from dataclasses import dataclass, replace
@@ -40,7 +40,7 @@ OUTLIER_SIGMAS = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """Holds how precisely the cameras of a solved structure are known.
+    """Holds the uncertainty of the cameras of a solved structure.
 
     Attributes:
         blocks: covariance of each camera's pose as a left perturbation (rad, mm), the lens's uncertainty included.
@@ -100,13 +100,13 @@ def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
 
 
 def reduced_camera_system(structure: Structure, noise_px: float) -> Float[np.ndarray, "p p"]:
-    """Returns the matrix ``S`` of the module's docstring, for keypoints with a noise of ``noise_px`` along each axis.
+    """Returns the matrix ``S`` of the module's docstring, for keypoints with noise ``noise_px`` along each axis.
     Outliers are left out."""
     return _reduced(structure, noise_px)[0]
 
 
 def lens_misfit(structure: Structure, noise_px: float) -> float:
-    """Computes how much better the points would be explained if each camera had its own lens: about 1 if one lens fits
+    """Tests how much better the points would be explained if each camera had its own lens: about 1 if one lens fits
     all, more if the lenses differ.
 
     It is a score test (Rao 1948): the decrease of chi-squared in one Gauss-Newton step, divided by the number of added
@@ -161,7 +161,7 @@ def _reduced(structure: Structure, noise_px: float) -> tuple[Float[np.ndarray, "
 
 
 def _inverse(matrix: Float[np.ndarray, "p p"], motions: Float[np.ndarray, "p 7"]) -> Float[np.ndarray, "p p"]:
-    """Returns the inverse of the reduced system where ``motions``, its null space, are held."""
+    """Returns the inverse of the reduced system with its null space, ``motions``, held fixed."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     held = np.linalg.qr(motions / scale[:, None])[0]
     inverse = np.linalg.inv(matrix * np.outer(scale, scale) + held @ held.T) - held @ held.T
@@ -171,7 +171,7 @@ def _inverse(matrix: Float[np.ndarray, "p p"], motions: Float[np.ndarray, "p 7"]
 def _per_camera(
     covariance: Float[np.ndarray, "p p"], places: Int[np.ndarray, "c 11"]
 ) -> Float[np.ndarray, "c 15 c 15"]:
-    """Returns the same by each camera's nine lens values and pose."""
+    """Returns the covariance by each camera's nine lens values and pose."""
     count = len(places)
     expand = np.zeros((count, 15, len(covariance)))
     for index in range(count):

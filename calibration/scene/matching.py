@@ -1,9 +1,9 @@
-"""Finds which keypoints of two photographs are one point of the scene: SIFT on the processor, by pycolmap.
+"""Finds the keypoints of two photographs that show the same point of the scene: SIFT on the CPU, by pycolmap.
 
-Shots of one rig have its cameras in common but not the scene, since heads turn from shot to shot. So pictures are
-matched within each shot only. The keypoints of all shots of a camera are then put into a single image of it, so that
-the data alone say that the cameras stand still, and the solver needs no constraint. Everything runs in one thread from
-one seed; with more threads, the order of RANSAC's draws, and so the result, would depend on the scheduler.
+Shots of one rig share its cameras but not the scene, because heads move between shots. So pictures are matched only
+within each shot. The keypoints of all shots of a camera are then merged into a single image. The data thus state that
+the cameras do not move, and the solver needs no constraint. Everything runs in one thread with one seed; with more
+threads, the order of RANSAC's draws, and so the result, would depend on the scheduler.
 """
 
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ SIDE_MOST_PX = 2400  # features are found in pictures no larger; they are placed
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """Holds the matches between photographs, in COLMAP databases that have one image for each camera.
+    """Holds the matches between photographs, in COLMAP databases with one image for each camera.
 
     Attributes:
         databases: the first has one lens for all images if these have one size; the last has a lens for each image,
@@ -81,7 +81,7 @@ def match_photographs(photographs: Photographs, scratch: Path, *, one_lens: bool
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Silences COLMAP's log while the block runs; hardly one of its lines is meant for a user."""
+    """Silences COLMAP's log in the block; hardly any of its lines are for users."""
     import pycolmap
 
     before = pycolmap.logging.minloglevel
@@ -93,7 +93,7 @@ def quiet() -> Iterator[None]:
 
 
 def _write_grey(photographs: Photographs, folder: Path) -> dict[str, tuple[int, int]]:
-    """Writes pictures as this project reads them, not as COLMAP would; returns width and height."""
+    """Writes pictures as this project decodes them, not as COLMAP would; returns width and height."""
 
     def one(job: tuple[str, str, Path]) -> tuple[tuple[int, int], Message | None]:
         camera, shot, path = job
@@ -170,7 +170,7 @@ def _pairs_file(path: Path, pairs: Iterator[tuple[str, str]]) -> Path:
 
 
 def _first(photographs: Photographs) -> list[str]:
-    """Returns the picture that stands for each camera among COLMAP's images."""
+    """Returns the picture that represents each camera among COLMAP's images."""
     return [f"{camera}/{next(iter(shots))}.png" for camera, shots in photographs.files.items()]
 
 

@@ -1,7 +1,7 @@
 """Lists the photographs of a folder by camera and shot.
 
-``PHOTOS/<camera>.<ext>``, or ``PHOTOS/<camera>/<shot>.<ext>`` where the same name of a shot means the same moment; both
-also inside ``PHOTOS/images/``. A camera's name becomes that of its file in a capture, so it must be a valid one.
+``PHOTOS/<camera>.<ext>``, or ``PHOTOS/<camera>/<shot>.<ext>``, where equal shot names mean the same moment; both also
+inside ``PHOTOS/images/``. A camera's name becomes that of its file in a capture, so it must be a valid one.
 """
 
 from collections.abc import Mapping
@@ -70,8 +70,8 @@ def find_photographs(folder: Path) -> Photographs:
 
 
 def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bool[np.ndarray, "_ _"]]:
-    """Reads the masks (True = subject) in masks/ beside the photographs of a single shot, by camera. Raises InputError
-    for a mask that is damaged or of another size than its photograph."""
+    """Reads the masks (True = subject) in the folder masks/ of a single shot's photographs, by camera. Raises
+    InputError for a mask that is damaged or of another size than its photograph."""
     root = capture_root(folder)
     if photographs.shots != (ONE_SHOT,) or not entry(root, "masks").is_dir():
         return {}

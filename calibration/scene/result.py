@@ -1,5 +1,5 @@
-"""Defines the result of a calibration from a scene: the rig with its covariances, its scale, and excluded views; and
-the verdict on it, by the same limits as for a board; and writes its report, one self-contained HTML page."""
+"""Defines the result of a calibration from a scene: the rig with its covariances, its scale, and excluded views. Also
+gives the verdict on it, with the same limits as for a board, and writes its report, one self-contained HTML page."""
 
 from dataclasses import dataclass
 from html import escape
@@ -46,7 +46,7 @@ class SceneCalibration:
     refinement: Message | None = None
 
     def absences(self) -> list[Message]:
-        """Returns a message for every view that could not be joined to the others: which it is, and why."""
+        """Returns a message for every view that could not be joined to the others, with the reason."""
         return [compose("located", where=name, fault=why) for name, why in self.left_out.items()]
 
     def figures(self) -> dict[str, Any]:
@@ -94,8 +94,8 @@ class SceneCalibration:
 
 
 def judge_scene(calibration: SceneCalibration) -> Verdict:
-    """Judges a calibration by its weakest camera. An assumed scale, or a view that did not join, makes it usable at
-    best."""
+    """Judges a calibration by its weakest camera. With an assumed scale, or a view that did not join, the verdict is
+    usable at best."""
     sigma = dict(zip(calibration.rig.names, calibration.uncertainty.pose_sigma_px, strict=True))
     poor = [name for name, px in sigma.items() if px > POSE_POOR_PX]
     loose = [name for name, px in sigma.items() if POSE_GOOD_PX < px <= POSE_POOR_PX]

@@ -1,13 +1,13 @@
-"""Finds how many millimetres the unit of a scene is: from a known length in it, or else from the usual size of heads.
+"""Determines the unit of a scene in millimetres: from a known length in it, otherwise from the usual size of heads.
 
-Enters: a structure in any unit. Leaves: the factor, with its relative standard deviation and where it comes from. The
-known lengths are those of ``scale.json``. Without one, the face in the photographs is assumed to be as large as a mean
-adult's. Where no two views show one, the points around the point that the cameras see are assumed to be a head, as far
-from their middle as the model's mean head is from its own; hair, a neck and the table distort that. Both are marked as
-an assumption wherever they are shown.
+In: a structure in any unit. Out: the factor, its relative standard deviation and its source. The known lengths are
+those of ``scale.json``. Without one, the face in the photographs is assumed to have a mean adult's size. If no two
+views show a face, the points around the cameras' common point are assumed to be a head, as far from their middle as the
+model's mean head is from its own. Hair, a neck and the table distort that. Both assumptions are marked as such wherever
+they are shown.
 
-The cameras of another program, whose unit is unknown, are brought to millimetres by a known length, too. Those that
-agree with the length within its uncertainty are not changed, since a calibration board is more precise.
+A known length also converts the cameras of another program, whose unit is unknown, to millimetres. Cameras that agree
+with the length within its uncertainty are not changed, because a calibration board is more precise.
 """
 
 from collections.abc import Iterable, Mapping
@@ -64,7 +64,7 @@ class Scale:
 
     @property
     def assumed(self) -> bool:
-        """Tells whether the scale is assumed, because the photographs hold nothing of known length."""
+        """Tells whether the scale is assumed because the photographs show no known length."""
         return self.source in ASSUMED
 
 
@@ -83,8 +83,8 @@ def find_scale(
 
 
 def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
-    """Computes the scale from the known distance between two cameras' centres. Seen from outside, the position of a
-    lens's entrance pupil is known to a few millimetres only. Raises InputError if one of the cameras was left out."""
+    """Computes the scale from the known distance between two cameras' centres. From outside, the position of a lens's
+    entrance pupil is known only to a few millimetres. Raises InputError if one of the cameras was left out."""
     lost = [name for name in known.cameras if name not in rig]
     if lost:
         raise InputError("scale.json", [compose("scale-camera-lost", camera=name) for name in lost])
@@ -165,8 +165,8 @@ def _tags_in(grey: UInt8[np.ndarray, "h w"], detector: cv2.aruco.ArucoDetector) 
 
 
 def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
-    """Computes the scale from the known side of tags: the median over all tags that two views or more show. Raises
-    InputError if there is none."""
+    """Computes the scale from the known side of tags: the median over all tags in two or more views. Raises InputError
+    if there is none."""
     markers = []
     for number, views in tags.items():
         joined = {camera: corners for camera, corners in views.items() if camera in rig}
@@ -220,7 +220,7 @@ def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Sca
 
 
 def _looked_at(structure: Structure) -> Float[np.ndarray, "p 3"]:
-    """Returns points in the largest sphere about the common point that all but a few cameras have whole in view."""
+    """Returns points in the largest sphere around the cameras' common point that all but a few cameras see whole."""
     centre, radii = structure.rig.centre_world(), []
     for camera in structure.rig:
         k = camera.intrinsics
@@ -238,7 +238,7 @@ def _median_radius(points: Float[np.ndarray, "p 3"]) -> float:
 
 
 def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> tuple[Rig, list[Message]]:
-    """Scales a rig so that a known length is right (mm). Returns the rig and a message of what was done. If the rig
+    """Scales a rig so that a known length is right (mm). Returns the rig and a message about the change. If the rig
     agrees with the length within the length's uncertainty, it is returned unchanged, without a message.
 
     Args:

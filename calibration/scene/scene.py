@@ -1,11 +1,11 @@
 """Calibrates a rig from photographs of a scene: matches, structure from motion, scale, world frame, covariances.
 
-Enters: one photograph for each camera, or a folder of shots for each, of a scene with enough detail to be matched: a
-head with skin and hair in view of cameras 10 to 25 degrees apart, a table with things on it, a room. Leaves: the rig.
+In: one photograph for each camera, or a folder of shots for each, of a scene with enough detail to be matched: a head
+with skin and hair seen by cameras 10 to 25 degrees apart, a table with things on it, a room. Leaves: the rig.
 
-Where a single capture has masks, cameras are refined by its silhouettes. No other capture can be held out, so pairs of
-cameras are. Every view takes part in pairs on both sides, so held-out pairs judge poses that they did not influence;
-but a fault of a view's mask is judged by the same mask.
+If a single capture has masks, its silhouettes refine the cameras. No second capture can be held out, so pairs of
+cameras are. Every view is in pairs on both sides, so held-out pairs judge poses that they did not influence. A fault of
+a view's mask, however, is judged by the same mask.
 """
 
 import tempfile
@@ -53,8 +53,8 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # abou
 
 
 def in_guessed_frame(rig: Rig, front: str | None) -> Rig:
-    """Returns the rig in a guessed world frame, as ``in_world_frame`` would choose it with all cameras upright. Cameras
-    held on their side or upside down are turned for the guess alone."""
+    """Returns the rig in a guessed world frame: the choice of ``in_world_frame`` with all cameras upright. Cameras on
+    their side or upside down are turned only for the guess."""
     turns = [np.linalg.matrix_power(QUARTER, int(count)) for count in quarter_turns(rig)]
     upright = Rig(
         tuple(
@@ -95,8 +95,8 @@ def calibrate_scene(
             one picture and all have one size.
         report: progress.
 
-    Raises InputError that names every fault of the photographs and of ``scale.json``, and CalibrationRefused with the
-    views that could not be joined, why, and what to add.
+    Raises InputError that names every fault of the photographs and of ``scale.json``; also CalibrationRefused with the
+    views that could not be joined, the reasons, and what to add.
     """
     photographs = find_photographs(folder)
     names = photographs.names
@@ -118,8 +118,8 @@ def calibrate_scene(
 
 
 def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, dict[str, Message]]:
-    """Returns the structure and, by name, why views are left out of it. Raises CalibrationRefused if too few views
-    could be joined."""
+    """Returns the structure and, by name, the reasons why views are left out of it. Raises CalibrationRefused if too
+    few views could be joined."""
     names = list(matches.sizes)
     joined = structure.rig.names if structure is not None else ()
     left_out = {name: why_not(name, matches, joined) for name in names if name not in joined}
@@ -168,8 +168,8 @@ def placed(
 
 
 def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.ndarray, "_ _"]]) -> SceneCalibration:
-    """Refines the poses of a calibration so that the subject's silhouettes agree. The new poses are kept if pairs of
-    views that were held out agree better. Returns the calibration unchanged if there are too few masks."""
+    """Refines the poses of a calibration so that the subject's silhouettes agree. The new poses are accepted if
+    held-out pairs of views agree better. Returns the calibration unchanged if there are too few masks."""
     rig = calibration.rig
     known = [name for name in rig.names if name in masks]
     if len(known) < VIEWS_LEAST:
@@ -206,10 +206,10 @@ class SingleRefinement:
 
 
 def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement | None:
-    """Refines extrinsics by the silhouettes of one capture.
+    """Refines extrinsics with the silhouettes of one capture.
 
-    The result is kept if pairs of cameras agree better while they are held out, a fifth of them at a time. Returns None
-    if fewer than ``VIEWS_LEAST`` views have a usable silhouette.
+    The result is accepted if held-out pairs of cameras, a fifth of them at a time, agree better. Returns None if fewer
+    than ``VIEWS_LEAST`` views have a usable silhouette.
     """
     usable = [name for name in rig.names if name in capture and capture[name].quality.usable]
     if len(usable) < VIEWS_LEAST:
@@ -236,6 +236,6 @@ def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement 
 
 
 def _pairs(names: list[str], fold: int, *, inside: bool) -> Pairs:
-    """Returns a test whether a pair of cameras is in a fold (``inside``) or not. All cameras have pairs in each."""
+    """Returns a test whether a pair of cameras is in a fold (``inside``) or not. Each side has pairs of all cameras."""
     index_of = {name: index for index, name in enumerate(names)}
     return lambda pair: (sum(index_of[name] for name in pair) % FOLDS == fold) == inside

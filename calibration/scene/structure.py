@@ -2,8 +2,8 @@
 pair and adds one view after another.
 
 Source: J. L. Schoenberger, J.-M. Frahm, Structure-from-Motion Revisited, CVPR 2016, in pycolmap. The unit of length and
-the frame are arbitrary and chosen afterwards. COLMAP has the centre of the top-left pixel at (0.5, 0.5), this project
-at (0, 0): principal points and keypoints are shifted when they are read.
+the frame are arbitrary and chosen afterwards. COLMAP's centre of the top-left pixel is (0.5, 0.5), this project's (0,
+0): principal points and keypoints are shifted on reading.
 """
 
 from collections.abc import Collection
@@ -33,7 +33,7 @@ TRACK_LEAST = 3  # a point in two views only tells nothing about the third; and 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Structure:
-    """Holds cameras and points that were solved from matches, in an arbitrary frame and unit.
+    """Holds cameras and points solved from matches, in an arbitrary frame and unit.
 
     Observation i is the pixel ``pixels[i]`` of the point ``point_of[i]`` in the camera ``camera_of[i]``. ``one_lens``
     says that all cameras have the same intrinsics.
@@ -48,7 +48,7 @@ class Structure:
 
     @property
     def estimated(self) -> int:
-        """Returns how many of the parameters f, k1, k2, cx, cy of a lens, counted in this order, were estimated."""
+        """Returns how many of the lens parameters f, k1, k2, cx, cy (in this order) were estimated."""
         if not self.one_lens:
             return 1
         return 5 if len(self.rig) >= CENTRE_VIEWS else 3
@@ -66,9 +66,9 @@ def solve_structure(matches: Matches, scratch: Path, *, report: Progress) -> Str
     """Solves for the largest set of cameras that can be joined, with their points. Returns None if no pair of views can
     start it.
 
-    If each camera has its own lens, it starts from the one lens that explains all views best, and keeps its distortion:
-    in a view of a head, focal length and distance cannot be separated, and 300 points cannot separate distortion from
-    noise.
+    If each camera has its own lens, the solution starts from the one lens that explains all views best, and keeps its
+    distortion: in a view of a head, focal length and distance cannot be separated, and 300 points cannot separate
+    distortion from noise.
     """
     import pycolmap
 
@@ -90,7 +90,7 @@ def solve_structure(matches: Matches, scratch: Path, *, report: Progress) -> Str
 
 
 def _start_lenses(path: Path, lens: Float[np.ndarray, " 5"] | None) -> None:
-    """Returns the initial lens of every camera of a database without its principal point; None: COLMAP's guess."""
+    """Sets the initial lens of every camera of a database, without its principal point; None means COLMAP's guess."""
     import pycolmap
 
     if lens is None:
@@ -105,7 +105,7 @@ def _start_lenses(path: Path, lens: Float[np.ndarray, " 5"] | None) -> None:
 
 
 def _pipeline_options() -> "pycolmap.IncrementalPipelineOptions":
-    """Keeps lenses undistorted while views join: three views bend k1 and k2 to their matches, and no fourth fits."""
+    """Returns options that keep lenses undistorted while views join: three views' k1 and k2 would exclude a fourth."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -121,7 +121,7 @@ def _pipeline_options() -> "pycolmap.IncrementalPipelineOptions":
 
 
 def _adjust(model: "pycolmap.Reconstruction", *, one_lens: bool, principal_point: bool) -> None:
-    """Does the last bundle adjustment with a robust loss, since a wrong match may be within COLMAP's four pixels."""
+    """Does the last bundle adjustment with a robust loss, because a wrong match may be within COLMAP's four pixels."""
     import pycolmap
 
     options = pycolmap.BundleAdjustmentOptions()

@@ -1,4 +1,3 @@
-"""Refines cameras by the outlines of the heads they photographed (Ramanathan, Steinbach and Girod 2000).
+"""Refines cameras with the outlines of the photographed heads (Ramanathan, Steinbach and Girod 2000).
 
-Enters: silhouettes of captures and a calibrated rig. Leaves: a refined rig, kept only if independent data confirm
-it."""
+In: silhouettes of captures and a calibrated rig. Out: a refined rig, accepted only if independent data confirm it."""

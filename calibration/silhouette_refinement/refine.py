@@ -1,26 +1,26 @@
-"""Refines extrinsics by silhouettes of any subject: epipolar tangency over several captures, without a model of the
+"""Refines extrinsics with silhouettes of any subject: epipolar tangency over several captures, without a model of the
 subject.
 
-The residual and its derivative by the cameras are in ``tangency_term``. Each step of Levenberg-Marquardt finds the
-tangencies anew: the first uses the outer ones of ``pipeline.multiview.tangency``, which cannot be confused, the others
-all frontier points. With a head model, the rims of fitted heads are added at the end. The calibration's covariance is
-the prior; the gauge is that of ``calibration.adjustment.gauge``. Silhouettes do not determine a rig's scale, so the
-board's is kept.
+The residual and its derivative by the cameras are in ``tangency_term``. Each step of Levenberg-Marquardt searches the
+tangencies anew: the first step uses the outer ones of ``pipeline.multiview.tangency``, which cannot be confused, the
+later steps all frontier points. With a head model, the rims of fitted heads are added at the end. The calibration's
+covariance is the prior; the gauge is that of ``calibration.adjustment.gauge``. Silhouettes do not determine a rig's
+scale, so the board's stays.
 
 Frontier points are points where an epipolar plane touches the subject, seen on the silhouettes of two cameras. Consider
-the angle of a contour's rays about the line through both camera centres. At a local extreme of the angle the epipolar
-plane touches the subject, and unless something hides that point, the other contour has an extreme at the same angle.
-``pipeline.multiview.tangency`` uses the two outermost extremes of a pair; a head with hair and shoulders has several
-more. Only convex extremes count: where two parts of an outline cross (a T-junction) the contour has a concave corner
-that is no point of the subject. Extremes are paired by their angles, so the cameras must be accurate to about
-``GATE_PX`` already.
+the angle of a contour's rays about the line through both camera centres. At a local extremum of the angle the epipolar
+plane touches the subject. Unless that point is hidden, the other contour has an extremum at the same angle.
+``pipeline.multiview.tangency`` uses the two outermost extrema of a pair; a head with hair and shoulders has several
+more. Only convex extrema count: where two parts of an outline cross (a T-junction), the contour has a concave corner
+that is no point of the subject. Extrema are paired by their angles, so the cameras must already be accurate to about
+``GATE_PX``.
 
-The rims of a head fitted to one capture are turned into equations for the cameras alone: the contour solver's (section
-4.4, ``pipeline.contour_fit.contour``) normal equations at the solution, over (shape, pose, cameras), are reduced to the
-cameras by the Schur complement, so that the uncertainty of the head's shape is accounted for. The equations of several
-captures add up: each has a head of its own, and all share the cameras.
+The rims of a head fitted to one capture give equations for the cameras alone. The contour solver's normal equations
+(section 4.4, ``pipeline.contour_fit.contour``) over (shape, pose, cameras) are reduced to the cameras by the Schur
+complement, which accounts for the uncertainty of the head's shape. The equations of several captures are added: each
+has its own head, and all share the cameras.
 
-Enters: silhouettes of several captures, and the rig. Leaves: the rig, refined if held-out captures agree.
+In: silhouettes of several captures, and the rig. Out: the rig, refined if held-out captures agree.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -99,7 +99,7 @@ class TooFewCaptures(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heads:
-    """Holds a model for the heads of all captures, and the pose at which the fit of each capture's head starts
+    """Holds a model for the heads of all captures, and the start pose for the fit of each capture's head
     (``world_from_head``)."""
 
     model: HeadModel
@@ -113,13 +113,13 @@ class Heads:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """Holds tangency residuals (px), and for each the two cameras that it belongs to."""
+    """Holds tangency residuals (px), each with its two cameras."""
 
     cameras: tuple[tuple[str, str], ...]
     px: Float[np.ndarray, " n"]
 
     def of(self, camera: str) -> Float[np.ndarray, " k"]:
-        """Returns the residuals of all tangencies in which a camera takes part."""
+        """Returns the residuals of all tangencies of a camera."""
         return self.px[[camera in pair for pair in self.cameras]]
 
 
@@ -214,15 +214,14 @@ def _joined(parts: Sequence[Residuals]) -> Residuals:
 def residuals(captures: Sequence[Mapping[str, Silhouette]], rig: Rig, pairs: Pairs | None = None) -> Residuals:
     """Returns the residuals of all captures' outer tangencies, or of those between the given ``pairs`` of cameras.
 
-    Outer tangencies are the same for every rig, so the residuals of two rigs can be compared."""
+    Outer tangencies are the same for every rig, so residuals of two rigs can be compared."""
     found = [_tangencies(capture, rig, pairs, outer=True) for capture in captures]
     misses = [tangency_residuals(PackedTangencies.of(tangencies, rig), rig) for tangencies in found]
     return Residuals(tuple(t.cameras for tangencies in found for t in tangencies), np.concatenate(misses))
 
 
 def robust_rms(misses: Float[np.ndarray, " n"], noise_px: float) -> float:
-    """Returns the RMS of residuals (px), in which those beyond three standard deviations count less and less
-    (Geman-McClure)."""
+    """Returns the RMS of residuals (px) with reduced weights beyond three standard deviations (Geman-McClure)."""
     return float(np.sqrt(np.mean(_forgiven(misses, noise_px)))) if len(misses) else float("nan")
 
 
@@ -236,7 +235,7 @@ def noise_of(misses: Float[np.ndarray, " n"]) -> float:
 
 
 def gain_of(before: np.ndarray, after: np.ndarray, noise: float) -> tuple[float, float]:
-    """Returns the fall of the mean robust cost from ``before`` to ``after``, and its standard deviation."""
+    """Returns the decrease of the mean robust cost from ``before`` to ``after``, and its standard deviation."""
     one, two = _forgiven(before, noise), _forgiven(after, noise)
     if len(one) != len(two):  # a tangency at the image's border appeared or disappeared
         spread = np.hypot(one.std() / np.sqrt(max(1, len(one))), two.std() / np.sqrt(max(1, len(two))))
@@ -282,7 +281,7 @@ def minimise_tangencies(
 
 
 class _Refining:
-    """Holds what stays constant while the tangencies of a refinement are found anew in each step."""
+    """Holds everything that stays constant while the tangencies of a refinement are searched anew in each step."""
 
     def __init__(
         self, captures: Sequence[Mapping[str, Silhouette]], start: Rig, focal: bool, pairs: Pairs | None
@@ -351,13 +350,13 @@ def _prior(rig: Rig, *, focal: bool) -> Float[np.ndarray, "p p"]:
 
 
 def gauge_free(information: Float[np.ndarray, "p p"], projection: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Removes the choice of the world frame from a prior: returns the information matrix of N(0, information^-1)
-    restricted to what ``projection`` keeps, plus a term that holds motions of the world at zero, since no image
+    """Removes the choice of the world frame from a prior. Returns the information matrix of N(0, information^-1)
+    restricted to the range of ``projection``, plus a term that holds motions of the world at zero, because no image
     determines them.
 
     With S the projection, I - S = A B of rank 6, and M the information, the minimum of (x - A t)^T M (x - A t) over all
-    motions t of the world is x^T (M - M A (A^T M A)^-1 A^T M) x. A rig moved as a whole then costs nothing, as it costs
-    the tangencies nothing. The term ``(I - S)^T M (I - S)`` fixes the frame without affecting anything visible.
+    motions t of the world is x^T (M - M A (A^T M A)^-1 A^T M) x. A motion of the whole rig then has no cost, as for the
+    tangencies. The term ``(I - S)^T M (I - S)`` fixes the frame without any visible effect.
     """
     world = np.eye(len(projection)) - projection
     motions = scipy.linalg.orth(world, rcond=1e-9)
@@ -400,7 +399,7 @@ class Contour:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Extremes:
-    """Holds the local extremes of the angle along one contour: angle (rad), +1 for maxima and -1 for minima, pixel, and
+    """Holds the local extrema of the angle along one contour: angle (rad), +1 for maxima and -1 for minima, pixel, and
     the angle's change per pixel."""
 
     angle: Float[np.ndarray, " e"]

@@ -19,7 +19,7 @@ BINS, HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT = 24, 420.0, 160.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinementRun:
-    """Holds a refinement together with the rig it started from, the names of its captures, and warnings."""
+    """Holds a refinement together with its starting rig, the names of its captures, and warnings."""
 
     refinement: Refinement
     start: Rig

@@ -1,7 +1,7 @@
-"""Computes the residual of a frontier point that two cameras see, and its derivatives by both cameras.
+"""Computes the residual of a frontier point in two cameras, and its derivatives by both cameras.
 
 A plane through two camera centres that touches the subject touches both silhouettes, at the images of one frontier
-point (Ramanathan, Steinbach and Girod 2000; Wong and Cipolla 2001). Each camera gives such a plane. With centres c,
+point (Ramanathan, Steinbach and Girod 2000; Wong and Cipolla 2001). Each camera defines such a plane. With centres c,
 rays d at the two tangent pixels and base b = c2 - c1, the angle between the two planes is
 
     delta = |b| b . (d1 x d2) / (|b x d1| |b x d2|)
@@ -12,7 +12,7 @@ first order the tangent pixels stay where they are when a camera moves. With x' 
 
     d delta ~ w . (R1 (d2 x b)) x R1 d1 + v . R1 (d1 x d2)         and likewise, signs swapped, for camera 2.
 
-A focal length (its logarithm) turns the rays; its derivative is taken by central differences.
+A focal length (its logarithm) rotates the rays; its derivative is taken by central differences.
 """
 
 from collections.abc import Sequence
@@ -96,7 +96,7 @@ def zoomed(camera: Camera, log_scale: float) -> Camera:
 
 
 def tangency_residuals(packed: PackedTangencies, rig: Rig) -> Float[np.ndarray, " n"]:
-    """Returns the residuals (px) that the module's docstring defines."""
+    """Returns the residuals (px), as defined in the module's docstring."""
     base, rays = _bases(packed, rig), _rays(packed, rig)
     across = np.cross(rays[:, 0], rays[:, 1])
     return _gain(packed, base, rays) * (base * across).sum(axis=1)

@@ -1,5 +1,5 @@
-"""Determines where the head stands (section 4.2).
+"""Determines the head's pose (section 4.2).
 
-Enters: feature points in the images, or silhouettes alone, and the mean head. Leaves: ``world_from_head``, the
-similarity from which the fit starts.
+In: feature points in the images, or silhouettes alone, and the mean head. Out: ``world_from_head``, the similarity from
+which the fit starts.
 """

@@ -1,9 +1,9 @@
-"""Aligns the head to the landmarks of a face that was found in the photographs: section 4.2 without clicked points.
+"""Aligns the head to the landmarks of the face in the photographs: section 4.2 without clicked points.
 
-Enters: a face matched over the views, and which points of the model its landmarks are. Leaves: ``world_from_head`` of
-the mean head, and the same landmarks as the contour solver reads them. As for clicked points, the model's covariance of
-these points says how far another head's face may differ; the rest must be due to the pose. Landmarks that contradict
-the others (an open jaw, a brow under a fringe) lose weight.
+In: a face matched over the views, and the model's points that correspond to its landmarks. Out: ``world_from_head`` of
+the mean head, and the same landmarks in the contour solver's form. As for clicked points, the model's covariance of
+these points describes how another head's face may differ; the pose explains the rest. Landmarks that contradict the
+others (an open jaw, a brow under a fringe) lose weight.
 """
 
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class FaceAlignment:
 
 
 def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> FaceAlignment:
-    """Aligns the mean head to the landmarks of a face. ``places`` are the points of the model that these are. ``model``
+    """Aligns the mean head to the landmarks of a face. ``places`` are the model's points for these landmarks. ``model``
     must have the modes of the later fit."""
     which = spread_points(places)
     mean, basis = blended_basis(model, places.rows[which], places.weights[which])
@@ -76,6 +76,6 @@ def spread_points(places: LandmarkMap) -> Int[np.ndarray, " n"]:
 
 
 def frontmost_camera(facing_world: Float[np.ndarray, " 3"], middle_world: Float[np.ndarray, " 3"], rig: Rig) -> str:
-    """Returns the name of the camera that a face looks towards most directly."""
+    """Returns the name of the camera towards which a face is turned most directly."""
     towards = {camera.name: camera.centre_world - middle_world for camera in rig}
     return max(towards, key=lambda name: float(towards[name] @ facing_world / np.linalg.norm(towards[name])))

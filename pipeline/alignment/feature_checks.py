@@ -1,12 +1,12 @@
 """Checks feature points before a fit: their names, in how many views they are, whether they span a triangle, and
-whether they lie on the face in the photographs; and suggests points from a found face, as a start for a person who
+whether they lie on the face in the photographs. Also suggests points from a detected face, as a start for a person who
 picks them (section 4.2).
 
-The mean head is laid on the face and deformed to its landmarks, with the face detector's mean error subtracted; jaw
-line and forehead, along which landmarks slide, are left out. A view gets a landmark if the face was found in it and the
-head does not hide the landmark. Suggestions are as good as the detector. On two subjects of the simulated studio they
-were 1 to 3.5 mm off at eyes and mouth, 5 to 6 at the tip of the nose, 1 and 12 (a beard) at the chin. Each point has to
-be checked.
+For suggestions, the mean head is aligned to the face and deformed to its landmarks, after the detector's mean error is
+subtracted; landmarks that slide (jaw line, forehead) are left out. A view gets a suggestion if its face was detected
+and the head does not hide the landmark. Suggestions are only as accurate as the detector. On two subjects of the
+simulated studio they were 1 to 3.5 mm off at eyes and mouth, 5 to 6 at the tip of the nose, 1 and 12 (a beard) at the
+chin. A person has to check each point.
 """
 
 from collections.abc import Iterable
@@ -66,9 +66,9 @@ def feature_faults(features: Features, rig: Rig) -> list[Message]:
 def features_beside_face(
     features: Features, face: MatchedFaces, rig: Rig, model: HeadModel, places: LandmarkMap
 ) -> Message | None:
-    """Returns the fault of feature points most of which lie more than ``BESIDE_MM`` beside the face in the photographs;
-    None if they do not. Points that were picked in cropped pictures, or in pictures of another size, agree with each
-    other but not with the face."""
+    """Returns the fault of feature points if most of them lie more than ``BESIDE_MM`` away from the face in the
+    photographs; None otherwise. Points picked in cropped or resized pictures agree with each other but not with the
+    face."""
     marks = model.levels["full"].landmarks
     names = [name for name in features if name in marks]
     if not names:

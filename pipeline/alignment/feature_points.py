@@ -1,7 +1,7 @@
 """Triangulates feature points (section 4.2): from pixels picked in a few images to points in the world.
 
-A picked point may be wrong in one view (right and left confused, a slip). With three views or more, the view that
-contradicts the others is left out; with two, the point is. Everything that is left out is reported.
+A point may be wrong in one view (right and left confused, a slip). With three views or more, the view that contradicts
+the others is left out; with two views, the whole point is. Everything left out is reported.
 """
 
 from collections.abc import Mapping
@@ -24,8 +24,8 @@ CONTRADICTION = 1e-4  # probability of a misfit this large by chance; one point 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedFeatures:
-    """Holds triangulated feature points (world frame) by landmark name, and a remark for each point or view that was
-    left out."""
+    """Holds triangulated feature points (world frame) by landmark name, and a remark for each point or view left
+    out."""
 
     points: Mapping[str, TriangulatedPoint]
     remarks: tuple[Message, ...] = ()
@@ -55,8 +55,8 @@ def locate_features(features: Features, rig: Rig, *, noise_px: float) -> Located
 
 
 def features_as_wholes(features: Features, rig: Rig, *, noise_px: float) -> Message | None:
-    """Returns the fault that most points have in common: rows and columns exchanged, or points that belong to other
-    pictures. None if most points agree between their views, or if there are too few to judge."""
+    """Returns a fault that most points share: rows and columns exchanged, or points that belong to other pictures. None
+    if most points agree between their views, or if there are too few to judge."""
     grossly = GROSS_NOISE * noise_px
     judged = {name: views for name, views in features.items() if len(views) >= MIN_JUDGED_VIEWS}
     wrong = len(judged) - len(locate_features(judged, rig, noise_px=grossly).points)
@@ -72,8 +72,8 @@ def features_as_wholes(features: Features, rig: Rig, *, noise_px: float) -> Mess
 def _consistent(
     pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig, noise_px: float
 ) -> tuple[TriangulatedPoint | None, str | None]:
-    """Triangulates a point from all views or, if these contradict each other, from all but one, and returns that view's
-    name as well. Returns (None, None) if that fails too."""
+    """Triangulates a point from all views or, if these contradict each other, from all but one; then it also returns
+    the name of that view. Returns (None, None) if that fails too."""
     point = triangulate(pixels, rig, noise_px=noise_px)
     if _agrees(point, noise_px):
         return point, None

@@ -1,18 +1,18 @@
-"""Aligns the head by feature points (section 4.2): the similarity ``T(x) = s (R x + t')`` that takes the head to the
-world.
+"""Aligns the head by feature points (section 4.2): estimates the similarity ``T(x) = s (R x + t')`` from the head frame
+to the world.
 
-Enters: picked points, the rig, the model. Leaves: world_from_head, and how far each point is from agreeing with it.
-Step 1 is the paper's: full ordinary Procrustes, the minimum of eq. (3), from the mean head's landmarks to the
-triangulated points. There are two departures.
+In: picked points, the rig, the model. Out: world_from_head, and the residual of each point. Step 1 is the paper's: full
+ordinary Procrustes, the minimum of eq. (3), from the mean head's landmarks to the triangulated points. There are two
+departures.
 
-A gross outlier among the points (right and left confused) must not turn the head. Every triple of points is tried; the
-alignment with which the points agree best decides which of them are kept.
+First, a gross outlier among the points (right and left confused) must not rotate the head. Every triple of points is
+tried; the alignment on which most points agree decides which of them are used.
 
-Eq. (3) trusts all points alike and takes the subject for the mean head. Step 2 weights each residual with the
-covariance of the triangulated point and with the model's covariance of its landmarks: a wide jaw is expected together
-with wide cheeks, and must not turn the head.
+Second, eq. (3) weights all points alike and assumes that the subject has the mean head's shape. Step 2 weights each
+residual by two covariances, of the triangulated point and of the model's landmarks: a wide jaw is expected together
+with wide cheeks, and must not rotate the head.
 
-The paper's alignment is ``pipeline.geometry.registration.rigid``.
+``pipeline.geometry.registration.rigid`` computes the paper's alignment.
 """
 
 from collections.abc import Mapping
@@ -64,9 +64,9 @@ class TooFewFeatures(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureAlignment:
-    """Holds the pose ``world_from_head`` and the points it was found from.
+    """Holds the pose ``world_from_head`` and the points from which it was computed.
 
-    ``used`` says whether a point counted; outliers do not.
+    ``used`` tells whether a point counted; outliers do not.
     """
 
     world_from_head: Similarity
@@ -76,7 +76,7 @@ class FeatureAlignment:
 
 
 def feature_alignment(model: HeadModel, features: Features, rig: Rig) -> FeatureAlignment:
-    """Aligns the mean head to picked feature points: rejects outliers, minimises eq. (3), then weighs the points by
+    """Aligns the mean head to picked feature points: rejects outliers, minimises eq. (3), then weights the points by
     their covariance. Raises TooFewFeatures or WrongFeatures."""
     if features.keys().isdisjoint(NAMES):
         raise WrongFeatures(compose("features-of-no-landmark", names=some_of([*features]), known=SEVEN_POINTS))
@@ -136,7 +136,7 @@ def _sides_exchanged(
 def landmark_statistics(model: HeadModel, names: list[str], noise_mm: float) -> tuple[Points, Float[np.ndarray, "p p"]]:
     """Returns the mean head's landmarks (head frame, mm) and their covariance over the population (mm^2, p = 3 n).
 
-    ``noise_mm`` is the standard deviation between where a person and the model place the same landmark.
+    ``noise_mm`` is the standard deviation between a person's and the model's position of the same landmark.
     """
     vertices = np.array([model.landmarks[name] for name in names])
     modes = model.basis("full", len(model.modes), vertices).reshape(len(model.modes), -1).astype(float)
@@ -148,8 +148,8 @@ def consensus(source: Points, target: Points, expected_mm: Float[np.ndarray, " n
     """Tells which points agree with one rigid alignment; None if no three of them span a triangle.
 
     The rigid alignment through every three points is tried, and the one with the smallest truncated sum of squared
-    residuals wins. Kept are points within ``OUTLIER_SIGMAS`` of the alignment of all that agree with it. 26 points make
-    2,600 triples: 0.3 s.
+    residuals wins. The result is all points within ``OUTLIER_SIGMAS`` of the alignment of the points that agree with
+    it. 26 points make 2,600 triples: 0.3 s.
     """
     best, agreed = np.inf, None
     for triple in combinations(range(len(source)), MIN_POINTS):

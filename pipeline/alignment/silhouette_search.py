@@ -1,15 +1,15 @@
-"""Aligns the head without feature points or a found face, which the paper leaves open (section 6).
+"""Aligns the head without feature points or a detected face, which the paper leaves open (section 6).
 
-Enters: silhouettes, the rig, and the camera that the subject probably faces. Leaves: world_from_head of the mean head,
-and how much worse the best other pose is.
+In: silhouettes, the rig, and the camera that the subject probably faces. Out: world_from_head of the mean head, and how
+much worse the best other pose is.
 
-The subject's crown and the middle of its head come from the visual hull. Down is where the body leaves the pictures. If
-it does not leave them, or the views disagree, every quarter turn about the line of sight is tried. If cameras stand all
-around, there is no front camera to be guessed, and every direction is tried. The axes of the world frame are not used.
-From each start the contour solver fits pose and a few modes on the coarsest mesh; the best few continue on a finer one,
-and the pose wins that all eigenheads explain most closely: under thick hair, 15 modes cannot distinguish the right pose
-from one that is 50 degrees off. A start that is 10 mm off ends in a local minimum under hair
-(tests/laboratory/notes/robustness.md), so the robust scale begins at 40 px.
+The subject's crown and the middle of its head come from the visual hull. Down is the direction in which the body leaves
+the pictures. If it does not leave them, or the views disagree, every quarter turn about the line of sight is tried. If
+cameras stand all around, no front camera can be guessed, and every direction is tried. The axes of the world frame are
+not used. From each start the contour solver fits pose and a few modes on the coarsest mesh, and the best few continue
+on a finer one. The winner is the pose that all eigenheads together explain best: under thick hair, 15 modes cannot
+distinguish the right pose from one that is 50 degrees off. A start that is 10 mm off would end in a local minimum under
+hair (tests/laboratory/notes/robustness.md), so the robust scale begins at 40 px.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -62,8 +62,8 @@ class NoSubject(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class FoundPose:
-    """Holds the pose that the search found. ``rival`` says how much more the best pose in another direction costs, as a
-    share of the found pose's cost; None if there is no such pose."""
+    """Holds the pose that the search found. ``rival`` is the extra cost of the best pose in another direction, relative
+    to the found pose's cost; None if there is no such pose."""
 
     world_from_head: Similarity
     rival: float | None
@@ -106,7 +106,7 @@ def moved_to_hull(
     pose: Similarity, camera: Camera, model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> Similarity:
     """Returns the pose moved along the camera's line of sight into the visual hull, and scaled so that it looks the
-    same from the camera. Meant for a pose of unknown distance. Raises NoSubject."""
+    same from the camera. It is meant for a pose of unknown distance. Raises NoSubject."""
     origin = head_origin(model, silhouettes, rig, pose.rotation)
     along = pose.translation - camera.centre_world
     share = float((origin - camera.centre_world) @ along / (along @ along))
@@ -117,7 +117,7 @@ def start_poses(
     model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig, front: str, *, stated: bool
 ) -> Iterator[Similarity]:
     """Yields the poses from which the search starts: upright, or in quarter turns if up is unknown; facing the front
-    camera, or in all directions if there is none."""
+    camera, or in all directions without one."""
     forward = rig[front].centre_world - rig.centre_world()
     up = body_up(silhouettes, rig)
     pictures_up = -np.mean([camera.camera_from_world.rotation[1] for camera in rig], axis=0)
@@ -140,8 +140,8 @@ def upright_axes(up_world: Float[np.ndarray, " 3"], forward_world: Float[np.ndar
 
 
 def body_up(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Float[np.ndarray, " 3"] | None:
-    """Returns the upward direction (world): opposite to where the body leaves the pictures. None if it leaves no
-    picture, or the views disagree."""
+    """Returns the upward direction (world), opposite to the direction in which the body leaves the pictures. Returns
+    None if it leaves no picture, or the views disagree."""
     total, weight = np.zeros(3), 0.0
     for camera in rig:
         silhouette = silhouettes.get(camera.name)
@@ -159,7 +159,7 @@ def body_up(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Float[np.ndarray
 
 
 def fan_strength(rig: Rig) -> float:
-    """Returns how one-sided the cameras stand around the subject: 1 if all see it from the same side, 0 if evenly from
+    """Returns how one-sided the cameras stand around the subject: 1 if all are on the same side, 0 if they are evenly
     all around."""
     directions = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     return float(np.linalg.norm((directions / np.linalg.norm(directions, axis=1, keepdims=True)).mean(axis=0)))
@@ -186,7 +186,7 @@ def _differently_turned(states: Sequence[State]) -> list[State]:
 def head_origin(
     model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig, axes: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, " 3"]:
-    """Returns the position (world, mm) of the mean head's origin at which its crown and the middle of its head match
+    """Returns the position (world, mm) of the mean head's origin that matches its crown and the middle of its head to
     those of the visual hull. Raises NoSubject."""
     line = np.arange(-REACH_MM, REACH_MM + 1, SPACING_MM)
     grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)  # along the head's axes
@@ -219,7 +219,7 @@ def head_origin(
 
 
 def turned(start: Similarity, yaw_deg: float, pitch_deg: float) -> Similarity:
-    """Returns the pose of the head turned in its own frame: by the yaw about its vertical axis, and by the pitch."""
+    """Returns the pose of the head rotated in its own frame: by the yaw about its vertical axis, and by the pitch."""
     turn = rotation_from_vector(np.radians([0.0, yaw_deg, 0.0])) @ rotation_from_vector(
         np.radians([pitch_deg, 0.0, 0.0])
     )

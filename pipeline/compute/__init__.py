@@ -1,4 +1,4 @@
-"""How loops run, compiled ahead and shared out over threads, and the arrays that a model alone decides.
+"""Runs compiled loops, shares them among threads, and caches arrays that depend on the model alone.
 
-Knows nothing of heads or images; every room may use it.
+It knows nothing of heads or images; every package may use it.
 """

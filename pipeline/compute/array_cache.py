@@ -1,11 +1,11 @@
-"""Arrays that a head model alone decides, made once and kept by content: every later process maps the file.
+"""Caches arrays that depend on the head model alone: the first process computes them, and later ones map the file.
 
-A file in ``cache_folder()/arrays`` holds the arrays of one making and is named by the sha256 of all that they follow
-from: what was given (arrays, settings), the sources of the modules that make them, versions, processor, and the threads
-of BLAS (two add up in another order than one, and a head must not depend on who filled the folder). So another model,
-another setting or another version of the code is another file, and nothing has to be called outdated. It is written
-atomically and carries a checksum, so that a damaged file is made again; where the folder cannot be written, a line says
-so and each process makes the arrays for itself. They are read-only in every case.
+A file in ``cache_folder()/arrays`` holds the arrays of one computation. Its name is the SHA-256 of everything that they
+depend on: the inputs (arrays, settings), the source code, versions, the processor, and the number of BLAS threads (sums
+depend on it, and a head must not depend on who filled the folder). So another model, setting or version of the code
+gives another file, and no file is ever outdated. A file is written atomically with a checksum, and a damaged one is
+made again. If the folder cannot be written, a line says so and each process computes its own arrays. The arrays are
+read-only in every case.
 """
 
 import contextlib

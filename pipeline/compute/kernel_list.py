@@ -1,14 +1,14 @@
-"""The compiled loops that a default job calls, with the types that it calls them with: what can be compiled ahead.
+"""Lists the compiled loops that a default job calls, with their argument types, so that they can be compiled ahead.
 
-``kernels.txt`` beside this file has a line for each: module and function, then the types of the arguments. First come
-those of a job without the dense stage (``--detail photo --surface head``), after an empty line those that it adds.
-``float32[2C]`` is a two-dimensional array in C order (A: any strides), with ``r`` behind it one that is not written to;
-``4*float64`` is a tuple, ``stereo.matching_kernels:Sight{float64[2C];int64}`` a named one. The list is recorded, not
-thought out: ``python -m tests.tools.kernel_recorder`` writes it from jobs that it runs, and a test runs a job and
-fails where the list lacks a loop.
+``kernels.txt`` in this folder has a line for each: module and function, then the types of the arguments. First come
+those of a job without dense matching (``--detail photo --surface head``); after an empty line come those that dense
+matching adds. ``float32[2C]`` is a two-dimensional array in C order (A: any strides), followed by ``r`` if it is
+read-only; ``4*float64`` is a tuple, ``stereo.matching_kernels:Sight{float64[2C];int64}`` a named one. The list is
+recorded, not written by hand: ``python -m tests.tools.kernel_recorder`` runs jobs and writes it. A test runs a job and
+fails if the list lacks a loop.
 
-Signatures in the decorators would say the same in 105 places, most of them loops that only other loops call, and a type
-that is wrong there is an error in a job. To run the whole pipeline in set-up takes as long as a job, in one process.
+Signatures in the decorators would be an alternative, but in 105 places, mostly loops that only other loops call, and a
+wrong type there would break a job. Running the whole pipeline during set-up would take as long as a job in one process.
 """
 
 import importlib
@@ -71,8 +71,8 @@ class Kernel:
         return not isinstance(kept, KeptFunction) or kept.is_kept(self.signature())
 
     def size(self) -> int:
-        """Returns the size in bytes of the Python byte code of the kernel and of all that it calls. Kernels are
-        compiled in the order of this size, the largest first; 0 if loops are not compiled."""
+        """Returns the size in bytes of the Python byte code of the kernel and of all functions that it calls. Kernels
+        are compiled in the order of this size, the largest first; 0 if loops are not compiled."""
         dispatcher = self.dispatcher()
         return 0 if dispatcher is None else code_size(dispatcher)
 
@@ -90,14 +90,14 @@ def import_kernels(module: str) -> ModuleType:
 
 
 def listed_kernels(*, dense: bool = True) -> list[Kernel]:
-    """Returns all kernels of the list; with ``dense`` False, without those that only the dense stage calls."""
+    """Returns all kernels of the list; if ``dense`` is False, without those that only dense matching calls."""
     plain, _, added = LIST.read_text(encoding="utf-8").partition("\n\n")
     return [Kernel.from_line(line) for line in (*plain.splitlines(), *(added.splitlines() if dense else ()))]
 
 
 def by_module(kernels: Iterable[Kernel]) -> Iterator[list[Kernel]]:
     """Yields lists of kernels, one for each module. Kernels of a module call the same inner loops, which two processes
-    would otherwise both compile."""
+    would otherwise compile twice."""
     groups: dict[str, list[Kernel]] = {}
     for kernel in kernels:
         groups.setdefault(kernel.module, []).append(kernel)
@@ -105,7 +105,7 @@ def by_module(kernels: Iterable[Kernel]) -> Iterator[list[Kernel]]:
 
 
 def type_from_text(text: str) -> types.Type:
-    """Returns the Numba type for its notation in the list. Raises ValueError for anything else."""
+    """Returns the Numba type for its notation in the list. Raises ValueError for an unknown notation."""
     if array := _ARRAY.fullmatch(text):
         dtype, dimensions, layout, readonly = array.groups()
         return types.Array(_scalar(dtype), int(dimensions), layout, readonly=bool(readonly))

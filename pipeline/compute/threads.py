@@ -1,8 +1,8 @@
-"""Threads over slices of compiled loops.
+"""Runs slices of compiled loops in threads.
 
-Numba's own ``parallel`` compiles five times as long, and its OpenMP threads spin while they wait: where another process
-held one of two cores, a fit took 22 s instead of one. These sleep, and they stay: starting them anew for every loop was
-a third of a fit.
+Numba's own ``parallel`` compiles five times as long, and its OpenMP threads spin while they wait: while another process
+held one of two cores, a fit took 22 s instead of one. These threads sleep instead, and are reused: starting them anew
+for every loop was a third of a fit.
 """
 
 import os
@@ -41,11 +41,11 @@ def slice_count(threads: int) -> int:
 
 
 def in_threads(count: int, work: Callable[[int, int], None]) -> None:
-    """Runs ``work(first, last)`` over slices of ``range(count)`` in several threads. Meant for compiled loops, which
-    release Python's interpreter lock.
+    """Runs ``work(first, last)`` over slices of ``range(count)`` in several threads. ``work`` is usually a compiled
+    loop, which releases Python's interpreter lock.
 
     The result may not depend on how the range is cut. The calling thread takes slices too. A helper thread that has not
-    begun when no slices are left is cancelled, so that nobody waits for it.
+    begun when no slices remain is cancelled, so nobody waits for it.
     """
     threads, trace = thread_count(), active_trace()
     if trace is not None:
@@ -110,8 +110,8 @@ def _share(slices: list[tuple[int, int]], work: Callable[[int, int], None], thre
 def _traced(
     trace: Trace, count: int, work: Callable[[int, int], None], name: str, threads: int, *, single: bool = False
 ) -> None:
-    """Runs a loop and records spans of it and of its slices. One thread cuts the loop as finely as several would, so
-    that the trace shows how it could be shared."""
+    """Runs a loop and records spans of it and of its slices. With one thread the loop is cut as finely as for several,
+    so the trace shows how it could be shared."""
     loop = trace.new_loop()
     parts = count if single else slice_count(threads if threads > 1 else TRACED_THREADS)
 
@@ -138,7 +138,7 @@ def task_pool(threads: int | None = None) -> Iterator[ThreadPoolExecutor]:
 
 
 def background_thread(name: str) -> ThreadPoolExecutor:
-    """Returns a pool of one thread, for work that runs beside the caller's. Compiled loops of either still share the
+    """Returns a pool of one thread, for work in parallel to the caller's. Compiled loops of either still share the
     common threads."""
     return ThreadPoolExecutor(1, thread_name_prefix=name)
 

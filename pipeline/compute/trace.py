@@ -1,9 +1,10 @@
-"""What runs on which thread when, for Chrome's trace viewer and Perfetto, and for the laboratory's ``scaling``.
+"""Records what each thread does and when, for Chrome's trace viewer, for Perfetto, and for the laboratory's
+``scaling``.
 
-Nothing is recorded, and nothing but one test is paid, unless a trace is active. Stages, parts of stages, shared loops
-and their slices are spans of one thread each; those of one thread nest. A stage in a thread of its own has a
-``background`` span, and the stages that run meanwhile a ``foreground`` span of the same name. Wall clock and processor
-seconds stand side by side: on a busy machine only the latter say what work there was."""
+Without an active trace nothing is recorded; the only cost is one test. Stages, parts of stages, shared loops and their
+slices are spans of one thread each; those of one thread nest. A stage in a thread of its own has a ``background`` span;
+the stages that run meanwhile have a ``foreground`` span of the same name. Each span has wall clock time and CPU
+seconds, because on a busy machine only the latter measure the work."""
 
 import functools
 import json
@@ -26,7 +27,7 @@ T = TypeVar("T")
 
 
 class Trace:
-    """Collects spans of all threads of this process, from its creation on. A span is a named piece of work of one
+    """Collects spans of all threads of this process, starting at its creation. A span is a named piece of work of one
     thread with its start and duration."""
 
     def __init__(self) -> None:
@@ -44,8 +45,8 @@ class Trace:
     def span(self, kind: Kind, name: str, **arguments: object) -> Iterator[None]:
         """Records the block as one span of the calling thread, also if it raises.
 
-        ``cpu_s`` of the span are the processor seconds of that thread. Except for loops and slices, ``process_cpu_s``
-        are those of all threads during the span.
+        ``cpu_s`` of the span is the CPU time of that thread. ``process_cpu_s`` is the CPU time of all threads during
+        the span; loops and slices have none.
         """
         whole = kind not in ("loop", "slice")
         before_s, process_s = time.thread_time(), time.process_time() if whole else 0.0
@@ -86,11 +87,10 @@ class Trace:
 
 
 def peak_memory_mb() -> float:
-    """Returns the most memory (MiB) that this process has held since its program was loaded; NaN where the system does
-    not say.
+    """Returns the peak memory (MiB) of this process since its program was loaded; NaN if the system does not report it.
 
-    ``getrusage`` gives more: its maximum outlives ``exec``, so that a child of a large process begins with the parent's
-    (proc(5), ``VmHWM``).
+    ``getrusage`` would return more: its maximum survives ``exec``, so a child of a large process begins with the
+    parent's (proc(5), ``VmHWM``).
     """
     status = Path("/proc/self/status")
     found = re.search(r"VmHWM:\s*(\d+) kB", status.read_text()) if status.is_file() else None

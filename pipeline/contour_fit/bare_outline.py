@@ -1,8 +1,8 @@
-"""Finds the stretches of a silhouette's outline that are the hairless head itself.
+"""Finds the stretches of a silhouette's outline that show the bare skull instead of hair.
 
-An outline that a population's heads do not explain is taken for hair (``noise_model.is_hairless``), though a head may
-just lie outside the population. The pixels decide: along a hairless head skin reaches up to the outline, and the
-outline is smooth. Hair as light as skin fails the second test, for strands and tufts stand out of it.
+``noise_model.is_hairless`` takes an outline for hair if no head of the model's population fits it. That is wrong for a
+bald head outside the population. This module looks at the pixels: along a hairless head skin reaches up to the outline,
+and the outline is smooth. Hair as light as skin fails the second test: strands and tufts make its outline rough.
 """
 
 from collections.abc import Mapping
@@ -37,8 +37,8 @@ MISSED_PX = 1.0  # a crown whose outline is farther off is fitted once more
 
 
 def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Plane]) -> ContourSolution:
-    """Marks the outline of the crown if it turns out to be hairless, and fits the head once more with it counted in
-    full.
+    """Marks the outline of the crown where it is hairless, and fits the head once more with that outline at full
+    weight.
 
     Args:
         solved: the solution of the contour solver.
@@ -55,10 +55,10 @@ def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Plane]) -> Con
 
 
 def with_counted_crown(solved: ContourSolution, cells: tuple[Bool[np.ndarray, "_ _"], ...]) -> ContourSolution:
-    """Fits the head once more with the outline of the crown counted in full in the marked cells of each view.
+    """Fits the head once more; the crown's outline has full weight in the marked cells of each view.
 
-    Where the outline of the whole head counts already, or the crown fits its outline within ``MISSED_PX``, only the
-    marks are added.
+    Skips the fit and only adds the marks if the whole head's outline already counts, or if the crown lies within
+    ``MISSED_PX`` of its outline.
     """
     problem, scale = solved.problem, solved.problem.settings.robust_px
     evidence = replace(solved.evidence, noise=replace(solved.evidence.noise, bare=cells))
@@ -77,14 +77,14 @@ def with_counted_crown(solved: ContourSolution, cells: tuple[Bool[np.ndarray, "_
 def _shown_crown(
     solved: ContourSolution, cells: tuple[Bool[np.ndarray, "_ _"], ...]
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
-    """Returns which rim samples lie on the crown, and which of these in the marked cells."""
+    """Returns two masks over the rim samples: those on the crown, and those on the crown in a marked cell."""
     rim = observed_rim(solved.problem, solved.evidence, solved.state, solved.stage)
     crown = is_crown(solved.problem, rim, solved.stage.level)
     return crown, crown & within(cells, rim)
 
 
 def find_bare(problem: ContourProblem, state: State, skin: Mapping[str, Plane]) -> tuple[Bool[np.ndarray, "_ _"], ...]:
-    """Marks, in every view, the square cells (``CELL_PX`` pixels wide) near an outline that is a hairless head's."""
+    """Marks, in every view, the square cells (``CELL_PX`` pixels wide) near the outline of a hairless head."""
     views, maps = problem.views, []
     for k, camera in enumerate(problem.rig):
         (width, height), first = views.size[k], views.offset[k]
@@ -98,8 +98,8 @@ def find_bare(problem: ContourProblem, state: State, skin: Mapping[str, Plane]) 
 
 
 def bare_cells(distance: Plane, skin: Plane, px_per_mm: float) -> Bool[np.ndarray, "_ _"]:
-    """Marks the square cells (``CELL_PX`` pixels wide) within ``REACH_MM`` of a hairless head's outline in one view: of
-    an outline that is smooth, with skin up to it.
+    """Marks the square cells (``CELL_PX`` pixels wide) of one view within ``REACH_MM`` of an outline that is smooth and
+    has skin up to it.
 
     Args:
         distance: signed distance to the outline (px), negative inside.
@@ -126,8 +126,8 @@ def largest_outline(distance: Plane) -> Float[np.ndarray, "n 2"] | None:
 def cells_along(
     outline: Float[np.ndarray, "n 2"], chosen: Bool[np.ndarray, " n"], shape: tuple[int, int], reach_px: float
 ) -> Bool[np.ndarray, "_ _"]:
-    """Marks the square cells (``CELL_PX`` pixels wide) of a picture of ``shape`` (rows, columns) within ``reach_px`` of
-    an outline, whose nearest point of the outline is ``chosen``."""
+    """Marks the square cells (``CELL_PX`` pixels wide) of a picture of ``shape`` (rows, columns) that lie within
+    ``reach_px`` of an outline and whose nearest outline point is ``chosen``."""
     height, width = shape
     cells = np.zeros((height // CELL_PX + 1, width // CELL_PX + 1), bool)
     if not chosen.any():
@@ -141,11 +141,11 @@ def cells_along(
 
 
 def roughness(distance: Plane, smooth: Float[np.ndarray, "n 2"], px_per_mm: float) -> Float[np.ndarray, " n"]:
-    """Returns the roughness (px, RMS) of an outline at each point of the ``smooth`` curve along it: how far the outline
-    strays from the curve within some millimetres, without their mean offset.
+    """Returns the roughness (px, RMS) of an outline at each point of the ``smooth`` curve along it: the scatter, within
+    some millimetres, of the outline's distance from the curve.
 
-    ``distance`` is the signed distance (px) to the outline. Read along the curve it has none of the steps that an
-    outline of whole pixels has.
+    ``distance`` is the signed distance (px) to the outline. It is read at the curve's points, because the pixels of the
+    outline would add steps of a whole pixel.
     """
     column, row = np.split(smooth.T.astype(np.float32), 2)
     off = cv2.remap(distance, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].astype(float)
@@ -161,8 +161,8 @@ def _pooled(values: Float[np.ndarray, " n"], px_per_mm: float) -> Float[np.ndarr
 def share_inside(
     distance: Plane, skin: Plane, outline: Float[np.ndarray, "n 2"], px_per_mm: float
 ) -> Float[np.ndarray, " n"]:
-    """Returns the probability of skin, or of what else is given for it, ``DEPTH_MM`` inside each point of an outline,
-    its mean across it."""
+    """Returns the mean of ``skin`` (a probability) at ``DEPTH_MM`` inside each point of an outline, averaged across the
+    outline."""
     reach = max(1, round(DEPTH_MM * px_per_mm))
     within = (distance < 0).astype(np.float32)
     size = (2 * reach + 1, 2 * reach + 1)
@@ -173,8 +173,8 @@ def share_inside(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CapOutline:
-    """Holds the silhouettes as they are without the cap, and the square cells (``CELL_PX`` pixels wide) near the
-    outline that it makes, by camera."""
+    """Holds, by camera, the silhouettes after the cap is taken off, and the square cells (``CELL_PX`` pixels wide) near
+    the cap's outline."""
 
     silhouettes: Mapping[str, Silhouette]
     cells: Mapping[str, Bool[np.ndarray, "_ _"]]
@@ -183,7 +183,7 @@ class CapOutline:
 def without_cap(
     silhouettes: Mapping[str, Silhouette], cap: Cap, rig: Rig, at_world: Float[np.ndarray, " 3"]
 ) -> CapOutline:
-    """Moves the outlines inwards by the cap's thickness where the cap makes them.
+    """Moves the outlines inwards by the cap's thickness wherever the cap forms the outline.
 
     Args:
         silhouettes: by camera.
@@ -206,7 +206,7 @@ def without_cap(
 
 
 def cells_of_views(cells: Mapping[str, Bool[np.ndarray, "_ _"]], views: Views) -> tuple[Bool[np.ndarray, "_ _"], ...]:
-    """Returns the cells of each view of a contour problem, none of them marked where a camera has none."""
+    """Returns the cells of each view of a contour problem; a view whose camera has no cells gets an empty map."""
     empty = {
         name: np.zeros((height // CELL_PX + 1, width // CELL_PX + 1), bool)
         for name, (width, height) in zip(views.names, views.size, strict=True)

@@ -1,5 +1,5 @@
-"""Decides which stretches of a rim do not count because hair, shoulders or clothes may lie there: clutter only ever
-adds area to a silhouette."""
+"""Finds the stretches of a rim that hair, shoulders or clothes may hide, and gives them no weight. Such clutter can
+only add area to a silhouette."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,8 +17,8 @@ CELL_PX, CLUTTER_CELLS = 4, 3  # clutter reaches 12 px beyond where it was found
 
 
 def downweight_outside_contour(problem: ContourProblem, evidence: StageEvidence, rim: Rim, level: str) -> Rim:
-    """Reduces the weight of the rim outside the face. On cranium, ears and neck a sample counts only where the model
-    sticks out of the silhouette, and then with ``OUTSIDE_SHARE`` of its weight."""
+    """Reduces the weight of the rim outside the face. A sample on cranium, ears or neck counts only where the model
+    lies outside the silhouette, with ``OUTSIDE_SHARE`` of its weight."""
     face = face_of(problem, evidence, level)[rim.corner].all(axis=1)
     share = np.where(rim.residual > 0, OUTSIDE_SHARE, 0.0)
     return replace(rim, length=np.where(face, rim.length, share * rim.length))
@@ -32,7 +32,7 @@ def face_of(problem: ContourProblem, evidence: StageEvidence, level: str) -> Boo
 
 
 def find_clutter(problem: ContourProblem, rim: Rim, threshold_px: float) -> tuple[Bool[np.ndarray, "_ _"], ...]:
-    """Marks clutter in every view, as square cells (``CELL_PX`` pixels wide): where the silhouette reaches more than
+    """Marks clutter in every view, as square cells (``CELL_PX`` pixels wide): where the silhouette extends more than
     ``threshold_px`` beyond the model, and ``CLUTTER_CELLS`` cells around."""
     maps = []
     for k, (width, height) in enumerate(problem.views.size):
@@ -54,8 +54,8 @@ def without_clutter(evidence: StageEvidence, rim: Rim) -> Rim:
 def with_bare_crown(
     problem: ContourProblem, evidence: StageEvidence, rim: Rim, length: Float[np.ndarray, " s"], level: str
 ) -> Rim:
-    """Restores the weight of a hairless crown: samples above the brows that lie in cells marked as bare get back their
-    full ``length``, the rest of the rim stays as it is."""
+    """Restores the weight of a hairless crown: samples above the brows in cells marked as hairless get their full
+    ``length``. All other samples stay as they are."""
     if evidence.noise.bare is None:
         return rim
     bare = is_crown(problem, rim, level) & within(evidence.noise.bare, rim)

@@ -1,8 +1,8 @@
-"""The contour solver: Levenberg-Marquardt on the rim (section 4.4's problem, another cost and another minimiser).
+"""Fits a head to outlines by Levenberg-Marquardt on the rim (section 4.4's problem, another cost and minimiser).
 
-In: the silhouettes' signed distances, a start pose, feature points where there are any. Out: coefficients, pose, camera
-corrections, and their covariance (each ``*_term`` has its equation). The robust scale shrinks step by
-step, which carries the fit over clutter from a start that is 20 px off; while it is coarse, the prior holds the shape.
+In: the silhouettes' signed distances, a start pose, and feature points if there are any. Out: coefficients, pose,
+camera corrections, and their covariance (each ``*_term`` has its equation). The robust scale shrinks step by step: a
+large scale lets the fit pass over clutter from a start that is 20 px off. The prior holds the shape until it is small.
 """
 
 from collections.abc import Callable, Mapping
@@ -50,7 +50,7 @@ NON_MONOTONE = 4  # costs that a step may climb back to
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContourSolution:
-    """Holds a problem of the contour solver and its solution, from which later stages continue.
+    """Holds the contour solver's problem and solution, from which later stages continue.
 
     ``evaluations`` counts evaluations of the cost. ``misfit_mm`` is handed on to ``Fit``.
     """
@@ -76,9 +76,9 @@ def solve_contour(
     landmarks: LandmarkObservations | None = None,
     report: Progress = discard_progress,
 ) -> ContourSolution:
-    """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes, from a start
-    pose: the first ``settings.modes`` modes first, the rest once those have converged. ``features`` are pixels by
-    camera and landmark, ``landmarks`` the face's. ``finish`` adds the covariance, which takes longer."""
+    """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes. It fits the
+    first ``settings.modes`` modes and, once these have converged, all of them. ``features`` are clicked pixels by
+    camera and landmark; ``landmarks`` are the face's. ``finish`` adds the covariance, which takes longer."""
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)
     few, span, whole, *rest = schedule(settings, len(model.modes))
     evidence, state = first_evidence(settings), start_state(problem, world_from_head)
@@ -130,8 +130,8 @@ def run_stage(
     """Runs Levenberg-Marquardt at each robust scale of one stage in turn. Returns the state, the number of evaluations
     and the reason why the last search stopped.
 
-    The set of rim samples changes with the state, which makes the cost slightly uneven. If every step had to lower it,
-    the search stopped at ridges 0.3 mm from the minimum; so a step may raise the cost a little.
+    The set of rim samples changes with the state, so the cost is not quite continuous. A step may therefore raise the
+    cost a little. When every step had to lower it, the search stopped 0.3 mm from the minimum.
     """
     few = state.coefficients[: stage.modes]
     state = replace(state, coefficients=np.concatenate([few, np.zeros(stage.modes - len(few))]))
@@ -159,8 +159,8 @@ def coarse_unit(scale_px: float) -> float:
     """Returns the noise unit l sigma^2 (px^3) to use at a coarse robust scale: l is a fixed correlation length, sigma
     half the scale.
 
-    With so much noise the prior holds the shape. Without it, hair over both ears moved the head by 5 mm and the first
-    15 modes to 8 standard deviations.
+    With so much noise the prior outweighs the outlines and holds the shape. Without it, hair over both ears moved the
+    head by 5 mm and the first 15 modes to 8 standard deviations.
     """
     return FIRST_CORRELATION_PX * (0.5 * scale_px) ** 2
 
@@ -178,8 +178,8 @@ def normal_equations(solved: ContourSolution) -> NormalEquations:
 
 
 def hold_at_bounds(solved: ContourSolution, equations: NormalEquations) -> None:
-    """Adds to the equations, in place, what holds expression weights at 0. At a bound a posterior is no Gaussian: it
-    falls exponentially with the slope there, its deviation 1 / slope."""
+    """Adds to the equations, in place, the terms that hold expression weights at their bound 0. At a bound the
+    posterior is exponential instead of Gaussian; its standard deviation is 1 / slope of the cost there."""
     posed = np.asarray(solved.problem.model.posed, int)
     if len(posed) and posed[-1] < solved.stage.modes:
         held = posed[(solved.state.coefficients[posed] <= 0.0) & (equations.gradient[posed] > 0.0)]
@@ -187,8 +187,8 @@ def hold_at_bounds(solved: ContourSolution, equations: NormalEquations) -> None:
 
 
 def finish(solved: ContourSolution) -> Fit:
-    """Returns the fit with its Laplace covariance: the inverse of the last normal matrix, of which the rows and columns
-    of shape and pose are kept. The uncertainty of the cameras is thereby included."""
+    """Returns the fit with its Laplace covariance: the rows and columns of shape and pose in the inverse of the last
+    normal matrix. The covariance thus includes the uncertainty of the cameras."""
     problem, state, stage = solved.problem, solved.state, solved.stage
     kept, equations = stage.modes + POSE, normal_equations(solved)
     hold_at_bounds(solved, equations)
@@ -209,12 +209,12 @@ def finish(solved: ContourSolution) -> Fit:
 
 
 def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_mm: float) -> Fit:
-    """Returns the fit of a solution with its misfit set to what the eigenheads cannot represent.
+    """Returns the fit of a solution with its misfit set to the error that eigenheads cannot represent.
 
-    The head of most people is not in their span, and the fit's own covariance does not include that. The fit agrees
-    with the outlines, where it was made to; between them its error is several times larger. So the same outlines are
-    fitted once more in a wider basis that can leave the span (``gaussian_process``). The distance between both heads,
-    and the wider fit's own uncertainty, are the misfit of the narrower one.
+    Most heads lie outside the span of the eigenheads, and the fit's covariance does not include that error. The fit
+    agrees with the head at the outlines; between them its error is several times larger. The same outlines are
+    therefore fitted once more in a wider basis that can leave the span (``gaussian_process``). The misfit of the narrow
+    fit is the distance between both heads, combined with the uncertainty of the wider fit.
 
     Args:
         solved: solution with the eigenheads alone.
@@ -233,8 +233,8 @@ def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_
 
 def judged_by(wider_model: HeadModel, wider: Fit, model: HeadModel, fit: Fit) -> Fit:
     """Returns ``fit`` with its misfit (mm, along the normals) set by comparison with ``wider``, a fit of more modes to
-    the same outlines. The misfit's square is their squared distance plus the variance that only the wider fit has. Both
-    fits must have a covariance."""
+    the same outlines. The squared misfit is the squared distance between both fits plus the variance that only the
+    wider fit has. Both fits must have a covariance."""
     cage = fit.world_from_head.apply(model.cage(fit.coefficients))
     normals = vertex_normals(cage, model.levels["cage"].faces)
     apart = ((wider.world_from_head.apply(wider_model.cage(wider.coefficients)) - cage) * normals).sum(axis=1)

@@ -1,10 +1,10 @@
-"""Separates what of a face is expression from what is shape, once everything else has been fitted.
+"""Separates expression from shape once everything else has been fitted.
 
-Smooth deformations can follow a smile as well as the shape of a smiling face. Which it is depends on how much this head
-needs them elsewhere. The prior variance of each group of modes (eigenheads, kernel, fine kernel) is therefore estimated
-from the fit itself (MacKay 1992, as in ``posterior``). Where a head hardly deviates from its population, the modes
-become stiff, and the expression has to explain the smile. Expression weights keep their prior and their bounds. The
-images are not read again: the problem is the quadratic one of the last stage, and the surface hardly moves.
+The shape modes can imitate a smile. How far they may depends on the size that this head's other deviations give them.
+The prior variance of each group of modes (eigenheads, kernel, fine kernel) is therefore estimated from the fit itself
+(MacKay 1992, as in ``posterior``). If the head hardly deviates from its population, the variance is small, and the
+expression has to explain the smile. Expression weights keep their prior and their bounds. The images are not read
+again: the surface hardly moves, so the quadratic problem of the last stage is reused.
 """
 
 import re
@@ -71,9 +71,9 @@ def makes_face(coefficients: Float[np.ndarray, " m"], posed: range) -> bool:
 
 
 def doubtful_weights(model: HeadModel, coefficients: Float[np.ndarray, " m"]) -> frozenset[int]:
-    """Returns the expressions, by their place among the model's, that explain noise or another head's shape rather than
-    a face: opposites that are both strong, and weights at their upper bound. Lids, which other evidence places, are
-    none."""
+    """Returns the indices of expressions that probably explain noise or an unusual shape: opposite expressions that are
+    both strong, and weights at their upper bound. Expressions of the lids are never returned, because other evidence
+    decides them."""
     weights = coefficients[model.posed.start : model.posed.stop]
     found = [np.flatnonzero(weights > BOUND)]
     strong = np.flatnonzero(weights > STRONG)
@@ -89,8 +89,8 @@ def estimated_variance(
     before: Float[np.ndarray, " m"],
     group: Int[np.ndarray, " k"],
 ) -> float:
-    """Estimates the prior variance of a group of modes: the sum of their squared coefficients, divided by how many of
-    them the evidence determines."""
+    """Estimates the prior variance of a group of modes: the sum of their squared coefficients, divided by the number of
+    coefficients that the observations determine."""
     if not len(group):
         return 1.0
     determined = float(np.clip(1.0 - covariance[group] / before[group], 0.0, 1.0).sum())

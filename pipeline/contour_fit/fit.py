@@ -1,4 +1,4 @@
-"""What a solver returns; the same for both."""
+"""The result of a solver, the same for the contour solver and the simplex."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,7 @@
-"""The complete problem of one stage at one robust scale: rim, points, photographs and priors as terms.
+"""Builds the least-squares problem of one stage at one robust scale; rim, points, photographs and priors are its terms.
 
-A feature's residual is ``(pi(X) - picked) / sigma`` in both image axes; sigma is a click's noise and, as far as the
-camera sees it, the landmark's place on another head. The loss of its norm is Geman and McClure's.
+A feature point's residual is ``(pi(X) - picked) / sigma`` in both image axes; sigma combines the noise of a click with
+the projected variation of the landmark between heads. The loss of the residual's norm is Geman and McClure's.
 """
 
 from dataclasses import dataclass
@@ -88,8 +88,8 @@ def head_problem(
     problem: ContourProblem, evidence: StageEvidence, stage: Stage, scale_px: float, reference_px: float | None = None
 ) -> Problem[State]:
     """Builds the least-squares problem of one stage: all its terms as functions of shape, pose and, in stages that
-    solve for them, cameras. ``scale_px`` is the robust scale of the contours, ``reference_px`` the outline length to
-    which ``RimTerm`` scales its cost."""
+    solve for them, cameras. ``scale_px`` is the contours' robust scale; ``reference_px`` is the outline length to which
+    ``RimTerm`` scales its cost."""
     cameras = PER_CAMERA * len(problem.views.names) if stage.cameras else 0
     rim = RimTerm(problem, evidence, stage, scale_px, reference_px)
     terms: tuple[Term[State], ...] = (rim, *_other_terms(problem, evidence, stage))
@@ -106,8 +106,8 @@ def head_problem(
 def weight_bounds(
     state: State, problem: ContourProblem, unknowns: int
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Returns the smallest and the largest step of every unknown that keep the expression weights between 0 and 1, and
-    those that are held at 0. All other unknowns are unbounded."""
+    """Returns the smallest and the largest step of every unknown that keep the expression weights between 0 and 1;
+    weights outside the stage stay 0. All other unknowns are unbounded."""
     posed = problem.model.posed
     least, most = np.full(unknowns, -np.inf), np.full(unknowns, np.inf)
     weights = state.coefficients[posed.start : posed.stop]

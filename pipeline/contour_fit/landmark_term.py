@@ -1,4 +1,4 @@
-"""The landmark term: where places of the face were found in the world, against where the head has them.
+"""Computes the landmark term: the difference between the triangulated landmarks of the face and those on the head.
 
 With the places ``X(theta)`` of the head, stacked, their found positions ``x`` and the covariance ``S`` of the
 difference (of the triangulation, and of a network's idea of a face, in which all places err together),
@@ -6,8 +6,8 @@ difference (of the triangulation, and of a network's idea of a face, in which al
     r = W (X(theta) - x),    W^T W = S^-1
     dr / d(coefficients) = W s R B,    dr / d(rotation, translation, log s) = W [-[X - t]x, I, X - t]
 
-as one residual under Geman and McClure's loss: a face that is another's loses its weight as a whole. Places that
-contradict the others have a larger variance in ``S`` already (``pipeline.alignment.face_alignment``).
+all landmarks make one residual under Geman and McClure's loss, so the face of another person loses its weight as a
+whole. A landmark that contradicts the others has a larger variance in ``S`` (``alignment.face_alignment``).
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ def observe_landmarks(
     position_world: Float[np.ndarray, "n 3"],
     covariance_world: Float[np.ndarray, "p p"],
 ) -> LandmarkObservations:
-    """Packs triangulated landmarks for the solver, with the model's mean and modes at each.
+    """Packs triangulated landmarks for the solver, with the mean and modes of the model at each landmark.
 
     Args:
         model: the head model with all modes of the fit.
@@ -48,8 +48,8 @@ def observe_landmarks(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkTerm:
-    """Computes the cost of the face's triangulated landmarks as a function of shape and pose. It does not depend on the
-    ``cameras``, whose number it needs only to leave zeros for them."""
+    """Computes the cost of the face's triangulated landmarks as a function of shape and pose. The cost does not depend
+    on ``cameras``; their number only tells how many columns of zeros to leave."""
 
     observed: LandmarkObservations
     stage: Stage
@@ -57,7 +57,7 @@ class LandmarkTerm:
 
     def at(self, state: State) -> Residuals:
         """Returns the differences between the head's landmarks and the triangulated ones as a single residual of many
-        components, in standard deviations, with Geman and McClure's loss. The landmarks thus lose their weight
+        components, in standard deviations, with Geman and McClure's loss. One loss for all lets them lose their weight
         together."""
         points = landmark_points(self.observed, state)
         residual = self.observed.whiten @ (points - self.observed.position_world).ravel()

@@ -1,5 +1,5 @@
-"""What the residuals of a stage say of the model's misfit: how far an outline may be believed, where it is clutter, and
-whether the head is bare."""
+"""Estimates from a stage's residuals how well the model fits: the noise of an outline, where it is clutter, and whether
+the head is hairless."""
 
 from dataclasses import replace
 
@@ -25,8 +25,8 @@ def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, 
     """Returns the evidence updated from the residuals of a stage: the noise unit, the lower limit of the robust scale
     and, the first time, the clutter.
 
-    Clutter is searched while the eigenheads alone hold the shape. A wider basis would rather bulge into the hair than
-    treat it as outliers.
+    Clutter is searched while only the eigenheads describe the shape. A wider basis would bulge into the hair and leave
+    no outliers.
     """
     rim = observed_rim(problem, evidence, state, stage)
     near = rim.residual[(np.abs(rim.residual) < 10.0) & (rim.length > 0)]
@@ -46,8 +46,8 @@ def with_clutter_of_start(
     """Returns the evidence with clutter marked before the first fit: wherever the silhouette reaches more than
     ``START_CLUTTER_MM`` beyond the mean head at the start pose.
 
-    Long hair in front of a face is wider than any face. The first modes would be drawn to it before residuals could
-    show that it is hair.
+    Long hair in front of a face is wider than any face. The first modes would follow it before residuals could show
+    that it is hair.
     """
     rim = observed_rim(problem, evidence, state, stage)
     depths = [camera.camera_from_world.apply(state.world_from_head.translation)[2] for camera in problem.rig]
@@ -61,7 +61,7 @@ def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float |
     Returns None if the settings state both noise and correlation length.
 
     The mean residual over a block of B px of outline has the variance l sigma^2 / B if B is well above the correlation
-    length l. So l itself need not be known. Residuals of ``most_px`` and more are left out.
+    length l. So l need not be known. Residuals of ``most_px`` and more are left out.
     """
     stated = problem.settings
     if stated.contour_noise_px is not None and stated.contour_correlation_px is not None:
@@ -83,10 +83,10 @@ def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float |
 
 
 def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, from_face: State) -> bool:
-    """Tells whether the outline of cranium and ears is that of the head itself rather than of hair.
+    """Tells whether the outline of cranium and ears belongs to the head itself instead of hair.
 
-    It is if ``state``, the fit to the whole head, explains that outline and fits the face about as well as
-    ``from_face``, the fit to the face alone. An outline of hair seldom fits a head; where it does, the face fits worse.
+    ``state`` is the fit to the whole head, ``from_face`` the fit to the face alone. The head is hairless if ``state``
+    explains the whole outline and fits the face about as well. A head seldom fits hair; if so, it fits the face worse.
     """
     rim = observed_rim(problem, evidence, state, replace(stage, whole_head=True))
     region = problem.model.levels[stage.level].face_region
@@ -101,6 +101,6 @@ def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, 
 
 
 def _robust_deviation_px(rim: Rim, chosen: Int[np.ndarray, " s"]) -> float:
-    """Returns the robust standard deviation (px) of the chosen residuals, from their median, which hair on the forehead
-    hardly changes."""
+    """Returns the robust standard deviation (px) of the chosen residuals from their median, since hair on the forehead
+    hardly changes a median."""
     return 1.4826 * float(np.median(np.abs(rim.residual[chosen]))) if len(chosen) else 0.0

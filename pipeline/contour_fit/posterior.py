@@ -1,15 +1,15 @@
 """Computes the uncertainty of a fitted head: the Laplace posterior, and from it the standard deviation of every vertex.
 
 Where no photograph constrains the surface, above all under hair, the posterior equals the prior, so its variance must
-be right. A head of the model's own population deviates there by half of what the kernel allows, one of another
-population by twice as much. ``with_estimated_prior`` therefore estimates the prior's variance from the coefficients
-that the photographs do determine (the evidence framework; MacKay 1992, *Bayesian interpolation*,
-https://doi.org/10.1162/neco.1992.4.3.415).
+be right. Where nothing is observed, a head of the model's population deviates by half of the kernel's standard
+deviation, a head of another population by twice as much. ``with_estimated_prior`` therefore estimates the prior's
+variance from the coefficients that the photographs determine (the evidence framework; MacKay 1992, *Bayesian
+interpolation*, https://doi.org/10.1162/neco.1992.4.3.415).
 
-Two more uncertainties follow, which no coefficient describes. The kernel moves the surface along its normals only; a
-head that deviates from the eigenheads deviates along the surface as well, so that a landmark's position there is as
-uncertain as the kernel allows (``Fit.sliding_mm``). Relief finer than the modes exists even where no photograph shows
-it. A fit to the eigenheads alone contains neither (see ``with_span_misfit``).
+Two more errors are added, which no coefficient describes. The kernel moves the surface along its normals only, but real
+heads also deviate along the surface; a landmark's position along it gets the standard deviation that the kernel has
+along the normal (``Fit.sliding_mm``). The second error is relief finer than the modes, which exists even where no
+photograph shows it. A fit to the eigenheads alone contains neither error (see ``with_span_misfit``).
 """
 
 import math
@@ -36,7 +36,7 @@ EAR_MISFIT_MM = 5.0  # where the face says that an ear sits, by the variance rat
 
 @traced
 def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_mm: float) -> Fit:
-    """Returns the fit with the covariance that follows from a prior whose variance is estimated from the fit itself.
+    """Returns the fit with a covariance whose prior variance is estimated from the fit itself.
 
     Coefficients that the photographs determine keep their variance. With ``C`` the covariance under unit priors, the
     prior variance of a group of modes is ``s^2 = sum z^2 / sum (1 - C_ii)``, and the new covariance is ``(C^-1 + 1 /
@@ -68,8 +68,8 @@ def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_
 
 
 def _variance_ratio(fit: Fit, modes: Int[np.ndarray, " k"]) -> float:
-    """Estimates the prior variance of a group of modes, relative to the unit prior; 1 if too few of them are
-    determined."""
+    """Estimates the prior variance of a group of modes relative to the unit prior; 1 if the photographs determine too
+    few of them."""
     assert fit.covariance is not None
     determined = float(np.clip(1.0 - np.diag(fit.covariance)[modes], 0.0, 1.0).sum())
     if determined < MIN_DETERMINED:
@@ -92,8 +92,8 @@ def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
 
 
 def cage_variance(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v0"]:
-    """Returns the variance (mm^2) of the cage's vertices along their normals, with the relief that no mode follows. The
-    fit must have a covariance."""
+    """Returns the variance (mm^2) of the cage's vertices along their normals, including relief finer than the modes.
+    The fit must have a covariance."""
     assert fit.covariance is not None
     rows = normal_rows(model, fit)
     # One triangular factor instead of rows @ covariance twice; the jitter keeps rounding from making it indefinite.

@@ -1,13 +1,13 @@
-"""Computes the prior: what is known of a head before it is observed. Coefficients are z ~ N(0, I), expressions are few,
-the scale is metric, and cameras stand where their calibration says, within its covariance.
+"""Computes the prior: what is known of any head before this one is observed. Coefficients are z ~ N(0, I); expressions
+are few; the scale is metric; cameras stand where their calibration says, within its covariance.
 
 Most faces are neutral, and the others combine few expressions. The prior of an expression's weight has a heavy tail,
 
     p(w) ~ (1 + w / t)^-2 N(w; 0, 1),    0 <= w <= 1
 
-Its first factor is Lomax's distribution (1954) of shape 1, whose median is t. A small weight is kept only if it
-explains much; a large one is hardly held back, unlike with a Gaussian or an exponential prior. In the equations the
-logarithm is replaced by its tangent, which lies above it, so that a step that lowers the one lowers the other (Candes,
+Its first factor is Lomax's distribution (1954) of shape 1, whose median is t. A small weight survives only if it
+explains much; a large one is penalised little, unlike under a Gaussian or an exponential prior. The equations replace
+the logarithm by its tangent, which lies above it: a step that lowers the tangent also lowers the logarithm (Candes,
 Wakin and Boyd 2008, *Enhancing sparsity by reweighted l1 minimization*). ``head_problem`` bounds the weights.
 
 The other priors are Gaussian: of the coefficients, of log scale and of each camera's correction.
@@ -28,14 +28,14 @@ TAIL = 2.0  # exponent of the weights' prior
 
 
 def weights_of(problem: ContourProblem, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, " e"]:
-    """Returns the expression weights among the coefficients, negative ones as 0. The array is empty in stages that do
-    not solve for expressions."""
+    """Returns the expression weights among the coefficients; negative weights become 0. The array is empty in stages
+    that do not solve for expressions."""
     return np.maximum(coefficients[problem.model.posed.start : problem.model.posed.stop], 0.0)
 
 
 def weight_slope(weights: Float[np.ndarray, " e"]) -> Float[np.ndarray, " e"]:
     """Returns ``TAIL / (t + w)`` for each expression weight w, where t is ``EXPRESSION_MEDIAN``. It is half the
-    derivative of ``2 TAIL log(1 + w / t)``, the part of the weights' prior that is not Gaussian."""
+    derivative of ``2 TAIL log(1 + w / t)``, the heavy-tailed factor of the weights' prior."""
     return TAIL / (EXPRESSION_MEDIAN + weights)
 
 

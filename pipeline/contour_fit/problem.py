@@ -1,4 +1,4 @@
-"""What the contour solver works on: its state, the stages of its schedule, and all that stays fixed during a fit."""
+"""Defines the contour solver's values: its state, the stages of its schedule, and everything fixed during a fit."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -84,7 +84,7 @@ class LevelBasis:
     level's vertices.
 
     A decimated level stores them at its own vertices (2 MB) and its operator is the identity. The full level stores
-    them at the cage's vertices, since rows for all its own would take 40 to 170 MB.
+    them at the cage's vertices instead, since its own would take 40 to 170 MB.
     """
 
     operator: sparse.csr_array
@@ -92,8 +92,8 @@ class LevelBasis:
     modes: Float32[np.ndarray, "v 3 m"]
 
     def vertices(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "V 3"]:
-        """Returns the level's vertices (head frame, mm) for the first coefficients. The sum over modes is in single
-        precision (exact to 1e-5 mm), which needs a third of the memory traffic."""
+        """Returns the level's vertices (head frame, mm); coefficients beyond the last one handed over count as 0. The
+        sum over modes is in single precision (exact to 1e-5 mm), which needs a third of the memory traffic."""
         flat = self.modes.reshape(self.mean.size, -1)
         moved = flat[:, : len(coefficients)] @ coefficients.astype(np.float32)
         return self.operator @ (self.mean + moved.reshape(-1, 3))
@@ -118,8 +118,8 @@ class ContourProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceObservations:
-    """Holds n point-to-plane observations: each says how far a vertex of the full level should move along a normal. The
-    equation is in ``surface_term``. The k cameras are in the order of the solver's views; c = 6 k."""
+    """Holds n point-to-plane observations: each states how far a vertex of the full level should move along a normal.
+    The equation is in ``surface_term``. The k cameras are in the order of the solver's views; c = 6 k."""
 
     vertex: Int[np.ndarray, " n"]
     basis: Float32[np.ndarray, "m n 3"]  # the model's modes at those vertices, head frame
@@ -137,7 +137,7 @@ class SurfaceObservations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RimNoise:
-    """Holds how much the outlines are trusted.
+    """Holds the noise of the outlines, from which the weights of the rim follow.
 
     Attributes:
         unit: l sigma^2 (px^3) of an outline with noise sigma and correlation length l. The cost is squared residual
@@ -165,7 +165,7 @@ class PhotoEvidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StageEvidence:
-    """Holds what earlier stages have found out: the noise of the outlines and, once measured, the surface in the
+    """Holds the results of earlier stages: the noise of the outlines and, once measured, the surface in the
     photographs."""
 
     noise: RimNoise
@@ -173,8 +173,8 @@ class StageEvidence:
 
 
 def first_evidence(settings: FittingSettings) -> StageEvidence:
-    """Returns the evidence for the first stage, before any residual is known: the contour noise that the settings
-    state, or a default."""
+    """Returns the evidence for the first stage: the contour noise from the settings or, if they state none, a
+    default."""
     noise, length = settings.contour_noise_px or FIRST_NOISE_PX, settings.contour_correlation_px
     return StageEvidence(RimNoise(noise**2 * (length or FIRST_CORRELATION_PX), 0.0, None))
 
@@ -213,8 +213,8 @@ def make_problem(
 
 @lru_cache(maxsize=4)  # models are few, jobs are many
 def level_basis(model: HeadModel, name: str) -> LevelBasis:
-    """Returns the mean and modes (head frame, mm) of a mesh level. They are stored at the level's vertices if these are
-    fewer than the cage's, else at the cage's."""
+    """Returns the mean and modes (head frame, mm) of a mesh level. They are stored at the level's vertices or at the
+    cage's, whichever are fewer."""
     level = model.levels[name]
     if level.count < len(model.mean):
         coarse_basis = model.basis(name, len(model.modes)).transpose(1, 2, 0)
@@ -225,8 +225,8 @@ def level_basis(model: HeadModel, name: str) -> LevelBasis:
 
 @lru_cache(maxsize=4)
 def level_topology(model: HeadModel, name: str) -> Topology:
-    """Returns a mesh level's edges and regions. Faces of the neck below the chin belong to no region: heads turn on the
-    neck, collars hide it, and its lower border is no contour of a person."""
+    """Returns a mesh level's edges and regions. Faces of the neck below the chin belong to no region: the head turns on
+    the neck, collars hide it, and its lower border is an edge of the model alone."""
     level = model.levels[name]
     mean = model.vertices(np.zeros(0), name)
     chin = model.vertices(np.zeros(0))[model.landmarks["gnathion"], 1]
@@ -238,7 +238,7 @@ def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Floa
     has one, else from an error of ``error_px`` in the image.
 
     The default prior moves the image of a head of 100 mm radius at ``depth_mm`` by ``error_px`` RMS. Half of that
-    variance is due to rotation and half to translation, whose effects on a head look the same.
+    variance is due to rotation and half to translation, because both shift the image of a head alike.
     """
     if camera.covariance is not None:
         return np.linalg.inv(camera.covariance + 1e-12 * np.eye(6))
@@ -288,8 +288,8 @@ def blended_basis(
 
 
 def widened(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) -> ContourProblem:
-    """Returns the problem for another ``model`` with the same mesh and more modes. Only the mesh levels named in
-    ``levels`` are kept."""
+    """Returns the problem for another ``model`` with the same mesh and more modes. Keeps only the mesh levels named in
+    ``levels``."""
     features = problem.features
     if features is not None:
         mean, basis = landmark_basis(model, features.vertex)

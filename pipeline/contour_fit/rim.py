@@ -1,15 +1,14 @@
-"""The rim of a head as every camera sees it, without drawing a single image.
+"""Finds the rim of a head in every camera without drawing an image.
 
 For X on the surface with normal N seen from C_k the rim is ``N . (X - C_k) = 0``: the zero crossing of vertex normals,
 linearly interpolated along mesh edges. A rim point is on the *outer* outline if a step outwards leaves the model's
-mask. That is decided exactly: the faces that look towards the camera all keep their orientation in the image, and those
-that look away all lose it, so that the number of faces over a pixel is the winding number of the image of the edges
-where the two sets meet (they count twice) or end (once). That chain is about a thousand edges a view, sorted into image
-rows, and a query is one walk along a row: no mask, no distance transform of the model, and no loose visibility test
-(one of |D_model| < 0.6 px lets inner facets through, and the fit stalls).
+mask. An exact test decides it. Project the edges where front-facing faces meet back-facing ones (counted twice) or
+where the mesh ends (counted once). Their winding number around a pixel is the number of faces over that pixel. This
+chain has about a thousand edges a view, sorted into image rows, so a test is one walk along a row. No mask is drawn.
+(The looser test |D_model| < 0.6 px accepts inner facets, and the fit stalls.)
 
 With P = d(pixel)/dX the image normal of the outline is ``n = l / |l|, l = N^T P^+``, since the tangent plane at the rim
-holds the viewing ray; so ``n^T P = N^T / |l|``, and the sliding of the rim along the surface drops out at first order.
+holds the viewing ray; so ``n^T P = N^T / |l|``. Sliding of the rim along the surface has no effect to first order.
 """
 
 from dataclasses import dataclass
@@ -44,7 +43,7 @@ STEPS_OUT_PX = (0.3, 2.5)  # both must leave the mask: the second drops samples 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Topology:
-    """Holds the faces, edges and regions of a mesh level, as the search for its rim needs them."""
+    """Holds the faces, edges and regions of a mesh level, in the form that the search for its rim needs."""
 
     faces: Int32[np.ndarray, "f 3"]
     edges: Int32[np.ndarray, "e 4"]  # from, to (as in face one), face one, face two or -1
@@ -73,8 +72,8 @@ class Views:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rim:
-    """Holds samples of a head's rim: the points where the rim crosses edges of the mesh, as far as they lie on the
-    outer outline. All views follow one another."""
+    """Holds samples of a head's rim: the points on the outer outline where the rim crosses edges of the mesh. The
+    samples of all views stand one after another."""
 
     view: Int32[np.ndarray, " s"]
     corner: Int32[np.ndarray, "s 2"]  # the edge's two vertices
@@ -114,7 +113,7 @@ def make_topology(
 
 
 def pack_views(rig: Rig, distances: dict[str, Float32[np.ndarray, "h w"]]) -> Views:
-    """Packs the cameras of ``rig`` that have a signed distance, with these distances (px), into flat arrays."""
+    """Packs the cameras of ``rig`` that have a signed distance, and these distances (px), into flat arrays."""
     cameras = [camera for camera in rig if camera.name in distances]
     maps = [np.ascontiguousarray(distances[camera.name], np.float32) for camera in cameras]
     return Views(
@@ -138,9 +137,9 @@ def find_rim(
 ) -> Rim:
     """Finds samples of a mesh's outer outline in every view, and reads the silhouette's signed distance (px) at each.
 
-    ``whole_head`` also searches cranium and ears, else only the face region. If ``averaged``, the distance is the mean
-    over the outline half way to both neighbouring samples; meant for a mesh whose edges are only 2 to 6 px long in the
-    image.
+    ``whole_head`` also searches cranium and ears; otherwise only the face region is searched. If ``averaged``, each
+    distance is a mean along the outline, half way to both neighbouring samples; this is meant for meshes whose edges
+    are only 2 to 6 px long in the image.
     """
     faces = topology.head if whole_head else topology.face
     vertices = np.ascontiguousarray(vertices_world)
@@ -164,10 +163,11 @@ def _outlines(
     some: slice,
     averaged: bool,
 ) -> list[tuple[Int32[np.ndarray, "_ 2"], Float[np.ndarray, "_ 14"]]]:
-    """Returns, for each of at most ``VIEWS_A_WORD`` views, the edges' corners and the samples; ``rim_kernels`` names
-    the samples' columns.
+    """Returns, for each of at most ``VIEWS_A_WORD`` views, the corners of the crossed edges and the samples;
+    ``rim_kernels`` names the samples' columns.
 
-    Faces and vertices are swept once for all views, a bit for each; a view then only touches what lies on its rim.
+    One sweep over faces and vertices serves all views, with a bit for each view; after it a view only visits the faces
+    on its rim.
     """
     centres = -np.einsum("kji,kj->ki", views.rotation[some], views.translation[some])
     pictures = Pictures(views.packed()[some], centres, views.size[some], views.distance, views.offset[some])
@@ -187,6 +187,6 @@ def _outlines(
 def project_with_slopes(
     points_world: Float[np.ndarray, "n 3"], view: Int[np.ndarray, " n"], views: Views
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
-    """Projects each point into one view: the one of the same row in ``view``. Returns the pixels and the derivatives
-    d(pixel) / d(point), px per mm."""
+    """Projects each point into one view, whose index stands in the same row of ``view``. Returns the pixels and the
+    derivatives d(pixel) / d(point), px per mm."""
     return projected_with_slopes(points_world, view, views.packed())

@@ -1,4 +1,4 @@
-"""Compiled inner loops of ``rim``: sweeps over the mesh for all views at once, then one view at a time, shared by
+"""Compiled loops of ``rim``: first sweeps over the mesh for all views at once, then a loop for each view, shared among
 threads."""
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ LONGEST_PX = 16.0  # between neighbours on the rim; farther apart, or turned by 
 
 
 class Surface(NamedTuple):
-    """Holds a mesh level (world, mm); an edge is from, to (as in its first face), first face, second face or -1."""
+    """Holds a mesh level (world, mm). An edge: from, to (in its first face's order), first face, second face or -1."""
 
     vertices: np.ndarray
     normals: np.ndarray
@@ -28,7 +28,7 @@ class Surface(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """Holds how faces, edges and vertices lie towards at most 64 views: a word each, whose bit k is view k's."""
+    """Holds which way faces, edges and vertices face in at most 64 views: a 64-bit word each; bit k is view k's."""
 
     facing: np.ndarray  # of all faces: that look to the view
     outline: np.ndarray  # edges where the number of layers changes in some view,
@@ -39,8 +39,8 @@ class Sweep(NamedTuple):
 
 
 class Pictures(NamedTuple):
-    """Holds the views: camera rows (``packed_camera``), centres (world, mm), and signed distances (px), one view after
-    another."""
+    """Holds the views: camera rows (``packed_camera``), centres (world, mm), and the signed distances (px) of all views
+    in sequence."""
 
     cameras: np.ndarray
     centres: np.ndarray
@@ -90,7 +90,7 @@ def normals_and_planes(vertices, faces):
 
 @njit(cache=True, fastmath=True)
 def _facing(planes, centres):
-    """By face a word: bit k is set where it looks to view k."""
+    """Returns one word for each face; bit k is set where the face is turned towards view k."""
     words = np.zeros(planes.shape[1], np.uint64)
     for first in range(0, len(words), BLOCK):
         last = min(first + BLOCK, len(words))
@@ -105,14 +105,14 @@ def _facing(planes, centres):
 
 @njit(cache=True, fastmath=True)
 def _side(vertex, normal, centre):
-    """N . (X - C): its zero crossings are the rim."""
+    """Returns N . (X - C), whose zero crossings are the rim."""
     x, y, z = vertex[0] - centre[0], vertex[1] - centre[1], vertex[2] - centre[2]
     return normal[0] * x + normal[1] * y + normal[2] * z
 
 
 @njit(cache=True, fastmath=True)
 def _back_facing(vertices, normals, centres):
-    """By vertex a word: bit k is set where its normal looks away from view k."""
+    """Returns one word for each vertex; bit k is set where its normal points away from view k."""
     words = np.zeros(len(vertices), np.uint64)
     for v in range(len(vertices)):
         word = np.uint64(0)
@@ -125,7 +125,7 @@ def _back_facing(vertices, normals, centres):
 
 @njit(cache=True, fastmath=True)
 def _silhouette_edges(edges, facing):
-    """The edges where the number of layers changes in some view, and the word of those views; borders in all."""
+    """Returns the edges where some view's number of layers changes, and all borders, with the word of these views."""
     count = 0
     for e in range(len(edges)):
         if edges[e, 3] < 0 or facing[edges[e, 2]] != facing[edges[e, 3]]:
@@ -145,7 +145,7 @@ def _silhouette_edges(edges, facing):
 
 @njit(cache=True, fastmath=True)
 def _crossed(faces, active, behind):
-    """The active faces that the rim crosses in some view, and the word of those views."""
+    """Returns the active faces that the rim crosses in some view, each with the word of those views."""
     which, words = np.empty(len(active), np.int32), np.empty(len(active), np.uint64)
     count = 0
     for s in range(len(active)):
@@ -160,8 +160,8 @@ def _crossed(faces, active, behind):
 
 @njit(cache=True, fastmath=True)
 def _chain(surface, sweep, bit, camera):
-    """Image of one view's outline: x0 y0 x1 y1, directed as in the face that looks to the camera (against the direction
-    in one that looks away), and by how many layers."""
+    """Returns the image of one view's outline, an edge a row: x0 y0 x1 y1 and a number of layers. An edge runs as in
+    its face towards the camera, or against its face away from the camera."""
     vertices, total = surface.vertices, 0
     for word in sweep.outline_words:
         total += 1 if word & bit else 0
@@ -183,8 +183,8 @@ def _chain(surface, sweep, bit, camera):
 
 @njit(cache=True, fastmath=True)
 def _rows(chain, height):
-    """The chain's edges sorted into the image rows that they cross: where each row starts, and for every entry the
-    edge's y0, y1, x0, dx/dy and signed layers. Copies, not indices: a query then reads one stretch of memory."""
+    """Sorts the chain's edges into the image rows that they cross. Returns where each row starts, and for every entry
+    the edge's y0, y1, x0, dx/dy and signed layers. They are copies, so that a test reads one stretch of memory."""
     start = np.zeros(height + 1, np.int64)
     for i in range(len(chain)):
         low, high = min(chain[i, 1], chain[i, 3]), max(chain[i, 1], chain[i, 3])
@@ -211,7 +211,7 @@ def _rows(chain, height):
 
 @njit(cache=True, fastmath=True)
 def _layers(x, y, start, entries):
-    """Winding number of the chain about a pixel: how many faces lie over it."""
+    """Returns the chain's winding number around a pixel: the number of faces over it."""
     row = int(np.floor(y))
     if row < 0 or row >= len(start) - 1:
         return 1.0  # outside the image nothing is known; such samples are dropped
@@ -225,7 +225,7 @@ def _layers(x, y, start, entries):
 
 @njit(cache=True, fastmath=True)
 def _read(pictures, k, x, y):
-    """The signed distance of a view at a pixel."""
+    """Returns the signed distance of a view at a pixel."""
     width, height = pictures.size[k, 0], pictures.size[k, 1]
     column, right = cell(x, width)
     row, down = cell(y, height)
@@ -234,8 +234,8 @@ def _read(pictures, k, x, y):
 
 @njit(cache=True, fastmath=True)
 def _crossings(surface, sweep, bit, centre, corners, samples):
-    """Zero crossings of N . (X - C) along the edges of the crossed faces; each edge once. Fills the sample's edge,
-    blend, point, normal (in the place of the slope); returns how many, and the segments that join them."""
+    """Finds the zero crossings of N . (X - C) along the edges of the crossed faces, each edge once. Fills in each
+    sample's edge, blend, point and normal (in the slope's column); returns their number, and the joining segments."""
     vertices, normals, faces, behind = surface.vertices, surface.normals, surface.faces, sweep.behind
     kept_index = np.full(len(vertices), -1, np.int32)
     segments = np.empty((corners.shape[0], 2), np.int32)
@@ -290,7 +290,7 @@ def _crossings(surface, sweep, bit, centre, corners, samples):
 
 @njit(cache=True, fastmath=True)
 def _view(k, surface, sweep, bit, pictures, steps, averaged, corners, samples):
-    """One view: fills ``corners`` and ``samples`` with the samples on the outer outline; returns their number."""
+    """Fills ``corners`` and ``samples`` with one view's samples on the outer outline; returns their number."""
     camera = pictures.cameras[k]
     width, height = pictures.size[k, 0], pictures.size[k, 1]
     start, entries = _rows(_chain(surface, sweep, bit, camera), height)
@@ -344,10 +344,10 @@ def _view(k, surface, sweep, bit, pictures, steps, averaged, corners, samples):
 
 @njit(cache=True, fastmath=True)
 def _average(segments, place, kept, pictures, k, samples):
-    """Residuals as means over the outline that samples stand for, half way to their neighbours.
+    """Replaces each residual by its mean over the outline that the sample represents, half way to its neighbours.
 
-    The rim crosses the mesh every 2 to 6 px, and the noise of a contour is another after 2 px: read at the samples
-    alone, half of what a contour says is thrown away.
+    Samples are 2 to 6 px apart, and a contour's noise is independent after 2 px: reading at the samples alone would
+    lose half of the contour's information.
     """
     total, read = np.zeros(kept), np.zeros(kept)
     for j in range(len(segments)):
@@ -393,7 +393,7 @@ def find_rim_samples(first, last, surface, sweep, pictures, steps, averaged, cou
     """Finds the rim samples of views ``first`` to ``last`` and fills, for each view k, ``counts[k]``, ``corners[k]``
     (the two vertices of each sample's edge) and ``samples[k]`` (columns as named above).
 
-    ``steps`` are distances (px) outside the outline that must be free of the model; ``averaged`` is that of
+    ``steps`` are distances (px) outside the outline at which no part of the model may lie; ``averaged`` is that of
     ``find_rim``.
     """
     for k in range(first, last):
@@ -428,8 +428,8 @@ def fill_rows(first, last, level, count, turn, place, cameras, rim, out):
     (rotation, translation). The equations are in ``rim_term``.
 
     ``turn`` is scale times rotation (3, 3) and ``place`` the translation (3, mm) of world_from_head; ``cameras`` has
-    the rows of ``Views.packed``. By the coefficients the derivative is gradient . mode, summed over the cage with the
-    weights of the level's operator and of the sample on its edge.
+    the rows of ``Views.packed``. The derivative by a coefficient is gradient . mode, summed over the cage's vertices
+    with the weights of the level's operator and of the sample on its edge.
     """
     indptr, indices, data, modes = level
     view, corner, blend, point, gradient = rim
@@ -461,6 +461,6 @@ def fill_rows(first, last, level, count, turn, place, cameras, rim, out):
 
 @njit(cache=True, fastmath=True)
 def _fill_rigid(x, y, z, gx, gy, gz, out, first):
-    """Rotation and translation: g . (w x arm) = w . (arm x g), and g."""
+    """Fills in the derivatives by rotation and translation: g . (w x arm) = w . (arm x g), and g."""
     out[first], out[first + 1], out[first + 2] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
     out[first + 3], out[first + 4], out[first + 5] = gx, gy, gz

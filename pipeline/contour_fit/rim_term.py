@@ -1,4 +1,4 @@
-"""The contour term: how far the input's outline lies from the model's rim, all samples of all views.
+"""Computes the contour term: the distances of the input's outline from the model's rim, over all samples of all views.
 
 Residual of a rim sample: the input's signed distance ``r = D_obs(u)`` (px), with
 
@@ -9,9 +9,9 @@ Residual of a rim sample: the input's signed distance ``r = D_obs(u)`` (px), wit
 Each sample stands for ``length`` px of outline and weighs ``length / (l sigma^2)``: the Fisher information of a contour
 with noise sigma and correlation length l.
 
-Clutter (hair, shoulders, clothes) only ever adds area: the input may lie outside the model, hardly ever inside. So the
-robust scale (Geman-McClure) is one-sided: it forgives early where the model lies inside the input, and late where it
-sticks out.
+Clutter (hair, shoulders, clothes) only adds area: the input's outline may lie outside the model but hardly ever inside.
+So the robust loss (Geman-McClure) is one-sided: its scale is small where the model lies inside the input, and large
+where the model sticks out.
 """
 
 from dataclasses import dataclass
@@ -33,8 +33,8 @@ OUTSIDE_SCALE = 2.0  # robust scale where the model sticks out of the input, by 
 
 
 def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> Rim:
-    """Returns the rim of the head at ``state``, with the weight of each sample that ``stage`` and ``evidence`` give it;
-    samples in clutter have length 0."""
+    """Returns the rim of the head at ``state``, with each sample's weight from ``stage`` and ``evidence``; samples in
+    clutter have length 0."""
     vertices = state.world_from_head.apply(problem.bases[stage.level].vertices(state.coefficients))
     # On a decimated mesh a sample's share of the outline is long enough to be half clutter: it would hide what is not.
     fine, whole = stage.level == "full", stage.whole_head or stage.contained
@@ -48,8 +48,8 @@ def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RimTerm:
-    """Computes the cost of the silhouettes' outlines. ``scale_px`` is the robust scale. The cost is scaled as if the
-    rim had ``reference_px`` of outline, so that hiding a part of it gains nothing; None for no scaling."""
+    """Computes the cost of the silhouettes' outlines. ``scale_px`` is the robust scale. The cost is normalised to an
+    outline of ``reference_px``, so that hiding a part of the rim does not lower it; None means no normalisation."""
 
     problem: ContourProblem
     evidence: StageEvidence
@@ -72,8 +72,8 @@ class LinearisedRimTerm:
 
     @property
     def cost(self) -> float:
-        """Returns the robust cost of all samples, each weighted with its length of outline, in squared standard
-        deviations."""
+        """Returns the robust cost of all samples in squared standard deviations, each weighted by its length of
+        outline."""
         rho = _loss(self.rim.residual, self.term.scale_px).cost(self.rim.residual**2)
         total = float(self.rim.length.sum())
         share = (self.term.reference_px or total) / max(total, 1.0)

@@ -1,15 +1,15 @@
-"""What is known of the surface itself, as against its rim: point-to-plane observations for the same normal equations.
+"""Computes the surface term: point-to-plane observations of the surface inside the outline, for the same equations.
 
-An observation says that a vertex of the full level lies ``displacement`` mm along a normal from where it stood when it
-was observed, with an information (mm^-2). Sliding along the surface is free, as for the rim. Where it came from images,
-it depends on the cameras: moving camera k by c_k moves the observed place by ``by_camera . c_k``, and what the images
-say of the cameras alone (shifts between them that no surface explains) stands in ``camera_matrix``. With
+An observation states that a vertex of the full level lies ``displacement`` mm along a normal from its position at that
+time, with an information (mm^-2). Sliding along the surface is free, as for the rim. An observation from images depends
+on the cameras: moving camera k by c_k moves the observed point by ``by_camera . c_k``. What the images tell of the
+cameras alone (shifts that no surface explains) is in ``camera_matrix``. With
 
     e = n . (X(theta) - X_seen) - displacement - by_camera . (c - c_seen)
 
 the term is ``sum information rho(e) + (c - c_seen)^T M (c - c_seen) - 2 g^T (c - c_seen)``, rho of Geman and McClure
-with a scale of ``FORGIVEN_SIGMAS``. A bound counts where e is positive: where the head stands out of it. (Taken for a
-place, a dozen of them held a chin on its beard, 9 mm out.)
+with a scale of ``FORGIVEN_SIGMAS``. A bound counts only where e is positive, that is where the head sticks out of it.
+(A dozen bounds treated as positions held a chin at its beard, 9 mm too far out.)
 """
 
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ def surface_residual(
     camera_shift: Float[np.ndarray, "k 6"],
 ) -> tuple[Float[np.ndarray, " n"], Points]:
     """Returns the residual e (mm) of each observation, as the module defines it, and the current positions of the
-    vertices (world, mm). An observation that is only a bound (of hair) has the residual 0 if the head keeps it."""
+    vertices (world, mm). A bound (from hair) has the residual 0 while the head stays inside it."""
     count = len(coefficients)
     moved = (coefficients.astype(np.float32) @ seen.basis[:count].reshape(count, -1)).reshape(-1, 3)
     points = world_from_head.apply(seen.mean + moved)
@@ -88,7 +88,7 @@ class LinearisedSurfaceTerm:
         return float(LOSS.cost(self.squares).sum()) + self.cameras.cost
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds the term's part to the normal equations in place. Bounds that are kept add nothing."""
+        """Adds the term's part to the normal equations in place. Bounds that the head satisfies add nothing."""
         seen, stage, state = self.term.seen, self.term.stage, self.state
         rows = surface_rows(seen, stage.modes, state.world_from_head, self.points, cameras=stage.cameras)
         counts = ~seen.bound | (self.residual > 0.0)

@@ -1,7 +1,7 @@
-"""Finds which point of the head each measured surface point shows: the closest one that faces the same way.
+"""Assigns each measured surface point to the closest point of the head that faces the same way.
 
-The search goes from the points to the head, and not the other way. So a part of the head that no point shows gets no
-observation, at the rim of a hole as well as in its middle.
+The search goes from the points to the head, not from the head to the points. So a part of the head without points gets
+no observation, neither at the rim of a hole nor in its middle.
 """
 
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ CANDIDATES = 4  # vertices whose triangles are tried
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Associated:
-    """Holds the n surface points that lie near a head, by their indices, and the point of the head's mesh that each one
-    shows."""
+    """Holds the n surface points near a head, by their indices, and the corresponding point of the head's mesh for
+    each."""
 
     row: Int[np.ndarray, " n"]  # of the points asked for
     triangle: Int[np.ndarray, " n"]
@@ -31,8 +31,7 @@ class Associated:
 
 
 def faces_at_vertices(faces: Faces, count: int) -> tuple[Int[np.ndarray, " v1"], Int[np.ndarray, " e"]]:
-    """Returns the faces at each vertex as compressed rows, ``start`` and ``members``: those of vertex i are
-    ``members[start[i]:start[i + 1]]``."""
+    """Returns the faces at each vertex as compressed rows: those of vertex i are ``members[start[i]:start[i + 1]]``."""
     start, corner = corners_at_vertices(faces, count)
     return start, corner // 3
 
@@ -60,7 +59,7 @@ class Target:
         reach_mm: float,
         least_agreement: float,
     ) -> Associated:
-        """Finds the closest point on the head for every surface point that has one within reach.
+        """Finds, for each surface point, the closest point on the head within reach.
 
         Args:
             points: measured surface points, mm, in the head's frame.

@@ -1,8 +1,8 @@
-"""Estimates how far the eyelids are closed, from the measured surface.
+"""Estimates from the measured surface how far the eyelids are closed.
 
-Patches of a few millimetres do not follow a lid, so that the fit to photographs leaves lids open; and what is seen
-between the lids (``eyelids``) is misleading for eyes whose white does not show. So a few weights of each eye's blink
-are tried, and the one is taken whose lids lie nearest to the surface points around the eye, robustly.
+Other evidence is weak. Patches of a few millimetres do not follow a lid, so the photometric fit leaves lids open; the
+appearance between the lids (``eyelids``) misleads for eyes whose white is hidden. So a few blink weights are tried for
+each eye. The result is the weight with the smallest robust distance between lids and surface points.
 """
 
 from collections.abc import Mapping
@@ -34,8 +34,8 @@ OPEN = 1.25  # ... and so are others, unless half closed ones fit that much wors
 
 
 def blinks_of(model: HeadModel) -> dict[str, int]:
-    """Returns, for each eye (``right``, ``left``), the index of the fit's coefficient that closes it. Eyes for which
-    the model has no blink expression are left out."""
+    """Returns, for each eye (``right``, ``left``), the index of the fit's coefficient of its blink. Eyes for which the
+    model has no blink expression are left out."""
     found: dict[str, int] = {}
     for name, place in zip(model.expressions.names, model.posed, strict=False):
         if plain_name(name) in BLINKS:
@@ -72,7 +72,7 @@ def estimate_eyelid_closure(
 
 
 def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Vertices:
-    """Returns the displacement (full level, world frame, mm) that takes each eye from the fit's blink weight to the
+    """Returns the displacement (full level, world frame, mm) that changes each eye from the fit's blink weight to the
     weight in ``lids``."""
     shift, places = np.zeros((model.levels["full"].count, 3)), blinks_of(model)
     for side, share in lids.items():
@@ -106,9 +106,9 @@ def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Vertices:
 def _nearest_closure(
     open_lids: Vertices, moved: Vertices, fitted: float, model: HeadModel, surface: SurfacePoints, slit: Fissure
 ) -> tuple[float, float]:
-    """Returns the blink weight whose lids lie nearest to the points, or ``fitted`` where too few points lie there or
-    none is nearer. Also returns the misfit of half closed lids divided by that of open ones, 1 where too few points lie
-    there.
+    """Returns the blink weight with the smallest distance between lids and points; ``fitted`` if too few points lie
+    there or no weight is better. Also returns the misfit of half closed lids divided by that of open ones; 1 if too few
+    points lie there.
 
     ``moved`` is the displacement of a full blink (mm).
     """
@@ -141,8 +141,8 @@ def _patch(
 
 
 def _misfit(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], points: SurfacePoints) -> float:
-    """Returns the mean of Geman and McClure's loss over the points' distances to the mesh, 0 to 1. A point with no
-    place on the mesh within reach counts as 1."""
+    """Returns the mean of Geman and McClure's loss over the points' distances to the mesh, 0 to 1. A point without a
+    mesh point within reach counts as 1."""
     normals = vertex_normals(vertices, faces)
     found = associate(
         points.points, points.normals, vertices, normals, faces, reach_mm=REACH_MM, least_agreement=AGREEMENT

@@ -1,5 +1,5 @@
-"""Converts the depth maps to one cloud of surface points with normals, each with the part of the subject that it
-shows."""
+"""Converts the depth maps to one cloud of surface points with normals; each point has a part label (skin, hair or
+clothes)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,8 +34,8 @@ TOGETHER_DEG = 65.0  # between views that may see one place: the dense stage com
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfacePoints:
-    """Holds n points of the visible surface in the world frame, each with its normal, its standard deviation, and the
-    part of the subject that it shows."""
+    """Holds n points of the visible surface in the world frame, each with its normal, its standard deviation, and its
+    part label."""
 
     points: Float[np.ndarray, "n 3"]  # mm
     normals: Float[np.ndarray, "n 3"]  # unit, outwards
@@ -48,13 +48,13 @@ class SurfacePoints:
 
 
 def with_scaled_deviation(surface: SurfacePoints, factor: float | Float[np.ndarray, " n"]) -> SurfacePoints:
-    """Returns the points with ``factor`` times their deviation."""
+    """Returns the points with their standard deviations multiplied by ``factor``."""
     return replace(surface, deviation_mm=factor * surface.deviation_mm)
 
 
 def thinned(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:
-    """Thins out points: returns the mean, weighted by information, of the points in each cell of a grid, for each part
-    of the subject and main direction of the normal.
+    """Thins out points to one for each cell of a grid, part and main direction of the normal: the mean, weighted by
+    information.
 
     The deviation remains that of a single point: neighbouring points have nearly the same error, since their windows
     overlap.
@@ -107,8 +107,8 @@ def dense_points(depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_w
 
 
 def count_views_needed(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"]) -> int:
-    """Returns how many views must agree on a point near the head: half of the cameras that stand within
-    ``TOGETHER_DEG`` of each other where they are densest, but at least two and at most ``MAX_VIEWS_NEEDED``.
+    """Returns how many views must agree on a point near the head: half of the cameras within ``TOGETHER_DEG`` of each
+    other where they are densest, but at least two and at most ``MAX_VIEWS_NEEDED``.
 
     Args:
         cameras: of the depth maps.
@@ -142,10 +142,10 @@ def _cloud(
 
 
 def skin_under_cap(points: SurfacePoints, depth_maps: Sequence[DepthMap], cap: Cap, rig: Rig) -> SurfacePoints:
-    """Moves the points that show the cap inwards by its thickness, and counts them as skin.
+    """Moves the points on the cap inwards by its thickness, and labels them as skin.
 
-    ``points``: of the visible surface, world, mm, with outward normals. ``depth_maps``: of which they come. ``cap``:
-    the pixels that show it. ``rig``: the cameras as calibrated.
+    ``points``: points of the visible surface (world, mm) with outward normals. ``depth_maps``: the maps from which the
+    points come. ``cap``: thickness of the cap, and its pixels. ``rig``: the cameras as calibrated.
     """
     worn = {
         name: PartMap(name, np.zeros((*shown.shape, 3), np.uint8)).with_clothes(shown)

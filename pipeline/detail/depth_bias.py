@@ -1,9 +1,9 @@
-"""Measures the bias of depth that comes from matching windows (``pipeline.stereo.depth_map``), on the fitted face of
-each capture. The face can serve as the reference: its cameras and shape were solved together, by patches that follow
-the surface.
+"""Measures the bias that matching windows cause in depth (``pipeline.stereo.depth_map``), on the fitted face of each
+capture. The face is a good reference: its shape and the cameras were solved together, from patches that follow the
+surface.
 
-On captures of two renderers the surface was 0.0 to 0.15 mm too deep, and the share was 0.7 to 1.5, within 0.1 the same
-from the fitted face as from the true one.
+On captures from two renderers the surface was 0.0 to 0.15 mm too deep, and the ``share`` was 0.7 to 1.5. The fitted
+face and the true face gave the same share to 0.1.
 """
 
 from dataclasses import dataclass, replace
@@ -28,8 +28,8 @@ MAX_MM, MAX_SHARE = 0.3, 2.0  # of the common offset, and of the share: beyond, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnFace:
-    """Holds points of skin, the points of the fitted face that they show, how far (mm, along the ``normal`` there) they
-    lie off the face, and the face's ``windowed_height`` there."""
+    """Holds points of skin with their closest points on the fitted face, their offsets from the face (mm, along the
+    ``normal`` there), and the face's ``windowed_height`` there."""
 
     row: Int[np.ndarray, " n"]  # of the points
     normal: Float[np.ndarray, "n 3"]
@@ -39,8 +39,8 @@ class OnFace:
 
 @traced
 def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarray, " v"]) -> OnFace:
-    """Returns the points of skin whose closest point on the fitted head (world frame, mm) is in a triangle with all
-    corners in ``face``."""
+    """Returns the points of skin whose closest triangle on the fitted head (world frame, mm) has all corners in
+    ``face``."""
     vertices, faces, normals = head_world.vertices, head_world.faces, head_world.normals()
     skin = np.flatnonzero(surface.part == Part.SKIN)
     if not len(skin):
@@ -69,7 +69,7 @@ def measure_bias(seen: OnFace) -> WindowBias:
 
 def without_window_bias(surface: SurfacePoints, seen: OnFace, bias: WindowBias) -> SurfacePoints:
     """Returns the points with the bias of the matching windows removed. Every point moves along its normal by the
-    common bias. Points on the face also move by their share of the windowed height, which is known only there."""
+    common bias. Points on the face also move by ``share`` times the windowed height, which is known only there."""
     points = surface.points - bias.common_mm * surface.normals
     points[seen.row] = (
         surface.points[seen.row] - (bias.common_mm + bias.share * seen.windowed_mm)[:, None] * seen.normal

@@ -1,8 +1,8 @@
-"""Moves each ear into place as a whole, before the head is deformed.
+"""Moves each ear into position as a whole, before the head is deformed.
 
-An ear may be a centimetre off where the face suggests, and it has many folds, so that the closest point may be on
-another fold. So each ear first moves by a similarity, from several starts, to where it agrees best with the surface
-points around it (iterated closest points along the normals; Chen and Medioni 1992). Its surroundings follow smoothly.
+An ear may be a centimetre away from its predicted position, and has many folds: the closest point may lie on the wrong
+fold. So each ear first moves by a similarity. From several starts, that with the best agreement to the surface points
+around it wins (iterated closest points along the normals; Chen and Medioni 1992). Its surroundings follow smoothly.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ AGREEMENT = 0.4
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
     """Holds a similarity about the middle of an ear, its robust cost per point, and the number of points (``shown``)
-    whose closest place then lies on the ear."""
+    whose closest point then lies on the ear."""
 
     cost: float
     scale: float
@@ -48,7 +48,7 @@ class Motion:
 
 
 def with_ears_in_place(vertices: Vertices, model: HeadModel, surface: SurfacePoints) -> Vertices:
-    """Returns the head with each ear moved to where the points of skin show it. An ear with too few points around it
+    """Returns the head with each ear moved to the points of skin that show it. An ear with too few points around it
     stays.
 
     Args:
@@ -82,8 +82,8 @@ def _registered(
     points: SurfacePoints,
     model: HeadModel,
 ) -> Vertices:
-    """Returns all vertices under the similarity that best fits the ear to the points about it. Returns them unchanged
-    if fewer than ``MIN_SHOWN`` points show the ear itself: where hair covers the ear, the cheek before it would drag it
+    """Returns all vertices under the similarity that best fits the ear to the points around it. Returns them unchanged
+    if fewer than ``MIN_SHOWN`` points show the ear itself: if hair covers the ear, the cheek in front would pull it
     along."""
     centre = vertices[ear].mean(axis=0)
     local = np.flatnonzero(np.linalg.norm(vertices - centre, axis=1) < np.linalg.norm(
@@ -107,7 +107,7 @@ def _registered(
 
 
 def _axes(vertices: Vertices, model: HeadModel) -> tuple[Vector, Vector]:
-    """Returns the unit vectors up and ahead of the head, world frame."""
+    """Returns the unit vectors up and forward of the head, world frame."""
     at = {name: vertices[row] for name, row in model.landmarks.items()}
     up = at["nasion"] - at["gnathion"]
     ahead = at["nasion"] - 0.5 * (at["tragion_left"] + at["tragion_right"])
@@ -122,7 +122,7 @@ def _descend(
     """Computes the similarity about ``centre`` to which iterated closest points converge from one starting ``shift``
     (mm). ``target`` is the ear with its surroundings, relative to ``centre``.
 
-    The points are mapped back to the ear as it was, so that the search tree is built only once.
+    The points are mapped back to the original ear, so that the search tree is built only once.
     """
     scale, turn, cost, shown = 1.0, np.eye(3), np.inf, 0
     for reach in REACHES_MM:

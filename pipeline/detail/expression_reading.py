@@ -1,17 +1,17 @@
-"""Reads the expression of a face from the head as it was deformed to the surface.
+"""Estimates the expression of a face from the deformed head.
 
-Enters: the deformed head (``refine``). Leaves: the weights of its expressions with their standard deviations. The fit
-determines these with few eigenheads and while the surface is known to half a millimetre only. Whatever the eigenheads
-lack then looks like an expression, above all at the brows and the wings of the nose. So the weights are estimated once
-more, from the final surface and with all eigenheads of the population. With X a point of the head, Y the same point on
-the deformed head and n the normal there,
+In: the deformed head (``refine``). Out: the weights of its expressions with their standard deviations. The fit
+estimates these weights with few eigenheads, when the surface is known to half a millimetre only. Shape that the few
+eigenheads lack then looks like an expression, above all at the brows and the wings of the nose. So the weights are
+estimated once more, from the final surface and with all eigenheads of the population. With X a point of the head, Y the
+same point on the deformed head and n the normal there,
 
     n . (mean + sum_m z_m modes_m + sum_e w_e shapes_e + pose - Y) = noise,    z ~ N(0, 1),
 
 robustly. The variance of the kernel's modes is estimated here, since all eigenheads leave little for them; the
-expression weights have the prior and bounds of the fit (``prior_term``). Sliding along the surface is free: the points
-are found anew on the deformed head. Only the weights change, not the head. If the head does not belong to the
-population, whose eigenheads would then need expressions to explain it, the weights of the fit are kept.
+expression weights have the prior and bounds of the fit (``prior_term``). Sliding along the surface is free: the closest
+points are searched anew on the deformed head. Only the weights change, not the head. If a head is outside the
+population, expressions would replace missing eigenheads, so the weights of the fit stay.
 """
 
 from dataclasses import dataclass, replace
@@ -59,8 +59,8 @@ class ReadingBasis:
 
 @lru_cache(maxsize=1)  # 10 MB; studios work with one model
 def reading_basis(population: HeadModel, model: HeadModel, eigenheads: int) -> ReadingBasis:
-    """Returns points spread over the mean face of ``population`` and how each mode moves them: first all eigenheads of
-    ``population``, then the kernel modes and the expressions of ``model``, which the fit used."""
+    """Returns points on the mean face of ``population`` and their displacement by each mode: first all its eigenheads,
+    then the kernel modes and expressions of ``model``, which the fit used."""
     full = population.levels["full"]
     inputs = (population.sha256, population.modes, model.modes, model.posed, eigenheads, SPACING_MM)
 
@@ -86,12 +86,12 @@ def with_read_expression(
     *,
     eigenheads: int,
 ) -> Fit:
-    """Returns the fit with expression weights, and their deviations, estimated anew from the deformed head. Returns the
-    fit unchanged if the model has no expressions, or if the population does not explain the head.
+    """Returns the fit with expression weights, and their standard deviations, estimated anew from the deformed head.
+    Returns the fit unchanged if the model has no expressions, or if the population does not explain the head.
 
-    ``fit``: to the photographs. ``model``: with the modes that the fit has. ``population``: the model with all its
-    eigenheads. ``vertices_world``: the deformed head, full level, mm. ``observed``: which of its vertices a point of
-    skin shows. ``eigenheads``: how many of the fit's modes are eigenheads.
+    ``fit``: the fit to the photographs. ``model``: the model with the fit's modes. ``population``: the model with all
+    its eigenheads. ``vertices_world``: the deformed head, full level, mm. ``observed``: which of its vertices have a
+    point of skin. ``eigenheads``: how many of the fit's modes are eigenheads.
     """
     if not len(model.posed):
         return fit
@@ -121,8 +121,8 @@ def with_read_expression(
 def _solved(
     basis: ReadingBasis, place: Points, normal: Points, information: Float[np.ndarray, " n"], expressions: int
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"], Points, float]:
-    """Estimates the expression weights. Returns the weights, their deviations, the modelled places under them (head
-    frame, mm) and the variance of the kernel's modes (MacKay 1992, as in ``posterior``)."""
+    """Estimates the expression weights. Returns the weights, their standard deviations, the modelled points under them
+    (head frame, mm) and the variance of the kernel's modes (MacKay 1992, as in ``posterior``)."""
     count = len(basis.modes)
     arm = place - place.mean(axis=0)
     by_mode = np.einsum("mnc,nc->nm", basis.modes, normal.astype(np.float32), optimize=True)
@@ -165,8 +165,7 @@ def _solved(
 def _with_weights(
     fit: Fit, model: HeadModel, weights: Float[np.ndarray, " e"], deviation: Float[np.ndarray, " e"]
 ) -> Fit:
-    """Returns the fit with other expression weights, and its covariance scaled so that those weights have the given
-    deviations."""
+    """Returns the fit with other expression weights, and its covariance scaled to their new standard deviations."""
     coefficients, posed = fit.coefficients.copy(), np.asarray(model.posed)
     coefficients[posed] = weights
     if fit.covariance is None:

@@ -1,10 +1,10 @@
-"""Closes eyes that are open in the model and closed in the photographs.
+"""Closes eyes that the photographs show closed but the model has open.
 
-What is seen between the lids decides: the white of an eye has no colour, iris and pupil are darker than skin; a closed
-lid is skin with a thin line of lashes. If the model has a blink expression, that closes the lids. If not, they bridge
-the opening: the surface between the lids, with their margins, is replaced by the smoothest one that continues the skin
-around it (biharmonic; Botsch and Kobbelt 2004, *An intuitive framework for real-time freeform modeling*), which the
-measured surface then deforms to the lids themselves. The eyeball of a model lies behind it and stays hidden.
+The pixels between the lids decide: the white of an eye has no colour, and iris and pupil are darker than skin; a closed
+lid is skin with a thin line of lashes. A blink expression of the model then closes the lids. In a model without one,
+the lids bridge the opening: the smoothest surface that continues the skin replaces the lids' margins and the surface
+between (biharmonic; Botsch and Kobbelt 2004, *An intuitive framework for real-time freeform modeling*). The measured
+surface later deforms it to the lids. The model's eyeball lies behind it and stays hidden.
 """
 
 from collections.abc import Mapping
@@ -40,8 +40,8 @@ MIN_VERTICES = 12
 
 @dataclass(frozen=True, slots=True)
 class EyeEvidence:
-    """Holds what the photographs show between an eye's lids: the shares (0 to 1) of the opening that are white and
-    dark, and how far the lids stand apart if a face was found (``faces.eyes.eye_openings``)."""
+    """Holds an eye's appearance in the photographs: the fractions (0 to 1) of the opening that are white and dark, and
+    the distance between the lids if a face was found (``faces.eyes.eye_openings``)."""
 
     white: float
     dark: float
@@ -60,8 +60,8 @@ class EyeEvidence:
 
     @property
     def closed(self) -> bool:
-        """Tells whether the eye is closed: its lids surely meet, or some view shows neither white nor dark between them
-        and they do not surely stand apart."""
+        """Tells whether the eye is closed: its lids surely touch, or some view shows neither white nor dark pixels
+        between them and the lids are not surely apart."""
         nothing = self.views > 0 and self.white < WHITE_SHARE and self.dark < DARK_SHARE
         return self.is_surely_closed or (nothing and not self.is_surely_open)
 
@@ -77,8 +77,8 @@ class Fissure:
     front: Bool[np.ndarray, " v"]
 
     def ellipse(self, half_length: float, half_height: float, below: float = 0.0) -> Bool[np.ndarray, " v"]:
-        """Returns which vertices lie inside an ellipse (half axes in mm) whose centre lies ``below`` mm under the
-        middle of the fissure."""
+        """Returns which vertices lie inside an ellipse (half axes in mm); its centre lies ``below`` mm under the middle
+        of the fissure."""
         inside = (self.along / half_length) ** 2 + ((self.above + below) / half_height) ** 2 < 1.0
         return self.front & inside
 
@@ -99,10 +99,10 @@ def eye_fissure(model: HeadModel, side: str) -> Fissure:
 def measure_eye_appearance(
     model: HeadModel, vertices: Vertices, images: Mapping[str, Photograph], rig: Rig, openings: Mapping[str, float]
 ) -> dict[str, EyeEvidence]:
-    """Measures what the photographs show between the lids of each eye (``right``, ``left``).
+    """Measures the appearance between the lids of each eye (``right``, ``left``) in the photographs.
 
     ``model``: the head model. ``vertices``: the fitted head, full level, world frame, mm. ``images``: photographs by
-    camera, sRGB. ``rig``: the cameras. ``openings``: how far the lids of the found face stand apart, by side; empty
+    camera, sRGB. ``rig``: the cameras. ``openings``: distance between the lids of the detected face, by side; empty
     without a face.
     """
     normals = vertex_normals(vertices, model.levels["full"].faces)
@@ -140,8 +140,8 @@ def _facing(
 def _shares(
     image: Photograph, opening: Float[np.ndarray, "n 2"], skin: Float[np.ndarray, "m 2"]
 ) -> tuple[float, float] | None:
-    """Returns the shares of the opening that are white and that are dark, compared with the skin about it; None where
-    too little of either lies inside the photograph."""
+    """Returns the fractions of the opening that are white and that are dark, compared with the skin around it; None if
+    too little of opening or skin lies inside the photograph."""
     eye, about = _colours(image, opening), _colours(image, skin)
     if len(eye) < MIN_VERTICES or len(about) < MIN_VERTICES:
         return None
@@ -159,22 +159,21 @@ def _colours(image: Photograph, pixels: Float[np.ndarray, "n 2"]) -> Float[np.nd
 
 
 def _light_and_chroma(colours: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Returns the linear light of each colour, and its red less blue divided by that light: about 0 for white in any
-    shade."""
+    """Returns the linear light of each colour, and (red - blue) / light: about 0 for white in any shade."""
     light = colours.mean(axis=1)
     return light, (colours[:, 0] - colours[:, 2]) / np.maximum(light, 1e-3)
 
 
 def _lids(slit: Fissure) -> Int[np.ndarray, " r"]:
-    """Returns the vertices of both lids and of what lies between them."""
+    """Returns the vertices of both lids and of the surface between them."""
     half_length, half_height = 0.5 * slit.length_mm + MARGIN_MM, BRIDGE_HEIGHT * slit.length_mm
     return np.flatnonzero(slit.ellipse(half_length, half_height, -BRIDGE_RAISED * slit.length_mm))
 
 
 def with_plain_lids(vertices: Vertices, shape: Vertices, model: HeadModel) -> Vertices:
-    """Returns the head with the lids of ``shape``, displaced as smoothly as the skin around them is displaced.
+    """Returns the head with the lids of ``shape``, moved by a displacement that continues the surrounding skin's.
 
-    Displacements along the normals tear lids apart: their margins' normals point at each other.
+    Displacements along the normals would tear lids, because the normals at the lids' margins point at each other.
 
     Args:
         vertices: full level, mm.

@@ -1,9 +1,9 @@
-"""Pushes the head out to its hair: the head's own vertices, on the bust where that shows hair.
+"""Pushes the head out to its hair: moves the head's own vertices to the bust's surface where the bust is hair.
 
-Enters: the delivered head and the bust (world frame, mm). Leaves: ``HairShell``. Every vertex moves along a direction
-that is smooth over the head, as far as the bust's hair lies away that way, and no vertex lies inside the skin. So one
-mesh in the head's vertex order, and through its binding in any template's, shows the whole person, as far as its
-topology reaches: what hangs beside the head has no vertices of its own.
+In: the delivered head and the bust (world frame, mm). Leaves: ``HairShell``. Every vertex moves along a direction that
+is smooth over the head, up to the bust's hair in that direction; no vertex ends inside the skin. The mesh retains the
+head's vertex order, so a template's binding applies to it. It shows hair only as far as its topology reaches: hair that
+hangs beside the head has no vertices.
 """
 
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ class HairShell:
 
 
 def hair_shell(head: Mesh, bust: Mesh, part: UInt8[np.ndarray, " b"]) -> HairShell:
-    """Pushes a head out to the hair of a bust, whose vertices show ``part`` (codes of ``Part``)."""
+    """Pushes a head out to the hair of a bust whose vertices have the labels ``part`` (codes of ``Part``)."""
     if not (part == Part.HAIR).any():
         return HairShell(head.vertices, np.zeros(len(head.vertices)), 1.0)
     topology = topology_of(head.faces, len(head.vertices))
@@ -64,7 +64,7 @@ def hair_shell(head: Mesh, bust: Mesh, part: UInt8[np.ndarray, " b"]) -> HairShe
 
 
 def covered_share(shell: Mesh, bust: Mesh, part: UInt8[np.ndarray, " b"]) -> float:
-    """Returns the share of the bust's hair vertices that lie within ``NEAR_MM`` of a mesh."""
+    """Returns the fraction of the bust's hair vertices that lie within ``NEAR_MM`` of a mesh."""
     hair = bust.vertices[part == Part.HAIR]
     if not len(hair):
         return 1.0
@@ -72,7 +72,7 @@ def covered_share(shell: Mesh, bust: Mesh, part: UInt8[np.ndarray, " b"]) -> flo
 
 
 def smooth_directions(head: Mesh, topology: Topology) -> Float[np.ndarray, "v 3"]:
-    """Returns unit directions out of the head, its normals averaged over their neighbours."""
+    """Returns unit directions out of the head: its normals averaged over their neighbours."""
     directions, beside = head.normals(), topology.beside
     degree = np.maximum(np.asarray(beside.sum(axis=1)).ravel(), 1.0)[:, None]
     for _ in range(DIRECTION_STEPS):
@@ -83,8 +83,8 @@ def smooth_directions(head: Mesh, topology: Topology) -> Float[np.ndarray, "v 3"
 def _traced(
     head: Mesh, directions: Float[np.ndarray, "v 3"], surface: SurfaceIndex
 ) -> tuple[Float[np.ndarray, " v"], Int[np.ndarray, " v"]]:
-    """Returns how far each vertex lies below the bust along its direction (mm; ``REACH_MM`` where it does not end), and
-    the bust's triangle there. A step is as long as the bust is away, so that none passes it."""
+    """Returns the distance of each vertex to the bust along its direction (mm; ``REACH_MM`` if there is none), and the
+    bust's triangle there. A step is as long as the distance to the bust, so no step passes it."""
     hits = surface.closest(head.vertices, CANDIDATES, facing=directions)
     depth = np.einsum("nx,nx->n", hits.points - head.vertices, hits.normals)
     heights, hit = np.zeros(len(head.vertices)), hits.triangles.copy()
@@ -101,8 +101,8 @@ def _traced(
 
 
 def _as_seen(shown: UInt8[np.ndarray, " v"], head: Mesh) -> UInt8[np.ndarray, " v"]:
-    """Returns the parts with the nearest seen one where nothing is seen: the back of a head has the hair of its sides,
-    a nape no collar."""
+    """Returns the parts with unseen ones replaced by the nearest seen one: the back of a head gets the hair of its
+    sides, a nape no collar."""
     seen = np.flatnonzero(shown != Part.UNSEEN)
     return shown[seen[KDTree(head.vertices[seen]).query(head.vertices)[1]]]
 
@@ -115,7 +115,7 @@ def _pulled(
     bending: sparse.csr_array,
     raised: Bool[np.ndarray, " v"],
 ) -> Float[np.ndarray, "v 3"]:
-    """Draws the raised vertices to the nearest hair, smoothly; the others stay."""
+    """Moves the raised vertices smoothly to the nearest hair; the others stay."""
     start, out = vertices, vertices
     for stiffness in PULLS:
         hits = surface.closest(out, CANDIDATES, facing=vertex_normals(out, head.faces))
@@ -127,7 +127,7 @@ def _pulled(
 
 
 def _outside(vertices: Float[np.ndarray, "v 3"], head: Mesh) -> Float[np.ndarray, "v 3"]:
-    """Returns the vertices with those that lie inside the head, or behind their own skin, back on it."""
+    """Returns the vertices with those inside the head, or behind their own skin, moved back onto it."""
     hits = SurfaceIndex(head.vertices, head.faces).closest(vertices, CANDIDATES)
     inside = np.einsum("nx,nx->n", vertices - hits.points, hits.normals) < 0.0
     return np.where(inside[:, None], head.vertices, vertices)
@@ -142,8 +142,8 @@ def _bending(topology: Topology) -> sparse.csr_array:
 def _solved(
     bending: sparse.csr_array, stiffness: float, weights: Float[np.ndarray, " v"], wanted: Float[np.ndarray, "v k"]
 ) -> Float[np.ndarray, "v k"]:
-    """Returns the smooth field nearest to the wanted values by their weights, by conjugate gradients: a
-    factorisation of the default model's 53,000 vertices takes six seconds."""
+    """Returns the smooth field nearest to the wanted values by their weights. It uses conjugate gradients, since
+    factorising for the default model's 53,000 vertices takes six seconds."""
     system = sparse.csr_array(sparse.diags_array(weights + MIN_WEIGHT) + stiffness * bending)
     inverse = sparse.diags_array(1.0 / np.asarray(system.diagonal(), dtype=np.float64))
     right = weights[:, None] * wanted

@@ -1,9 +1,9 @@
-"""Observes the deformed head by the outlines of the silhouettes.
+"""Adds the silhouettes' outlines as observations of the deformed head.
 
-Where skin is smooth and shines, windows match highlights, which lie behind a convex surface: all views agree on a tip
-of the nose that is 2 to 3 mm too deep. In profile the silhouettes show the same tip to half a pixel. At the rim the
-surface's normal lies in the image, so that the signed distance to the silhouette is an offset along that normal. Only
-the face's rim counts, and less where pixels show hair, whose outline is not the skin's.
+Where skin is smooth and shiny, windows match highlights, which lie behind a convex surface: all views agree on a tip of
+the nose that is 2 to 3 mm too deep. In profile the silhouettes show the same tip to half a pixel. At the rim the
+surface's normal lies in the image, so the signed distance to the silhouette is an offset along that normal. Only the
+face's rim counts; pixels of hair reduce its weight, since the outline of hair is not the skin's.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,8 +32,8 @@ Outlines = Callable[[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"], float],
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutlineSearch:
-    """Holds what the outlines are compared with: the full level's topology, the silhouettes' distances with the cameras
-    as the fit corrected them, and the probability of hair by camera."""
+    """Holds the inputs of the comparison with outlines: the full level's topology, the silhouettes' distances with the
+    cameras corrected by the fit, and the probability of hair by camera."""
 
     topology: Topology
     views: Views
@@ -70,8 +70,8 @@ class OutlineSearch:
 def outline_search(model: HeadModel, views: Views, cameras: Sequence[Camera], hair: HairProbability) -> OutlineSearch:
     """Prepares the search.
 
-    ``model``: whose full level is deformed. ``views``: the silhouettes. ``cameras``: of the views, with the fit's
-    corrections. ``hair``: for each camera, the probability that a pixel shows hair.
+    ``model``: the model whose full level is deformed. ``views``: the silhouettes. ``cameras``: cameras of the views,
+    with the fit's corrections. ``hair``: for each camera, the probability that a pixel shows hair.
     """
     level, poses = model.levels["full"], [camera.camera_from_world for camera in cameras]
     moved = replace(

@@ -1,9 +1,9 @@
-"""Measures the deformed head once more with patches of its own surface, where the windows of dense matching flatten it.
+"""Measures the deformed head again with patches of its own surface, where the windows of dense matching flatten it.
 
-Dense windows are planes; they make curved skin too flat and too deep (``pipeline.stereo.depth_map``). A patch of the
-deformed head (``pipeline.photometric_fit.patches``) has its shape already, so that it is warped rightly into all its
-views, with the cameras' corrections that the fit found. Patches narrower than those of the fit determine the last
-tenths of a millimetre where they match. Elsewhere the dense points are used.
+Dense windows are planes, so curved skin comes out too flat and too deep (``pipeline.stereo.depth_map``). A patch of the
+deformed head (``pipeline.photometric_fit.patches``) already has the surface's shape, so it warps correctly into all its
+views. The cameras have the fit's corrections. These patches are narrower than the fit's; where they match, they
+determine the last tenths of a millimetre. Elsewhere the dense points are used.
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ SEARCH = Round(window_mm=1.2, blur_mm=0.3, reach_mm=0.8, steps=9)  # 1.6 and 2 m
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchPlaces:
-    """Holds n vertices of the full level, and how far along their normals the photographs see the surface."""
+    """Holds n vertices of the full level, and the measured distance of the surface along their normals."""
 
     vertex: Int[np.ndarray, " n"]
     place_mm: Float[np.ndarray, " n"]
@@ -41,7 +41,7 @@ class PatchPlaces:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchSearch:
-    """Holds what a search with patches needs: the photographs, the cameras with the fit's corrections, and a model's
+    """Holds the inputs of a search with patches: the photographs, the cameras with the fit's corrections, and a model's
     patches."""
 
     model: HeadModel
@@ -52,8 +52,8 @@ class PatchSearch:
     hair: HairProbability
 
     def places(self, vertices: Float[np.ndarray, "v 3"]) -> PatchPlaces:
-        """Measures where the photographs show the surface near a head (world frame, mm). Patches without a clear match
-        in several views, and those under hair, are left out."""
+        """Measures the surface in the photographs near a head (world frame, mm). Patches without a clear match in
+        several views, and those under hair, are left out."""
         level, coarse = self.model.levels["full"], self.model.levels[DEPTH_LEVEL]
         head, hiding = Mesh(vertices, level.faces), Mesh(vertices[coarse.rows], coarse.faces)
         speaks = self.photographs.speaks
@@ -78,9 +78,9 @@ def patch_search(
 ) -> PatchSearch:
     """Prepares the search: chooses patches on ``model``, and loads the photographs of the views that have a silhouette.
 
-    ``model``: the patches lie on its full level. ``fit``: has the cameras' corrections. ``images``: sRGB photographs by
-    camera. ``distances``: signed distances to the silhouettes (px), by camera. ``hair``: for each camera, the
-    probability that a pixel shows hair. ``rig``: the cameras as calibrated.
+    ``model``: the model on whose full level the patches lie. ``fit``: holds the cameras' corrections. ``images``: sRGB
+    photographs by camera. ``distances``: signed distances to the silhouettes (px), by camera. ``hair``: for each
+    camera, the probability that a pixel shows hair. ``rig``: the cameras as calibrated.
     """
     views = pack_views(rig, dict(distances))
     cameras = tuple(corrected(rig[name], fit) for name in views.names)

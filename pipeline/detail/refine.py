@@ -1,13 +1,13 @@
 """Deforms the fitted head to the measured surface.
 
-Enters: a fit with its covariance, and the surface points of the depth maps with normals. Leaves: every vertex of the
-model's full level displaced (same vertices, same order), and its standard deviation. The displacement is a smooth field
-(``smooth_field``) whose amplitude is the uncertainty of the fit. Each point of skin pulls the point of the head that it
-shows along their normals (``association``), robustly; where there are no points the shape of the fit is kept.
+In: a fit with its covariance, and the surface points of the depth maps with normals. Out: every vertex of the model's
+full level displaced (same vertices, same order), and its standard deviation. The displacement is a smooth random field
+(``smooth_field``); its prior standard deviation is the uncertainty of the fit. Each point of skin pulls the nearest
+point of the head along their normals (``association``), robustly; without points the head retains the fit's shape.
 
-It goes from coarse to fine. First every node moves in three dimensions, over a long range, which brings ears and jaw
-into place. Then the vertices move along their normals alone, so that a vertex remains the same point on every subject.
-Points of hair and clothes do not pull; they only say that the skin does not reach beyond them.
+The rounds go from coarse to fine. In the first rounds every node moves in three dimensions, over a long range, which
+brings ears and jaw into position. Then the vertices move only along their normals, so that a vertex remains the same
+anatomical point on every subject. Points of hair and clothes do not pull; they only bound the skin from outside.
 """
 
 from collections.abc import Callable, Mapping
@@ -69,8 +69,8 @@ SEED = 16
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Holds the limits of one round, which first associates the points with the head and then solves for the
-    displacement. ``agreement`` is the smallest cosine between a point's normal and the head's."""
+    """Holds the limits of one round, which first assigns the points to the head and then solves for the displacement.
+    ``agreement`` is the smallest cosine between a point's normal and the head's."""
 
     reach_mm: float
     loose_reach_mm: float
@@ -86,8 +86,8 @@ PATCH_REACH_MM = 4.0  # no dense point counts so near to a patch, whose window r
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointObservations:
-    """Holds the observations of the head that surface points give; for the n points of skin among them, also the
-    triangles that they show (corners and barycentric coordinates) and their deviations."""
+    """Holds the observations of the head from surface points. For the n points of skin it also holds their triangles on
+    the head (corners and barycentric coordinates) and their standard deviations."""
 
     observed: Observed
     corner: Int[np.ndarray, "n 3"]
@@ -97,8 +97,8 @@ class PointObservations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeformedSurface:
-    """Holds the deformed head (world frame, mm), the standard deviation of each vertex, whether a point of skin shows
-    it, and how far the eyes are closed."""
+    """Holds the deformed head (world frame, mm), the standard deviation of each vertex, whether a point of skin
+    observes it, and how far the eyes are closed."""
 
     vertices: Vertices
     deviation_mm: PerVertex  # along the normal
@@ -179,7 +179,7 @@ def deform_to_points(
     shared_error: float = SHARED_ERROR,
     report: Progress = discard_progress,
 ) -> DeformedSurface:
-    """Deforms a surface to measured points, where there are points near it.
+    """Deforms a surface to the measured points near it.
 
     Args:
         vertices: of the surface, mm.
@@ -250,7 +250,7 @@ def _coarsely_deformed(
 def with_outlines(
     observed: Observed, outlines: Outlines | None, base: Vertices, current: Vertices, robust_mm: float
 ) -> Observed:
-    """Returns the observations and those of the outlines, if there are any."""
+    """Returns the observations together with those of the outlines, if there are any."""
     return observed if outlines is None else observed.joined(outlines(base, current, robust_mm))
 
 
@@ -268,8 +268,8 @@ def observe(
     limits: Round,
     floor_mm: float,
 ) -> PointObservations:
-    """Returns how points observe the head at ``current``: offsets (mm) from ``base``. Points of
-    hair count only where the head reaches beyond them.
+    """Returns the observations of the head at ``current`` by points, as offsets (mm) from ``base``. A point of hair
+    counts only where the head reaches beyond it.
 
     The normal of an observation is half the point's and half the head's (Rusinkiewicz 2019, *A symmetric objective
     function for ICP*), which is exact to second order where both are curved.
@@ -334,7 +334,7 @@ def typical_deviation(dense: PointObservations, faces: Faces, count: int) -> Per
 
 
 def _pooled(values: PerVertex, faces: Faces) -> PerVertex:
-    """Returns the sum of the values over the triangles about each vertex, twice."""
+    """Returns twice the sum of the values over the triangles around each vertex."""
     for _ in range(2):
         values = np.bincount(faces.ravel(), np.repeat(values[faces].sum(axis=1), 3), len(values))
     return values
@@ -343,8 +343,8 @@ def _pooled(values: PerVertex, faces: Faces) -> PerVertex:
 def _local_density(
     found: Associated, corner: Int[np.ndarray, "n 3"], vertices: Vertices, faces: Faces, correlation_mm: float
 ) -> Float[np.ndarray, " n"]:
-    """Returns, for each point, how many points share its error, itself included: those within ``correlation_mm`` of it,
-    by the density of points there."""
+    """Returns, for each point, the number of points with the same error, itself included: those within
+    ``correlation_mm``, computed from the density of points there."""
     area = np.linalg.norm(np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]],
                                    vertices[faces[:, 2]] - vertices[faces[:, 0]]), axis=1) / 6.0  # fmt: skip
     mass = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
@@ -363,7 +363,7 @@ def field_deviation(
     common_mm: PerVertex,
 ) -> PerVertex:
     """Returns the standard deviation (mm) of every vertex along its normal. Near observed vertices it comes from random
-    draws of the posterior and from the error ``common_mm`` that all points share; far from them it is at least
+    draws of the posterior and from ``common_mm``, the error common to all points; far from them it is at least
     ``deviation_mm``."""
     draws = posterior.draws(np.random.default_rng(SEED), DRAWS)
     square = common_mm**2
@@ -377,7 +377,7 @@ def field_deviation(
 
 
 def folded(before: Vertices, after: Vertices, faces: Faces) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles a displacement turns over, or squeezes to almost no area."""
+    """Tells which triangles a displacement turns over or squeezes to almost no area."""
     old, new = face_normals(before, faces), face_normals(after, faces)
     size, length = np.linalg.norm(old, axis=1), np.linalg.norm(new, axis=1)
     return ((old * new).sum(axis=1) <= MAX_TURN * size * length) | (length < MIN_AREA * size)
@@ -408,7 +408,7 @@ def unfolded(before: Vertices, after: Vertices, faces: Faces) -> Vertices:
 
 
 def _around(chosen: Int[np.ndarray, "b 3"], faces: Faces, count: int, rings: int) -> Int[np.ndarray, "g 3"]:
-    """Returns the faces within the given number of rings about the chosen faces."""
+    """Returns the faces within this number of rings around the chosen faces."""
     about = np.zeros(count, bool)
     about[chosen] = True
     for _ in range(rings - 1):
@@ -417,8 +417,8 @@ def _around(chosen: Int[np.ndarray, "b 3"], faces: Faces, count: int, rings: int
 
 
 def _neighbour_mean(faces: Faces, count: int) -> sparse.csr_array:
-    """Returns the matrix that takes, for each vertex, the mean over the corners of the faces at it; the vertex itself
-    is among those corners."""
+    """Returns the matrix that computes, for each vertex, the mean over the corners of the faces at it, including the
+    vertex itself."""
     rows, columns = np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, 3).ravel()
     share = 1.0 / np.maximum(np.bincount(rows, minlength=count), 1)
     return sparse.csr_array((share[rows], (rows, columns)), shape=(count, count))

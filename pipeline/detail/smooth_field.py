@@ -8,8 +8,8 @@ to 0.14 at ``sqrt(8) / kappa``. With linear finite elements, lumped masses M and
 
     precision = tau^2 K M^-1 K,    K = kappa^2 M + S.
 
-The field here has unit deviation; the displacement is the field times an amplitude at each vertex. Where nothing is
-observed it continues the observed displacement, and fades to nothing over ``length_mm = 1 / kappa``.
+The field here has unit variance; the displacement is the field times an amplitude at each vertex. Where nothing is
+observed, the field continues the observed displacement and fades to zero over ``length_mm = 1 / kappa``.
 """
 
 from dataclasses import dataclass

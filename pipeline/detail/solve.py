@@ -1,15 +1,15 @@
-"""Solves for the displacement on which the field's prior and point-to-plane observations agree, and for its
+"""Solves for the displacement that best agrees with the field's prior and point-to-plane observations, and computes its
 uncertainty.
 
-Unknown is a unit field w on the nodes, in ``d`` directions each (three, or one along the normals); the head moves by
-``operator @ (amplitude w direction)``. With K observations ``n . X = e`` of information q, each at a point inside a
+The unknown is a unit field w on the nodes, in ``d`` directions each (three, or one along the normals); the head moves
+by ``operator @ (amplitude w direction)``. With K observations ``n . X = e`` of information q, each at a point inside a
 triangle, tr(w^T Q w) + sum q (n . dX(w) - e)^2 is a sparse linear problem, solved exactly. Each random draw of its
 posterior takes one more solution (Papandreou and Yuille 2010, *Gaussian sampling by local perturbations*).
 
-The nodes are as fine as photographs resolve, and no finer. A model that refines its cage by subdivision has both
-meshes: its cage, and the mesh one step before its full level (edges of 1.7 mm in the face, where the windows of dense
-matching are 2.6 mm wide). The full level follows these smoothly. A model without subdivision is solved on its own
-vertices, and before that on a decimated level.
+The nodes are as dense as the photographs' resolution, not denser. A model with subdivision has two such meshes: its
+cage, and the mesh one step before its full level (edges of 1.7 mm in the face, where the windows of dense matching are
+2.6 mm wide). The full level follows both smoothly. A model without subdivision is solved first on a decimated level,
+then on its own vertices.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ NEIGHBOURS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeMesh:
-    """Holds a mesh of control points, the nodes. A displacement of the nodes gives that of the full level: ``full =
+    """Holds a mesh of control points, the nodes. A displacement of the nodes defines that of the full level: ``full =
     operator @ nodes``."""
 
     faces: Int[np.ndarray, "f 3"]
@@ -43,7 +43,7 @@ class NodeMesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Nodes:
-    """Holds the coarse and the fine mesh of control points that a displacement is solved on."""
+    """Holds the coarse and the fine mesh of control points on which a displacement is solved."""
 
     coarse: NodeMesh
     fine: NodeMesh
@@ -65,8 +65,8 @@ def solving_nodes(model: HeadModel) -> Nodes:
 
 
 def node_mesh(faces: Int[np.ndarray, "f 3"], operator: sparse.csr_array) -> NodeMesh:
-    """Returns the control mesh of a subdivision ``operator``. Node i lies at vertex i, since subdivision keeps old
-    vertices first."""
+    """Returns the control mesh of a subdivision ``operator``. Node i lies at vertex i, since a subdivision numbers the
+    old vertices first."""
     total, count = row_count(operator), row_count(sparse.csr_array(operator.T))
     shape = sparse.csr_array((np.ones(count), (np.arange(count), np.arange(count))), shape=(count, total))
     return NodeMesh(faces, sparse.csr_array(operator), shape)
@@ -113,7 +113,7 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Directions:
-    """Holds the matrix (3 v, d n) that turns the solver's unknowns, d at each of n nodes, into displacements (mm) of
+    """Holds the matrix (3 v, d n) that converts the solver's unknowns, d at each of n nodes, to displacements (mm) of
     the head's v vertices: x, y and z of each vertex are three rows."""
 
     matrix: sparse.csr_array
@@ -155,7 +155,7 @@ class Posterior:
     directions: Directions
 
     def draws(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "u c"]:
-        """Returns ``count`` random deviations of the field from the posterior mean, one per column."""
+        """Returns ``count`` random deviations of the field from the posterior mean, one in each column."""
         d = self.directions.count
         prior = self.field.draw(rng, count * d).reshape(-1, d, count).reshape(-1, count)
         noise = rng.standard_normal((row_count(self.rows), count))

@@ -35,7 +35,7 @@ def mean_points(
     group: np.ndarray, count: int, points: np.ndarray, normals: np.ndarray, deviation: np.ndarray, part: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Returns the mean point, unit mean normal, deviation and part of ``count`` groups of points (n, 3), weighted by
-    information. The deviation is that of a single point of a group."""
+    information. The standard deviation is that of a single point of a group."""
     place, towards, single = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count)
     total, of = np.zeros(count), np.zeros(count, np.uint8)
     for n in range(len(group)):

@@ -1,5 +1,5 @@
-"""The one estimator of the project: robust least squares over a sum of terms, by Levenberg-Marquardt.
+"""Holds the project's only estimator: robust least squares over a sum of terms, by Levenberg-Marquardt.
 
-Enters: terms, each with its equation; a start; a function that applies a step to it. Leaves: a ``Solution`` with its
-evidence. The room knows nothing of heads, cameras or boards; the caller chooses the type that is estimated.
+In: terms, each with its equation; a start; a function that applies a step to a value. Out: a ``Solution`` with its
+evidence. This package knows nothing of heads, cameras or boards; the caller chooses the estimated type.
 """

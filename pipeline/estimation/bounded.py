@@ -1,4 +1,4 @@
-"""The minimum of a quadratic form with bounds on a few of its unknowns."""
+"""Minimises a quadratic form with bounds on a few of its unknowns."""
 
 import numpy as np
 import scipy.linalg
@@ -18,8 +18,8 @@ def least_within(
     """Returns the x that minimises ``x^T M x / 2 + g^T x`` subject to ``lower <= x <= upper``, where ``matrix`` M is
     symmetric and positive definite and ``gradient`` is g.
 
-    Bounds may be infinite. The unknowns without any bound are eliminated first, so that only the few bounded ones need
-    a search: with the unbounded ones in front, the last corner of M's Cholesky factor is the factor of their Schur
+    Bounds may be infinite. The unbounded unknowns are eliminated first, so that only the few bounded ones need a
+    search. With the unbounded ones in front, the last corner of M's Cholesky factor is the factor of their Schur
     complement.
     """
     tied = np.isfinite(lower) | np.isfinite(upper)

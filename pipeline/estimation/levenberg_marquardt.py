@@ -1,14 +1,14 @@
-"""Levenberg-Marquardt for a sum of robust terms, with one rule of damping and one of stopping.
+"""Implements Levenberg-Marquardt for a sum of robust terms, with one rule for damping and one for stopping.
 
-Each step solves ``(M + lambda diag(M)) step = -gradient`` (Marquardt 1963: steps do not depend on the unknowns' units).
-It is taken where the cost falls; lambda then shrinks ten times, else it grows a hundred times and the step is tried
-again. The end is where the linear model predicts a fall below ``Limits.tolerance``: costs count squared standard
-deviations, so that a predicted fall of f is a step of sqrt(f) standard deviations of what is estimated.
+Each step solves ``(M + lambda diag(M)) step = -gradient`` (Marquardt 1963: steps do not depend on the units of the
+unknowns). A step that lowers the cost is taken, and lambda is divided by ten; otherwise lambda is multiplied by a
+hundred and the step is tried again. The search ends when the predicted decrease is below ``Limits.tolerance``. Costs
+are squared standard deviations: a predicted decrease of f is a step of sqrt(f) standard deviations.
 
-Where unknowns are bounded, the step is the damped model's minimum within their bounds (``bounded``).
+If unknowns have bounds, the step is the damped model's minimum within them (``bounded``).
 
-Some costs are uneven (the rim's samples change as the head moves). For these a step may climb back to the worst of the
-last ``Limits.memory`` costs (Grippo, Lampariello and Lucidi 1986); the best value is returned in any case.
+Some costs are not smooth (the rim's samples change as the head moves). For these a step may climb back to the worst of
+the last ``Limits.memory`` costs (Grippo, Lampariello and Lucidi 1986); the best value is returned in any case.
 """
 
 from collections.abc import Callable
@@ -32,8 +32,8 @@ Solve = Callable[[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]], Float[np.n
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Holds the rule by which a search stops, and its first damping. ``tolerance`` is in squared standard deviations: a
-    step whose predicted fall of the cost is smaller is not worth taking."""
+    """Holds the stopping rule of a search, and its first damping. ``tolerance`` (squared standard deviations) is the
+    smallest predicted decrease of the cost for which a step is taken."""
 
     steps: int = 50
     tolerance: float = 1e-6
@@ -157,7 +157,7 @@ def _within(
     room: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
     least: Callable[..., Float[np.ndarray, " p"]],
 ) -> tuple[Float[np.ndarray, " p"], float]:
-    """Returns the step limited to its bounds ``room``, and the fall of the cost that the equations predict for it."""
+    """Returns the step limited to its bounds ``room``, and the decrease of the cost that the equations predict."""
     if ((step >= room[0]) & (step <= room[1])).all():
         return step, -float(equations.gradient @ step)
     damped = _damped(equations, damping)

@@ -1,5 +1,5 @@
-"""Inverses of symmetric positive definite matrices by their Cholesky factor: half of the general inverse's work for the
-whole, a third for the diagonal. Both raise LinAlgError where a matrix is not definite."""
+"""Inverts symmetric positive definite matrices by their Cholesky factor: half the work of a general inverse, a third
+for the diagonal alone. Both functions raise LinAlgError if the matrix is not positive definite."""
 
 import numpy as np
 import scipy.linalg

@@ -1,4 +1,4 @@
-"""Robust losses rho(s) of a squared residual s in units of its variance, and the weights rho'(s) of their equations.
+"""Defines robust losses rho(s) of a squared residual s in units of its variance, and their weights rho'(s).
 
 Triggs, McLauchlan, Hartley and Fitzgibbon, *Bundle Adjustment: A Modern Synthesis*, 2000, section 3.3 (without the
 second-order correction: J^T rho' J is never indefinite).
@@ -21,8 +21,7 @@ class Loss(Protocol):
         ...
 
     def weight(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Returns rho'(s), the weight of each residual: 1 at s = 0, and less the larger the residual, down to almost 0
-        for gross errors."""
+        """Returns rho'(s), the weight of each residual: 1 at s = 0, decreasing to almost 0 for gross errors."""
         ...
 
 
@@ -41,8 +40,8 @@ class LeastSquares:
 
 @dataclass(frozen=True, slots=True)
 class GemanMcClure:
-    """Computes Geman and McClure's loss (1987), rho(s) = s / (1 + s / c^2). It never exceeds c^2, so that residuals of
-    many c have almost no weight.
+    """Computes Geman and McClure's loss (1987), rho(s) = s / (1 + s / c^2). It never exceeds c^2, so residuals of many
+    c have almost no weight.
 
     ``scale`` is c, in the unit of the unsquared residual; an array gives each residual its own scale.
     """

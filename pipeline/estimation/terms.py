@@ -1,11 +1,11 @@
-"""What a cost is made of: terms, each with its own residuals, and the sum of them as a complete problem.
+"""Defines the terms of a cost, each with its own residuals, and their sum as a complete problem.
 
-A term taken at a value has a cost and adds its part to the normal equations
+A term evaluated at a value has a cost and adds its part to the normal equations
 
     matrix += J^T W J,    gradient += J^T W r,
 
-W the information times the robust weight, so that the gradient is half of the cost's. ``Residuals`` is the usual form,
-with its Jacobian; a term whose Jacobian is too large to build adds its blocks by itself.
+W the information times the robust weight, so the gradient is half of the cost's. ``Residuals`` is the usual form, with
+its Jacobian; a term whose Jacobian is too large to build adds its blocks by itself.
 """
 
 from collections.abc import Callable
@@ -37,8 +37,7 @@ ValueIn = TypeVar("ValueIn", contravariant=True)
 
 @runtime_checkable
 class Linearised(Protocol):
-    """Describes a term of the cost at one value of the unknowns: its cost there, and its part of the normal
-    equations."""
+    """Describes a term linearised at one value of the unknowns: its cost, and its part of the normal equations."""
 
     @property
     def cost(self) -> float:
@@ -57,7 +56,7 @@ class Term(Protocol[ValueIn]):
     estimate."""
 
     def at(self, value: ValueIn, /) -> Linearised:
-        """Returns the term evaluated at ``value`` and made linear there."""
+        """Returns the term linearised at ``value``."""
         ...
 
 
@@ -108,8 +107,8 @@ class Linear:
 @dataclass(frozen=True, slots=True, eq=False)
 class Quadratic:
     """Holds the quadratic form ``(x - c)^T M (x - c) - 2 g^T (x - c)`` of a vector x, with ``matrix`` M, ``centre`` c
-    and ``pull`` g (towards the minimum). With g zero it is a Gaussian prior; it can also summarise another problem that
-    is solved for everything but x."""
+    and ``pull`` g (towards the minimum). With g = 0 it is a Gaussian prior. It can also summarise another problem after
+    all unknowns except x have been eliminated."""
 
     matrix: Float[np.ndarray, "p p"]
     centre: Float[np.ndarray, " p"]
@@ -135,7 +134,7 @@ class LinearisedQuadratic:
 
     @property
     def cost(self) -> float:
-        """Returns the value of the form; below zero where its linear part outweighs its quadratic part."""
+        """Returns the value of the form; it is negative where the linear part outweighs the quadratic part."""
         return float(self.away @ self.term.matrix @ self.away - 2.0 * self.term.pull @ self.away)
 
     def add_to(self, equations: NormalEquations) -> None:
@@ -189,8 +188,8 @@ class Problem(Generic[Value]):
     to a value.
 
     ``free`` flags the unknowns that may move; None lets all of them move. ``moved(value, step)`` receives a step of all
-    unknowns and returns the new value. ``room(value)`` returns the smallest and the largest step that each free unknown
-    may take from there, infinite where it has no bound.
+    unknowns and returns the new value. ``room(value)`` returns the smallest and the largest step of each free unknown
+    from there; infinite without a bound.
     """
 
     terms: tuple[Term[Value], ...]

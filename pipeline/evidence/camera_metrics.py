@@ -31,11 +31,11 @@ Masks = Mapping[str, Bool[np.ndarray, "h w"]]
 class CameraFigures:
     """Holds how well the fitted head explains one camera's silhouette.
 
-    ``iou`` and ``contour_rms_px`` are over all rim samples of the face region, none left out; ``excluded_share`` is the
-    part of them (0 to 1) whose residual is too large for the fit to use. ``xor_cost`` is eq. (5) for the fitted head,
-    ``xor_cost_start`` for the head at the start of the fit. ``outside_rms_px`` counts only how far the head reaches
-    beyond the mask: what lies inside it may be hidden by hair, hands or shoulders. A figure is None if it cannot be
-    computed for the view (no rim sample in it).
+    ``iou`` and ``contour_rms_px`` are over all rim samples of the face region, outliers included; ``excluded_share`` is
+    the fraction of them (0 to 1) whose residual is too large for the fit. ``xor_cost`` is eq. (5) for the fitted head,
+    ``xor_cost_start`` for the head at the start of the fit. ``outside_rms_px`` counts only rim samples outside the
+    mask: hair, hands or shoulders may hide those inside. A figure is None if it cannot be computed for the view (no rim
+    sample).
     """
 
     used: bool
@@ -84,8 +84,8 @@ def _rms(values: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> fl
 
 
 def _costs(observed: Bool[np.ndarray, "h w"], *models: Bool[np.ndarray, "h w"]) -> list[float]:
-    """Returns the cost of eq. (5) for each model's mask. Only the box around all masks is compared, since nothing
-    differs outside."""
+    """Returns the cost of eq. (5) for each model's mask. Only the box around all masks is compared, because the masks
+    do not differ outside."""
     everything = observed.copy()
     for model in models:
         everything |= model

@@ -37,7 +37,7 @@ class Found:
 @dataclass(frozen=True, slots=True, eq=False)
 class BlendshapeRig:
     """Holds a neutral head, the morph targets that animate it, and their weights on the photographed head. ``missing``
-    are those of Apple's names that have no counterpart in the model; their morph targets move nothing."""
+    are Apple's names without counterpart in the model; their morph targets move nothing."""
 
     neutral_world: Mesh
     morphs: Mapping[str, Float[np.ndarray, "v 3"]]  # mm, head frame, at weight 1
@@ -57,7 +57,7 @@ def fitted_weights(model: HeadModel, fit: Fit) -> dict[str, float]:
 
 
 def found_expressions(model: HeadModel, fit: Fit, least_sigma: float = MIN_SIGMA) -> tuple[Found, ...]:
-    """Returns the expressions of the head, the strongest first: those whose weight is at least ``TOLD`` and more than
+    """Returns the expressions of the head, the strongest first: those whose weight is at least ``TOLD`` and exceeds
     ``least_sigma`` standard deviations."""
     weights = fitted_weights(model, fit)
     spread = None if fit.covariance is None else np.sqrt(np.diag(fit.covariance))[np.asarray(model.posed, int)]
@@ -75,7 +75,7 @@ def shut_eyes(model: HeadModel, fit: Fit) -> frozenset[str]:
 
 
 def neutral_mesh(model: HeadModel, place: Similarity, mesh_world: Mesh, found: Collection[Found]) -> Mesh:
-    """Returns the head without the displacement of its expressions; all other detail is kept."""
+    """Returns the head without the displacement of its expressions; all other detail stays."""
     moved = model.levels["full"].operator @ model.expressions.moved({each.name: each.weight for each in found})
     back = place.scale * moved @ place.rotation.T
     return Mesh(mesh_world.vertices - back, mesh_world.faces, mesh_world.colours)
@@ -84,7 +84,7 @@ def neutral_mesh(model: HeadModel, place: Similarity, mesh_world: Mesh, found: C
 def build_blendshape_rig(
     model: HeadModel, place: Similarity, mesh_world: Mesh, found: Collection[Found]
 ) -> BlendshapeRig:
-    """Builds the neutral head with Apple's 52 morphs. Adds a morph for every found expression that they do not fully
+    """Builds the neutral head with Apple's 52 morphs. Adds a morph for every measured expression that they do not fully
     reproduce, so that the weights give the head as photographed."""
     operator, names = model.levels["full"].operator, model.expressions.names
     expression_weights = {each.name: each.weight for each in found}

@@ -1,20 +1,20 @@
 """Measures anthropometric landmarks and distances of a fitted head, with standard deviations by linear propagation.
 
-Enters: a model, a fit and its covariance. Leaves: landmarks and lengths in the world frame, mm. A landmark is a vertex
-of the model's full level. With ``x = s R (h0 + sum_m z_m h_m) + t`` (eq. 1 and the paper's T) its derivatives are
-exact: ``s R h_m`` by a coefficient, ``-[x - t]x`` by a rotation about the head's origin, the identity by the
-translation, and ``x - t`` by log scale. A distance has ``var = g C g^T``; its rotation and translation parts cancel.
+In: a model, a fit and its covariance. Out: landmarks and lengths in the world frame, mm. A landmark is a vertex of the
+model's full level. With ``x = s R (h0 + sum_m z_m h_m) + t`` (eq. 1 and the paper's T) its derivatives are exact: ``s R
+h_m`` by a coefficient, ``-[x - t]x`` by a rotation about the head's origin, the identity by the translation, and ``x -
+t`` by log scale. A distance has ``var = g C g^T``; its rotation and translation parts cancel.
 
-Outlines and photographs of skin hardly show where on the surface a landmark lies. The eigenheads determine it, and a
-head that deviates from them deviates along the surface, too. So a landmark is uncertain by ``Fit.sliding_mm`` in every
-direction of its tangent plane; two landmarks slide together as far as the kernel of ``gaussian_process`` says for their
-distance.
+Outlines and photographs of skin hardly determine a landmark's position along the surface. The eigenheads determine it,
+but a head outside their span also deviates along the surface. So a landmark has the standard deviation
+``Fit.sliding_mm`` in every direction of its tangent plane. The kernel of ``gaussian_process`` gives the correlation of
+two landmarks, which decreases with their distance.
 
-Definitions follow Farkas, *Anthropometry of the Head and Face* (1994). Head length and breadth need three points that
-are not among the 26 landmarks: the point of the back of the head farthest from the glabella in the midsagittal plane
-(opisthocranion), and the most lateral points of the skull above the ears (euryon). They are found on the fitted head.
-The distance is stationary in their choice, so that its first-order variance does not depend on it. Heads without a
-cranium (face-only models) have no such measurement.
+Definitions follow Farkas, *Anthropometry of the Head and Face* (1994). Head length and breadth need three more points:
+the point of the back of the head farthest from the glabella in the midsagittal plane (opisthocranion), and the most
+lateral points of the skull above the ears (euryon). They are searched on the fitted head. Each distance is extremal at
+these points, so to first order its variance does not depend on their choice. Heads without a cranium (face-only models)
+have no such measurement.
 """
 
 from collections.abc import Mapping
@@ -64,7 +64,7 @@ class Landmark:
     std_mm: Float[np.ndarray, " 3"] | None
 
     def widen_by_scale(self, sigma: float, centre: Float[np.ndarray, " 3"]) -> "Landmark":
-        """Returns the landmark of a head whose size about ``centre`` (mm) is known to the share ``sigma``."""
+        """Returns the landmark for a relative standard deviation ``sigma`` of the head's size about ``centre`` (mm)."""
         off = sigma * (self.position_mm - centre)
         return Landmark(self.position_mm, None if self.std_mm is None else np.hypot(self.std_mm, off))
 
@@ -77,7 +77,7 @@ class Measurement:
     std_mm: float | None
 
     def widen_by_scale(self, sigma: float) -> "Measurement":
-        """Returns the length of a head whose size is known to the share ``sigma``."""
+        """Returns the length for a head whose size has the relative standard deviation ``sigma``."""
         std = None if self.std_mm is None else float(np.hypot(self.std_mm, sigma * self.value_mm))
         return Measurement(self.value_mm, std)
 
@@ -120,7 +120,7 @@ def measurements(model: HeadModel, fit: Fit, vertices: Vertices | None = None) -
 
 
 def _normals(model: HeadModel, fit: Fit, vertices: Vertices | None) -> Vertices:
-    """Returns the vertex normals (world frame) of the delivered head or, if None, of the fitted one."""
+    """Returns the vertex normals (world frame) of the delivered head; ``vertices`` None means the fitted head."""
     head = fit.world_from_head.apply(model.vertices(fit.coefficients)) if vertices is None else vertices
     return vertex_normals(head, model.levels["full"].faces)
 
@@ -128,8 +128,8 @@ def _normals(model: HeadModel, fit: Fit, vertices: Vertices | None) -> Vertices:
 def _sliding_apart(
     units: Points, lengths_mm: Float[np.ndarray, " n"], first_normals: Points, second_normals: Points
 ) -> Float[np.ndarray, " n"]:
-    """Returns the variance of distances along ``units`` between places that slide in their tangent planes with unit
-    variance. Near places slide together."""
+    """Returns the variance of distances along ``units`` between points that slide in their tangent planes with unit
+    variance. Points near each other slide together."""
     first, second = (
         units - normals * (units * normals).sum(axis=1, keepdims=True) for normals in (first_normals, second_normals)
     )

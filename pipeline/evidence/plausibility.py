@@ -1,8 +1,8 @@
-"""Checks whether a finished fit is plausible, given what heads, rigs and masks are like. Each check has its own code.
+"""Checks whether a finished fit is plausible for heads, rigs and masks. Each check has its own code.
 
-Enters: a fit and the figures of its cameras. Leaves: warnings. Nothing here changes a result; ``settings.fail_on``
-turns codes into failures. Thresholds are given together with what good captures had at the deepest level of detail: a
-real scan with closed eyes and hair (scale 1.024), and a random head of another population (1.053).
+In: a fit and the figures of its cameras. Leaves: warnings. These checks change no result; ``settings.fail_on`` turns
+codes into failures. Thresholds are documented with the values of good captures at the deepest level of detail: a real
+scan with closed eyes and hair (scale 1.024), and a random head of another population (1.053).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,7 +30,7 @@ UNEXPLAINED_MM = 5.0  # and median over the views of the rim's RMS distance from
 
 
 class UnexplainedOutlines(EigenheadError):
-    """Reports a fitted head that explains hardly any outline, so that it is not the subject's."""
+    """Reports a fitted head that explains hardly any outline and thus cannot be the subject's."""
 
 
 class ImplausibleResult(EigenheadError):
@@ -75,7 +75,7 @@ def unexplained_outlines(cameras: Mapping[str, CameraFigures], pixels_mm: Mappin
 
 
 def unseen_face(views: UInt8[np.ndarray, " v"], face_region: Bool[np.ndarray, " v"]) -> ReportWarning | None:
-    """Returns a warning if no camera sees a good part of the face, which the fit then takes from faces like it.
+    """Returns a warning if no camera sees a considerable part of the face, which then comes from the model's prior.
 
     Args:
         views: number of photographs that coloured each vertex.
@@ -101,7 +101,7 @@ def _scale(scale: float) -> list[ReportWarning]:
 
 def size_of(fit: Fit, model: HeadModel) -> tuple[float, float]:
     """Returns the size of the face relative to the mean face (RMS distance from its middle, shape and scale together),
-    and its deviation in standard deviations of the population."""
+    and its difference from the mean in standard deviations of the population."""
     by_mode = size_by_mode(model)
     z = fit.coefficients[: len(by_mode)]
     size = float(np.log(fit.world_from_head.scale) + z @ by_mode[: len(z)])
@@ -127,9 +127,9 @@ def _size(size: float, sigmas: float) -> list[ReportWarning]:
 
 
 def _contours(cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]) -> list[ReportWarning]:
-    """Returns a warning for each camera beyond whose outline the head reaches much farther than in most cameras.
+    """Returns a warning for each camera in which the head extends much farther beyond the outline than in most cameras.
 
-    A rim inside the outline is no fault: seen from above, a chin lies before the shirt, a hundred pixels inside.
+    A rim inside the outline is no fault: seen from above, a chin lies in front of the shirt, a hundred pixels inside.
     """
     rms = {name: of.outside_rms_px for name, of in cameras.items() if of.used and of.outside_rms_px is not None}
     if not rms:

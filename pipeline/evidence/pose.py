@@ -1,8 +1,8 @@
-"""Judges the pose: whether the head lies where the photographs show the face, and how much worse other poses are.
+"""Judges the pose: whether the head lies on the face in the photographs, and how much worse other poses are.
 
-Enters: the delivered head, the faces found in the photographs, and how the pose was found. Leaves: ``PoseEvidence`` and
-warnings. A face that lies elsewhere in most of the views that show one always gives a warning. If no face was found,
-the pose rests on outlines alone, and a warning says so. Of irises that were found, also where the eyes look.
+In: the delivered head, the faces found in the photographs, and the pose's method. Out: ``PoseEvidence`` and warnings.
+If the face lies elsewhere in most views that show one, there is always a warning. If no face was found, the pose
+depends on outlines alone, and a warning says so. The module also computes gaze and pupil distance from the irises.
 """
 
 from collections.abc import Mapping
@@ -36,9 +36,9 @@ RIVAL_MARGIN = 0.03  # of the cost of the outlines: a rival so near to the best 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEvidence:
-    """Holds how well the pose is known. ``off``: for each camera, the RMS distance of the head's landmarks from those
-    of the face in the photograph, relative to the face's size. ``rival``: how much more the best other pose costs, as a
-    share of the cost; None if none was tried."""
+    """Holds the evidence for the pose. ``off``: for each camera, the RMS distance of the head's landmarks from those of
+    the face in the photograph, relative to the face's size. ``rival``: extra cost of the best other pose, relative to
+    the cost; None if none was tried."""
 
     method: str
     off: Mapping[str, float]
@@ -47,7 +47,7 @@ class PoseEvidence:
 
     @property
     def is_on_face(self) -> bool:
-        """Tells whether a face was found and, in every view with one, lies where the head's face is."""
+        """Tells whether a face was found and agrees with the head's face in every view that shows one."""
         return bool(self.off) and max(self.off.values()) <= ELSEWHERE
 
 
@@ -64,10 +64,10 @@ def judge_pose(
     """Compares the delivered head with the faces in the photographs. Returns the evidence and the warnings about the
     pose.
 
-    ``head_world``: full level, mm. ``world_from_head``: its pose. ``rig``: the cameras as calibrated. ``subject``: the
-    faces; None if they were not searched for. ``places``: where on the head the landmarks are; None if there is no
-    face. ``method``: how the pose was found: features, landmarks or silhouettes. ``rival``: how much more the best
-    other pose costs (``FoundPose.rival``).
+    ``head_world``: the head's full level (mm). ``world_from_head``: its pose. ``rig``: the cameras as calibrated.
+    ``subject``: the faces; None if they were not searched for. ``places``: positions of the landmarks on the head; None
+    if there is no face. ``method``: method of the pose: features, landmarks or silhouettes. ``rival``: extra cost of
+    the best other pose (``FoundPose.rival``).
     """
     warnings: list[ReportWarning] = []
     off: dict[str, float] = {}
@@ -100,7 +100,7 @@ def landmark_offsets(
     """Returns, for each camera, the RMS distance of the head's landmarks from those found in the photograph, relative
     to the face's size.
 
-    In a view with several faces the nearest one counts: others may be a poster or a bystander.
+    In a view with several faces the nearest one counts; the others may be posters or bystanders.
     """
     turned = world_from_head.scale * places.offset_mm @ world_from_head.rotation.T
     expected_world = (places.points(head_world.vertices) + turned)[~places.slides]
@@ -119,8 +119,8 @@ def cameras_in_front(world_from_head: Similarity, rig: Rig, least: float = MIN_F
 
 
 def _seen(subject: SubjectFaces) -> dict[str, tuple[FaceDetection, ...]]:
-    """Returns the subject's face in each camera. If the views agree on no face, returns all faces of each view, unless
-    there are only uncertain ones in too few views."""
+    """Returns the subject's face in each camera. If the views agree on no face, it returns all faces of each view; none
+    if there are only uncertain ones in too few views."""
     if subject.matched is None:
         seen = {name: faces for name, faces in subject.found.items() if faces}
         doubtful = len(seen) < MIN_VIEWS and all(f.score < CERTAIN_SCORE for faces in seen.values() for f in faces)
@@ -140,17 +140,17 @@ def _elsewhere(names: list[str], off: Mapping[str, float]) -> ReportWarning:
 
 
 def pupils(eyes: Mapping[str, Iris | UnseenEye]) -> dict[str, Measurement]:
-    """Returns the far pupil distance by its name among the measurements; nothing where there is none."""
+    """Returns the far pupil distance under its name; empty if it was not measured."""
     found = pupil_distance(eyes)
     return {} if found is None else {PUPIL_DISTANCE: found}
 
 
 def pupil_distance(eyes: Mapping[str, Iris | UnseenEye]) -> Measurement | None:
-    """Returns the far pupil distance (mm), None unless both irises were found.
+    """Returns the far pupil distance (mm); None unless both irises were found.
 
-    It is the distance when both eyes look straight ahead at a point infinitely far away (ISO 13666). Both pupils then
-    lie the same way in front of the points about which the eyes turn: it is the distance between the centres of the
-    eyeballs, whatever the eyes looked at when they were photographed."""
+    It is the pupil distance while both eyes look at a point infinitely far ahead (ISO 13666). It equals the distance
+    between the centres of the eyeballs, whatever the eyes looked at in the photographs: with parallel gazes both pupils
+    are equally displaced from the centres."""
     right, left = eyes.get("right"), eyes.get("left")
     if not isinstance(right, Iris) or not isinstance(left, Iris):
         return None
@@ -163,7 +163,7 @@ def pupil_distance(eyes: Mapping[str, Iris | UnseenEye]) -> Measurement | None:
 
 
 def angles_deg(direction: Float[np.ndarray, " 3"]) -> tuple[float, float]:
-    """Returns azimuth (from z towards x) and elevation (from there towards y) of a unit vector, degrees. In the head
-    frame these are to the subject's left, and up."""
+    """Returns the azimuth (from z towards x) and elevation (towards y) of a unit vector, degrees. In the head frame
+    these are to the subject's left, and up."""
     x, y, z = direction
     return float(np.degrees(np.arctan2(x, z))), float(np.degrees(np.arcsin(np.clip(y, -1.0, 1.0))))

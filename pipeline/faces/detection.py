@@ -1,10 +1,10 @@
 """Finds faces in one picture, with 468 points on each.
 
-Enters: a picture as it was taken, in whatever orientation. Leaves: ``FaceDetection``. The detector proposes faces
-in the picture turned by each quarter (it tolerates 45 degrees either way). A proposal counts as a face if the
-landmark network confirms it, in a crop that follows the points. The network is given the face and its mirror image;
-the points are the means of both. Crops are squares, turned so that the face is upright in them; a picture is kept
-at full size and repeatedly halved, so that a small sample of a large face averages over its pixels."""
+In: a picture as it was taken, in any orientation. Leaves: ``FaceDetection``. The detector proposes faces in the picture
+rotated by 0, 90, 180 and 270 degrees (it tolerates 45 degrees either way). A proposal is a face if the landmark network
+confirms it, in a crop that follows the points. The network sees the face and its mirror image; the points are the means
+of both results. Crops are squares, rotated so that the face is upright in them. A picture is stored at full size and
+repeatedly halved, so that a small sample of a large face averages over its pixels."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -90,7 +90,7 @@ def make_pyramid(image: ImageRgb) -> Pyramid:
 def in_picture(
     points_crop: Float[np.ndarray, "n 2"], picture_from_crop: Float[np.ndarray, "2 3"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Returns the pixels of the picture at which points of a crop lie."""
+    """Converts points of a crop to pixels of the picture."""
     return points_crop @ picture_from_crop[:, :2].T + picture_from_crop[:, 2]
 
 
@@ -99,8 +99,8 @@ class FaceDetection:
     """Holds one face that was found in one picture.
 
     All positions are pixels of the picture as it was taken, lens distortion included; (0, 0) is the centre of the
-    top-left pixel. ``landmarks_px`` are the 468 points of the face mesh. ``roll_deg`` says how far the face is turned
-    clockwise in the picture. ``irises_px`` holds five points of the subject's right eye, then five of the left one: the
+    top-left pixel. ``landmarks_px`` are the 468 points of the face mesh. ``roll_deg`` is the clockwise angle of the
+    face in the picture. ``irises_px`` holds five points of the subject's right eye, then five of the left one: the
     centre of the iris, then its edge towards the nose, above, away from the nose, and below. ``lids_px`` holds 16
     points on the edges of the right eye's lids, in the order of ``points.RIGHT_EYE_OUTLINE``, then 16 of the left.
     """
@@ -115,13 +115,13 @@ class FaceDetection:
 
     @property
     def size_px(self) -> float:
-        """Returns the larger side (px) of the box around the 468 points, the box being turned as the face is."""
+        """Returns the longer side (px) of the box around the 468 points; the box is rotated with the face."""
         return crop_around(self.landmarks_px).side_px / CROP_OF_FACE
 
 
 def find_faces(image: ImageRgb, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
     """Finds the faces in a picture, the best score first. Faces larger than an eighth of the picture's longer side are
-    searched first; smaller ones, down to half of that, only if there are none."""
+    searched first. Only if there are none are smaller ones searched, down to half of that."""
     pyramid = make_pyramid(image)
     return find_large_faces(pyramid, networks) or find_small_faces(pyramid, networks)
 
@@ -141,7 +141,7 @@ def find_face_at(
     pyramid: Pyramid, crop: Crop, networks: FaceNetworks, *, min_rounds: int = MIN_ROUNDS
 ) -> FaceDetection:
     """Places the 468 points on the face in a crop. The crop follows the points until they no longer change; the
-    result's score says whether it holds a face."""
+    result's score tells whether it shows a face."""
     for count in range(MAX_ROUNDS):
         points, _, _ = _place(pyramid, crop, networks)
         before, crop = crop, crop_around(points)
@@ -170,7 +170,7 @@ def crop_around(points_px: Float[np.ndarray, "468 2"]) -> Crop:
 def _place(
     pyramid: Pyramid, crop: Crop, networks: FaceNetworks
 ) -> tuple[Float[np.ndarray, "468 2"], Float[np.ndarray, " 468"], float]:
-    """Pixels, depths and score of the points in a crop."""
+    """Returns pixels, depths and score of the points in a crop."""
     points, score = networks.place_landmarks(pyramid.sample(crop, LANDMARK_SIZE))
     if crop.mirrored:
         points = points[point_table().mirror_images]
@@ -194,8 +194,8 @@ def _parts(pyramid: Pyramid) -> list[Crop]:
 
 
 def _find(pyramid: Pyramid, frames: Sequence[Crop], networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """Returns the faces in parts of a picture, best first: the upright ones if one is beyond doubt, else those of any
-    orientation."""
+    """Returns the faces in parts of a picture, best first. If an upright face is beyond doubt, only upright ones are
+    returned."""
     seen: list[tuple[float, Crop]] = []
     found: tuple[FaceDetection, ...] = ()
     for turns in ((0.0,), (90.0, 180.0, 270.0)):
@@ -212,7 +212,7 @@ def _find(pyramid: Pyramid, frames: Sequence[Crop], networks: FaceNetworks) -> t
 
 
 def _proposals(seen: Sequence[tuple[float, Crop]]) -> list[Crop]:
-    """Returns crops of the detector's faces, best first; one for each orientation of a face."""
+    """Returns crops of the detector's faces, best first, one crop for each orientation of a face."""
     chosen: list[Crop] = []
     for _, crop in sorted(seen, key=lambda proposal: -proposal[0]):
         if not any(_is_same(crop, other) and _angle_deg(crop, other) < SAME_WAY_UP_DEG for other in chosen):
@@ -221,7 +221,7 @@ def _proposals(seen: Sequence[tuple[float, Crop]]) -> list[Crop]:
 
 
 def _seen(pyramid: Pyramid, frame: Crop, networks: FaceNetworks) -> Iterator[tuple[float, Crop]]:
-    """Returns score and crop of each face that the detector finds in one square, from its best cell."""
+    """Returns score and crop of each face that the detector finds in one square; each comes from its best cell."""
     faces, scores = networks.find(pyramid.sample(frame, FINDER_SIZE))
     picture_from_crop = frame.picture_from_crop(FINDER_SIZE)
     centres: list[Float[np.ndarray, " 2"]] = []
@@ -239,7 +239,7 @@ def _seen(pyramid: Pyramid, frame: Crop, networks: FaceNetworks) -> Iterator[tup
 
 
 def _verified(pyramid: Pyramid, proposals: Sequence[Crop], networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """Returns the proposals that are faces, best first and each face once; the most likely are tried first."""
+    """Returns the proposals that are faces, best first and without duplicates; it tests the most likely first."""
     candidates = [_place(pyramid, crop, networks) for crop in proposals]
     chosen: list[FaceDetection] = []
     for points, _, _ in sorted(candidates, key=lambda candidate: -candidate[2]):
@@ -255,7 +255,7 @@ def _verified(pyramid: Pyramid, proposals: Sequence[Crop], networks: FaceNetwork
 
 
 def _is_same(a: Crop, b: Crop) -> bool:
-    """Tells whether two crops show one face, however they are turned."""
+    """Tells whether two crops show one face, whatever their rotation."""
     return bool(np.linalg.norm(a.centre_px - b.centre_px) < SAME_FACE / CROP_OF_FACE * max(a.side_px, b.side_px))
 
 

@@ -1,8 +1,7 @@
 """Finds the irises and lids of a face.
 
-Enters: a picture and a face in it. Leaves: the face with its irises and lids. The network for eyes has a higher
-resolution than that for landmarks: its lids follow the visible edge, where the 468 points tend towards the opening of
-an average eye.
+In: a picture and a face in it. Out: the face with its irises and lids. The network for eyes has a higher resolution
+than the one for landmarks. Its lids follow the visible edge; the 468 points tend towards the opening of an average eye.
 """
 
 from collections.abc import Collection, Mapping
@@ -36,8 +35,8 @@ def find_eyes(pyramid: Pyramid, face: FaceDetection, networks: FaceNetworks) -> 
 
 
 def eye_openings(face: MatchedFaces, rig: Rig) -> dict[str, float]:
-    """Returns how wide each eye (``right``, ``left``) is open: the mean gap between its lids divided by the eye's
-    length, as the median over the most frontal views. An eye is left out if no view has its lids.
+    """Returns the opening of each eye (``right``, ``left``): the mean gap between its lids divided by the eye's length,
+    as the median over the most frontal views. An eye is left out if no view has its lids.
 
     Measured: on rendered heads of both models, 31 eyes half closed 0.108 to 0.177, 31 closed 0.025 to 0.093, 16 open
     0.19 to 0.24; on six path-traced and scanned people: open 0.18 to 0.27, closed 0.03 to 0.05.
@@ -57,12 +56,12 @@ def eye_openings(face: MatchedFaces, rig: Rig) -> dict[str, float]:
 
 
 def closed_by_openings(openings: Mapping[str, float]) -> frozenset[str]:
-    """Returns the eyes whose lids meet."""
+    """Returns the eyes whose lids touch."""
     return frozenset(side for side, opening in openings.items() if opening < MIN_HALF_OPENING)
 
 
 def eye_warnings(closed: Collection[str]) -> list[Message]:
-    """Returns a warning if an eye is closed. The result is right, but most studios then want another shot."""
+    """Returns a warning if an eye is closed. The reconstruction is correct, but most studios then want another shot."""
     if not closed:
         return []
     both = len(closed) == 2
@@ -70,7 +69,7 @@ def eye_warnings(closed: Collection[str]) -> list[Message]:
 
 
 def opening_of(lids_px: Float[np.ndarray, "16 2"], direction: Float[np.ndarray, " 3"]) -> float:
-    """Returns the gap's height over the length between the eye's corners, as if seen from the front."""
+    """Returns the height of the gap divided by the length between the eye's corners, as if seen from the front."""
     across = lids_px[INNER] - lids_px[0]
     length = float(np.linalg.norm(across))
     normal = np.array([-across[1], across[0]]) / length

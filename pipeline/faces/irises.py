@@ -1,20 +1,20 @@
-"""Finds irises and where the eyes look: a circle in space, the limbus, whose edges all views share.
+"""Finds irises and gaze directions: fits a circle in space, the limbus, to its edges in all views.
 
-Enters: the subject's face in the views with the points of the eyes' network, the photographs and the cameras. Leaves,
-by eye: centre and radius of the iris, the direction of the gaze, each with its deviation; or why the eye is not seen.
-The gaze is the limbus' normal, the eye's optical axis; the line of sight lies about 5 degrees nearer to the nose.
+In: the subject's face in the views with the eye network's points, the photographs and the cameras. Out, for each eye:
+centre and radius of the iris and the direction of the gaze, with standard deviations; or why the eye was not measured.
+The gaze is the normal of the limbus, the eye's optical axis; the line of sight lies 5 degrees nearer to the nose.
 
-Each eye is fitted alone and, where both do not look alike, again from where the other eye looks, and
-from where both look; what most edges speak for is kept. Priors: the radius is 5.85 mm (deviation 0.25; a visible iris
-of 11.7 mm, Ruefer et al. 2005). The eyeball lies 10.5 mm behind the iris and 5 mm behind the corners of the eye, to 4
-mm in each direction. Both eyes look at one point: elevations are the same to 1 degree, and the lines meet as for a
-point half a metre away or farther; where the two eyes contradict that clearly (a squint), each is left as it was found.
+Each eye is fitted alone. If both gazes differ, each is fitted again from the other's gaze and from the common gaze, and
+the fit that most edges support is retained. Priors: the radius is 5.85 mm (standard deviation 0.25; a visible iris of
+11.7 mm, Ruefer et al. 2005). The eyeball lies 10.5 mm behind the iris and 5 mm behind the corners of the eye, with 4 mm
+standard deviation in each direction. Both eyes look at one point: elevations are equal to 1 degree, and the lines of
+sight meet half a metre away or farther. If the two eyes clearly contradict that (a squint), each keeps its own result.
 
-Edges of the limbus and pupils are looked for about the circle, the circle is fitted to them, and so on, nearer and
-nearer. The pupil lies on the circle's axis; how far before the circle is found, too: an iris lies behind the cornea,
-which lifts it, and a model's may be painted on the cornea. The pupil is the darkest disc in the iris, of the same size
-in all views. Pixels that mirror a lamp are left out. Brightness is taken by its square root, so that noise is alike in
-bright and dark.
+The fit repeats: it searches edges of limbus and pupils near the circle, fits the circle to them, and narrows the
+search. The pupil lies on the circle's axis, at a distance in front that is fitted too: the cornea lifts the image of an
+iris, and a model's iris may be painted on the cornea. The pupil is the darkest disc in the iris, of the same size in
+all views. Pixels with the reflection of a lamp are left out. The square root of the brightness is used, because its
+noise is the same in bright and dark pixels.
 """
 
 from collections.abc import Mapping, Sequence
@@ -86,7 +86,7 @@ MAX_NETWORK_OFF = 0.6  # between a view's network and the circle's centre, by th
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EyeSight:
-    """Holds one view of an eye, and where the network puts the iris in it."""
+    """Holds one view of an eye, and the network's position of the iris in it."""
 
     name: str
     view: EyeView
@@ -95,8 +95,8 @@ class EyeSight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LimbusCircle:
-    """Holds a limbus (world, mm), and how far before it the pupil lies. ``up`` is the face's, so that the result does
-    not depend on the world's axes."""
+    """Holds a limbus (world, mm), and the pupil's distance in front of it. ``up`` is the face's upward direction, so
+    that the result does not depend on the world's axes."""
 
     centre: Float[np.ndarray, " 3"]
     gaze: Float[np.ndarray, " 3"]
@@ -105,45 +105,45 @@ class LimbusCircle:
     ahead: float = AHEAD_MM
 
     def axes(self) -> Float[np.ndarray, "2 3"]:
-        """Returns two unit vectors across the gaze."""
+        """Returns two unit vectors at right angles to the gaze."""
         across = np.cross(self.up, self.gaze)
         across /= np.linalg.norm(across)
         return np.stack([across, np.cross(self.gaze, across)])
 
     def after(self, step: Float[np.ndarray, " 7"]) -> "LimbusCircle":
-        """Returns the circle after a step: of the centre, of the gaze about ``axes``, of the radius, and of the
-        pupil."""
+        """Returns the circle after a step. A step changes the centre, the gaze about ``axes``, the radius, and the
+        pupil's distance."""
         turn = rotation_from_vector(step[3:5] @ self.axes())
         radius, ahead = self.radius + float(step[5]), self.ahead + float(step[6])
         return LimbusCircle(self.centre + step[:3], turn @ self.gaze, self.up, radius, ahead)
 
     def on_axis(self, ahead: float) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 7"]]:
-        """Returns a point on the axis before the centre, and its derivative by a step (which keeps ``ahead``)."""
+        """Returns a point on the axis ``ahead`` of the centre, and its derivative by a step with ``ahead`` fixed."""
         slopes = np.zeros((3, 7))
         slopes[:, :3] = np.eye(3)
         slopes[:, 3:5] = ahead * np.stack([np.cross(axis, self.gaze) for axis in self.axes()], axis=1)
         return self.centre + ahead * self.gaze, slopes
 
     def radius_px(self, view: EyeView) -> float:
-        """Returns how large an iris is in a view."""
+        """Returns the radius (px) of an iris in a view."""
         _, slopes = view.camera.project_with_jacobian(self.centre[None])
         return RADIUS_MM * float(np.linalg.svd(slopes[0], compute_uv=False)[0])
 
     def faces(self, seen: EyeSight) -> bool:
-        """Tells whether an eye looks towards a view."""
+        """Tells whether an eye is turned towards a view."""
         towards = seen.view.camera.centre_world - self.centre
         return bool(towards @ self.gaze > MIN_FACING * np.linalg.norm(towards))
 
     def agrees(self, seen: EyeSight) -> bool:
-        """Tells whether the network sees the iris where the circle is."""
+        """Tells whether the network's iris agrees with the circle."""
         pixel = seen.view.camera.project(self.centre[None])[0]
         return bool(np.linalg.norm(pixel - seen.network_px) < MAX_NETWORK_OFF * self.radius_px(seen.view))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LimbusEdges:
-    """Holds how far beyond the circle a view has its edges (px), the derivatives of the circle's image along these rays
-    by a step, weights, and their deviation (px)."""
+    """Holds the edges of a circle in one view: their distances beyond the circle (px), the derivatives of the circle's
+    image along these rays by a step, weights, and standard deviation (px)."""
 
     offsets: Float[np.ndarray, " n"]
     slopes: Float[np.ndarray, "n 7"]
@@ -153,7 +153,7 @@ class LimbusEdges:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LimbusFit:
-    """Holds a circle, the inverse of its covariance (of a step), and the edges it was fitted to, by view."""
+    """Holds a circle, its information matrix (of a step), and the edges it was fitted to, by view."""
 
     circle: LimbusCircle
     information: Float[np.ndarray, "7 7"]
@@ -161,19 +161,19 @@ class LimbusFit:
 
     @property
     def offsets(self) -> Float[np.ndarray, " n"]:
-        """Returns how far beyond the circle all edges lie (px)."""
+        """Returns the distances of all edges beyond the circle (px)."""
         return np.concatenate([edges.offsets for edges in self.edges.values()])
 
     @property
     def agreement(self) -> float:
-        """Returns how many edges speak for the circle."""
+        """Returns the number of edges that support the circle."""
         return float((1.0 / (1.0 + (self.offsets / AGREED_PX) ** 2) ** 2).sum())
 
 
 def fitted(
     seen: Sequence[EyeSight], circle: LimbusCircle, eyeball: Float[np.ndarray, " 3"], reaches: Sequence[float]
 ) -> LimbusFit | None:
-    """Returns the circle that views agree on, None where too few do.
+    """Returns the circle on which the views agree; None if too few do.
 
     Args:
         seen: the views.
@@ -196,7 +196,7 @@ def fitted(
 
 
 def _edges(circle: LimbusCircle, view: EyeView, reach: float) -> LimbusEdges | None:
-    """Returns the edges of a limbus in a view, None where there are too few."""
+    """Returns the edges of a limbus in a view; None if there are too few."""
     angles = np.arange(RAYS) * 2.0 * np.pi / RAYS
     axes = circle.axes()
     spokes = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ axes
@@ -222,14 +222,14 @@ def _edges(circle: LimbusCircle, view: EyeView, reach: float) -> LimbusEdges | N
 
 
 def _end_weights(there: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns smaller weights for the last two rays of each arc of the circle."""
+    """Returns smaller weights for the last two rays at each end of an arc of the circle."""
     inner = there & np.roll(there, 1) & np.roll(there, -1)
     innermost = inner & np.roll(inner, 1) & np.roll(inner, -1)
     return np.where(innermost, 1.0, np.where(inner, ENDS[1], ENDS[0]))
 
 
 def _pupils(circle: LimbusCircle, seen: Sequence[EyeSight]) -> list[tuple[EyeView, Float[np.ndarray, " 2"]]]:
-    """Returns the views that show the pupil, and where."""
+    """Returns the views that show the pupil, each with its position."""
     centre, _ = circle.on_axis(AHEAD_MM)
     found = pupils_px([sight.view for sight in seen], centre, circle.axes())
     return [(sight.view, pixel) for sight, pixel in zip(seen, found, strict=True) if pixel is not None]
@@ -241,7 +241,7 @@ def _normal_equations(
     pupils: Sequence[tuple[EyeView, Float[np.ndarray, " 2"]]],
     eyeball: Float[np.ndarray, " 3"],
 ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, " 7"]]:
-    """Returns matrix and right side of the step that edges, pupils and priors ask for."""
+    """Returns the matrix and right side of the normal equations from edges, pupils and priors."""
     matrix, right = np.zeros((7, 7)), np.zeros(7)
     for view in edges.values():
         scale = max(ROBUST_PX, 2.0 * view.noise)
@@ -269,7 +269,7 @@ def _normal_equations(
 def pupils_px(
     views: Sequence[EyeView], centre: Float[np.ndarray, " 3"], axes: Float[np.ndarray, "2 3"]
 ) -> list[Float[np.ndarray, " 2"] | None]:
-    """Returns the pupil's centre in each view (px of the picture), None where it is not clear.
+    """Returns the pupil's centre in each view (px of the picture); None where it is not clear.
 
     Args:
         views: of one eye.
@@ -288,7 +288,7 @@ def pupils_px(
 
 
 def _contrasts(view: EyeView, centre: Float[np.ndarray, " 3"], axes: Float[np.ndarray, "2 3"]) -> Contrasts:
-    """Returns by how much each disc, by its radius and place, is darker than the ring about it, by the iris."""
+    """Returns, by disc radius and position, how much darker a disc is than the ring around it, by the iris' level."""
     across, up = np.meshgrid(ALONG_MM, ALONG_MM)
     places = centre + across.reshape(-1, 1) * axes[0] + up.reshape(-1, 1) * axes[1]
     x, y = (view.camera.project(places) - view.origin_px).T.astype(np.float32).reshape(2, *across.shape)
@@ -312,7 +312,7 @@ def _contrasts(view: EyeView, centre: Float[np.ndarray, " 3"], axes: Float[np.nd
 
 @lru_cache(maxsize=1)
 def _kernels() -> list[tuple[Float32[np.ndarray, "k k"], Float32[np.ndarray, "k k"]]]:
-    """Returns a disc of each radius and the ring about it."""
+    """Returns a disc of each radius and the ring around it."""
     out = []
     for radius in RADII_MM:
         count = int((radius + RING_MM) / STEP_MM) + 1
@@ -323,8 +323,8 @@ def _kernels() -> list[tuple[Float32[np.ndarray, "k k"], Float32[np.ndarray, "k 
 
 
 def _peak(contrast: Float32[np.ndarray, "n n"]) -> Float[np.ndarray, " 2"] | None:
-    """Returns the place of the highest contrast (mm along both axes) between cells; None at the border of what could be
-    measured, and where it is low."""
+    """Returns the sub-cell position (mm along both axes) of the highest contrast; None if it is low or at the border of
+    the measured area."""
     row, column = np.unravel_index(contrast.argmax(), contrast.shape)
     about = contrast[row - 1 : row + 2, column - 1 : column + 2]
     if contrast[row, column] < MIN_CONTRAST or about.shape != (3, 3):
@@ -339,8 +339,8 @@ def _peak(contrast: Float32[np.ndarray, "n n"]) -> Float[np.ndarray, " 2"] | Non
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Iris:
-    """Holds an iris (world frame, mm). ``gaze`` is the unit vector along which the eye looks. ``covariance`` is that of
-    the centre (mm), of a rotation of the gaze (rad, world axes; nothing about the gaze), and of the radius (mm)."""
+    """Holds an iris (world frame, mm). ``gaze`` is the unit vector of the eye's optical axis. ``covariance`` is over
+    the centre (mm), a rotation of the gaze (rad, world axes; none about the gaze itself), and the radius (mm)."""
 
     centre: Float[np.ndarray, " 3"]
     gaze: Float[np.ndarray, " 3"]
@@ -356,29 +356,29 @@ class Iris:
 
     @property
     def gaze_std_deg(self) -> float:
-        """Returns the standard deviation of the gaze, the mean of both directions across it (degrees)."""
+        """Returns the standard deviation of the gaze (degrees), the mean of the two directions across it."""
         return float(np.degrees(np.sqrt(np.trace(self.covariance[3:6, 3:6]) / 2.0)))
 
     @property
     def eyeball(self) -> Float[np.ndarray, " 3"]:
-        """Returns the centre of the eyeball, about which the eye turns."""
+        """Returns the centre of the eyeball, about which the eye rotates."""
         return self.centre - BEHIND_MM * self.gaze
 
     def widen_by_scale(self, sigma: float, origin: Float[np.ndarray, " 3"]) -> "Iris":
-        """Returns the iris of a head whose size about ``origin`` (mm) is known to the share ``sigma``."""
+        """Returns the iris if the head's size about ``origin`` (mm) has the relative standard deviation ``sigma``."""
         moved = sigma * np.concatenate([self.centre - origin, np.zeros(3), [self.radius_mm]])
         return replace(self, covariance=self.covariance + np.outer(moved, moved))
 
     @property
     def eyeball_jacobian(self) -> Float[np.ndarray, "3 7"]:
-        """Returns the derivative of ``eyeball`` by what ``covariance`` is of."""
+        """Returns the derivative of ``eyeball`` by the seven parameters of ``covariance``."""
         return np.concatenate([np.eye(3), BEHIND_MM * cross_matrix(self.gaze), np.zeros((3, 1))], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
 class UnseenEye:
-    """Holds why an eye is not seen: its lids are closed, fewer than two views show it, no two show it large enough, or
-    its limbus is not clear."""
+    """Holds why an eye was not measured: its lids are closed, fewer than two views show it, no two views show it large
+    enough, or its limbus is not clear."""
 
     cause: Cause
 
@@ -407,8 +407,8 @@ def find_irises(
 
 
 def believed(eyes: Mapping[str, Iris | UnseenEye], ahead: Float[np.ndarray, " 3"]) -> dict[str, Iris | UnseenEye]:
-    """Returns the eyes without gazes that nobody has: two that differ by more than ``MAX_BETWEEN_DEG``, and one alone
-    that is farther than ``MAX_ALONE_DEG`` from ``ahead``, where the face looks (a unit vector)."""
+    """Rejects impossible gazes: two that differ by more than ``MAX_BETWEEN_DEG``, or a single one that is more than
+    ``MAX_ALONE_DEG`` from ``ahead``, the direction of the face (a unit vector)."""
     gazes = [eye.gaze for eye in eyes.values() if isinstance(eye, Iris)]
     beside, limit_deg = (gazes[1], MAX_BETWEEN_DEG) if len(gazes) == len(eyes) else (ahead, MAX_ALONE_DEG)
     if not gazes or gazes[0] @ beside >= np.cos(np.radians(limit_deg)):
@@ -417,7 +417,7 @@ def believed(eyes: Mapping[str, Iris | UnseenEye], ahead: Float[np.ndarray, " 3"
 
 
 def looking_together(right: Iris, left: Iris, face_axes: Float[np.ndarray, "3 3"]) -> tuple[Iris, Iris]:
-    """Returns both irises turned towards one point, as far as their deviations allow. ``face_axes`` has the
+    """Returns both irises rotated towards one point, as far as their standard deviations allow. ``face_axes`` has the
     face's axes as columns: to the subject's left, up, ahead."""
     across, up = face_axes[:, 0], face_axes[:, 1]
     covariance = np.zeros((14, 14))
@@ -443,7 +443,7 @@ def _moved(iris: Iris, step: Float[np.ndarray, " 7"], covariance: Float[np.ndarr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Eye:
-    """Holds the views of an eye, where its eyeball may lie, and the face's upward direction."""
+    """Holds the views of an eye, the prior position of its eyeball, and the face's upward direction."""
 
     seen: Sequence[EyeSight]
     eyeball: Float[np.ndarray, " 3"]
@@ -464,7 +464,7 @@ def _eye(face: MatchedFaces, images: Mapping[str, ImageRgb], rig: Rig, side: str
 
 
 def _first_fit(eye: _Eye, ahead: Float[np.ndarray, " 3"]) -> LimbusFit | UnseenEye:
-    """Returns the limbus that an eye's views agree on, or why there is none."""
+    """Returns the limbus on which an eye's views agree, or the reason why there is none."""
     if len(eye.seen) < MIN_VIEWS:
         return UnseenEye("few-views")
     centre = _nearest_to_rays(eye.seen, eye.eyeball + BEHIND_MM * ahead)
@@ -484,7 +484,7 @@ def _large(circle: LimbusCircle, seen: Sequence[EyeSight]) -> list[EyeSight]:
 
 
 def _together(fits: Mapping[str, LimbusFit | UnseenEye], eyes: Mapping[str, _Eye]) -> dict[str, LimbusFit | UnseenEye]:
-    """Returns the fits once each was tried from where the other eye looks, and from where both look, if they differ."""
+    """Returns the fits, each repeated from the other eye's gaze and from the common gaze if both gazes differ."""
     out = dict(fits)
     for side, fit in fits.items():
         beside = next(
@@ -504,7 +504,7 @@ def _together(fits: Mapping[str, LimbusFit | UnseenEye], eyes: Mapping[str, _Eye
 
 
 def _iris(fit: LimbusFit, seen: Sequence[EyeSight]) -> Iris | UnseenEye:
-    """Returns a fit's iris, or that it is no iris."""
+    """Returns the iris of a fit, or the reason why it is none."""
     circle = fit.circle
     rms = float(1.4826 * np.median(np.abs(fit.offsets)))
     scale = float(np.mean([circle.radius_px(sight.view) for sight in seen if sight.name in fit.edges]))
@@ -518,13 +518,13 @@ def _iris(fit: LimbusFit, seen: Sequence[EyeSight]) -> Iris | UnseenEye:
 
 
 def _towards(gaze: Float[np.ndarray, " 3"], ahead: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-    """Returns the direction from eyeball to iris, drawn towards straight ahead, since eyeballs are known roughly."""
+    """Returns the direction from eyeball to iris, moved towards straight ahead, as eyeballs are known only roughly."""
     mixed = gaze / BEHIND_MM + ahead
     return mixed / np.linalg.norm(mixed)
 
 
 def _nearest_to_rays(seen: Sequence[EyeSight], start: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-    """Returns the place nearest to the rays through the network's irises, those far off it left aside; ``start`` to
+    """Returns the point nearest to the rays through the network's irises, without outliers; its prior is ``start`` with
     ``CENTRE_STD_MM``."""
     rays = np.concatenate([each.view.camera.rays_world(each.network_px[None]) for each in seen])
     centres = np.array([each.view.camera.centre_world for each in seen])

@@ -1,14 +1,13 @@
-"""Says which surface point of a head model each of the face detector's 468 points is, and how large the detector's
-error is.
+"""Maps each of the face detector's 468 points to a point on a head model's surface, with the detector's error.
 
 Both were measured on renders of heads of the model's own population (``python -m
 tests.laboratory.model_packs.landmark_map``), for the two models whose triangles are known: MakeHuman's and ICT-FaceKit.
-To any other model the points are transferred from the first one's mean head, by the landmarks that both have, and the
-error of that is added.
+For any other model the points are transferred from the first model's mean head, by the landmarks that both have, and
+the error of the transfer is added.
 
-A point that the detector puts at x (triangulated, without its biases) is ``map.points(vertices) + e``. The error e has
-the mean ``offset_mm``, a part that is independent for each point (``deviation_mm``), and a part in which all points
-move together (``shared_mm``), since the detector has learned an average face and tends towards it.
+The detector places a point (triangulated, without its bias) at ``map.points(vertices) + e``. The error e has the mean
+``offset_mm``, a part that is independent for each point (``deviation_mm``), and a part common to all points
+(``shared_mm``), because the detector tends towards the average face of its training.
 """
 
 import hashlib
@@ -44,8 +43,8 @@ class NoLandmarkMap(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkMap:
-    """Holds the points on a head model's surface that the detector's 468 points stand for, and the detector's error at
-    each (mm, head frame). ``slides`` marks points that slide along the skin (jaw line, forehead). Arrays are
+    """Holds the points on a head model's surface that correspond to the detector's 468 points, and the detector's error
+    at each (mm, head frame). ``slides`` marks points that may slide along the skin (jaw line, forehead). Arrays are
     read-only."""
 
     rows: Int[np.ndarray, "468 3"]  # vertices of the full level
@@ -61,7 +60,7 @@ class LandmarkMap:
         return (vertices[self.rows] * self.weights[..., None]).sum(axis=1)
 
     def expected(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "468 3"]:
-        """Returns where the detector puts the 468 points on average: the surface points plus its mean error (mm, head
+        """Returns the detector's mean positions of the 468 points: the surface points plus its mean error (mm, head
         frame)."""
         return self.points(vertices) + self.offset_mm
 
@@ -114,7 +113,7 @@ def _map(rows: np.ndarray, weights: np.ndarray, offset_mm: np.ndarray, carried_m
 
 
 def _carried(model: HeadModel) -> Mapping[str, np.ndarray]:
-    """Returns rows and weights of the default model's points on another model's mean head."""
+    """Returns the rows and weights that place the default model's points on another model's mean head."""
     marks = model.levels["full"].landmarks
     default = load_model()
     names = sorted(set(marks) & set(default.levels["full"].landmarks))

@@ -1,8 +1,8 @@
 """Finds the limbus, the border of iris and white, in the picture of an eye: sub-pixel edges along rays.
 
-Enters: a picture, the lids' edges in it, and points of a predicted limbus with the directions away from the iris.
-Leaves: how far from its point each ray meets the strongest step from dark to bright, slopes of neighbouring rays being
-averaged, since the limbus is smooth and noise is not. Rays that lids cut off have none.
+In: a picture, the lids' edges in it, and points of a predicted limbus with the directions away from the iris. Out: the
+distance from each point to the strongest step from dark to bright along its ray. Slopes of neighbouring rays are
+averaged, since the limbus is smooth and noise is not. Rays that the lids cut off get no distance.
 """
 
 from dataclasses import dataclass
@@ -33,9 +33,9 @@ CROP = 2.2  # half side of what is cut out, by the eye's length
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EyeView:
-    """Holds one camera's picture of an eye: brightness about it (linear, 1 the white of the eye), how near each pixel's
-    colour is to skin (0 the white of the eye, 1 skin), and the distance inside the lids' edges (px, ``FINE`` cells a
-    pixel). ``origin_px`` is the picture's pixel of the crop's first."""
+    """Holds one camera's picture of an eye: its brightness (linear, 1 for the white of the eye), the similarity of each
+    pixel's colour to skin (0 for the white of the eye, 1 for skin), and the distance inside the lids' edges (px,
+    ``FINE`` cells a pixel). ``origin_px`` is the picture's pixel at the crop's first pixel."""
 
     camera: Camera
     origin_px: Float[np.ndarray, " 2"]
@@ -46,7 +46,7 @@ class EyeView:
 
 def eye_view(camera: Camera, image: ImageRgb, lids_px: Float[np.ndarray, "16 2"]) -> EyeView | None:
     """Cuts an eye out of a picture. ``lids_px`` are the edges of its lids, in the order of ``FaceDetection``. Returns
-    None where it lies beyond the picture."""
+    None if the eye lies outside the picture."""
     height, width = image.shape[:2]
     half = CROP * 0.5 * float(np.linalg.norm(lids_px[8] - lids_px[0]))
     middle = lids_px.mean(axis=0)
@@ -72,7 +72,7 @@ def eye_view(camera: Camera, image: ImageRgb, lids_px: Float[np.ndarray, "16 2"]
 def _skin_share(
     crop: Float32[np.ndarray, "h w 3"], brightness: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"] | None:
-    """Returns how near colours are to skin, from the palest bright ones between the lids to those around them."""
+    """Returns how similar colours are to skin: 0 for the palest bright one between the lids, 1 for those around."""
     redness = (crop[:, :, 0] - crop[:, :, 2]) / (crop.sum(axis=2) + 1e-3)
     far = cv2.dilate(inside.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=int(SKIN_PX)) == 0
     if inside.sum() < MIN_PIXELS or far.sum() < MIN_PIXELS:
@@ -85,8 +85,8 @@ def _skin_share(
 def limbus_offsets(
     view: EyeView, points_px: Float[np.ndarray, "n 2"], outwards: Float[np.ndarray, "n 2"], reach_px: float
 ) -> Float[np.ndarray, " n"]:
-    """Returns how far beyond each predicted point, along its direction (unit, px), the picture has its edge (px); NaN
-    where there is none within ``reach_px``, or lids cover it. The points go once round the iris."""
+    """Returns the distance from each predicted point to the picture's edge, along its direction (unit, px); NaN where
+    there is none within ``reach_px``, or lids cover it. The points run once around the iris."""
     count = max(int(np.ceil(reach_px / STEP_PX)), 2)
     along = np.arange(-count - 1, count + 2) * STEP_PX
     at = points_px[:, None] + along[None, :, None] * outwards[:, None] - view.origin_px
@@ -107,7 +107,7 @@ def limbus_offsets(
 
 
 def _averaged_along(slope: Float[np.ndarray, "n k"], valid: Bool[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-    """Returns the mean slope of neighbouring rays that are valid, 0 where a ray itself is not."""
+    """Returns the mean slope of neighbouring valid rays; 0 where the ray itself is not valid."""
     apart = np.abs(np.arange(len(slope)) - np.arange(len(slope))[:, None])
     near = np.minimum(apart, len(slope) - apart)  # the rays go round
     share = np.where(near <= 3 * ALONG_RAYS, np.exp(-0.5 * (near / ALONG_RAYS) ** 2), 0.0)

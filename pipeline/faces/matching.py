@@ -1,9 +1,9 @@
-"""Finds which faces in several pictures are the same subject's.
+"""Finds the faces in several pictures that belong to one subject.
 
-Enters: the faces found in each view. Leaves: ``MatchedFaces``, or None if no two views show one face. Every two
-detections that may be one face are triangulated. The result must have the size (mm) and the relief of a face (a poster
-is flat), and look towards its cameras. Further views are added if the points project onto their detections. Of several
-faces, the one is taken that is large in the pictures and near their middles: others stand behind.
+In: the faces found in each view. Out: ``MatchedFaces``, or None if no two views show one face. Every two detections
+that may show one face are triangulated. The result must have the size (mm) and the relief of a face (a poster is flat),
+and be turned towards its cameras. Further views are added if the points project onto their detections. If there are
+several faces, it takes the one that is large and central in the pictures: bystanders stand behind.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -44,9 +44,9 @@ DISSENTING_FACING = 0.5  # the same of a camera that must see it
 class MatchedFaces:
     """Holds one person's face as found in several views, and its 468 points in the world frame (mm).
 
-    The error of a point is the sum of three: the point's own, independent of all others (``covariances``); the view's,
-    common to all points in a view (``shared_mm``: each row times a standard normal number); and the network's, which
-    tends towards an average face in all views (the model's ``landmark_map.LandmarkMap``).
+    The error of a point is the sum of three: its own, independent of all others (``covariances``); the view's, common
+    to all its points (``shared_mm``: each row times a standard normal number); and the network's, which tends towards
+    an average face in all views (``landmark_map.LandmarkMap`` of the model).
     """
 
     detections: Mapping[str, FaceDetection]  # by view
@@ -68,14 +68,14 @@ class MatchedFaces:
 
     @property
     def facing_world(self) -> Float[np.ndarray, " 3"]:
-        """Returns the unit vector (world frame) along which the face looks."""
+        """Returns the unit vector (world frame) in which the face is turned."""
         return self.world_from_face.rotation[:, 2]
 
 
 def find_subject_face(
     candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
 ) -> TriangulatedFace | None:
-    """Finds the subject's face among all faces in the views (the best of each first), and triangulates only every
+    """Finds the subject's face among all faces in the views (best first in each), and triangulates only every
     thirteenth of its points. Returns None if no two views show one face. ``eye_distance_mm``: limits of a face's size;
     None if the rig's scale is not known."""
     faces = _consistent(candidates, rig, eye_distance_mm)
@@ -85,7 +85,7 @@ def find_subject_face(
 def complete_match(
     face: TriangulatedFace, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
 ) -> MatchedFaces | None:
-    """Triangulates all 468 points of a face that was found. Returns None if its views do not determine every point."""
+    """Triangulates all 468 points of the subject's face. Returns None if its views do not determine every point."""
     whole = triangulate_face(face.detections, rig)
     return whole and _matched(whole, rig, _outliers(face, candidates, rig))
 
@@ -93,7 +93,7 @@ def complete_match(
 def _consistent(
     candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
 ) -> Iterator[TriangulatedFace]:
-    """Returns the faces that two views or more agree on, each with all views that do."""
+    """Returns the faces on which two or more views agree, each with all its views."""
     detections = [(name, face) for name, faces in candidates.items() for face in faces]
     pairs = [(a, b) for k, a in enumerate(detections) for b in detections[k + 1 :] if a[0] != b[0]]
     pairs.sort(key=lambda pair: -min(pair[0][1].score, pair[1][1].score))
@@ -149,7 +149,7 @@ def _may_be_one(
 def _grown(
     face: TriangulatedFace | None, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
 ) -> TriangulatedFace | None:
-    """Returns the face of a pair, with the detections of all views in which its points project to a detection."""
+    """Returns a pair's face extended by all views in which its points project to a detection."""
     for _ in range(GROWING_ROUNDS):
         if face is None:
             return None
@@ -165,7 +165,7 @@ def _nearest(
     face: TriangulatedFace, detections: Sequence[FaceDetection], camera: Camera
 ) -> tuple[FaceDetection, float]:
     """Returns a view's detection nearest to the projected points of the face, and its misfit: the RMS of residuals over
-    their expected deviation (the points' noise and uncertainty); infinite behind the camera."""
+    their expected standard deviation (noise and uncertainty of points). Behind the camera it is infinite."""
     points, placed = face.points.positions_world, face.world_from_face
     pixels, slopes = camera.project_with_jacobian(points)
     if not np.isfinite(pixels).all():
@@ -184,7 +184,7 @@ def _nearest(
 
 
 def _is_face(face: TriangulatedFace, rig: Rig, eye_distance_mm: tuple[float, float] | None) -> bool:
-    """Tells whether the points are a face's: of its size and relief, and turned towards its cameras."""
+    """Tells whether the points form a face: with its size and relief, and turned towards its cameras."""
     low, high = eye_distance_mm or (0.0, np.inf)
     scaled_mm = face.world_from_face.scale * mean_eye_distance_mm()
     middle, facing = face.world_from_face.translation, face.world_from_face.rotation[:, 2]
@@ -199,7 +199,7 @@ def _is_face(face: TriangulatedFace, rig: Rig, eye_distance_mm: tuple[float, flo
 
 
 def _dissenting(face: TriangulatedFace, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig) -> int:
-    """Counts the views that should show this face and show other faces only."""
+    """Counts the views that should show this face but show only other faces."""
     middle, facing = face.world_from_face.translation, face.world_from_face.rotation[:, 2]
     count = 0
     for name, faces in candidates.items():
@@ -225,7 +225,7 @@ def _eye_distance_mm(points: Float[np.ndarray, "468 3"]) -> float:
 
 
 def _prominence(face: TriangulatedFace, rig: Rig) -> float:
-    """Scores over all views how large the face is in the picture and how near to its middle."""
+    """Scores how large and how central a face is in its pictures."""
 
     def of_view(name: str, detection: FaceDetection) -> float:
         k = rig[name].intrinsics
@@ -240,7 +240,7 @@ def _prominence(face: TriangulatedFace, rig: Rig) -> float:
 def _outliers(
     face: TriangulatedFace, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
 ) -> dict[str, FaceDetection]:
-    """Returns detections of excluded views that lie where the face is but do not fit it."""
+    """Returns detections of excluded views that lie at the face but do not fit it."""
     found = {}
     for name, faces in candidates.items():
         if name not in face.detections and faces:
@@ -252,7 +252,7 @@ def _outliers(
 
 
 def _matched(face: TriangulatedFace, rig: Rig, outliers: Mapping[str, FaceDetection]) -> MatchedFaces:
-    """Builds the face that the stage hands on."""
+    """Builds the face that the stage returns."""
     names = list(face.detections)
     return MatchedFaces(
         detections=face.detections,

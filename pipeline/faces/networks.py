@@ -1,13 +1,13 @@
-"""The networks that find a face and 468 points on it: MediaPipe's, run by OpenCV.
+"""Loads the networks that find a face and 468 points on it: MediaPipe's, run by OpenCV.
 
-Bazarevsky et al., *BlazeFace* (2019), finds faces; Kartynnik et al., *Real-time facial surface geometry from monocular
-video on mobile GPUs* (2019), places 468 points on one; Ablavatski et al., *Real-time pupil tracking from monocular
-video for digital puppetry* (2020), places the lids and the iris of an eye. The files lie in ``packs`` (Apache-2.0) and
-are checked by their sha256 when they are loaded. OpenCV's classic engine gives both outputs of a network at once; the
-new one of 5.0 lets only the first be asked for.
+BlazeFace (Bazarevsky et al. 2019) finds faces. Kartynnik et al., *Real-time facial surface geometry from monocular
+video on mobile GPUs* (2019), place 468 points on one. Ablavatski et al., *Real-time pupil tracking from monocular video
+for digital puppetry* (2020), place the lids and the iris of an eye. The files lie in ``packs`` (Apache-2.0) and are
+checked by their sha256 when they are loaded. OpenCV's classic engine returns both outputs of a network at once; the new
+engine of 5.0 returns only the first.
 
-Pixel (0, 0) of a network's input is the centre of its top-left pixel: with faces mirrored, x of a point and of its
-mirror image add up to 190.8 of 192 px (191 in this convention, 192 if its edge were meant).
+Pixel (0, 0) of a network's input is the centre of its top-left pixel. This was measured: x of a point and of its mirror
+image add up to 190.8 of 192 px (191 in this convention, 192 for corners).
 """
 
 import hashlib
@@ -39,7 +39,7 @@ LID_POINTS, IRIS_POINTS = 16, 5
 
 
 class DamagedNetwork(EigenheadError):
-    """Reports a network file that is missing or whose content is not the one that this version was made with."""
+    """Reports a network file that is missing or differs from the one of this version."""
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(f"{path}: {why}; install the program again")
@@ -55,7 +55,7 @@ class FaceNetworks:
     _lock: Any = field(default_factory=threading.Lock, repr=False)
 
     def find(self, crop: UInt8[np.ndarray, "192 192 3"]) -> tuple[Float[np.ndarray, "n 8 2"], Float[np.ndarray, " n"]]:
-        """Proposes a face for every cell of the 192 x 192 crop. Most proposals are no faces, as their scores show.
+        """Proposes a face for every cell of the 192 x 192 crop. Most proposals are no faces and have a low score.
 
         Returns:
             For each cell a face's centre, width and height, right eye, left eye, tip of the nose, mouth, right and left

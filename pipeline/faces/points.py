@@ -1,7 +1,7 @@
-"""Provides measured properties of the landmark network's 468 points: which are each other's mirror image, their mean
-shape, and their bias and noise. ``right`` and ``left`` are the subject's.
+"""Provides measured properties of the landmark network's 468 points: the pairs of mirror images, their mean shape, and
+their bias and noise. ``right`` and ``left`` are the subject's.
 
-The network was run on faces and on their mirror images; each point was paired with the one that comes nearest (``python
+The network was run on faces and on their mirror images; each point was paired with the nearest mirrored point (``python
 -m tests.laboratory.model_packs.landmark_map``).
 """
 
@@ -24,11 +24,11 @@ inner one, then along the upper lid."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointTable:
-    """Holds what was measured of the landmark network's 468 points. Arrays are read-only.
+    """Holds the measured properties of the landmark network's 468 points. Arrays are read-only.
 
-    Face frame: x to the subject's left, y up, z out of the face. Noise is relative to the face's size in the picture.
-    Its logarithm grows linearly with ``1 - cos`` of the angle between the point's normal and the direction to the
-    camera.
+    Face frame: x to the subject's left, y up, z out of the face. Noise is relative to the size of the face in the
+    picture. Its logarithm grows linearly with ``1 - cos`` of the angle between the point's normal and the direction to
+    the camera.
     """
 
     mirror_images: Int[np.ndarray, " 468"]  # of each point; those of the midline are their own
@@ -62,8 +62,8 @@ VIEW_TERMS_MIRRORED = np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
 
 
 def view_bias(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "468 2"]:
-    """Returns by how much the network misplaces each point of a face seen from ``direction`` (unit, face frame): to the
-    right and down in a picture in which the face is upright, relative to the face's size."""
+    """Returns the network's mean error at each point of a face seen from ``direction`` (unit, face frame): to the right
+    and down in a picture with the face upright, relative to the face's size."""
     return np.tensordot(view_terms(direction), point_table().view_bias, axes=1)
 
 
@@ -71,8 +71,8 @@ def place_face(points_world: Float[np.ndarray, "n 3"], which: slice = slice(None
     """Fits a mean face to some of the points, the indices ``which``. Returns its pose and scale (world_from_face), and
     the relief.
 
-    The scale follows from breadth and height. The relief is the points' depth divided by the mean face's: 1 for a mean
-    face, 0 for a flat picture.
+    The scale is fitted to breadth and height only. The relief is the depth of the points divided by the mean face's: 1
+    for a mean face, 0 for a flat picture.
     """
     shape = point_table().shape_mm[which]
     mean, middle = shape.mean(axis=0), points_world.mean(axis=0)

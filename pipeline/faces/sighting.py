@@ -1,7 +1,7 @@
-"""Searches the subject's face quickly, for the verdict on a shot: which pictures lack it, and where it looks.
+"""Searches the subject's face quickly, to judge a shot: which pictures lack it, and which way it is turned.
 
-Enters: small pictures (``reduce_picture``) and their cameras. Leaves: ``FaceSighting``. The search is short: it ends
-after a few views without a face, and then tests only those cameras that must show it.
+In: small pictures (``reduce_picture``) and their cameras. Leaves: ``FaceSighting``. The search is short: it ends after
+a few views without a face, and then tests only those cameras that must show it.
 """
 
 from dataclasses import replace
@@ -40,8 +40,7 @@ def reduce_picture(image: ImageRgb, camera: Camera, longest_px: int) -> tuple[UI
 
 
 def sight_face(subject: SubjectFaces, rig: Rig, *, front: str) -> FaceSighting:
-    """Tells which cameras lack the subject's face, whether its eyes are closed, and how far it is turned from the front
-    camera.
+    """Returns which cameras lack the subject's face, whether its eyes are closed, and its angle from the front camera.
 
     Args:
         subject: as ``find_subject`` finds it in small pictures with the effort ``GLANCE``, in 0.1 to 0.4 s at 640 px.
@@ -57,7 +56,7 @@ def sight_face(subject: SubjectFaces, rig: Rig, *, front: str) -> FaceSighting:
 
 
 def turned_deg(world_from_face: Similarity, rig: Rig, front: str) -> tuple[float, float] | tuple[None, None]:
-    """Returns by how many degrees a face is turned to its left and up from the front camera; None without a front."""
+    """Returns the angles (degrees, to the face's left and up) between a face and the front camera; None without one."""
     if not has_front(rig):
         return None, None
     left, up = gaze_from(world_from_face, rig[front].axis_world if front in rig.names else -_fan(rig))
@@ -66,8 +65,8 @@ def turned_deg(world_from_face: Similarity, rig: Rig, front: str) -> tuple[float
 
 
 def _turned(from_front_deg: float, from_middle_deg: float) -> float:
-    """Returns the angle from the front camera; 0 unless the face is turned that way from the middle of the cameras,
-    too. The front one of cameras in rows stands above or below that middle; a face between rows counts as straight."""
+    """Returns the angle from the front camera; 0 unless the face is also turned that way from the cameras' middle. With
+    rows of cameras the front one is above or below that middle; a face directed between the rows counts as straight."""
     agreed = from_front_deg * from_middle_deg > 0.0 and abs(from_middle_deg) >= MIN_OFF_MIDDLE_DEG
     return from_front_deg if agreed else 0.0
 
@@ -78,28 +77,29 @@ def has_front(rig: Rig) -> bool:
 
 
 def _fan(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """Returns the mean unit vector from the subject to the cameras: of length 1 in one spot, 0 in a full ring."""
+    """Returns the mean unit vector from the subject to the cameras: length 1 if they are at one spot, 0 in a full
+    ring."""
     directions = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return directions.mean(axis=0)
 
 
 def gaze_from(world_from_face: Similarity, axis_world: Float[np.ndarray, " 3"]) -> tuple[float, float]:
-    """Returns by how many degrees a face is turned away from an axis of view: to the subject's left, and up."""
+    """Returns the angles (degrees) between a face and an axis of view: to the subject's left, and up."""
     towards = -axis_world / np.linalg.norm(axis_world)
     across, upwards, ahead = towards @ world_from_face.rotation
     return float(-np.degrees(np.arctan2(across, ahead))), float(-np.degrees(np.arcsin(np.clip(upwards, -1.0, 1.0))))
 
 
 def _missing(subject: SubjectFaces, face: MatchedFaces) -> tuple[str, ...]:
-    """Returns the cameras that must see the face by other cameras' detections, but in which none was found."""
+    """Returns the cameras without a detection that must see the face according to the other cameras."""
     if len(face.detections) < MIN_WITNESSES:
         return ()
     return tuple(name for name in subject.expected if name not in face.detections and not subject.found.get(name))
 
 
 def file_pixels(pixels: Float[np.ndarray, "n 2"], read_by: Camera, recorded_by: Camera) -> Float[np.ndarray, "n 2"]:
-    """Converts pixels of a picture that was reduced and undistorted when it was read to pixels of its file."""
+    """Converts pixels of a picture that was reduced and undistorted on reading to pixels of its file."""
     small, full = read_by.intrinsics, recorded_by.intrinsics
     scaled = (pixels + 0.5) * (full.width / small.width, full.height / small.height) - 0.5
     lens = recorded_by.recorded

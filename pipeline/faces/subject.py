@@ -1,13 +1,11 @@
-"""Finds the subject's face in all views of a rig: searches a few views, then looks in the others where the face must
-be.
+"""Finds the subject's face in all views of a rig: searches a few views, then the expected position in the others.
 
-Enters: pictures and rig. Leaves: ``SubjectFaces``. To search a picture takes 0.06 s, to look at a known place 0.01 s.
-Views far apart are searched until two or more agree on a face; it is then projected into all others.
+In: pictures and rig. Leaves: ``SubjectFaces``. Searching a picture takes 0.06 s, testing a known position 0.01 s. Views
+far apart are searched until two or more agree on a face; the face is then projected into all others.
 
-A face that only one view shows gets its pose from the mean adult's points. On rendered captures it is turned by 5
-degrees against the result of all views (median, up to 75 degrees from the camera; 17 for profiles). Its distance
-follows from its size: 9 % off (RMS), 24 % for profiles, plus the difference between the subject's and the mean adult's
-head.
+A face in only one view gets its pose from the mean adult's points. On rendered captures that pose differs from the
+result of all views by 5 degrees (median, up to 75 degrees from the camera; 17 for profiles). Its distance follows from
+the face's size: 9 % off (RMS), 24 % for profiles, plus the difference between the subject's head and the mean adult's.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -76,8 +74,8 @@ THOROUGH = SearchEffort()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SubjectFaces:
-    """Holds the faces found in each view that was searched, the best first, and which of them are the subject's. If a
-    single view shows a face, and without doubt, its points are a mean adult's."""
+    """Holds the faces found in each searched view, best first, and which of them are the subject's. If only one view
+    shows a face, and beyond doubt, its points are those of a mean adult."""
 
     found: Mapping[str, tuple[FaceDetection, ...]]
     matched: MatchedFaces | None  # None where views that show faces do not agree on one
@@ -95,9 +93,9 @@ def find_subject(
 ) -> SubjectFaces:
     """Finds the subject's face in the views of one shot.
 
-    ``images``: by camera; those of cameras that the rig lacks are ignored. ``rig``: the cameras. ``networks``: the
-    result of ``load_networks``. ``eye_distance_mm``: limits of a face's size; None if the rig's scale is not known.
-    ``effort``: how thorough the search is. ``report``: called with the share that is done.
+    ``images``: by camera; images of cameras outside the rig are ignored. ``rig``: the cameras. ``networks``: the result
+    of ``load_networks``. ``eye_distance_mm``: limits of a face's size; None if the rig's scale is not known.
+    ``effort``: how thorough the search is. ``report``: called with the finished fraction.
     """
     views = rig.subset(name for name in rig.names if name in images)
     if not len(views):
@@ -167,8 +165,8 @@ def _search(
 
 
 def _next_view(left: Sequence[str], found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> str:
-    """Returns the view to search next: the first one left until a face is found, then one about ``APART_DEG`` from the
-    view of the best face."""
+    """Returns the view to search next: the first remaining one until a face is found, then one about ``APART_DEG`` from
+    the view of the best face."""
     seen = [name for name in found if found[name]]
     if not seen:
         return left[0]
@@ -183,7 +181,7 @@ def _next_view(left: Sequence[str], found: Mapping[str, tuple[FaceDetection, ...
 
 
 def _matched_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> MatchedFaces | None:
-    """Returns the face that is beyond doubt and the only one that any view shows."""
+    """Returns a face that is beyond doubt if no other face was found in any view."""
     seen = [(name, faces) for name, faces in found.items() if faces]
     if len(seen) != 1 or len(seen[0][1]) != 1 or seen[0][1][0].score < CERTAIN_SCORE:
         return None
@@ -194,8 +192,8 @@ def _matched_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> 
 def _search_missing(
     scene: _Scene, face: TriangulatedFace, found: Mapping[str, tuple[FaceDetection, ...]]
 ) -> dict[str, tuple[FaceDetection, ...]]:
-    """Looks for a face in the views in which it must be and was not found; other detections of these views follow
-    it."""
+    """Tests the views that must show the face but have no detection of it; new detections come before the view's
+    others."""
     added = {}
     points = face.world_from_face.apply(point_table().shape_mm)
     for name in _expected(face.world_from_face, scene.rig, scene.effort.min_facing):
@@ -209,7 +207,7 @@ def _search_missing(
 
 
 def _expected(world_from_face: Similarity, rig: Rig, min_facing: float) -> Iterator[str]:
-    """Returns the views that a face is turned to and whose pictures hold it."""
+    """Returns the views towards which a face is turned and whose pictures contain it."""
     points = world_from_face.apply(point_table().shape_mm)
     for camera in rig:
         pixels = camera.project(points)
@@ -221,8 +219,8 @@ def _expected(world_from_face: Similarity, rig: Rig, min_facing: float) -> Itera
 
 
 def place_from_one_view(face: FaceDetection, camera: Camera) -> Similarity | None:
-    """Returns the pose (world_from_face, scale 1) in which a mean adult's points project to where one camera found
-    them. Returns None if no pose explains the points, or if they lie outside the lens."""
+    """Returns the pose (world_from_face, scale 1) in which a mean adult's points project to the pixels of one camera.
+    Returns None if no pose explains the points, or if they lie outside the lens."""
     shape, pixels = point_table().shape_mm, face.landmarks_px
     seen = np.ones(len(shape), bool)
     placed: Similarity | None = None
@@ -239,10 +237,10 @@ def place_from_one_view(face: FaceDetection, camera: Camera) -> Similarity | Non
 
 
 def match_alone(name: str, face: FaceDetection, camera: Camera) -> MatchedFaces | None:
-    """Returns a face that only one view shows in the form of ``matching``, with a mean adult's points. Returns None
-    where ``place_from_one_view`` does.
+    """Returns a face from a single view in the form of ``matching``, with a mean adult's points. Returns None if
+    ``place_from_one_view`` does.
 
-    The pixels determine the points across the line of sight. What they leave open moves all points together: along
+    The pixels determine the points across the line of sight. The undetermined motions move all points together: along
     their rays, and about the middle of the face.
     """
     placed = place_from_one_view(face, camera)

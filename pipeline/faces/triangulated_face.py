@@ -1,8 +1,8 @@
 """Triangulates a face's points from its detections in several views.
 
-Enters: one detection for each view. Leaves: ``TriangulatedFace``. The network has a bias that depends on the direction
-from which it sees the face (``points.view_bias``); it is subtracted once the face's pose is known. The more a point
-turns away from a camera, the larger is its noise.
+In: one detection for each view. Leaves: ``TriangulatedFace``. The network has a bias that depends on the viewing
+direction (``points.view_bias``); it is subtracted once the face's pose is known. The more a point turns away from a
+camera, the larger is its noise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,7 +42,7 @@ class TriangulatedFace:
 
     @property
     def misfits(self) -> dict[str, float]:
-        """Returns, for each view, the RMS of its residuals divided by their expected noise: 1 where they agree."""
+        """Returns, for each view, the RMS of its residuals divided by their expected noise: about 1 if they agree."""
         variance = self.noise_px[..., None] ** 2 + self.view_noise_px[:, None, None] ** 2
         squares = (self.points.residuals_px**2 / variance).mean(axis=(1, 2))
         return dict(zip(self.detections, np.sqrt(squares).tolist(), strict=True))
@@ -104,7 +104,7 @@ def view_noise_px(size_px: float, world_from_face: Similarity, camera: Camera) -
 
 
 def shared_modes(face: TriangulatedFace, rig: Rig) -> Float[np.ndarray, "m n 3"]:
-    """Returns, for each view and each image axis, how far every point moves (mm) if all pixels of the view are off by
+    """Returns the displacement (mm) of every point, for each view and image axis, if all pixels of the view are off by
     one standard deviation of the view's common error."""
     modes = []
     for name, noise, view_noise in zip(face.detections, face.noise_px, face.view_noise_px, strict=True):

@@ -1,6 +1,5 @@
-"""Provides geometric primitives, one implementation of each: meshes and points in mm, in any common frame. Nothing here
-knows of heads.
+"""Provides geometric primitives, one implementation of each, for meshes and points in mm in any common frame. This
+package knows nothing of heads.
 
-Beside each fast function there is a naive one (``..._naive``), a few lines that are plainly right; tests compare the
-two.
+Each fast function has a naive counterpart (``..._naive``) of a few obvious lines; tests compare the two.
 """

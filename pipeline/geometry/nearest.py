@@ -1,7 +1,7 @@
-"""Finds the nearest of many points, with the threads that compiled loops share.
+"""Finds the nearest of many points, with the threads of compiled loops.
 
-SciPy's tree takes 2 microseconds for a place among 53,000 points; this one, of boxes, takes 0.5. Points sorted into
-cubic cells let compiled loops find all neighbours.
+SciPy's tree takes 2 microseconds for a query among 53,000 points; this one, of boxes, takes 0.5. A grid of cubic cells
+lets compiled loops find all neighbours of a point.
 """
 
 from dataclasses import dataclass
@@ -36,8 +36,8 @@ def nearest(
     """Returns the distances and rows of the ``count`` points of the tree nearest to each place, the nearest first, with
     an axis for the count if that is more than 1.
 
-    Of points equally far the first row comes first. Where fewer points are nearer than ``within``, the distance is
-    infinite and the row is the number of points.
+    Of equally distant points, the one with the lower row comes first. Where fewer points are nearer than ``within``,
+    the distance is infinite and the row is the number of points.
     """
     distance, row = np.empty((len(places), count)), np.empty((len(places), count), np.int64)
     placed = _in_space(places)
@@ -50,7 +50,7 @@ def nearest(
 
 
 def _in_space(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 3"]:
-    """Returns the points as new rows of three numbers; those of a plane get a third that is 0."""
+    """Returns the points as new rows of three numbers; points of a plane get a third coordinate 0."""
     placed = np.zeros((len(points), 3))
     placed[:, : points.shape[1]] = points
     return placed

@@ -1,5 +1,5 @@
-"""Compiled loops of ``pipeline.geometry.nearest``: a balanced tree of points and the search in it,
-and what lies near a point among points sorted into cubic cells."""
+"""Compiled loops of ``pipeline.geometry.nearest``: a balanced tree of points with its search, and the neighbours of a
+point in a grid of cubic cells."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ class Tree(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def sort_into_tree(points: np.ndarray, levels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sorts points (n, 3) into the leaves of a tree: each node's are halved along the longest side of their box.
+    """Sorts points (n, 3) into the leaves of a tree: each node's points are halved along the longest side of their box.
     Returns their rows in the order of the leaves, and the boxes of all nodes."""
     row = np.arange(len(points))
     nodes = 2 ** (levels + 1) - 1
@@ -83,9 +83,9 @@ def square_to_box(x: float, y: float, z: float, box: np.ndarray) -> float:
 def find_nearest(
     tree: Tree, places: np.ndarray, within: float, distance: np.ndarray, near: np.ndarray, first: int, last: int
 ) -> None:
-    """Finds the points nearest to places ``first`` to ``last`` (n, 3), as many as ``distance`` and ``near`` (n, count)
-    have columns: their distances, the least first, and their rows. Of points equally far the first row comes first.
-    Where fewer are nearer than ``within``, the distance is infinite and the row is the number of points."""
+    """Finds the points nearest to places ``first`` to ``last`` (n, 3): distances, smallest first, and rows.
+    ``distance`` and ``near`` (n, count) have a column for each. Of equally distant points, the lower row comes first.
+    If fewer are nearer than ``within``, the distance is infinite and the row is the number of points."""
     points, row, boxes, levels = tree
     leaves, total, count = 2**levels - 1, len(points), distance.shape[1]
     node_at, first_at, last_at = np.empty(DEEPEST, np.int64), np.empty(DEEPEST, np.int64), np.empty(DEEPEST, np.int64)
@@ -137,7 +137,7 @@ def find_nearest(
 @njit(cache=True, nogil=True)
 def columns_about(cell: int, keys: np.ndarray, spans: np.ndarray, ranges: np.ndarray) -> None:
     """Fills ``ranges`` (9, 2): where the points of the 27 cells around ``cell`` begin and end in the sorted ``keys``.
-    Three cells that are adjacent in z have consecutive keys, so that nine ranges suffice. ``keys`` and ``spans`` are
+    Three cells that are adjacent in z have consecutive keys, so nine ranges are enough. ``keys`` and ``spans`` are
     those of ``cells.Cells``."""
     for column in range(COLUMNS):
         low = cell + ((column // 3 - 1) * spans[1] + column % 3 - 1) * spans[2] - 1

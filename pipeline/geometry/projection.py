@@ -1,10 +1,10 @@
-"""Packs cameras into rows of numbers for compiled loops, which ``projection_kernels`` reads. ``rig.camera`` is the
-reference. And draws depth on the processor: which triangle a pixel sees, and how far away.
+"""Packs cameras into rows of numbers for compiled loops (``projection_kernels``). ``rig.camera`` is the reference. The
+module also draws depth on the CPU: the visible triangle at each pixel and its distance.
 
-The z-buffer serves visibility for the texture (section 4.5), and a result's figures and small pictures, where reading
-images back from OpenGL takes longer than drawing them here. ``rig.render`` is the reference; tests compare the two.
-Vertices are projected exactly, lens distortion included. Triangles between them are drawn with straight edges, which on
-a head of 48,000 vertices (edges of 2 to 5 px) is wrong by less than 0.001 px.
+The texture (section 4.5) uses this z-buffer for visibility. A result's figures and small pictures use it because
+reading images back from OpenGL takes longer. ``rig.render`` is the reference; tests compare the two. Vertices are
+projected exactly, lens distortion included. Triangles between them have straight edges; on a head of 48,000 vertices
+(edges of 2 to 5 px) the error is below 0.001 px.
 """
 
 import cv2

@@ -1,10 +1,9 @@
-"""Compiled camera model: world to camera to pixel, and the derivatives; and the z-buffer.
-``projection`` packs the rows.
+"""Compiled camera model: world to camera to pixel, the derivatives, and the z-buffer. ``projection`` packs the rows.
 
 A camera is a row of numbers. A row called ``pose`` begins with rotation (9, row by row) and translation (3, mm) of
 camera_from_world. If a lens follows, it begins at entry 12: fx fy cx cy (px) and, for a lens that distorts, k1 k2 p1 p2
-k3 and the largest ray radius at which distortion is valid. The helpers are inlined, so that their arithmetic is the
-calling loop's, fast or strict. Only ``distorted`` is always fast: strict, it made the visual hull a tenth slower.
+k3 and the largest ray radius at which distortion is valid. The helpers are inlined, so they use the calling loop's
+arithmetic, fast or strict. Only ``distorted`` is always fast: strict arithmetic made the visual hull 10 % slower.
 """
 
 import numpy as np
@@ -107,8 +106,8 @@ def project_all(camera: np.ndarray, points: np.ndarray) -> np.ndarray:
 def rasterise(
     pixels: np.ndarray, depths: np.ndarray, faces: np.ndarray, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draws a mesh and returns what is seen at every pixel centre: depth (height, width; float32, camera z in mm, inf
-    where there is nothing) and face index (int32, -1 for none).
+    """Draws a mesh and returns, for every pixel centre, the depth (height, width; float32, camera z in mm, inf where
+    there is nothing) and the visible face's index (int32, -1 for none).
 
     ``pixels`` (v, 2) and ``depths`` (v) are the projected vertices, float64. A triangle with a vertex that is not
     finite or not in front of the camera is left out. Depth is perspective-correct: 1/z is linear in the image.

@@ -1,4 +1,4 @@
-"""Finds closest points on triangle surfaces, exactly among the triangles around the nearest samples of the surface; and
+"""Finds closest points on triangle surfaces, exactly among the triangles near the closest surface samples; also lists
 the faces at each vertex.
 
 Lengths are in mm, in any common frame."""
@@ -118,7 +118,7 @@ def corners_at_vertices(
 def facing_cosine(
     place: Float[np.ndarray, " 3"], points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns the cosine between the unit normal of each point and the direction from there to a place."""
+    """Returns the cosine between the unit normal of each point and the direction from the point to a place."""
     return cosines_towards(
         np.ascontiguousarray(place, float), np.ascontiguousarray(points, float), np.ascontiguousarray(normals, float)
     )

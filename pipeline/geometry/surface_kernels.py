@@ -116,7 +116,7 @@ def closest_of_candidates(first, last, points, candidates, corners, facing, faci
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _cosine(corners, direction):
-    """Of the triangle's normal with a unit vector; 0 where the triangle has no area."""
+    """Returns the cosine between a triangle's normal and a unit vector; 0 for a triangle without area."""
     abx, aby, abz = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1], corners[1, 2] - corners[0, 2]
     acx, acy, acz = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1], corners[2, 2] - corners[0, 2]
     nx, ny, nz = aby * acz - abz * acy, abz * acx - abx * acz, abx * acy - aby * acx
@@ -126,8 +126,8 @@ def _cosine(corners, direction):
 
 @njit(cache=True, nogil=True)
 def sort_corners(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sorts the corners of faces (f, 3) by their vertices, by counting: those of vertex v are ``corner[start[v]:start[v
-    + 1]]``, numbers of the corners row by row, in order."""
+    """Sorts the corners of faces (f, 3) by vertex (a counting sort). The corners of vertex v are
+    ``corner[start[v]:start[v + 1]]``, in ascending order; a corner's number counts row by row."""
     start, corner = np.zeros(count + 1, np.int64), np.empty(faces.size, np.int64)
     for f in range(len(faces)):
         for k in range(3):

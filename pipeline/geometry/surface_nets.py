@@ -1,10 +1,9 @@
-"""Makes surface nets: a mesh of the zero of a field between the nodes of a grid.
+"""Makes surface nets: a mesh of the zero level of a field on a grid's nodes.
 
-Gibson, *Constrained elastic surface nets*, 1998, the naive kind: a vertex in every cell with corners of both signs, at
-the mean of the points where the cell's edges cross zero; and a quadrilateral over every edge with both signs. Enters: a
-field, negative inside, at the nodes of a sparse grid, positive on the outermost ones. Leaves:
-vertices in grid steps, triangles facing outwards. The mesh is closed; it is a manifold if the signs are well composed
-(``pipeline.fusion.grid_kernels``).
+Gibson, *Constrained elastic surface nets*, 1998, the naive kind: every cell with corners of both signs has a vertex at
+the mean of its edges' zero crossings, and every edge with both signs has a quadrilateral. In: a field, negative inside,
+at the nodes of a sparse grid, positive on the outermost ones. Out: vertices in grid steps, triangles facing outwards.
+The mesh is closed; it is a manifold if the signs are well composed (``pipeline.fusion.grid_kernels``).
 """
 
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from pipeline.geometry.surface_nets_kernels import linked, net_faces, net_vertic
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceNet:
-    """Holds a mesh in units of the grid's step. ``of_cell`` is the vertex in the cell whose lowest corner is the node,
+    """Holds a mesh in units of the grid's step. ``of_cell`` is the vertex in the cell whose lowest corner is the node;
     -1 if the cell has none."""
 
     vertices: Float[np.ndarray, "v 3"]

@@ -12,9 +12,9 @@ EDGES = np.array(
 
 @njit(cache=True, nogil=True, inline="always")
 def corners_of(n: int, neighbours: np.ndarray, corners: np.ndarray) -> bool:
-    """Fills ``corners`` (8) with the rows of the corners of the cell whose lowest node is ``n``; returns False if the
-    grid lacks one of them. Corner c has the offset (c >> 2, (c >> 1) & 1, c & 1). ``neighbours`` is the result of
-    ``linked``."""
+    """Fills ``corners`` (8) with the rows of the corners of the cell whose lowest node is ``n``; returns False if a
+    corner is missing from the grid. Corner c has the offset (c >> 2, (c >> 1) & 1, c & 1). ``neighbours`` is the result
+    of ``linked``."""
     for c in range(8):
         at = n
         if c & 4:

@@ -1,1 +1,1 @@
-"""Holds head models at run time (section 3): the mean head, its modes, landmarks, expressions and levels of detail."""
+"""Holds head models (section 3): the mean head, its modes, landmarks, expressions and levels of detail."""

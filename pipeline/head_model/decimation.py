@@ -1,5 +1,5 @@
-"""Decimation by quadric error (Garland and Heckbert, *Surface simplification using quadric error metrics*, SIGGRAPH
-1997)."""
+"""Decimates meshes by quadric error (Garland and Heckbert, *Surface simplification using quadric error metrics*,
+SIGGRAPH 1997)."""
 
 import heapq
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ class _Collapser:
         return {w for k in self.at[v] for w in self.faces[k]} - {v}
 
     def push_from(self, v: int) -> None:
-        """Offers the collapses of v into each neighbour."""
+        """Adds the collapses of v into each neighbour to the heap."""
         if self.fixed[v]:
             return
         for u in self.ring(v):
@@ -66,7 +66,7 @@ class _Collapser:
         return all(self._survives(k, v, u) for k in self.at[v] - shared)
 
     def _survives(self, k: int, v: int, u: int) -> bool:
-        """Tells whether the triangle stays unfolded (in the chart, too) and no sliver if its corner v moves to u."""
+        """Tells whether the triangle neither folds (in surface or chart) nor gets a sliver if corner v moves to u."""
         corners, moved = self.faces[k], [u if w == v else w for w in self.faces[k]]
         if self.chart is not None and _turn(self.chart, corners) * _turn(self.chart, moved) <= 0:
             return False
@@ -134,12 +134,12 @@ def decimate(
     fixed: Bool[np.ndarray, " V"],
     chart: Float[np.ndarray, "V 2"] | None = None,
 ) -> list[tuple[Int[np.ndarray, " _"], Int[np.ndarray, "_ 3"]]]:
-    """Reduces a mesh to each of the decreasing numbers of triangles in ``targets``. Returns, for each, the vertices
-    that remain (indices, ascending) and the triangles among them.
+    """Reduces a mesh to each of the decreasing numbers of triangles in ``targets``. Returns, for each, the remaining
+    vertices (indices, ascending) and the triangles among them.
 
-    ``importance`` multiplies the error of a vertex: where it is high the mesh stays denser. Vertices that are ``fixed``
-    all remain. With a ``chart`` (texture coordinates) no triangle turns over in it. A result has more triangles than
-    its target if every further collapse would fold the surface, leave a sliver, or break the manifold.
+    ``importance`` multiplies the error of a vertex: where it is high the mesh stays denser. All ``fixed`` vertices
+    remain. With a ``chart`` (texture coordinates) no triangle turns over in it. A result has more triangles than its
+    target if every further collapse would fold the surface, leave a sliver, or break the manifold.
     """
     state = _Collapser(vertices, faces, importance, fixed, chart)
     out = []

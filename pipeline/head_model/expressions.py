@@ -1,9 +1,9 @@
 """Defines the expressions of a head model: displacements in addition to the identity, each with a weight from 0 to 1.
 
-A head is ``mean + sum_m z_m modes_m + sum_e w_e shapes_e``: identity is Gaussian, expressions are blendshapes. They
-keep the names of their source. Programs exchange Apple's 52 names
-(https://developer.apple.com/documentation/arkit/arfaceanchor/blendshapelocation); ``arkit_parts`` says which of a
-model's shapes correspond to which of these.
+A head is ``mean + sum_m z_m modes_m + sum_e w_e shapes_e``: identity is Gaussian, expressions are blendshapes.
+Expressions retain the names of their source. Other programs use Apple's 52 names
+(https://developer.apple.com/documentation/arkit/arfaceanchor/blendshapelocation); ``arkit_parts`` maps these to a
+model's shapes.
 """
 
 import re
@@ -37,8 +37,8 @@ ARKIT = tuple(sorted([*_WHOLE, *(f"{name}{side}" for name in _SIDED for side in 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expressions:
-    """Holds the expressions of a model as displacements of the cage's vertices (head frame). Arrays are read-only once
-    they belong to a model."""
+    """Holds the expressions of a model as displacements of the cage's vertices (head frame). The arrays are
+    read-only."""
 
     names: tuple[str, ...]
     shapes: Float32[np.ndarray, "E V0 3"]  # mm at weight 1
@@ -82,8 +82,8 @@ def words(name: str) -> str:
 
 def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
     """Returns, for each of Apple's 52 names, the indices of the model's shapes that together correspond to it; empty if
-    none does. It is the shape of the same name or, if the model has two shapes for one of Apple's, the left and the
-    right one (ICT-FaceKit's cheekPuff_L and cheekPuff_R)."""
+    none does. That is the shape of the same name. If the model has two shapes for one name, it is both, the left and
+    the right one (ICT-FaceKit's cheekPuff_L and cheekPuff_R)."""
     known = {plain_name(name): k for k, name in enumerate(names)}
     found = {}
     for name in ARKIT:
@@ -117,7 +117,7 @@ def weights_from_text(texts: Sequence[str], names: tuple[str, ...]) -> dict[str,
 
 
 def closed_lids(weights: Mapping[str, float]) -> dict[str, float]:
-    """Returns how far each eye (``right``, ``left``) is closed by the blinks among the weights, from 0 (open) to 1."""
+    """Returns how far the blink weights close each eye (``right``, ``left``), from 0 (open) to 1."""
     found: dict[str, float] = dict.fromkeys(("right", "left"), 0.0)
     for name, weight in weights.items():
         side = BLINKS.get(plain_name(name))
@@ -182,7 +182,7 @@ VISEMES: Mapping[str, Mapping[str, float]] = {
 
 
 def mixed(shapes: Mapping[str, Float[np.ndarray, "v 3"]], mixture: Mapping[str, float]) -> Float[np.ndarray, "v 3"]:
-    """Returns the displacement of a mixture; shapes that are not there move nothing."""
+    """Returns the displacement of a mixture; missing shapes contribute nothing."""
     out = np.zeros_like(next(iter(shapes.values())))
     for name, weight in mixture.items():
         if name in shapes:

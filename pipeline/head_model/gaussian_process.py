@@ -1,4 +1,4 @@
-"""Adds modes with which the solver can leave the span of the eigenheads: smooth deformations that need not occur in the
+"""Adds modes that let the solver leave the span of the eigenheads: smooth deformations that need not occur in the
 population.
 
 It is a Gaussian process on the mean surface, as in Gaussian process morphable models (Luethi et al. 2018,
@@ -7,10 +7,10 @@ https://doi.org/10.1109/TPAMI.2017.2739743): displacement along the mean's norma
     k(x, y) = sum_i a_i^2 [ (1 - f) (g_i(x, y) + g_i(x, My)) + f g_i(x, y) ],
     g_i(x, y) = exp(-|x - y|^2 / (2 l_i^2)),
 
-where M mirrors at the median plane: faces deviate from a population mostly symmetrically. Its leading eigenfunctions
-(Nystroem's method on a subset of the cage), each scaled by its standard deviation, follow the eigenheads as modes with
-the same unit prior, orthogonal to the span of the eigenheads. They move along the normal only, since sliding along the
-surface changes no silhouette.
+where M mirrors at the median plane: faces deviate from their population mostly symmetrically. Its leading
+eigenfunctions (Nystroem's method on a subset of the cage) are scaled by their standard deviations and appended to the
+eigenheads as modes with unit prior, orthogonal to the span of the eigenheads. They move along the normal only, since
+sliding along the surface changes no silhouette.
 """
 
 from collections.abc import Callable
@@ -63,8 +63,8 @@ def with_fine_kernel(model: HeadModel, *, length_mm: float, amplitude_mm: float)
     """Returns the model with more modes, of a shorter length, that deform the face region only, for solvers that see
     more of the face than its outline.
 
-    The modes fade out over half a length beyond the region. They are not made orthogonal to the other modes: the prior
-    variances of all lengths are meant to add up.
+    The modes fade out over half a length beyond the region. They are not orthogonal to the other modes, because the
+    prior variances of all lengths should add up.
     """
     level = model.levels["cage"]
     points = model.mean.astype(float)

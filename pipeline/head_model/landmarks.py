@@ -1,4 +1,4 @@
-"""The 26 landmarks of section 3.2, by their anthropometric names, and the seven of section 4.2 among them.
+"""Lists the 26 landmarks of section 3.2 by their anthropometric names, and the seven of them that section 4.2 uses.
 
 Right and left are the subject's. The definitions follow Farkas, *Anthropometry of the Head and Face* (1994);
 docs/models.md lists them for people who mark scans.
@@ -47,8 +47,7 @@ SEVEN_POINTS = (
 
 
 def mirrored(name: str) -> str:
-    """Returns the name of the landmark on the other side of the head; a midline landmark has no other and keeps its
-    name."""
+    """Returns the name of the landmark on the other side of the head; a midline landmark keeps its name."""
     if name.endswith("_right"):
         return name.removesuffix("_right") + "_left"
     if name.endswith("_left"):

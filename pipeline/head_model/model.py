@@ -1,8 +1,8 @@
-"""Eigenhead models (section 3.1, eq. 1): a mean head, its modes, and the resolutions it is evaluated at.
+"""Defines eigenhead models (section 3.1, eq. 1): a mean head, its modes, and its levels of resolution.
 
 A model is stored as a coarse cage (mean and modes) and a linear operator from cage vertices to each level. The default
-refines its cage by Loop subdivision to at least 48,000 vertices; an imported model keeps its own vertices and has the
-identity there. Modes carry their standard deviation, so coefficients are N(0, 1) (the paper's alpha_m = sigma_m z_m).
+model refines its cage by Loop subdivision to at least 48,000 vertices. An imported model keeps its own vertices. Modes
+are scaled by their standard deviation, so coefficients are N(0, 1) (the paper's alpha_m = sigma_m z_m).
 
 Memory of a loaded model: 12 (M + 1) V0 bytes for mean and modes (5 MB for the default's 137 modes), plus about 20 bytes
 per stored operator entry (13 MB). ``basis`` of a whole level is cached: 12 M V bytes (36 MB at full, 60 modes).
@@ -78,24 +78,24 @@ class HeadModel:
         return found.reshape(-1, 3)
 
     def vertices(self, coefficients: Float[np.ndarray, " m"], level: str = "full") -> Float[np.ndarray, "V 3"]:
-        """Returns the vertices of a level (head frame, mm) for the first coefficients, given in standard deviations.
-        Raises KeyError for an unknown level."""
+        """Returns the vertices of a level (head frame, mm) for the first coefficients, in standard deviations. Raises
+        KeyError for an unknown level."""
         return self.levels[level].operator @ self.cage(coefficients)
 
     def posed_vertices(
         self, coefficients: Float[np.ndarray, " m"], weights: Mapping[str, float], level: str = "full"
     ) -> Float[np.ndarray, "V 3"]:
-        """Returns the vertices of a level (head frame, mm) with expressions added, whose weights are named by
+        """Returns the vertices of a level (head frame, mm) with expressions added; ``weights`` are by name of
         expression. Raises KeyError for an unknown level or expression."""
         return self.levels[level].operator @ (self.cage(coefficients) + self.expressions.moved(weights))
 
     def basis(
         self, level: str, count: int, vertices: Int[np.ndarray, " S"] | None = None
     ) -> Float32[np.ndarray, "m S 3"]:
-        """Returns the first ``count`` modes at the vertices of a level, or at those in ``vertices`` alone (mm per
-        standard deviation).
+        """Returns the first ``count`` modes at all vertices of a level, or only at ``vertices`` (mm per standard
+        deviation).
 
-        The basis of a whole level is kept and handed out read-only; that of a few vertices is computed anew.
+        The basis of a whole level is cached and read-only; that of a few vertices is computed anew.
         """
         if vertices is not None:
             return self._rows(self.levels[level].operator[np.asarray(vertices)], count)
@@ -207,8 +207,8 @@ def with_expressions(model: HeadModel) -> HeadModel:
 
 
 def model_info(model: HeadModel) -> dict[str, Any]:
-    """Returns the description of a model as JSON types. ``vertices`` and ``faces`` are those of the full level; figures
-    that were never measured are None."""
+    """Returns the description of a model as JSON types. ``vertices`` and ``faces`` are those of the full level;
+    unmeasured figures are None."""
     full = model.levels["full"]
     return {
         "name": model.name,

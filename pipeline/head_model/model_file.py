@@ -1,4 +1,4 @@
-"""Reads and writes head models as files. In memory a model is a ``pipeline.head_model.model``."""
+"""Reads and writes head models as files. ``pipeline.head_model.model`` holds a model in memory."""
 
 import hashlib
 import json
@@ -29,7 +29,7 @@ class BadModel(EigenheadError):
 
 
 class Damaged(BadModel):
-    """Reports a model file of which a part is missing or cannot be read."""
+    """Reports a model file with a missing or unreadable part."""
 
     def __init__(self, path: Path | str, fault: Exception) -> None:
         super().__init__(path, f"damaged or incomplete ({fault})")
@@ -91,7 +91,7 @@ def save_model(path: Path, parts: ModelParts) -> None:
 
 
 def rounded(values: np.ndarray) -> Float32[np.ndarray, "..."]:
-    """Returns lengths (mm) rounded to 2^-12 mm, as a model file keeps them."""
+    """Returns lengths (mm) rounded to 2^-12 mm, the precision of a model file."""
     return (np.round(np.asarray(values, float) * 4096) / 4096).astype(np.float32)
 
 

@@ -1,8 +1,8 @@
-"""Lists the available head models and their files. Loads no model: the command line calls it.
+"""Lists the available head models and their files. It loads no model, so the command line can call it quickly.
 
 The data folder is ``--data``, which sets EIGENHEAD_DATA, else EIGENHEAD_DATA, else ``$XDG_DATA_HOME/eigenhead``, else
-~/.local/share/eigenhead. Models lie in its folder ``models``, unless EIGENHEAD_MODELS names another one: one rule for
-the command line, the service and its workers.
+~/.local/share/eigenhead. Models lie in its folder ``models``, unless EIGENHEAD_MODELS names another one. The command
+line, the service and its workers share this rule.
 """
 
 import os
@@ -60,7 +60,7 @@ def model_path(name_or_path: str | Path) -> Path:
 
 
 def model_sha256(path: Path) -> str:
-    """Returns the SHA-256 of a model file, by which results name their model. Raises OSError."""
+    """Returns the SHA-256 of a model file; results identify their model by it. Raises OSError."""
     state = path.stat()
     return _sha256(path, state.st_mtime_ns, state.st_size)
 
@@ -81,7 +81,7 @@ def remove_model(name: str) -> Path:
 
 
 def data_folder() -> Path:
-    """Returns the folder in which captures, results, keys, jobs and models are kept. The folder need not exist."""
+    """Returns the folder of captures, results, keys, jobs and models. The folder may not exist yet."""
     configured = os.environ.get(DATA)
     if configured:
         return Path(configured)
@@ -89,6 +89,6 @@ def data_folder() -> Path:
 
 
 def models_folder() -> Path:
-    """Returns the folder of the user's head models. The folder need not exist."""
+    """Returns the folder of the user's head models. The folder may not exist yet."""
     configured = os.environ.get(MODELS)
     return Path(configured) if configured else data_folder() / "models"

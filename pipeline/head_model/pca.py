@@ -1,8 +1,8 @@
-"""Alignment of corresponded heads and their principal components (sections 3.1 and 3.2, last step).
+"""Aligns corresponded heads and computes their principal components (sections 3.1 and 3.2, last step).
 
-Alignment is a rigid Procrustes analysis *without* scale: rigs are metric, and size is a mode of the population
-(figure 2, first mode). Departure from the paper, which does not say: the mean is re-estimated until it settles
-(generalised Procrustes, Gower 1975), so that no single reference head is favoured.
+Alignment is a rigid Procrustes analysis *without* scale: rigs are metric, and size is a mode of the population (figure
+2, first mode). Departure from the paper, which leaves this open: the mean is re-estimated until it converges
+(generalised Procrustes, Gower 1975), so that no single head serves as reference.
 """
 
 from dataclasses import dataclass
@@ -27,8 +27,8 @@ class Components:
 def align(
     heads: Float[np.ndarray, "N V 3"], weights: Float[np.ndarray, " V"], *, rounds: int = 10
 ) -> Float[np.ndarray, "N V 3"]:
-    """Returns the heads, each moved rigidly (never scaled) onto their common mean. The mean keeps the pose and place of
-    the first head; ``weights`` are those of the vertices."""
+    """Returns the heads, each moved rigidly (never scaled) onto their common mean. The mean has the pose and position
+    of the first head; ``weights`` are those of the vertices."""
     aligned, mean = heads.copy(), heads[0]
     first = heads[0]
     for _ in range(rounds):
@@ -45,7 +45,7 @@ def align(
 
 def principal_components(heads: Float[np.ndarray, "N V 3"]) -> Components:
     """Computes the principal components of N aligned heads, N - 1 at most. The largest entry of each mode is positive,
-    so that two builds agree."""
+    so that repeated builds have the same signs."""
     count, vertices = heads.shape[:2]
     flat = heads.reshape(count, -1).astype(float)
     mean = flat.mean(0)
@@ -63,11 +63,11 @@ def principal_components(heads: Float[np.ndarray, "N V 3"]) -> Components:
 
 
 def orthogonalised(modes: Float[np.ndarray, "M V 3"]) -> tuple[Float[np.ndarray, "K V 3"], Float[np.ndarray, " K"]]:
-    """Returns orthogonal modes that describe exactly the same Gaussian distribution of heads, and their standard
-    deviations (mm): as many as are independent.
+    """Returns orthogonal modes for exactly the same Gaussian distribution of heads, and their standard deviations (mm):
+    as many as are independent.
 
-    For z ~ N(0, I), heads are mean + A z with A = U S V^T. V^T z is N(0, I) again, so U S spans the same Gaussian: no
-    variance is lost or moved, only the axes turn.
+    For z ~ N(0, I), heads are mean + A z with A = U S V^T. V^T z is N(0, I) again, so U S describes the same Gaussian
+    along other axes.
     """
     count, vertices = modes.shape[:2]
     flat = modes.reshape(count, -1).astype(float)

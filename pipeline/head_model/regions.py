@@ -1,6 +1,6 @@
-"""Defines named regions of a head for every model: figures are reported by region, and detail differs between them.
+"""Defines named regions of a head for every model; figures are by region, and the detail differs between regions.
 
-Their borders are at distances from landmarks on the mean head, so that a region is the same part of the head for any
+Their borders are defined by distances from landmarks on the mean head, so a region is the same part of the head for any
 mesh.
 """
 
@@ -57,8 +57,8 @@ def head_regions(model: HeadModel) -> dict[str, Bool[np.ndarray, " v"]]:
 
 
 def halves_of_face(model: HeadModel) -> tuple[Bool[np.ndarray, " v"], Bool[np.ndarray, " v"]]:
-    """Returns which vertices of the full level belong to the face above the nose's base, which no jaw moves, and to
-    mouth and chin."""
+    """Returns which vertices of the full level belong to the face above the nose's base, which the jaw does not move,
+    and which belong to mouth and chin."""
     vertices, face = model.vertices(np.zeros(0)), model.levels["full"].face_region
     above = vertices[:, 1] - vertices[model.landmarks["subnasale"], 1]
     upper, lower = above > NOSE_BASE_MM, above < -NOSE_BASE_MM
@@ -67,15 +67,15 @@ def halves_of_face(model: HeadModel) -> tuple[Bool[np.ndarray, " v"], Bool[np.nd
 
 @lru_cache(maxsize=2)
 def pinnae(model: HeadModel) -> Bool[np.ndarray, " v"]:
-    """Returns which vertices of the full level belong to what stands off the head at the ears, seen from the side: the
-    region ``ears`` has the scalp about it, too."""
+    """Returns which vertices of the full level protrude from the head at the ears, seen from the side. (The region
+    ``ears`` also contains the scalp around them.)"""
     vertices, ears = model.vertices(np.zeros(0)), head_regions(model)["ears"]
     inputs = (vertices, ears, PINNA_OFF_MM, PINNA_REACH_MM)
     return cached_arrays("pinnae", inputs, lambda: {"pinnae": _standing(vertices, ears)}, made_by=())["pinnae"]
 
 
 def scalp(model: HeadModel) -> Bool[np.ndarray, " v"]:
-    """Returns which vertices of the full level can bear the hair of a head: cranium and temples, without the pinnae."""
+    """Returns which vertices of the full level can have hair: cranium and temples, without the pinnae."""
     regions = head_regions(model)
     return (regions["cranium"] | regions["ears"]) & ~pinnae(model)
 
@@ -93,8 +93,8 @@ def _standing(vertices: Float[np.ndarray, "v 3"], ears: Bool[np.ndarray, " v"]) 
 
 
 def stable_region(model: HeadModel) -> Bool[np.ndarray, " v"]:
-    """Returns which vertices of the full level lie over bone that neither expression nor jaw, weight or teeth move
-    much: the forehead above the brows and the bridge of the nose. Heads of two visits are aligned on it."""
+    """Returns which vertices of the full level lie over bone that expression, jaw, weight and teeth hardly move: the
+    forehead above the brows and the bridge of the nose. Heads of two visits are aligned on it."""
     vertices = model.vertices(np.zeros(0))
     at = {name: vertices[row] for name, row in model.landmarks.items()}
     low, high = at["glabella"][1] + np.array(FOREHEAD_ABOVE_GLABELLA_MM)
@@ -112,7 +112,7 @@ def _within(
 
 
 def _ears(vertices: Float[np.ndarray, "v 3"], at: dict[str, Float[np.ndarray, " 3"]]) -> Bool[np.ndarray, " v"]:
-    """Returns the vertices that stand off the side of the head about the opening of the ear."""
+    """Returns the vertices that protrude from the side of the head around the opening of the ear."""
     found = np.zeros(len(vertices), bool)
     for side in ("right", "left"):
         notch = at[f"tragion_{side}"]

@@ -1,9 +1,9 @@
-"""Triangle surfaces as the head models need them: edges, borders, Loop subdivision as a sparse operator, decimation.
+"""Computes with triangle surfaces for head models: edges, borders, and Loop subdivision as a sparse operator.
 
 Subdivision: C. Loop, *Smooth Subdivision Surfaces Based on Triangles* (1987), interior weights after Warren, cubic
-B-spline rule on open borders. It is linear in the vertices, so one operator refines mean and modes alike (section 3.1).
-Decimation: half-edge collapses ordered by Garland and Heckbert's quadric error (1997). Half-edge collapses keep a
-subset of the vertices where they are, so that a decimated level is a choice of rows of the same operator.
+B-spline rule on open borders. It is linear in the vertices, so one operator refines both mean and modes (section 3.1).
+Decimation: half-edge collapses ordered by Garland and Heckbert's quadric error (1997). Half-edge collapses do not move
+the remaining vertices, so a decimated level is a selection of rows of the same operator.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ MAX_CLOSING = 400  # triangles that close eyes and mouth: 192 of the default mod
 
 
 class NotAManifold(EigenheadError):
-    """Reports a surface on which an edge has more than two triangles, or two that disagree about the outside."""
+    """Reports a surface on which an edge has more than two triangles, or two with opposite orientation."""
 
     def __init__(self, count: int, what: str) -> None:
         super().__init__(f"{count} edges {what}; repair the mesh (one consistently wound surface) and try again")
@@ -80,9 +80,9 @@ def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[list[int]]:
 
 
 def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.ndarray, "T 3"]:
-    """Returns triangles that close a long opening such as a mouth or an eye, as a strip from its end with the smallest
-    x to that with the largest. No vertex is added. The triangles face as the surface around the opening, if ``loop`` is
-    a result of ``boundary_loops``."""
+    """Returns triangles that close a long opening such as a mouth or an eye: a strip from the end with the smallest x
+    to the end with the largest. No vertex is added. The triangles have the orientation of the surface around the
+    opening, if ``loop`` is a result of ``boundary_loops``."""
     x = vertices[loop, 0]
     start, end = int(x.argmin()), int(x.argmax())
     ring = loop[start:] + loop[:start]
@@ -103,7 +103,7 @@ def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.nd
 
 def opened_faces(levels: Mapping[str, Int[np.ndarray, "F 3"]]) -> Int[np.ndarray, "G 3"]:
     """Returns the triangles of the level ``full`` without those that close eyes and mouth; all of them if there are
-    none. Models have those last in the level ``cage``, of which every triangle becomes equally many of ``full``."""
+    none. Those are the last triangles of the level ``cage``; each of its triangles becomes equally many of ``full``."""
     cage, full = levels["cage"], levels["full"]
     first, closing = len(cage), MAX_CLOSING if len(boundary_loops(cage)) == 1 else 0
     for count in range(len(cage) - 1, len(cage) - closing, -1):

@@ -1,9 +1,9 @@
 """Estimates gain and offset of every camera's colours, from vertices that several cameras see.
 
-A matt point sends the same light everywhere, so ``g_k c_k + b_k`` should agree over the cameras k that see it. The
-solution is by least squares, channel by channel in linear light, with the point's own colour eliminated, and reweighted
-(Cauchy) because skin also shines and fits are not exact. The rest is fixed by the prior: gains have the product 1,
-offsets are small.
+A matt point sends the same light in all directions, so ``g_k c_k + b_k`` should agree over the cameras k that see it.
+Each channel is solved by least squares in linear light, with the point's own colour eliminated. Cauchy weights reduce
+the effect of shiny skin and inexact fits. A prior fixes the remaining freedom: gains have the product 1, offsets are
+small.
 """
 
 import numpy as np

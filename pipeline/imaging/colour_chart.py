@@ -1,7 +1,7 @@
 """Finds a colour chart in a photograph (the 24 patches of a ColorChecker Classic, by OpenCV's mcc module), and computes
 a camera's colour correction from it.
 
-Colours are linear light here, 0 to 1, in the picture's own channels. The true colours of the patches are those of
+Colours here are linear light, 0 to 1, in the picture's own channels. The true colours of the patches are those of
 OpenCV's colour correction model (X-Rite's, in linear sRGB under D65: the white patch is 0.91).
 """
 
@@ -50,8 +50,8 @@ def true_colours() -> Float[np.ndarray, "24 3"]:
 
 
 def find_chart(picture: UInt8[np.ndarray, "h w 3"]) -> Chart | None:
-    """Finds the colour chart in an sRGB picture; None if there is none, or if its colours differ too much from a
-    chart's."""
+    """Finds the colour chart in an sRGB picture; None if there is none, or if its colours differ too much from the
+    reference."""
     height, width = picture.shape[:2]
     for wanted in WIDTHS_PX:
         scale = wanted / width

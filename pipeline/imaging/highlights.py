@@ -1,14 +1,14 @@
 """Removes highlights on skin from photographs, for matching.
 
-A highlight moves with the camera. Matched between views, it lies behind a convex surface, by up to half its radius of
-curvature; and on smooth skin there is nothing else to match. Comparing the views at each point of the fitted head
-separates it: the skin's own light is the same in all of them, while a highlight adds light of the lamp's colour to a
-few. So each view is darkened to the level of the darkest third of the views, with a correction that varies slowly along
-the surface, where the excess is less coloured than the skin (the dichromatic model: Shafer 1985, *Using color to
-separate reflection components*; Lin et al. 2002, *Diffuse-specular separation and depth recovery from image sequences*,
-compare views in the same way). The skin's texture is finer and is kept. If views differ by the skin's own colour, the
-head is in the wrong place, and nothing is removed. Levels are subtracted as displayed, not in linear light, since a
-camera's tone curve for highlights is unknown.
+A highlight moves with the camera. A matched highlight lies behind a convex surface, by up to half its radius of
+curvature; smooth skin offers nothing else to match. Comparing the views at each point of the fitted head separates a
+highlight: the skin's own light is the same in all views, while a highlight adds the lamp's colour to a few. So each
+view is darkened to the level of the darkest third of the views, by a correction that varies slowly along the surface.
+It applies where the excess is less coloured than the skin (the dichromatic model: Shafer 1985, *Using color to separate
+reflection components*; Lin et al. 2002, *Diffuse-specular separation and depth recovery from image sequences*, compare
+views in the same way). The skin's texture is finer and stays. If views differ by the skin's own colour, the head is
+misplaced, and nothing is removed. Levels are subtracted in sRGB codes instead of linear light, because a camera's tone
+curve for highlights is unknown.
 """
 
 from collections.abc import Mapping
@@ -52,8 +52,8 @@ MIN_GAIN_PLACES = 300  # that a camera shares with others, for its gain
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sight:
-    """Holds the head as one camera sees it: the part of the image with the head, and within it the pixels and depths
-    (mm) of the vertices, the triangle at each pixel, and the vertices' colours (linear; NaN where hidden)."""
+    """Holds the head in one camera: the part of the image with the head, the pixels and depths (mm) of the vertices in
+    it, the triangle at each pixel, and the vertices' colours (linear; NaN where hidden)."""
 
     box: tuple[slice, slice]
     pixels: Float[np.ndarray, "v 2"]
@@ -64,8 +64,8 @@ class _Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Excess:
-    """Holds how much brighter than the skin's own light each of v vertices is in each of k views, as far as the added
-    light is whiter than the skin."""
+    """Holds the excess over the skin's own light of each of v vertices in each of k views, as far as the added light is
+    whiter than the skin."""
 
     levels: Float32[np.ndarray, "k v"]  # 0 to 255, as displayed
     sure: Bool[np.ndarray, "k v"]  # where nothing but a highlight explains it
@@ -103,8 +103,7 @@ def without_highlights(
 
 
 def highlight_levels(colours: Float32[np.ndarray, "k v 3"], faces: Int[np.ndarray, "f 3"]) -> Excess:
-    """Computes how much the light in each view exceeds the skin's own light at each vertex, as far as a highlight
-    explains it.
+    """Computes the excess over the skin's own light at each vertex in each view, as far as a highlight explains it.
 
     Args:
         colours: linear light of each view at each vertex of the head; NaN where the view does not see it.
@@ -191,8 +190,8 @@ def _box(pixels: Float[np.ndarray, "v 2"], margin: float, height: int, width: in
 def _lowered(
     image: UInt8[np.ndarray, "h w 3"], camera: Camera, sight: _Sight, head_world: Mesh, excess: Excess, view: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns the image less the view's excess near sure highlights. The excess is smoothed in the image, which also
-    extends it beyond where it is known."""
+    """Returns the image minus the view's excess near certain highlights. The excess is smoothed in the image, which
+    also extends it to pixels where it is unknown."""
     if not excess.sure[view].any():
         return image
     values = np.stack([excess.levels[view], excess.sure[view], excess.known[view]], axis=1).astype(np.float32)
@@ -209,7 +208,7 @@ def _lowered(
 
 
 def _blurred_widely(values: Float32[np.ndarray, "h w c"], sigma: float) -> Float32[np.ndarray, "h w c"]:
-    """Returns a Gaussian blur of ``sigma`` pixels, computed on pixels of a quarter of that."""
+    """Returns a Gaussian blur of ``sigma`` pixels, computed on an image whose pixels are ``sigma / 4`` wide."""
     height, width = values.shape[:2]
     scale = max(int(sigma / 4.0), 1)
     small = cv2.resize(values, (max(width // scale, 1), max(height // scale, 1)), interpolation=cv2.INTER_AREA)

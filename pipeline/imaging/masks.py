@@ -21,7 +21,7 @@ def box_around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice
 
 
 def eroded(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
-    """Returns the mask shrunk by a disc of ``steps`` pixels; it does not shrink from the image's border."""
+    """Returns the mask shrunk by a disc of ``steps`` pixels, but not at the image's border."""
     return cv2.erode(mask.view(np.uint8), _disc(steps), borderValue=1).view(bool)
 
 
@@ -63,9 +63,9 @@ def distance_to_level(field: Float32[np.ndarray, "h w"], level: float = 0.5) -> 
     """Computes the signed distance (px) to the contour ``field == level``, negative where the field is above it.
     Without a contour every distance is +-(h + w), a finite value so that slopes can be computed.
 
-    The contour is what marching squares draws between pixel centres. Up to ``BAND_PX`` from it, every pixel gets the
-    exact distance to the nearest piece of the contour. Farther away, hundredths of a pixel do not matter: the distance
-    there is a 5 x 5 chamfer transform of the mask, exact to half a pixel and 2 %, blended in over the outer third of
+    The contour is the one that marching squares draws between pixel centres. Up to ``BAND_PX`` from it, every pixel
+    gets the exact distance to the nearest piece of the contour. Farther away, hundredths of a pixel do not matter: the
+    distance is a 5 x 5 chamfer transform of the mask, exact to half a pixel and 2 %, blended in over the outer third of
     the band."""
     above = field > level
     near = box_around(above, BAND_PX + 1)

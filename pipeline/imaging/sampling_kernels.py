@@ -1,8 +1,8 @@
-"""Bilinear interpolation for compiled loops, and the distance to a contour. The helpers are inlined, so that their
-arithmetic is the calling loop's, fast or strict.
+"""Bilinear interpolation for compiled loops, and the distance to a contour. The helpers are inlined, so they use the
+calling loop's arithmetic, fast or strict.
 
-Four neighbouring pixels are named ``a b`` above ``c d``; ``right`` and ``down`` (0 to 1) say how far a point is from
-``a``.
+Four neighbouring pixels are named ``a b`` above ``c d``; ``right`` and ``down`` (0 to 1) are the offsets of a point
+from ``a``.
 """
 
 import numpy as np
@@ -27,13 +27,13 @@ def bilinear_slopes(a, b, c, d, right, down):
 
 @njit(cache=True, nogil=True, inline="always")
 def held(at, size):
-    """Returns a coordinate along one side of an image, limited to its inside (``size`` pixels)."""
+    """Returns a coordinate clamped to one side of an image (``size`` pixels)."""
     return min(max(at, 0.0), size - INSIDE)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def cell(at, size):
-    """Returns the pixel before a coordinate along one side, and the fraction of the way to the next one. Beyond the
+    """Returns the pixel before a coordinate along one side, and the fraction of the way to the next one. Outside the
     image the outermost two pixels are extrapolated: the fraction is then below 0 or above 1."""
     low = min(max(int(np.floor(at)), 0), size - 2)
     return low, at - low
@@ -48,7 +48,7 @@ def sample(image, column, row):
 
 @njit(cache=True, nogil=True, inline="always")
 def sample_row(images, at, width, right, down):
-    """Returns the same value from an image stored row by row in the flat array ``images``. ``at`` is the index of the
+    """Returns the value of an image that is stored row by row in the flat array ``images``. ``at`` is the index of the
     upper left neighbour, ``width`` the image's width."""
     return bilinear(images[at], images[at + 1], images[at + width], images[at + width + 1], right, down)
 
@@ -56,7 +56,7 @@ def sample_row(images, at, width, right, down):
 @njit(cache=True, nogil=True)
 def segments_of_level(field: np.ndarray, level: float) -> np.ndarray:
     """Finds the contour of ``field`` (h, w) at ``level`` by marching squares. Returns its segments as rows (x0, y0, x1,
-    y1, x cell, y cell), px. A cell whose corners allow two ways is split according to their mean."""
+    y1, x cell, y cell), px. A cell whose corners allow two contours is split according to their mean."""
     height, width = field.shape
     out = np.empty((height * width // 4 + 16, 6), np.float32)
     count = 0
@@ -101,7 +101,7 @@ def segments_of_level(field: np.ndarray, level: float) -> np.ndarray:
 @njit(cache=True, nogil=True, fastmath=True)
 def refine_distance(whole: np.ndarray, field: np.ndarray, level: float, segments: np.ndarray, band: int) -> None:
     """Replaces the signed distances ``whole`` (h, w; px) near the contour, in place, by exact distances to its
-    ``segments``. Full replacement ends at two thirds of ``band`` (px) and fades out to its end. The sign is negative
+    ``segments``. Replacement is full up to two thirds of ``band`` (px) and fades out to its end. The sign is negative
     where ``field`` is above ``level``."""
     height, width = field.shape
     best = np.full((height, width), np.float32(1e12), np.float32)

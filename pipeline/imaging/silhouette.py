@@ -1,4 +1,4 @@
-"""Defines silhouettes, and the paper's costs of their differences (section 4.3)."""
+"""Defines silhouettes, and the paper's costs for their differences (section 4.3)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -18,8 +18,8 @@ CONTOUR_BLUR_PX = 1.0  # noise of a digital edge falls from 0.29 to 0.1 px; a be
 
 @dataclass(frozen=True, slots=True)
 class ViewQuality:
-    """Holds whether a view's silhouette is usable, and the warnings about it. ``doubts`` are those that a clean plate
-    or a mask would resolve, for views that had neither."""
+    """Holds whether a view's silhouette is usable, and the warnings about it. ``doubts`` are warnings that a clean
+    plate or a mask would resolve; only views without either have them."""
 
     usable: bool = True
     contrast: float = float("inf")  # subject against background, in standard deviations of the noise
@@ -46,17 +46,17 @@ class Silhouette:
 
 
 def silhouette_from_mask(mask: Mask) -> Silhouette:
-    """Builds the silhouette from a given binary mask."""
+    """Builds the silhouette from a binary mask."""
     return Silhouette(mask, signed_distance(mask))
 
 
 def signed_distance(mask: Mask) -> Float32[np.ndarray, "h w"]:
-    """Returns sub-pixel signed distance (px) to the contour of a binary mask, negative inside. Without a contour it is
-    +-(h + w), farther than any pixel.
+    """Returns the sub-pixel signed distance (px) to the contour of a binary mask, negative inside. Without a contour it
+    is +-(h + w), farther than any pixel.
 
-    Far from the contour it is the Euclidean distance transform, which measures to the nearest pixel *centre* of the
-    other kind, less half a pixel. Within two pixels its steps would leave 0.3 px of noise. There the mask is blurred by
-    a Gaussian, which turns a straight edge at distance d into ``Phi(-d / s)``, and d is computed from that.
+    Far from the contour it is the Euclidean distance to the nearest pixel *centre* on the other side, minus half a
+    pixel. Within two pixels that transform's steps would leave 0.3 px of noise. There the mask is blurred by a
+    Gaussian: a straight edge at distance d becomes ``Phi(-d / s)``, which is solved for d.
     """
     inside, outside = _distance_transforms(mask)
     far = float(sum(mask.shape))
@@ -76,9 +76,9 @@ def _distance_transforms(mask: Mask) -> tuple[Float32[np.ndarray, "h w"], Float3
 
 
 def _distance_transform(mask: Mask) -> Float32[np.ndarray, "h w"]:
-    """Computes ``D(S)`` exactly, the same in every call. OpenCV's result can differ in the last bit between calls, in
-    pictures of less than 16384 pixels and on one core (it then calls IPP). Squared distances between pixels are
-    integers, so rounding the squares recovers them, up to 1400 px."""
+    """Computes ``D(S)`` exactly, with the same result in every call. OpenCV's result can differ in the last bit between
+    calls, for pictures of less than 16384 pixels on one core (where it calls IPP). Squared distances between pixels are
+    integers, so rounding the squares gives exact values, up to 1400 px."""
     distance = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     squares = np.square(distance, dtype=np.float64)
     return np.sqrt(np.rint(squares, out=squares), out=squares).astype(np.float32)

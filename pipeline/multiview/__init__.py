@@ -1,5 +1,5 @@
-"""Measures what several calibrated views show together: points (section 4.2), the visual hull, epipolar tangencies, and
-which way is up.
+"""Computes with several calibrated views at once: points (section 4.2), the visual hull, epipolar tangencies, and the
+upward direction.
 
-Enters: rays or silhouettes and the rig. Leaves: points, volumes and distances in mm of the world frame.
+In: rays or silhouettes and the rig. Out: points, volumes and distances in mm of the world frame.
 """

@@ -1,11 +1,11 @@
-"""Finds points of the subject that three neighbouring views or more show, to a fraction of a pixel, with cameras that
-are nearly known.
+"""Finds points of the subject in three or more neighbouring views, to a fraction of a pixel, with cameras that are
+nearly known.
 
 Two views cannot show an error along the epipolar line; three can. SIFT keypoints are compared near that line only, so
-that many more can be accepted than by their likeness alone (``find_scene_points``, whose points lie in two
-neighbouring views each and say what is near and what is far where colours do not).
+many more are accepted than by similarity alone. (``find_scene_points`` uses similarity alone; its points have two
+neighbouring views each, and separate near from far where colours do not.)
 
-Enters: photographs, silhouettes and the rig. Leaves: pixels by point and view, and by how much their rays miss.
+In: photographs, silhouettes and the rig. Out: pixels by point and view, and the errors of their rays.
 """
 
 from collections.abc import Callable, Mapping
@@ -51,7 +51,7 @@ def find_scene_points(
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], rig: Rig, *, report: Callable[[float], None] = lambda share: None
 ) -> ScenePoints:
     """Finds points of the scene by matching keypoints between every two neighbouring views. ``images`` are RGB, by
-    camera name; ``report`` is called with the share that is done."""
+    camera name; ``report`` is called with the finished fraction."""
     seen = {}
     for count, camera in enumerate(rig):
         report(0.5 * count / len(rig))
@@ -145,8 +145,8 @@ def _where_rays_pass(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneTracks:
-    """Holds n observations of points in several views: ``pixels[i]`` is where the camera of index ``cameras[i]`` in the
-    rig sees the point of index ``points[i]``."""
+    """Holds n observations of points in several views: the camera of index ``cameras[i]`` in the rig sees the point of
+    index ``points[i]`` at ``pixels[i]``."""
 
     points: Int[np.ndarray, " n"]
     cameras: Int[np.ndarray, " n"]
@@ -159,8 +159,7 @@ class SceneTracks:
         return int(self.points.max()) + 1 if len(self.points) else 0
 
     def chosen(self, good: Bool[np.ndarray, " n"]) -> "SceneTracks":
-        """Returns the observations that are ``good``, without the points that then have fewer than ``min_views`` of
-        them."""
+        """Returns the observations marked ``good``; points with fewer than ``min_views`` of them are removed."""
         left = good & (np.bincount(self.points[good], minlength=self.count)[self.points] >= self.min_views)
         _, numbers = np.unique(self.points[left], return_inverse=True)
         return SceneTracks(numbers, self.cameras[left], self.pixels[left], self.min_views)
@@ -169,7 +168,7 @@ class SceneTracks:
 def find_tracks(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], rig: Rig, *, min_views: int = MIN_VIEWS
 ) -> SceneTracks:
-    """Finds points of the subject in all views of the rig, each in ``min_views`` views or more whose rays nearly
+    """Finds points of the subject in all views of the rig; each has at least ``min_views`` views, whose rays nearly
     meet."""
     names = rig.names
     seen = map_in_threads(lambda k: _keypoints(images[names[k]], silhouettes[names[k]]), len(rig))
@@ -190,8 +189,8 @@ def find_tracks(
 
 
 def misses_px(tracks: SceneTracks, rig: Rig) -> Float[np.ndarray, "n 2"]:
-    """Returns the reprojection error of each observation, measured minus projected: each point is placed where it is
-    nearest to all its rays. NaN where a pixel lies outside what the lens can show."""
+    """Returns the reprojection error of each observation, measured minus projected, for the point nearest to all its
+    rays. The error is NaN where a pixel lies outside the lens's valid area."""
     rays, weights = np.zeros((len(rig), tracks.count, 3)), np.zeros((len(rig), tracks.count))
     for number, camera in enumerate(rig):
         observed = tracks.cameras == number
@@ -210,7 +209,7 @@ Keypoints = tuple[Float[np.ndarray, "_ 2"], Float32[np.ndarray, "_ 128"]]
 
 
 def _keypoints(image: ImageRgb, silhouette: Silhouette) -> Keypoints:
-    """Returns the pixels of keypoints on the subject, and the roots of their descriptors."""
+    """Returns the pixels of keypoints on the subject, and the square roots of their descriptors."""
     inside = silhouette.distance < -INSET_PX
     if not inside.any():
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
@@ -230,7 +229,7 @@ def _keypoints(image: ImageRgb, silhouette: Silhouette) -> Keypoints:
 
 
 def _matches(one: Camera, first: Keypoints, two: Camera, second: Keypoints) -> Int[np.ndarray, "m 2"]:
-    """Returns the numbers of keypoints that are each other's most alike near the epipolar lines."""
+    """Returns pairs of keypoint indices that are each other's best match near the epipolar lines."""
     if min(len(first[0]), len(second[0])) < 2:
         return np.zeros((0, 2), int)
     every = first[1] @ second[1].T
@@ -266,7 +265,7 @@ def _near_lines(
 def _joined(
     pairs: list[tuple[int, int]], matched: list[Int[np.ndarray, "_ 2"]], seen: list[Keypoints], min_views: int
 ) -> SceneTracks:
-    """Returns chains of matches as points; chains that meet one view twice are left out."""
+    """Joins chains of matches to points; a chain with two pixels in one view is left out."""
     from scipy.sparse import coo_array  # a tenth of a second
     from scipy.sparse.csgraph import connected_components
 

@@ -1,7 +1,7 @@
-"""Finds epipolar tangencies: a plane through two camera centres that touches one silhouette touches the other's, too.
+"""Finds epipolar tangencies: a plane through two camera centres that touches one silhouette also touches the other.
 
-Enters: two silhouettes and their cameras. Leaves: pairs of contour points that one plane should touch, and by how much
-they miss (Wong and Cipolla, *Structure and motion from silhouettes*, ICCV 2001).
+In: two silhouettes and their cameras. Out: pairs of contour points that one plane should touch, and their error (Wong
+and Cipolla, *Structure and motion from silhouettes*, ICCV 2001).
 """
 
 from collections.abc import Mapping
@@ -47,8 +47,8 @@ class Tangency:
 
 
 def find_tangencies(silhouettes: Mapping[str, Silhouette], rig: Rig, inset_mm: float = 0.0) -> list[Tangency]:
-    """Finds the outer tangent planes of every two cameras whose images both show the subject whole there. With
-    ``inset_mm``, the planes touch curves that far inside the outlines, measured at the subject."""
+    """Finds the outer tangent planes of every two cameras, where both images contain the whole subject on that side.
+    With ``inset_mm``, the planes touch curves at that distance (at the subject) inside the outlines."""
     middle = rig.centre_world()
     insets_px = {camera.name: inset_mm / pixel_mm(camera, middle) if inset_mm else 0.0 for camera in rig}
     outlines = {camera.name: _Outline.of(camera, silhouettes[camera.name], insets_px[camera.name]) for camera in rig}
@@ -66,7 +66,7 @@ def pixel_mm(camera: Camera, place_world: Vector) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Outline:
-    """Holds the convex hull of a mask, which is all that outer tangents touch."""
+    """Holds the convex hull of a mask, since outer tangents touch nothing else."""
 
     pixels: Float[np.ndarray, "n 2"]
     rays: Float[np.ndarray, "n 3"]
@@ -85,8 +85,8 @@ class _Outline:
 def outer_hull(silhouette: Silhouette, inset_px: float = 0.0) -> Float[np.ndarray, "n 2"]:
     """Returns the corners (px) of the convex hull of a mask, to a fraction of a pixel; empty for an empty mask.
 
-    With ``inset_px``, the hull is that of the curve so far inside the contour. Strands and specks thinner than twice
-    that do not reach it.
+    With ``inset_px``, the hull is that of a curve at this distance inside the contour. Strands and specks thinner than
+    twice ``inset_px`` do not reach that curve.
     """
     inside = silhouette.distance < -inset_px if inset_px else silhouette.mask
     contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

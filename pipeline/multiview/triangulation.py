@@ -1,7 +1,7 @@
 """Computes a point from its pixels in several views (section 4.2), by Gauss-Newton steps on the reprojection error.
 
-Enters: one pixel per camera. Leaves: the world point with its covariance. The search starts at the point nearest to all
-rays (linear least squares). Lens distortion is part of the projection, so that nothing is undistorted first.
+In: one pixel per camera. Out: the world point with its covariance. The search starts at the point nearest to all rays
+(linear least squares). The projection includes lens distortion, so no undistortion is needed first.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ class TriangulatedPoint:
     residuals_px: Mapping[str, Float[np.ndarray, " 2"]]
 
     def misfit(self, noise_px: float) -> float:
-        """Returns the sum of squared residuals divided by the squared noise. For right pixels it is distributed as
+        """Returns the sum of squared residuals divided by the squared noise. For correct pixels it is distributed as
         chi-square with ``2 * views - 3`` degrees of freedom."""
         return sum(float(r @ r) for r in self.residuals_px.values()) / noise_px**2
 
@@ -54,7 +54,7 @@ def triangulate(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig, *, nois
         rig: the cameras.
         noise_px: standard deviation of each coordinate of a picked pixel, to which the covariance scales.
 
-    Raises NoPoint as ``triangulate_many`` does, and for fewer than two views.
+    Raises NoPoint like ``triangulate_many``, and for fewer than two views.
     """
     if len(pixels) < 2:
         raise NoPoint(compose("point-in-few-views", count=len(pixels)))
@@ -159,13 +159,13 @@ def parallax(
     view: Int[np.ndarray, "n v"],
     value: Float[np.ndarray, "n v"],
 ) -> Float[np.ndarray, " n"]:
-    """Returns the parallax of points on a surface: by how much two views shift against each other along the surface,
-    for each millimetre that the surface moves along its normal. It is the root mean square over all pairs of views,
+    """Returns the parallax of points on a surface: the shift of two views against each other along the surface, for
+    each millimetre that the surface moves along its normal. It is the root mean square over all pairs of views,
     weighted. An error in an image (noise, a highlight, the calibration) is a shift of some pixels; divided by the
     parallax it is the error in depth.
 
-    ``points``: on a surface, mm. ``normals``: unit normals of the surface there. ``centres``: of the cameras, in the
-    same frame. ``view``: the cameras that compare each point; -1 for none. ``value``: their weights; 0 for none.
+    ``points``: points on a surface, mm. ``normals``: unit normals of the surface there. ``centres``: camera centres, in
+    the same frame. ``view``: the cameras that compare each point; -1 for none. ``value``: their weights; 0 for none.
     """
     towards = centres[np.maximum(view, 0)] - points[:, None]
     towards /= np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-9)
@@ -177,7 +177,7 @@ def parallax(
 
 
 def depth_factor(found: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns how much larger the depth error is that an error in the images causes than with the usual rig (eleven
-    cameras around a face, parallax ``USUAL``): the ratio of the parallaxes, at least 1. ``found`` is the parallax of
-    each point."""
+    """Returns the ratio of the depth error to that with the usual rig (eleven cameras around a face, parallax
+    ``USUAL``), for the same error in the images: the ratio of the parallaxes, at least 1. ``found`` is the parallax of
+    each point with this rig."""
     return USUAL / np.clip(found, MIN_PARALLAX, USUAL)

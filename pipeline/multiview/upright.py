@@ -1,7 +1,7 @@
 """Estimates which way is up, from cameras that were held upright, on their side or upside down.
 
-If a camera is rolled only by quarter turns, up is nearly along one of its image axes and across the other. That is a
-guess from the poses alone; the pictures are not examined.
+If a camera is rolled by quarter turns only, up is nearly along one of its image axes and at right angles to the other.
+This is a guess from the poses alone; the pictures are not examined.
 """
 
 import numpy as np

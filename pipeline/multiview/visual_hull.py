@@ -1,4 +1,4 @@
-"""Finds the extent of the visual hull: a cube about what the silhouettes show."""
+"""Finds the extent of the visual hull: a cube around the subject in the silhouettes."""
 
 from collections.abc import Mapping
 
@@ -14,13 +14,13 @@ Vector = Float[np.ndarray, " 3"]
 
 
 def hull_extent(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Vector, float]:
-    """Returns centre (world, mm) and edge length (mm) of a cube that contains the subject, as ``mask_extent`` of the
+    """Returns centre (world, mm) and edge length (mm) of a cube that contains the subject: ``mask_extent`` of the
     usable silhouettes."""
     return mask_extent({camera.name: silhouettes[camera.name].mask for camera in usable_cameras(silhouettes, rig)}, rig)
 
 
 def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple[Vector, float]:
-    """Returns the centre (world, mm) and edge length (mm) of a cube that contains what the masks show. Masks may be
+    """Returns the centre (world, mm) and edge length (mm) of a cube that contains the masked object. Masks may be
     smaller than the images.
 
     The centre is the point nearest to the rays through the masks' middles; the edge is the largest diagonal of a mask

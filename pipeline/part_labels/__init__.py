@@ -1,5 +1,5 @@
 """Labels every pixel of the subject as skin, hair or clothes.
 
-Enters: photographs, silhouettes and the head fitted to its outlines. Leaves: probabilities of the parts at each pixel,
-which the photometric fit, the detail and the bust read.
+In: photographs, silhouettes and the head fitted to its outlines. Out: probabilities of the parts at each pixel, for the
+photometric fit, the detail and the bust.
 """

@@ -1,5 +1,5 @@
-"""Computes what distinguishes the parts, on a coarse grid of every photograph: colour, fine structure, and position on
-the head.
+"""Computes features that distinguish the parts, on a coarse grid of every photograph: colour, fine structure, and
+position on the head.
 
 A cell is a square of pixels, about two millimetres wide on the subject whatever the camera's resolution.
 """
@@ -52,8 +52,8 @@ class HeadGuide:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """Holds one view's coarse grid of cells. A cell's place on the head (``into_face_mm``, ``above_chin_mm``) is that
-    of the fitted head's surface where the head covers the cell, and elsewhere that of the plane through the head's
+    """Holds one view's coarse grid of cells. The position of a cell (``into_face_mm``, ``above_chin_mm``) is that of
+    the fitted head's surface where the head covers the cell. Elsewhere it is that of the plane through the head's
     middle that faces the camera."""
 
     camera: Camera
@@ -173,7 +173,7 @@ def _means(values: np.ndarray, size: int) -> np.ndarray:
 def _seen(
     camera: Camera, size: int, head: HeadGuide, shape: tuple[int, int]
 ) -> tuple[Float32[np.ndarray, "r c"], Float32[np.ndarray, "r c 5"]]:
-    """Returns the depth of the head (mm) at every cell's centre, inf beside the head, and the guide's values there."""
+    """Returns the depth of the head (mm) at every cell's centre, inf outside the head, and the guide's values there."""
     pixels = (camera.project(head.mesh.vertices) - (size - 1) / 2) / size
     depths = camera_depths(camera, head.mesh.vertices)
     depth, face = rasterise(pixels, depths, head.mesh.faces, *shape)
@@ -245,8 +245,8 @@ def _cells(
 
 
 def _height_beside(camera: Camera, size: int, shape: tuple[int, int], head: HeadGuide) -> Float[np.ndarray, "r c"]:
-    """Returns the height (mm) above the chin at which each cell's ray meets the plane through the head's middle that
-    faces the camera. It is nearly affine in the image, so it is fitted to a 3 x 3 grid of rays."""
+    """Returns the height (mm) above the chin where each cell's ray meets the plane through the head's middle that faces
+    the camera. This height is nearly affine in the image, so it is fitted to a 3 x 3 grid of rays."""
     row, column = np.meshgrid(np.linspace(0, shape[0] - 1, 3), np.linspace(0, shape[1] - 1, 3), indexing="ij")
     pixels = np.stack([column.ravel(), row.ravel()], axis=1) * size + (size - 1) / 2
     rays = camera.rays_world(pixels)
@@ -260,7 +260,7 @@ def _height_beside(camera: Camera, size: int, shape: tuple[int, int], head: Head
 
 
 def grey_of(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """Returns the photograph in grey as displayed, 0 to 1."""
+    """Returns the photograph in grey (sRGB codes scaled to 0 to 1)."""
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.float32) / np.float32(255.0)
 
 

@@ -1,10 +1,10 @@
-"""Finds a thin cap of a stated colour on the head, a swim or wig cap, in every photograph.
+"""Finds a thin swim or wig cap of a stated colour on the head, in every photograph.
 
-Colours are compared by their chromaticities, which shading leaves alone: by hue where the cap has one, so that sheen,
-which only pales a colour, counts, and a colour may be stated by a name. Grey caps are compared by luminance, widely.
-The capture's own colour then decides, the median of what resembles the stated one above the brows. Cells nearer to the
-cheeks' colour are skin. In every view the largest connected piece counts, its highlights and seams filled, if most of
-it lies above the brows.
+Colours are compared by chromaticity, which shading does not change. A coloured cap is compared by hue alone: sheen only
+pales its colour, and its colour may be stated by a name. Grey caps are compared by luminance, with a wide tolerance.
+Then the cap's colour in this capture decides: the median of the pixels above the brows that resemble the stated colour.
+Cells nearer to the cheeks' colour are skin. Each view's cap is the largest connected piece, with highlights and seams
+filled, if most of it lies above the brows.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,8 +32,8 @@ CLOSED_MM = 7.0  # highlights and seams of that width are filled
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cap:
-    """Holds the pixels that show the cap, by camera, and its thickness. ``share`` is how much it covers of what the
-    views show of the head well above the brows."""
+    """Holds the pixels that show the cap, by camera, and its thickness. ``share`` is the fraction of the visible head
+    well above the brows that it covers."""
 
     masks: Mapping[str, Bool[np.ndarray, "_ _"]]
     thickness_mm: float
@@ -59,8 +59,8 @@ def find_cap(
     """Finds the cap's pixels in every view that has a photograph and a mask.
 
     ``images``: sRGB photographs by camera. ``masks``: of the subject, by camera. ``rig``: the cameras as calibrated.
-    ``head_world``: a head at the subject's pose, the mean one will do (mm). ``face_region``: its vertices.
-    ``landmarks_world``: its landmarks (mm). ``colour``: of the cap, linear RGB, about. ``thickness_mm``: of the cap.
+    ``head_world``: a head at the subject's pose, such as the mean head (mm). ``face_region``: its vertices.
+    ``landmarks_world``: its landmarks (mm). ``colour``: of the cap, about, linear RGB. ``thickness_mm``: the cap's.
     """
     guide = head_guide(head_world, face_region, landmarks_world)
     used = rig.subset(name for name in rig.names if name in masks and name in images)
@@ -77,7 +77,7 @@ def find_cap(
 
 
 def colour_of(linear: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-    """Returns a linear RGB colour as cells have it: log red / green, log blue / green, log luminance."""
+    """Converts a linear RGB colour to the form of the cells: log red / green, log blue / green, log luminance."""
     red, green, blue = np.log(linear + DARKEST)
     return np.array([red - green, blue - green, np.log(linear @ (0.2126, 0.7152, 0.0722) + DARKEST)])
 
@@ -85,7 +85,7 @@ def colour_of(linear: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
 def cap_cells(
     cells: Sequence[Cells], brows_mm: float, stated: Float[np.ndarray, " 3"]
 ) -> tuple[dict[str, Bool[np.ndarray, "_ _"]], float]:
-    """Returns the cells of the cap in the views that show it, and how much of the head above the brows they cover.
+    """Returns the cap's cells in the views that show it, and the fraction of the head above the brows that they cover.
 
     Args:
         cells: of each view.
@@ -119,8 +119,8 @@ def _gathered(cells: Sequence[Cells], chosen: Sequence[Bool[np.ndarray, "_ _"]])
 
 
 def chromaticity(colour: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-    """Returns the chromaticity of colours as cells have them: white is the origin, red, green and blue have length 1
-    and stand at 0, 120 and 240 degrees."""
+    """Returns the chromaticity of the cells' colours: white is the origin; red, green and blue have length 1 at 0, 120
+    and 240 degrees."""
     red, blue = np.exp(colour[..., 0]), np.exp(colour[..., 1])
     total = red + 1.0 + blue
     return np.stack([(red - 0.5 * (1.0 + blue)) / total, np.sqrt(0.75) * (1.0 - blue) / total], axis=-1)
@@ -129,7 +129,7 @@ def chromaticity(colour: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]
 def _resembles(
     colour: Float32[np.ndarray, "*n 3"], cap: Float[np.ndarray, " 3"], cheeks: Float[np.ndarray, " 3"], hue_deg: float
 ) -> Bool[np.ndarray, "*n"]:
-    """Tells which colours are the cap's, shading and sheen apart, and nearer to it than to the cheeks'."""
+    """Tells which colours are the cap's, apart from shading and sheen, and nearer to it than to the cheeks' colour."""
     seen, worn, skin = chromaticity(colour), chromaticity(cap), chromaticity(cheeks)
     saturation = float(np.linalg.norm(worn))
     if saturation < NEUTRAL:
@@ -165,7 +165,7 @@ def _piece(view: Cells, like: Bool[np.ndarray, "r c"], brows_mm: float) -> Bool[
 
 
 def _at_pixels(cells: Bool[np.ndarray, "r c"], size_px: int, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Returns the subject's pixels in the cells, and those of a cell's edge length beside them, up to the outline."""
+    """Returns the subject's pixels in the cells and, up to the outline, within a cell's edge length of them."""
     whole = np.zeros(mask.shape, np.uint8)
     grown = np.repeat(np.repeat(cells, size_px, axis=0), size_px, axis=1)
     whole[: grown.shape[0], : grown.shape[1]] = grown

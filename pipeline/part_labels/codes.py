@@ -1,7 +1,7 @@
 """Defines the parts that a surface shows, as ``bust.ply`` stores them, and the channel of each in a map of
 probabilities.
 
-The last axis of a map holds skin, hair and clothes; there is no channel for what no view sees. All conversions between
+The last axis of a map holds skin, hair and clothes; there is no channel for unseen surface. All conversions between
 codes and channels are here.
 """
 
@@ -12,7 +12,7 @@ from jaxtyping import Int, UInt8
 
 
 class Part(IntEnum):
-    """Names what a vertex or a point of the surface shows. The numbers stand in files that were written, and never
+    """Names the part of the subject at a vertex or a point of the surface. The numbers are stored in files and never
     change."""
 
     UNSEEN = 0

@@ -8,7 +8,7 @@ from rig.jit import njit
 @njit(cache=True, nogil=True, fastmath=True)
 def spread_parts(slope, offset, size_px, grey, mask, out):
     """Fills ``out`` (h, w, 3; uint8) with the probabilities of the three parts, in 255ths, at the pixels of ``mask``
-    (h, w): ``slope * grey + offset``, limited to 0 to 1 and to a sum of at most 1. Other pixels are left as they are.
+    (h, w). They are ``slope * grey + offset``, clipped to 0 to 1 and to a sum of at most 1. Other pixels do not change.
 
     ``slope`` and ``offset`` (r, c, 3) are interpolated between the middles of cells of ``size_px`` pixels, and constant
     beyond the outermost ones; ``grey`` (h, w) is 0 to 255, and counts as 0 to 1.

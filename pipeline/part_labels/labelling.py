@@ -1,10 +1,10 @@
-"""Labels every pixel of the subject as skin, hair or clothes, by what it learns from the capture itself.
+"""Labels every pixel of the subject as skin, hair or clothes, by models learnt from the capture itself.
 
-The middle of the fitted face is skin. Pixels beside the head above the chin are hair unless they look like that skin,
-as a bald crown does; pixels below are clothes unless they look like skin. From this start, expectation maximisation
-(Dempster, Laird and Rubin 1977) learns how the parts of this capture look, as histograms of colour and fine structure
-over all views, with the cameras' gains removed. The position on the head is the prior. A filter that keeps the edges of
-the photograph makes neighbours agree (He, Sun and Tang 2010, guided image filtering,
+The middle of the fitted face is skin. Pixels beside the head above the chin are hair, unless they look like that skin
+(a bald crown). Pixels below are clothes, unless they look like skin. From this start, expectation maximisation
+(Dempster, Laird and Rubin 1977) learns the appearance of each part in this capture: histograms of colour and fine
+structure over all views, after the cameras' gains are removed. The position on the head is the prior. A filter that
+preserves the edges of the photograph smooths the labels (He, Sun and Tang 2010, guided image filtering,
 https://doi.org/10.1007/978-3-642-15549-9_1). A cap is distinguished from hair only if it looks like the clothes below;
 both hide skin."""
 
@@ -50,7 +50,7 @@ FLOOR = 0.02  # of a part's looks that its histogram has not shown
 @dataclass(frozen=True, slots=True, eq=False)
 class PartMap:
     """Holds one view's probabilities of skin, hair and clothes at each pixel of the photograph, in 255ths: a byte each,
-    since a view has millions. Where they sum to less than 255, the rest is unknown; outside the subject all of it
+    since a view has millions. If they sum to less than 255, the remainder is unknown; outside the subject all of it
     is."""
 
     camera: str
@@ -141,11 +141,10 @@ def _bin(values: Float32[np.ndarray, "r c"], span: tuple[float, float], count: i
 
 
 def starts(view: Cells) -> Float32[np.ndarray, "r c 3"]:
-    """Marks cells (1, else 0) that by their position can hardly be anything but skin, hair or clothes, one channel
-    each.
+    """Marks cells (1, else 0) that are almost certainly skin, hair or clothes by their position, one channel each.
 
-    Skin: cheeks and nose. Hair: the cranium far from the face, and what lies beside the head above the ears. Clothes:
-    what lies well below the chin and beside the neck.
+    Skin: cheeks and nose. Hair: the cranium far from the face, and cells beside the head above the ears. Clothes: cells
+    well below the chin and beside the neck.
     """
     skin = view.cheek > 0.5
     beside = ~view.on_head & (view.outside_mm > 3.0)
@@ -167,21 +166,21 @@ def sideburn_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
 
 
 def lower_face(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Marks the cells of the beard zone that would be evenly lit skin without a beard: not the lips, and not the
-    underside of jaw and chin, which is dark with and without a beard."""
+    """Marks the cells of the beard zone that show evenly lit skin on a face without a beard. Lips are excluded, and so
+    is the underside of jaw and chin, which is always dark."""
     return beard_zone(view) & (np.maximum(view.feature, view.underside) < PLAIN)
 
 
 def beard_evidence(unlikeness: Float[np.ndarray, " n"], lower: Bool[np.ndarray, " n"]) -> float:
-    """Returns a number from 0 (no beard) to 1 (beard), from how much the lower face differs on average from cheeks and
-    nose (``unlikeness``): below 0.12 without a beard, above 0.9 with one."""
+    """Returns a number from 0 (no beard) to 1 (beard), from the mean difference (``unlikeness``) of the lower face from
+    cheeks and nose: below 0.12 without a beard, above 0.9 with one."""
     share = float(unlikeness[lower].mean()) if lower.any() else 0.0
     return float(_ramp(np.full((1, 1), share, np.float32), *BEARD_SHARE)[0, 0])
 
 
 def place_prior(view: Cells, bearded: float = 0.0) -> Float32[np.ndarray, "r c 4"]:
-    """Returns the prior probability of skin, hair, clothes, and of none of them, in each cell: from its position and
-    from ``beard_evidence`` alone."""
+    """Returns the prior probability of skin, hair, clothes, and none of them in each cell, from its position and from
+    ``beard_evidence`` alone."""
     face = _ramp(view.into_face_mm, -25.0, 15.0)
     upper = np.where(view.on_head, _ramp(view.above_chin_mm, -15.0, 45.0), _ramp(view.above_chin_mm, -45.0, 25.0))
     skin_above = np.where(view.on_head, 0.15 + 0.8 * face, 0.12)
@@ -212,9 +211,9 @@ def _ramp(values: Float32[np.ndarray, "r c"], low: float, high: float) -> Float3
 def unlike_cheeks(
     appearance: Int[np.ndarray, "n 2"], cheeks: Float32[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Returns how much every cell differs from the cells ``cheeks``, which are certainly skin, from 0 to 1: by colour
-    alone, and by colour and fine structure. Fine structure separates a blond beard from skin, but also the borders of
-    shadows."""
+    """Returns the difference (0 to 1) of every cell from the cells ``cheeks``, which are certainly skin: by colour
+    alone, and by colour and fine structure. Fine structure separates a blond beard from skin, but also reacts to the
+    borders of shadows."""
     everything = np.ones(len(appearance), np.float32)
     colour, detail = (
         (of(which, cheeks) / of(which, everything))[which]
@@ -234,8 +233,8 @@ def fit_appearance(
     """Learns the appearance of the parts by expectation maximisation. Returns the log likelihood of every cell under
     skin, hair, clothes and an outlier class, plus the evidence that this subject shows the part at all.
 
-    It starts from the cells whose part follows from their position; those of hair and clothes count less the more they
-    look like skin.
+    It starts from the cells whose position decides their part; those of hair and clothes count less the more they look
+    like skin.
     """
     colour, detail = appearance.T
     share = start.copy()
@@ -257,8 +256,8 @@ def fit_appearance(
 def _presence(
     unlikeness: Float[np.ndarray, " n"], start: Float32[np.ndarray, "n 3"], lower: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, " 3"]:
-    """Returns how likely the subject shows each part at all: for hair and clothes, the mean unlikeness to skin of their
-    sure cells. A beard counts as hair."""
+    """Returns the probability that the subject shows each part at all: for hair and clothes, the mean unlikeness to
+    skin of their certain cells. A beard counts as hair."""
     shares = [float(unlikeness[place > 0].mean()) if place.any() else 0.0 for place in (*start.T, lower)]
     return np.maximum([1.0, max(shares[HAIR_CHANNEL], shares[3]), shares[CLOTHES_CHANNEL]], MIN_PRESENT)
 

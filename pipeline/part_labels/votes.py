@@ -1,6 +1,6 @@
-"""Combines the part maps of all views on the surface: in each small cell, the views that see it vote.
+"""Combines the part maps of all views on the surface: it is divided into small cells, and the views of a cell vote.
 
-A single pixel may be a freckle or a gap between strands, and a view that sees a point from the side knows less of it.
+One pixel may be a freckle or a gap between strands, and an oblique view of a point is less reliable.
 """
 
 from collections.abc import Mapping, Sequence
@@ -73,7 +73,7 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
 
 
 def parts_shown(points: Float[np.ndarray, "n 3"], part: PartMap, camera: Camera) -> Float[np.ndarray, "n 3"]:
-    """Returns the probabilities of skin, hair and clothes at the pixel of each point (world, mm); 0 beside the
+    """Returns the probabilities of skin, hair and clothes at the pixel of each point (world, mm); 0 outside the
     picture."""
     height, width = part.of_255.shape[:2]
     column, row = np.rint(np.nan_to_num(project_points(camera, points), nan=-1.0)).astype(int).T

@@ -1,5 +1,5 @@
-"""Fits the head to what photographs show inside the outline.
+"""Fits the head to the photographs inside the outline.
 
-Enters: a solved contour problem and the photographs. Leaves: the same problem with a finer basis and with observations
-of the surface, solved again. The paper leaves this open.
+In: a solved contour problem and the photographs. Out: the same problem with a finer basis and with observations of the
+surface, solved again. The paper does not do this.
 """

@@ -1,22 +1,22 @@
-"""Finds where along its normal each patch of the surface looks alike in the views that see it (photo-consistency).
+"""Finds the position along its normal at which each patch of the surface looks alike in its views (photo-consistency).
 
 The variance of the depth is that of a shift between two signals of correlation rho,
 
     variance = floor^2 + noise area / window area * (1 - rho) / |d^2 rho / d shift^2|,
 
-so that texture, noise, defocus and grazing views all have their effect. Gain and offset of a camera have none.
+so that texture, noise, defocus and grazing views all have their effect. Gain and offset of a camera have no effect.
 
-The same patches say by how much each view should shift in its image. At the depth where a patch's views correlate best,
-the mean correlation is the least-squares problem ``sum_k v_k |f_k - T|^2``. Here f_k are the patch's grey values in
-view k, centred and of unit norm, and T is their mean with the weights v_k. That eliminates the unknown texture exactly,
-and with it sliding along the surface. Linear in the image shifts delta_k (px) of the views,
+The same patches tell by how much the image of each view should shift. At the depth where a patch's views correlate
+best, the mean correlation is the least-squares problem ``sum_k v_k |f_k - T|^2``. Here f_k are the patch's grey values
+in view k, centred and of unit norm, and T is their mean with the weights v_k. That eliminates the unknown texture
+exactly, and also sliding along the surface. Linear in the image shifts delta_k (px) of the views,
 
     H_kl = v_k [k = l] <g_k, g_k> - v_k v_l / V <g_k, g_l>,   gradient_k = v_k <g_k, f_k - T>,
 
 where g_k are the images' slopes and V is the sum of the weights. A displacement u along the normal and camera
-corrections c_k make ``delta_k = p_k u + C_k c_k``. Eliminating u leaves the derivative of the patch's depth by the
-cameras' poses, and a quadratic form in the cameras alone: shifts that no surface explains. A camera of 0.2 px error
-shows in thousands of patches.
+corrections c_k make ``delta_k = p_k u + C_k c_k``. Eliminating u leaves two results: the derivative of the patch's
+depth by the cameras' poses, and a quadratic form in the cameras alone (shifts that no surface explains). A camera error
+of 0.2 px is visible in thousands of patches.
 """
 
 from collections.abc import Sequence
@@ -117,11 +117,11 @@ def visibility_of(
     patches: Patches,
     speaks: Bool[np.ndarray, " k"],
 ) -> SampleVisibility:
-    """Finds which samples of a head each camera sees. A coarser mesh of the same surface decides what hides them.
+    """Finds which samples of a head each camera sees. A coarser mesh of the same surface decides which are hidden.
 
     ``head_world``: the mesh that the patches belong to, mm. ``coarse_world``: the same surface with fewer triangles.
-    ``cameras``: of the views, at their current poses. ``views``: the silhouettes. ``patches``: whose samples are looked
-    up. ``speaks``: which views have a photograph with texture; the others see nothing.
+    ``cameras``: cameras of the views, at their current poses. ``views``: the silhouettes. ``patches``: the patches to
+    test. ``speaks``: which views have a photograph with texture; the others see nothing.
     """
     normals = head_world.normals()
     points, outward = patches.points(head_world.vertices), patches.normals(normals)
@@ -163,8 +163,8 @@ def facing_of(
 ) -> Float32[np.ndarray, " s"]:
     """Returns the cosine between normal and line of sight for every sample that the camera sees; 0 for hidden samples.
 
-    ``points``: the samples, world, mm. ``normals``: unit, world. ``camera``: at its current pose. ``depth``: z-buffer
-    (mm) of the head in this camera. ``distance``: signed distance (px) to the silhouette.
+    ``points``: the samples, world, mm. ``normals``: unit, world. ``camera``: the camera at its current pose. ``depth``:
+    z-buffer (mm) of the head in this camera. ``distance``: signed distance (px) to the silhouette.
     """
     cosine = facing_cosine(camera.centre_world, points, normals)
     height, width = depth.shape
@@ -198,10 +198,10 @@ def observe(
     """Measures the surface at the patches' centres. Returns the observations, and the vertices of patches that several
     cameras see but whose views do not match.
 
-    ``problem``: the contour solver's. ``state``: the current head and cameras. ``photographs``: of the views.
-    ``patches``: to be measured. ``visibility``: of the patches' samples at ``state``. ``hair``: patches under hair,
-    which only bound the head from outside. ``basis``: the model's modes at the patches' centres. ``each``: lengths of
-    the search.
+    ``problem``: problem of the contour solver. ``state``: the current head and cameras. ``photographs``: photographs of
+    the views. ``patches``: the patches to measure. ``visibility``: of the patches' samples at ``state``. ``hair``:
+    patches under hair, which only bound the head from outside. ``basis``: the model's modes at the patches' centres.
+    ``each``: lengths of the search.
     """
     scale = pixels_per_mm(visibility.cameras, state.world_from_head.translation)
     found = find_places(photographs, patches, visibility, problem.views, scale, each=each)
@@ -239,8 +239,8 @@ def observe(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """Holds, for c patches, where along its normal each looks most alike in its views, and the data of which that was
-    computed."""
+    """Holds, for c patches, the position along its normal at which each looks most alike in its views, and the data
+    behind it."""
 
     place: Float[np.ndarray, " c"]  # mm along the normal
     height: Float[np.ndarray, " c"]  # the correlation there
@@ -284,15 +284,15 @@ def find_places(
 def patch_depth_factor(
     patches: Patches, visibility: SampleVisibility, view: Int[np.ndarray, "c n"], value: Float[np.ndarray, "c n"]
 ) -> Float[np.ndarray, " c"]:
-    """Returns how much less precise the depth of each patch is than with the usual rig, since its views stand closer
-    together: the ratio of the depth errors that the same error in the images causes, at least 1."""
+    """Returns the ratio of each patch's depth error to that with the usual rig, for the same error in the images; at
+    least 1. It exceeds 1 where the patch's views stand closer together."""
     centres, at = np.array([camera.centre_world for camera in visibility.cameras]), patches.centre
     return depth_factor(parallax(visibility.vertices[at], visibility.normals[at], centres, view, value))
 
 
 def head_depth_factor(head_world: Mesh, face: Int[np.ndarray, " n"], cameras: Sequence[Camera]) -> float:
     """Returns the median of ``depth_factor`` over the vertices ``face`` of a head (mm). Each vertex counts as seen by
-    its ``MAX_VIEWS`` most frontal cameras; what may hide it is ignored. Returns 1 if no vertex faces two cameras."""
+    its ``MAX_VIEWS`` most frontal cameras; occlusion is ignored. Returns 1 if no vertex faces two cameras."""
     points, normals = head_world.vertices[face], head_world.normals()[face]
     centres = np.array([camera.centre_world for camera in cameras])
     towards = centres[None] - points[:, None]
@@ -306,11 +306,11 @@ def head_depth_factor(head_world: Mesh, face: Int[np.ndarray, " n"], cameras: Se
 
 
 def metric_rig(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "c c"]:
-    """Returns the information (inverse covariance, over all cameras' corrections) that keeps the rig from shrinking or
-    growing: a common change of all distances to the head has the relative deviation ``RIG_SCALE_SPREAD``.
+    """Returns the information (inverse covariance, over all cameras' corrections) that prevents the rig from shrinking
+    or growing: a common relative change of all distances to the head has the standard deviation ``RIG_SCALE_SPREAD``.
 
     All distances come from one calibration board of known size. Images alone cannot determine them: a contour a tenth
-    of a pixel too far out would move every camera closer, and the surface with them.
+    of a pixel too far out would move every camera and the surface closer.
     """
     depth = np.array([camera.camera_from_world.apply(at_world)[2] for camera in cameras])
     nearer = np.zeros((len(depth), 6))
@@ -319,7 +319,7 @@ def metric_rig(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -
 
 
 def pixels_per_mm(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " k"]:
-    """Returns how many pixels a millimetre at ``at_world`` covers in each camera."""
+    """Returns how many pixels of each camera cover a millimetre at ``at_world``."""
     return np.array([c.intrinsics.fx / c.camera_from_world.apply(at_world)[2] for c in cameras])
 
 
@@ -353,8 +353,8 @@ def choose_views(
     patches: Patches, weights: Float[np.ndarray, " e"], facing: Float32[np.ndarray, "k s"], least_seen: float, most: int
 ) -> tuple[Int[np.ndarray, "c n"], Float[np.ndarray, "c n"]]:
     """Chooses the views that compare each patch: at most ``most`` of those that see it most frontally and nearly whole
-    (``least_seen``, a share). Returns them with their weights, the squared cosine between normal and line of sight; -1
-    and 0 where there are fewer."""
+    (at least the fraction ``least_seen``). Returns them with their weights, the squared cosine between normal and line
+    of sight; missing ones are -1 with weight 0."""
     total = patches.sums(weights, np.ones((facing.shape[1], 1)))
     seen = patches.sums(weights, (facing > 0).T.astype(float))
     cosine = patches.sums(weights, facing.T.astype(float)) / np.maximum(seen, 1e-9)
@@ -366,8 +366,8 @@ def choose_views(
 
 
 def sweep(samples: Samples, pictures: Pictures, steps: Float[np.ndarray, " d"]) -> Float32[np.ndarray, "s k d"]:
-    """Returns the grey value that each camera shows for every sample after it is moved along its normal by each of
-    ``steps`` (mm)."""
+    """Returns each camera's grey value for every sample after it is moved along its normal by each of ``steps``
+    (mm)."""
     cameras, count = samples.seen.shape
     out = np.zeros((count, cameras, len(steps)), np.float32)
     in_threads(count, lambda a, b: sweep_pictures(a, b, samples, pictures, steps, out))
@@ -388,7 +388,7 @@ def correlate(
     the normal; 0 if there is no pair.
 
     Gain and offset of a view have no effect. ``noise``, the standard deviation of each camera's grey values, is part of
-    the norm, so that patches without texture correlate with nothing. ``view`` and ``value`` are the results of
+    the norm, so patches without texture correlate with nothing. ``view`` and ``value`` are the results of
     ``choose_views``, ``grey`` that of ``sweep``.
     """
     score = np.zeros((len(patches.centre), grey.shape[2]), np.float32)
@@ -425,11 +425,11 @@ def camera_sensitivity(
     axes: Float[np.ndarray, "n 3"],
     cameras: tuple[Camera, ...],
 ) -> CameraSensitivity:
-    """Computes how the depths of n patches depend on the cameras.
+    """Computes the derivatives of n patches' depths by the cameras' poses.
 
     ``view``: the views of each patch, -1 for none. ``value``: their weights. ``grams``: the result of
     ``gram_matrices``. ``places``: the surface points of the patches, world, mm. ``axes``: unit normals along which they
-    move, world. ``cameras``: of the views, at their current poses.
+    move, world. ``cameras``: cameras of the views, at their current poses.
     """
     slopes, mixed = grams
     axis_value = np.repeat(value, 2, axis=1)  # of the 2 v image axes

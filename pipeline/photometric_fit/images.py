@@ -1,8 +1,8 @@
-"""Prepares the photographs for photo-consistency: grey, with their noise, with or without shading, and blurred.
+"""Prepares the photographs for photo-consistency: grey, with a noise level, with or without shading, and blurred.
 
-Shading varies slowly, and its glossy part moves with the camera. Where it is matched, the result lies behind a convex
-surface and before a concave one: by 3 to 5 mm on oily skin, with cameras 12 degrees apart. Pores, moles and lashes are
-fine and stay where they are.
+Shading varies slowly, and its glossy part moves with the camera. Matching it gives a surface behind a convex one and in
+front of a concave one: by 3 to 5 mm on oily skin, with cameras 12 degrees apart. Pores, moles and lashes are fine and
+fixed to the skin.
 """
 
 from collections.abc import Mapping
@@ -60,8 +60,8 @@ def fine_texture(photographs: Photographs, views: Views, px_per_mm: Float[np.nda
 def without_shading(
     grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"], sigma_px: float
 ) -> Float32[np.ndarray, "h w"]:
-    """Returns the difference between an image and its mean over a Gaussian window, into which the background does not
-    enter; 0 outside the silhouette."""
+    """Returns the difference between an image and its mean over a Gaussian window that ignores the background; 0
+    outside the silhouette."""
     out = np.zeros_like(grey)
     rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
     if not len(rows):
@@ -81,8 +81,8 @@ def distance_of(views: Views, k: int) -> Float32[np.ndarray, "h w"]:
 
 
 def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"], noise: float) -> bool:
-    """Tells whether the pixels inside the silhouette show more than noise, with more than half of them neither
-    overexposed nor black. A mask that was given as a photograph does not: it is a single value there."""
+    """Tells whether the pixels inside the silhouette vary by more than noise, and more than half of them are neither
+    overexposed nor black. A mask supplied as a photograph fails, because it is constant there."""
     if not inside.any():
         return False
     smooth = cv2.GaussianBlur(grey, (0, 0), TEXTURE_BLUR_PX)[inside]
@@ -95,8 +95,8 @@ def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h 
 def blurred(
     photographs: Photographs, sigma_px: Float[np.ndarray, " k"]
 ) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
-    """Blurs each image with its ``sigma_px``. Returns all of them one after another in a flat array, and the noise that
-    is left in each: a blur divides white noise by 2 sqrt(pi) sigma."""
+    """Blurs each image with its ``sigma_px``. Returns all images in sequence in a flat array, and the remaining noise
+    of each: a blur divides white noise by 2 sqrt(pi) sigma."""
     sigma = np.maximum(sigma_px, MIN_BLUR_PX)
     grey = photographs.grey
     smooth = map_in_threads(lambda k: cv2.GaussianBlur(grey[k], (0, 0), float(sigma[k])).ravel(), len(grey))

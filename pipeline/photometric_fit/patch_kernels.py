@@ -1,5 +1,5 @@
-"""Compiled loops of photo-consistency: the grey values that views show along the normals, their correlation, and the
-rows of the camera term (``depth_search`` has the equations). Threads share out the samples or patches.
+"""Compiled loops of photo-consistency: the views' grey values along the normals, their correlation, and the rows of the
+camera term (``depth_search`` has the equations). Threads share out the samples or patches.
 
 Shapes in the camera term: n patches, v views of each, a = 2 v image axes.
 """
@@ -15,8 +15,8 @@ from rig.jit import njit
 
 
 class Samples(NamedTuple):
-    """Holds at which pixel each of k cameras sees each of s samples, how that moves along the sample's normal (px per
-    mm), and whether the camera sees it."""
+    """Holds the pixel at which each of k cameras sees each of s samples, its motion for a step along the sample's
+    normal (px per mm), and whether the camera sees the sample."""
 
     pixel: Float[np.ndarray, "k s 2"]
     along: Float[np.ndarray, "k s 2"]
@@ -24,7 +24,7 @@ class Samples(NamedTuple):
 
 
 class Pictures(NamedTuple):
-    """Holds the grey images of all cameras in one flat array, one after the other, row by row."""
+    """Holds the grey images of all cameras in sequence in one flat array, row by row."""
 
     size: Int[np.ndarray, "k 2"]  # width, height
     offset: Int[np.ndarray, " k"]
@@ -33,8 +33,8 @@ class Pictures(NamedTuple):
 
 
 class Members(NamedTuple):
-    """Holds which samples belong to which patch, with their weights in its window. Those of patch p are
-    ``member[start[p]:start[p + 1]]``."""
+    """Holds the samples of each patch, with their weights in its window. Those of patch p are ``member[start[p]:start[p
+    + 1]]``."""
 
     start: np.ndarray
     member: np.ndarray
@@ -43,7 +43,7 @@ class Members(NamedTuple):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def read(image, start, width, height, x, y):
-    """Returns the bilinear value of an image at (x, y), limited to its inside. The image begins at index ``start`` of
+    """Returns the bilinear value of an image at (x, y), clamped to the image. The image begins at index ``start`` of
     the flat array ``image``."""
     x, y = held(x, width), held(y, height)
     column, row = int(x), int(y)
@@ -52,9 +52,8 @@ def read(image, start, width, height, x, y):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def sweep_pictures(first, last, samples, pictures, steps, out):
-    """Fills ``out`` (s, k, d) for samples ``first`` to ``last``: the grey value that camera k shows for a sample that
-    is moved along its normal by each of ``steps`` (d; mm). Entries of cameras that do not see the sample are left as
-    they are."""
+    """Fills ``out`` (s, k, d) for samples ``first`` to ``last``: camera k's grey value for a sample moved along its
+    normal by each of ``steps`` (d; mm). Entries of cameras that do not see the sample are left as they are."""
     pixel, along, seen = samples
     size, offset, image, _ = pictures
     for s in range(first, last):
@@ -73,7 +72,7 @@ def correlate_views(first, last, members, view, value, seen, grey, noise, score)
     views over all their pairs, weighted, at each of d steps along the normal. Patches with fewer than two views are
     left as they are.
 
-    With f the centred grey values of a view and v its weight, the squared norm of ``sum v f / |f|`` holds every pair
+    With f the centred grey values of a view and v its weight, the squared norm of ``sum v f / |f|`` counts every pair
     twice, and each view with itself; the latter part is subtracted. ``view`` and ``value`` (c, n) are the views of each
     patch (-1 for none) and their weights; ``grey`` (s, k, d) is the result of ``sweep_pictures``; ``noise`` (k) is part
     of the norm.
@@ -132,7 +131,7 @@ def correlate_views(first, last, members, view, value, seen, grey, noise, score)
 
 @njit(cache=True, nogil=True, fastmath=True)
 def write_image_motion(view, places, axes, cameras, ahead, slides):
-    """Fills how the image of each patch moves in each of its views: ``ahead`` (n, a; px per mm) when the patch moves
+    """Fills the motion of each patch's image in each of its views: ``ahead`` (n, a; px per mm) when the patch moves
     along its axis, and ``slides`` (n, a, 6; px per rad and mm) when the camera is corrected (rotation, translation,
     applied to camera_from_world on the left).
 
@@ -159,7 +158,7 @@ def write_image_motion(view, places, axes, cameras, ahead, slides):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def add_by_camera(view, pull, slides, by_camera):
-    """Fills how the depth of each patch depends on the cameras: adds ``pull * slides``, summed over the image axes of
+    """Fills the derivative of each patch's depth by the cameras: adds ``pull * slides``, summed over the image axes of
     each view, to the six columns of the view's camera in ``by_camera`` (n, 6 k), in place. ``pull`` (n, a) is the
     derivative of the depth by an image shift, ``slides`` (n, a, 6) that of the shift by the camera."""
     for n in range(len(view)):
@@ -207,7 +206,7 @@ def write_grams(first, last, chosen, members, view, shifts, samples, pictures, s
 
     Grey values are read with the surface moved by ``shifts`` (n; mm along the normals), weighted with the members'
     weights, centred and scaled to unit norm, with the noise as part of the norm. The slopes are the derivatives of
-    these (per px).
+    these values (per px).
     """
     start, member, weight = members
     pixel, along, seen = samples

@@ -1,9 +1,8 @@
-"""Chooses where photographs are compared: samples spread over the face region, and patches of samples around chosen
-vertices.
+"""Chooses where photographs are compared: samples over the face region, and patches of samples around chosen vertices.
 
-A patch is neither a square of an image nor a tangent plane, but a piece of the current surface. Its samples move with
-the head while it is fitted, so that all views of a patch are warped by the surface, lens distortion included.
-Overlapping patches share samples, so that every image is read once per sample, whatever the size of the patches.
+A patch is a piece of the current surface, neither a square of an image nor a tangent plane. Its samples move with the
+head during the fit, so the surface warps a patch into all its views, lens distortion included. Overlapping patches
+share samples, so every image is read once per sample, whatever the size of the patches.
 """
 
 from collections.abc import Mapping, Sequence
@@ -91,8 +90,8 @@ def spread_samples(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], spacing_mm: float
 ) -> tuple[Int32[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
     """Spreads points over triangles, about one for each square with an edge of ``spacing_mm``. Returns the triangle's
-    three vertices and the barycentric coordinates of each. A large triangle gets several points; of small ones only
-    some get one."""
+    three vertices and the barycentric coordinates of each. A large triangle gets several points; small triangles share
+    one."""
     a, b, c = (vertices[faces[:, j]] for j in range(3))
     wanted = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1) / spacing_mm**2
     splits = np.maximum(np.round(np.sqrt(wanted)), 1).astype(int)
@@ -118,7 +117,7 @@ def _centroids(k: int) -> Float[np.ndarray, "n 3"]:
 def thinned(
     vertices: Float[np.ndarray, "v 3"], rows: Int[np.ndarray, " n"], spacing_mm: float
 ) -> Int[np.ndarray, " c"]:
-    """Thins out the vertices ``rows``: keeps one for each cube with an edge of ``spacing_mm``, the one nearest to its
+    """Thins out the vertices ``rows`` to one for each cube with an edge of ``spacing_mm``, the one nearest to its
     middle."""
     scaled = vertices[rows] / spacing_mm
     cell = np.floor(scaled).astype(np.int64)
@@ -141,12 +140,12 @@ def under_hair(
     seen: Bool[np.ndarray, "k s"],
     centres: Float[np.ndarray, "c 3"],
 ) -> Bool[np.ndarray, " c"]:
-    """Tells which patches show hair or lie within ``REACH_MM`` of one that does: its window then reaches into the
-    hair, which stands off the skin. Photographs show hair sharply, but its surface is not the head's.
+    """Tells which patches show hair or lie within ``REACH_MM`` of one that does: their windows include hair, which lies
+    above the skin. Hair matches well in photographs, but its surface is not the head's.
 
     ``patches``: samples of the face and patches of them. ``hair``: probability that a pixel shows hair, by camera;
-    cameras without a map are ignored. ``names``: of the k cameras. ``pixel``: the pixel at which each camera sees each
-    sample. ``seen``: whether it sees the sample. ``centres``: of the patches, mm.
+    cameras without a map are ignored. ``names``: names of the k cameras. ``pixel``: the pixel at which each camera sees
+    each sample. ``seen``: whether it sees the sample. ``centres``: centres of the patches, mm.
     """
     total, views = np.zeros(pixel.shape[1]), np.zeros(pixel.shape[1])
     for k, name in enumerate(names):

@@ -1,12 +1,12 @@
 """Refines a fit to outlines with the photographs inside them, in the contour solver's own problem.
 
-Enters: a solved contour problem and the photographs. Leaves: the same problem, solved again with finer modes and with
+In: a solved contour problem and the photographs. Out: the same problem, solved again with finer modes and with
 observations of the surface. There are three rounds, from coarse to fine. Each patch of the current surface
 (``patches``) is moved along its normal through the images of the cameras that see it. The surface is observed where its
-views look most alike (``depth_search``), and the shifts that remain between the views correct the cameras
-(``depth_search``). A patch whose best match is weak or at the end of the search (hidden, glossy, without texture) is
-left out, and so is hair (``under_hair``). The observations enter the normal equations beside rims, features and priors
-(``surface_term``), robustly; where there are none, the kernels continue the surface smoothly.
+views look most alike; the remaining shifts between the views correct the cameras (``depth_search``). Two kinds of
+patches are left out: those whose best match is weak or at the end of the search (hidden, glossy, without texture), and
+those of hair (``under_hair``). The observations enter the normal equations together with rims, features and priors
+(``surface_term``), robustly; without observations, the kernels continue the surface smoothly.
 """
 
 import math
@@ -114,8 +114,8 @@ def rounds_of_rig(factor: float) -> tuple[Round, ...]:
 
     Each round has as many steps as usual, over a range ``factor`` times as wide. For each doubling of the factor, the
     last round is repeated once, and once more over half its range: with three cameras in front, outlines leave the
-    middle of a face undetermined by 8 mm, and large errors converge slowly. Shading is then removed in the last rounds,
-    too, since gloss looks like depth."""
+    middle of a face undetermined by 8 mm, and large errors converge slowly. Shading is then removed in the last rounds
+    as well, because gloss looks like depth."""
     more = round(math.log2(factor))
     wider = [replace(each, reach_mm=factor * each.reach_mm) for each in ROUNDS]
     wider[-1] = replace(wider[-1], with_shading=not more)
@@ -126,7 +126,7 @@ def rounds_of_rig(factor: float) -> tuple[Round, ...]:
 @lru_cache(maxsize=1)  # 150 MB; studios work with one model
 def finer(model: HeadModel) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
     """Returns the model with the fine kernel's modes added, its patches, and its modes at the patches' centres. All of
-    it depends on the model alone, and is kept for the next call."""
+    it depends on the model alone, and is cached."""
     length, amplitude = FINE_LENGTH_MM, FINE_AMPLITUDE_MM
     sizes = {
         "sample_mm": SAMPLE_MM,
@@ -155,8 +155,8 @@ def finer(model: HeadModel) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m 
 
 
 def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " v"]:
-    """Tells which vertices of the rim's mesh level lie near the full level's vertices ``hair``, those under hair. The
-    outline there is that of hair, and a fit to contours alone bulged into the hair at its border with the face."""
+    """Tells which vertices of the rim's mesh level lie near ``hair``, the full level's vertices under hair. The outline
+    there is that of hair: a fit to contours alone bulged into the hair at its border with the face."""
     mean = model.vertices(np.zeros(0))
     if not len(hair):
         return np.zeros(model.levels[LEVEL].count, bool)
@@ -166,11 +166,10 @@ def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray,
 def local_misfit_mm(
     model: HeadModel, seen: SurfaceObservations, state: State, lost: Int[np.ndarray, " u"]
 ) -> Float[np.ndarray, " v0"]:
-    """Returns, around each cage vertex, the RMS distance (mm) between the surface that photographs show and the fitted
-    one.
+    """Returns, around each cage vertex, the RMS distance (mm) between the photographed surface and the fitted one.
 
-    The vertices ``lost`` are seen by several cameras but have no match within the search; there the distance is taken
-    as ``LOST_MM``. An example are eyes that are open in the model and closed in the photographs. They affect only the
+    Several cameras see the vertices ``lost``, but find no match within the search; their distance is set to
+    ``LOST_MM``. An example is an eye that is open in the model and closed in the photographs. They affect only the
     surface around them. Away from the patches the misfit fades to 0."""
     skin = ~seen.bound
     off = surface_residual(seen, state.coefficients, state.world_from_head, state.camera_shift)[0][skin]

@@ -1,1 +1,1 @@
-"""Defines what a reconstruction consists of, and writes its result folder."""
+"""Defines the content of a reconstruction, and writes its result folder."""

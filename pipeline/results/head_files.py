@@ -1,10 +1,9 @@
-"""Writes the fitted head in every format that the settings ask for.
+"""Writes the fitted head in every format that the settings request.
 
 head.ply, head.obj: world frame, mm. head.glb, head.usdz: head frame, metres, y up. head.stl, head.3mf: closed, mm, z
 up. texture/albedo.png: in the layout of head.glb and head.obj, if the settings ask for it; so are the textures of
-texture sets. With a texture, the first
-vertices of head.glb are those of head.ply in the same order; the vertices on the texture's seam follow once more. With
-a normal map it has only some of them (``rows_of_ply``).
+texture sets. With a texture, the first vertices of head.glb are those of head.ply in the same order; the vertices on
+the texture's seam are repeated at the end. With a normal map it has only some of the vertices (``rows_of_ply``).
 """
 
 import math
@@ -52,7 +51,7 @@ PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # level 6 takes four times as long
 
 
 def write_head_ply(folder: Path, result: Reconstruction) -> None:
-    """Writes head.ply, and head.png if the settings ask for its texture. Raises OSError."""
+    """Writes head.ply, and head.png if the settings request its texture. Raises OSError."""
     atlas = result.texturing.atlas
     named = atlas is not None and result.settings.outputs.ply_texture
     corner_uv = atlas.layout.uv[atlas.layout.faces] if atlas is not None and named else None
@@ -107,7 +106,7 @@ def write_formats(folder: Path, result: Reconstruction, head: Mesh) -> None:
 
 
 def head_skin(result: Reconstruction, head: Mesh) -> Skin | None:
-    """Returns the texture that the head's files show, with its maps; None without one."""
+    """Returns the texture of the head's files, with its maps; None without a texture."""
     texturing, kind = result.texturing, result.settings.outputs.image
     atlas, sets = texturing.atlas, texturing.sets
     if atlas is None:
@@ -137,20 +136,20 @@ def plain_skin(atlas: Atlas | None, kind: str) -> Skin | None:
 
 
 def head_mesh(result: Reconstruction) -> Mesh:
-    """Returns the result's mesh in the head frame, in true millimetres: the rotation and translation of the pose are
-    undone, its scale is kept."""
+    """Returns the result's mesh in the head frame, in true millimetres: without the pose's rotation and translation,
+    but with its scale."""
     mesh = result.mesh_world
     return Mesh(head_from_world(result).apply(mesh.vertices), mesh.faces, result.texturing.vertices.colours)
 
 
 def head_from_world(result: Reconstruction) -> RigidTransform:
-    """Returns the transform from the world to the head frame, which keeps the pose's scale."""
+    """Returns the transform from the world to the head frame; lengths stay in true millimetres."""
     place = result.head.fit.world_from_head
     return RigidTransform(place.rotation, place.translation).inverse()
 
 
 def _glb(result: Reconstruction, head: Mesh, normals: Float[np.ndarray, "v 3"]) -> bytes:
-    """Encodes head.glb, with the shapes about the photographed head if the settings ask for them."""
+    """Encodes head.glb, with morph targets around the photographed head if the settings request them."""
     skin, extras, blendshape_rig = head_skin(result, head), asset_extras(result), result.evidence.blendshape_rig
     if result.texturing.reduced is not None and skin is not None and result.texturing.atlas is not None:
         mapped = normal_mapped(head.vertices, normals, result.texturing.atlas.layout, result.texturing.reduced)
@@ -217,7 +216,7 @@ def write_skin_maps(folder: Path, atlas: Atlas, maps: SkinMaps) -> None:
 
 
 def strength_png(specular: Specular) -> bytes:
-    """Returns glTF's specular strength as a PNG whose alpha it is; the colours of the pixels are white."""
+    """Returns glTF's specular strength as a PNG: the strength is its alpha, and the pixels are white."""
     alpha = specular.strength()
     white = np.full_like(alpha, 255)
     return cv2.imencode(".png", cv2.merge([white, white, white, alpha]), PNG_SPEED)[1].tobytes()
@@ -240,8 +239,8 @@ def landmarks_document(result: Reconstruction) -> dict[str, Any]:
 
 
 def uncertainty(std_mm: Float[np.ndarray, " 3"] | None) -> str:
-    """Returns the standard deviation as text: that of the distance, which no rotation changes, and those of the three
-    world coordinates, as in report.json."""
+    """Returns the standard deviation as text: that of the distance, which is independent of rotation, and those of the
+    three world coordinates, as in report.json."""
     if std_mm is None:
         return "standard deviation unknown"
     x, y, z = (float(value) for value in std_mm)

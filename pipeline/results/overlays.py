@@ -1,9 +1,9 @@
-"""Draws the pictures of a result: input and fitted contour over each image, the contact sheet, the turntable strip;
-and a head in clay or in colours, lit from its right front.
+"""Draws the pictures of a result: input and fitted contour over each image, the contact sheet, and the turntable strip;
+also a head in clay or in colours, lit from its right front.
 
-A contour is painted from its signed distance d, with opacity ``half width + 1/2 - |d|``, so that it is antialiased and
-lies where the sub-pixel contour lies. Vermilion and sky blue can be told apart with every kind of colour vision (Okabe
-and Ito, *Color Universal Design*, https://jfly.uni-koeln.de/color/); a dark border keeps them readable on any image.
+A contour is painted from its signed distance d, with opacity ``half width + 1/2 - |d|``, so it is antialiased and has
+sub-pixel position. Vermilion and sky blue can be told apart with every kind of colour vision (Okabe and Ito, *Color
+Universal Design*, https://jfly.uni-koeln.de/color/); a dark border keeps them readable on any image.
 """
 
 from collections.abc import Sequence
@@ -74,7 +74,7 @@ def tinted(image: ImageRgb, parts: Float32[np.ndarray, "h w 3"]) -> ImageRgb:
 
 
 def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> Resized:
-    """Draws the difference of eq. (4) over a pale copy of the image in a panel's size: sky blue where only the input
+    """Draws the difference of eq. (4) over a pale copy of the image, in a panel's size: sky blue where only the input
     mask is, vermilion where only the model is."""
     size = _fitted_size(image)
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -91,7 +91,7 @@ def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[n
 
 
 def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]]) -> ImageRgb:
-    """Returns the image with lines of text in its top left corner, each in its colour on a darkened ground."""
+    """Returns the image with lines of text on a darkened ground in its top left corner, each line in its own colour."""
     if not entries:
         return image
     scale = max(0.5, image.shape[1] / 1280)
@@ -119,8 +119,8 @@ def portrait(
     mesh: Mesh, colours: UInt8[np.ndarray, "v 3"], box: Box, azimuth_deg: float, panel: tuple[int, int], *,
     paper: tuple[int, int, int] = PAPER, lift: float = 0.0, share: float = 0.9,
 ) -> ImageRgb:  # fmt: skip
-    """Draws a mesh (head frame) from a direction about y and ``lift`` above it, supersampled twice. ``box``:
-    opposite corners of what fills this ``share`` of the ``panel`` (px)."""
+    """Draws a mesh (head frame) from a direction about y and ``lift`` above it, supersampled twice. ``box``: opposite
+    corners of the part of the mesh that fills ``share`` of the ``panel`` (px)."""
     centre, radius = (box[0] + box[1]) / 2, float(np.linalg.norm(box[1] - box[0])) / 2
     width, height = 2 * panel[0], 2 * panel[1]
     azimuth, distance = np.radians(azimuth_deg), 6.0 * radius
@@ -133,8 +133,8 @@ def portrait(
 
 
 def contact_sheet(rows: Sequence[Sequence[tuple[str, Resized]]], key: Sequence[str] = ()) -> Resized:
-    """Returns one picture of rows of labelled pictures, each fitted into a panel of ``PANEL``. Below them stands what
-    the colours of ``difference`` mean: ``key`` names that of the input and that of the model."""
+    """Returns one picture of rows of labelled pictures, each fitted into a panel of ``PANEL``. A key below them
+    explains the colours of ``difference``; ``key`` names the input and the model."""
     width = max(len(row) for row in rows)
     blank = np.full((PANEL[1], PANEL[0], 3), PAPER, np.uint8)
     drawn = [[legend(_panel(image), [(text, (255, 255, 255))] if text else []) for text, image in row] for row in rows]
@@ -165,8 +165,8 @@ def _fitted_size(image: ImageRgb) -> tuple[int, int]:
 
 
 def _smooth_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Returns the distance (px) to a mask's contour, blurred so that a thin line along it has no steps; infinite
-    farther than a margin from the mask."""
+    """Returns the distance (px) to a mask's contour, blurred so that a thin line along it is smooth; infinite beyond a
+    margin around the mask."""
     distance = np.full(mask.shape, np.inf, np.float32)
     window = box_around(mask, MARGIN_PX)
     if mask[window].size:
@@ -203,10 +203,10 @@ def clay(
 ) -> Resized:
     """Draws a mesh (head frame, mm), supersampled twice.
 
-    ``mesh``: the head. ``colours``: sRGB of its vertices; None draws clay. ``azimuth_deg``: direction from which it is
-    seen, 0 = from the front, positive from its left. ``panel``: width and height of the picture, px. ``box``: two
-    opposite corners (mm) of what fills the picture, so that several meshes can share a scale; None fits the mesh.
-    ``paper``: sRGB of the background. ``darkest``: brightness of surfaces in full shadow.
+    ``mesh``: the head. ``colours``: sRGB of its vertices; None draws clay. ``azimuth_deg``: viewing direction, 0 from
+    the front, positive from the head's left. ``panel``: width and height of the picture, px. ``box``: two opposite
+    corners (mm) of the drawn part, so that several meshes can share a scale; None fits the mesh. ``paper``: sRGB of the
+    background. ``darkest``: brightness of surfaces in full shadow.
     """
     fitting = (mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) if box is None else box
     shaded = lit(mesh, colours, darkest)

@@ -1,4 +1,4 @@
-"""Pages of a PDF: A4, in the fonts that every reader has, with lines, tables and pictures."""
+"""Draws pages of a PDF: A4, in the fonts that every reader has, with lines, tables and pictures."""
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -26,20 +26,20 @@ class PdfPage(FPDF):
         self.set_auto_page_break(False)
 
     def line_of(self, text: str, *, size: float = 9, bold: bool = False, ink: tuple[int, int, int] = INK) -> None:
-        """Draws a line or, where it is too long, several."""
+        """Draws a line of text, wrapped if it is too long."""
         self.set_font("Helvetica", style="B" if bold else "", size=size)
         self.set_text_color(*ink)
         self.multi_cell(WIDTH_MM, LINE_MM * size / 9, latin(text), align="L", new_x="LMARGIN", new_y="NEXT")
 
     def pictures_of(self, row: Sequence[Resized], width_mm: float) -> None:
-        """Draws pictures side by side, each ``width_mm`` wide, and goes below them."""
+        """Draws pictures in a row, each ``width_mm`` wide, and moves below them."""
         top, height = self.get_y(), width_mm * row[0].shape[0] / row[0].shape[1]
         for column, image in enumerate(row):
             self.image(encode_image(".jpg", image, JPEG_OPTIONS), x=MARGIN_MM + column * width_mm, y=top, w=width_mm)
         self.set_y(top + height)
 
     def scale_of(self, legend: Resized, ends: tuple[str, str]) -> None:
-        """Draws a scale of colours with words at both of its ends and 0 in its middle, and goes below it."""
+        """Draws a colour scale with words at both ends and 0 in the middle, and moves below it."""
         left, top, width = MARGIN_MM + 39, self.get_y(), 100
         self.image(encode_image(".jpg", legend, JPEG_OPTIONS), x=left, y=top, w=width, h=4)
         self.set_y(top + 4)
@@ -52,7 +52,7 @@ class PdfPage(FPDF):
     def table_of(
         self, header: Sequence[str], rows: Sequence[Sequence[str]], widths_mm: Sequence[float], inks: dict[int, tuple]
     ) -> None:
-        """Draws a table. ``inks``: colour of the last cell, by row."""
+        """Draws a table. ``inks``: colour of each row's last cell."""
         for number, row in enumerate([header, *rows], -1):
             self.set_font("Helvetica", style="B" if number < 0 else "", size=8.5)
             for column, (text, width) in enumerate(zip(row, widths_mm, strict=True)):

@@ -1,7 +1,7 @@
 """Defines what a reconstruction is: the products of the stages, which ``pipeline.results.write`` writes.
 
-It holds everything that the result folder shows and nothing that depends on where or when it was made, apart from the
-seconds of the stages (those reach report.json only, never head.ply).
+It holds everything that the result folder contains. Nothing in it depends on place or time, except the seconds of the
+stages (which reach report.json only, never head.ply).
 """
 
 from collections.abc import Mapping
@@ -60,7 +60,7 @@ class Reconstruction:
         return self.refined.mesh_world
 
     def widen_by_scale(self, sigma: float) -> "Reconstruction":
-        """Returns the result with deviations that also hold for cameras whose common scale has the relative standard
+        """Returns the result with standard deviations widened for cameras whose common scale has the relative standard
         deviation ``sigma``, about the head's origin."""
         centre = self.head.fit.world_from_head.translation
 

@@ -1,4 +1,4 @@
-"""``report.json`` of a result (format ``eigenhead-report/1``): everything that a program may want to know of it."""
+"""Builds ``report.json`` of a result (format ``eigenhead-report/1``) for other programs."""
 
 import math
 from collections.abc import Iterable, Mapping

@@ -8,7 +8,7 @@ FORMAT = "eigenhead-report/1"
 
 
 class ViewReport(TypedDict):
-    """Describes how far a camera's silhouette was trusted."""
+    """Describes the quality of a camera's silhouette."""
 
     usable: bool
     contrast: float | None
@@ -46,9 +46,9 @@ class FaceReport(TypedDict):
 
 
 class PoseReport(TypedDict):
-    """Describes how the pose was found: the method (landmarks, features or silhouettes), how much more the best other
-    pose costs (a share), how far the head's landmarks lie from those in each camera's picture (relative to the face's
-    size), and whether the pose is in doubt."""
+    """Describes the pose: its method (landmarks, features or silhouettes), the relative extra cost of the best other
+    pose, the distance of the head's landmarks from those in each camera's picture (relative to the face's size), and
+    whether the pose is doubtful."""
 
     method: str
     rival: float | None
@@ -86,10 +86,10 @@ class GazeReport(TypedDict):
 
 
 class EyeReport(TypedDict):
-    """Describes an eye. ``seen`` is false where its iris was not found, and ``cause`` says why: ``closed``,
-    ``few-views``, ``coarse`` (too few pixels) or ``unclear`` (no clear border of the iris); all else is null then.
+    """Describes an eye. ``seen`` is false where its iris was not found. ``cause`` then says why (``closed``,
+    ``few-views``, ``coarse``: too few pixels, ``unclear``: no clear border of the iris), and all other fields are null.
 
-    ``iris`` is the middle of the limbus (world, mm), ``radius`` the limbus' (mm). ``gaze`` is the unit vector of the
+    ``iris`` is the middle of the limbus (world, mm), ``radius`` its radius (mm). ``gaze`` is the unit vector of the
     optical axis (world), ``std_deg`` its standard deviation in each direction. Azimuth and elevation of ``rig`` are in
     the world frame (from z towards x, then towards y), of ``face`` in the head frame (to the subject's left, up)."""
 
@@ -115,17 +115,17 @@ class ExpressionReport(TypedDict):
 
 
 class MorphsReport(TypedDict):
-    """Describes the morph targets of posed.glb: the weights that give the head as photographed, and those of Apple's
-    names that move nothing because the model has no counterpart."""
+    """Describes the morph targets of posed.glb: the weights for the head as photographed, and those of Apple's names
+    that move nothing because the model has no counterpart."""
 
     weights: dict[str, float]
     without_counterpart: list[str]
 
 
 class TemplateReport(TypedDict):
-    """Describes the template in whose vertex order head-NAME.obj is. ``sha256`` is that of its mesh's file;
-    ``registration`` has the figures that ``eigenhead template add`` printed, ``flame`` those of its FLAME
-    model's fit, where it has one."""
+    """Describes the template whose vertex order head-NAME.obj has. ``sha256`` is that of its mesh's file.
+    ``registration`` has the figures that ``eigenhead template add`` printed; ``flame`` has those of its FLAME model's
+    fit, if it has one."""
 
     name: str
     source: str
@@ -135,8 +135,8 @@ class TemplateReport(TypedDict):
 
 
 class SimilarityReport(TypedDict):
-    """Describes x_world = scale (rotation x_head + translation), mm. In the paper's form (section 4.2), which this is,
-    the scale applies to the translation, too."""
+    """Describes x_world = scale (rotation x_head + translation), mm. This is the paper's form (section 4.2), in which
+    the scale also applies to the translation."""
 
     scale: float
     rotation: list[list[float]]
@@ -144,8 +144,8 @@ class SimilarityReport(TypedDict):
 
 
 class HairReport(TypedDict):
-    """Describes head_hair.ply: the share of the bust's hair that it comes within 2 mm of, and its largest height above
-    the skin (mm)."""
+    """Describes head_hair.ply: the fraction of the bust's hair within 2 mm of it, and its largest height above the skin
+    (mm)."""
 
     covered_share: float
     highest_mm: float
@@ -154,7 +154,7 @@ class HairReport(TypedDict):
 class BustReport(TypedDict):
     """Describes the bust, the whole visible surface. ``closed`` says whether every edge has two faces. ``flipped`` and
     ``crossing`` count triangles, ``folded`` counts edges. Of its vertices on the face, ``face_silent_share`` is the
-    share that no view's depth agrees with, and ``guessed_share`` the share that the head did not measure either."""
+    fraction without support by any view's depth, and ``guessed_share`` the part of it that the head did not measure."""
 
     spacing_mm: float
     vertices: int
@@ -172,9 +172,9 @@ class BustReport(TypedDict):
 
 
 class SkinReport(TypedDict):
-    """Describes the maps in texture/. A code of the displacement map is ``mm_per_code`` along the normal of head.ply,
-    from ``mid_code`` on. ``repeated`` is the share of the shading's power that two disjoint sets of views both show, by
-    octave of wavelength from the longest."""
+    """Describes the maps in texture/. A code of the displacement map is ``mm_per_code`` along the normal of head.ply;
+    ``mid_code`` is zero. ``repeated`` is the fraction of the shading's power that two disjoint sets of views both show,
+    by octave of wavelength, the longest first."""
 
     size: int
     mm_per_code: float
@@ -188,9 +188,9 @@ class SkinReport(TypedDict):
 
 
 class SpecularReport(TypedDict):
-    """Describes texture/specular: the exposure of each camera's parallel picture by that of its crossed one, the light
-    below zero by that above before it was cut off, the share of mirrored light that is a strength of 1 in head.glb, and
-    the material's roughness, which is assumed."""
+    """Describes texture/specular: each camera's exposure ratio (parallel to crossed picture), the ratio of negative to
+    positive light before clipping, the fraction of mirrored light at strength 1 in head.glb, and the material's assumed
+    roughness."""
 
     exposure: dict[str, float]
     negative: float
@@ -208,7 +208,7 @@ class SetsReport(TypedDict):
 
 
 class TextureReport(TypedDict):
-    """Describes the head's colours. ``filled`` counts the vertices that no photograph coloured; ``gains`` are factors
+    """Describes the head's colours. ``filled`` counts the vertices whose colour was interpolated; ``gains`` are factors
     of linear RGB, by camera."""
 
     vertices: int
@@ -221,7 +221,7 @@ class TextureReport(TypedDict):
 
 
 class DetailReport(TypedDict):
-    """Describes which level of detail the fit reached, and why that one."""
+    """Describes which level of detail the fit reached, and the reason."""
 
     level: str
     reason: str
@@ -265,6 +265,6 @@ class Report(TypedDict):
 
 
 class AddedReport(TypedDict, total=False):
-    """Declares the fields of the report that writers beside the method's own may fill; they are None without."""
+    """Declares the report's fields for writers outside the method; they are None without such writers."""
 
     template: TemplateReport

@@ -1,8 +1,8 @@
-"""Writes a capture as a data set of views: undistorted pictures, masks, and the files that say where each was taken.
+"""Writes a capture as a data set of views: undistorted pictures, masks, and files with their cameras.
 
-Enters: a capture, its silhouettes and rig. Leaves: the folder described in ``rig.formats.cameras.dataset_json``, of the
-views that take part. For GaussianAvatars the pictures show the subject on white, by pinhole cameras with square pixels
-and the principal point in the middle; for nerfstudio they keep background and camera matrix.
+In: a capture, its silhouettes and rig. Out: the folder described in ``rig.formats.cameras.dataset_json``, with the used
+views. For GaussianAvatars the pictures show the subject on white, by pinhole cameras with square pixels and the
+principal point in the middle. For nerfstudio they have the original background and camera matrix.
 """
 
 import math
@@ -41,8 +41,8 @@ THREADS = 4  # a view of four megapixels takes half a gigabyte while it is resam
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewDataset:
-    """Holds what a data set is made of. ``head_world`` is a surface in the capture's world frame (mm) from which
-    training may start, ``flame`` its parameters there."""
+    """Holds the content of a data set. ``head_world`` is a surface in the capture's world frame (mm) from which
+    training may start; ``flame`` is its FLAME parameters."""
 
     capture: Capture
     rig: Rig
@@ -52,7 +52,7 @@ class ViewDataset:
 
     @property
     def rig_used(self) -> Rig:
-        """Returns the cameras whose views take part."""
+        """Returns the cameras whose views are used."""
         return self.rig.subset(name for name, view in self.silhouettes.items() if view.quality.usable)
 
 
@@ -97,8 +97,8 @@ def _write_view(folder: Path, dataset: ViewDataset, camera: Camera, pinholes: Ri
 
 
 def _subject_share(dataset: ViewDataset, name: str) -> Plane:
-    """Returns the share of the subject in every pixel, 0 to 1: of a mask in the capture as it is, else of the sub-pixel
-    contour that was found."""
+    """Returns the subject's share in every pixel, 0 to 1: from the capture's mask if it has one, else from the
+    sub-pixel contour."""
     capture = dataset.capture
     if name in capture.soft_masks:
         return capture.soft_masks[name].astype(np.float32) / np.float32(255.0)
@@ -117,7 +117,7 @@ SPLINE_ORDER = 3
 
 def pinhole_of(lens: Intrinsics, *, centred: bool = False) -> Intrinsics:
     """Returns the same camera without distortion. If ``centred``, it has square pixels and the principal point in the
-    middle of the picture, as formats require that state only a field of view."""
+    middle of the picture, for formats that state only a field of view."""
     if not centred:
         return Intrinsics(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
     focal = math.sqrt(lens.fx * lens.fy)
@@ -125,7 +125,7 @@ def pinhole_of(lens: Intrinsics, *, centred: bool = False) -> Intrinsics:
 
 
 def undistorted_picture(picture: Photograph, lens: Intrinsics, pinhole: Intrinsics) -> UInt8[np.ndarray, "y x 3"]:
-    """Returns the picture that ``pinhole`` would have taken instead; black where the lens shows nothing."""
+    """Returns the picture that ``pinhole`` would have taken; black where the lens shows nothing."""
     if lens == pinhole:
         return picture
     places = _sampled_pixels(lens, pinhole)
@@ -145,8 +145,8 @@ def undistorted_share(share: Plane, lens: Intrinsics, pinhole: Intrinsics) -> Fl
 
 
 def _sampled_pixels(lens: Intrinsics, pinhole: Intrinsics) -> Float[np.ndarray, "2 y x"]:
-    """Returns the row and column of the lens's picture for every pixel of the pinhole's; -1 beyond the turning radius
-    of the distortion."""
+    """Returns the row and column of the lens's picture for every pixel of the pinhole's; -1 beyond the radius up to
+    which the distortion is valid."""
     rows, columns = np.mgrid[: pinhole.height, : pinhole.width].astype(float)
     rays = np.stack([(columns - pinhole.cx) / pinhole.fx, (rows - pinhole.cy) / pinhole.fy], axis=-1).reshape(-1, 2)
     pixels = lens.distortion.apply(rays) * (lens.fx, lens.fy) + (lens.cx, lens.cy)

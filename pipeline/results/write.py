@@ -1,4 +1,4 @@
-"""The result folder of docs/capture-format.md, and the pictures beside it.
+"""Writes the result folder of docs/capture-format.md, and its pictures.
 
     head.ply  head.glb  report.json  overlays/<camera>.png     fixed by docs/capture-format.md
     bust.ply  bust.glb  the whole visible surface; settings.outputs.surface says which of the two is written, or both
@@ -11,8 +11,8 @@
     texture/sets/       a texture of each texture set; of polarised light texture/diffuse and texture/specular
     landmarks.mrk.json  on request: the landmarks as a point list of 3D Slicer
 
-Applications write further files, and fill fields of report.json, by a ``ResultWriter``. Files of the same input, model,
-settings and version are the same bytes, report.json's seconds excepted.
+Applications add files and fields of report.json by a ``ResultWriter``. The same input, model, settings and version give
+the same bytes, except for the seconds in report.json.
 """
 
 import json
@@ -52,7 +52,7 @@ THREADS = 4  # cv2, NumPy and the rasteriser release the interpreter lock, and e
 
 @runtime_checkable
 class ResultWriter(Protocol):
-    """Declares what ``write_result`` calls, in a thread of its own, for files that the method does not know."""
+    """Declares a writer of files that the method does not know; ``write_result`` calls it in a thread of its own."""
 
     def __call__(self, folder: Path, result: Reconstruction, /) -> AddedReport | None:
         """Writes files of its own into ``folder``, each under a temporary name first. Returns the fields that it fills
@@ -128,7 +128,7 @@ def _write_hair(folder: Path, result: Reconstruction, hair: HairyHead) -> None:
 
 
 def write_neutral(folder: Path, result: Reconstruction) -> None:
-    """Writes neutral.glb, with the texture of the photographed head, if the settings ask for it and the model has
+    """Writes neutral.glb, with the texture of the photographed head, if the settings request it and the model has
     expressions. Raises OSError."""
     if result.evidence.blendshape_rig is None or not result.settings.outputs.neutral:
         return

@@ -1,10 +1,10 @@
-"""Estimates what the clean plate would look like behind the subject, at the moment of the shot.
+"""Estimates the background behind the subject at the moment of the shot, from the clean plate.
 
 Between plate and shot the lamps drift, and a camera may change its exposure. So the plate is multiplied by a smooth
-gain field, one for each channel, estimated from the pixels that still look like the plate. It starts at the mode of the
-log ratio, which is the background's however large the subject is, because the subject's ratios have no common value.
-The noise is measured from the residuals: as a curve over brightness (photon noise grows with it), and by pixel where
-several plates show more.
+gain field for each channel, estimated from the pixels that still show the background. The estimate starts at the mode
+of the log ratio of image to plate. The mode is the background's, even for a large subject, because the subject's ratios
+have no common value. The noise is measured from the residuals: as a function of brightness (photon noise grows with
+it), and for each pixel if several plates show more noise there.
 """
 
 from dataclasses import dataclass
@@ -31,8 +31,8 @@ STEPS = 4  # of reweighting; the field moves by less than 0.1 grey level after t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Background:
-    """Holds the clean plates and what makes them look like the background of the image: a gain field, the noise, and
-    which pixels show the background."""
+    """Holds the clean plates and their fit to the image: a gain field, the noise, and which pixels show the
+    background."""
 
     plates: UInt8[np.ndarray, "p h w 3"]
     field: CoarsePicture  # what their mean is multiplied by
@@ -43,14 +43,14 @@ class Background:
 
 
 def coarse_size(shape: tuple[int, ...], width: int) -> tuple[int, int]:
-    """Returns the width and height (px) of the coarse level: those of the image divided by the whole number that brings
-    its width nearest to ``width``."""
+    """Returns the width and height (px) of the coarse level: the image's, divided by the integer that brings the width
+    nearest to ``width``."""
     factor = max(1, round(shape[1] / width))
     return max(1, shape[1] // factor), max(1, shape[0] // factor)
 
 
 def plate_tolerance(levels: Picture) -> Picture:
-    """Returns by how many levels a plate of these levels may be off where nothing happened."""
+    """Returns the difference (levels) to a plate that is still taken for unchanged background."""
     return TOLERANCE_LEVELS + TOLERANCE_SHARE * levels
 
 
@@ -132,8 +132,8 @@ def _noise_by_level(
     plate_coarse: CoarsePicture,
     inliers: Bool[np.ndarray, "hc wc"],
 ) -> CoarsePicture:
-    """Estimates the noise (levels) of every coarse pixel from its brightness, by a curve measured on the background
-    pixels."""
+    """Estimates the noise (levels) of every coarse pixel from its brightness. The function of brightness is measured on
+    the background pixels."""
     rows, columns = np.arange(3, image.shape[0], 6), np.arange(3, image.shape[1], 6)  # 20,000 samples are enough
     at = np.ix_(rows * inliers.shape[0] // image.shape[0], columns * inliers.shape[1] // image.shape[1])
     kept = inliers[at]

@@ -1,14 +1,14 @@
-"""Decides what is subject and what is background, at a coarse level, where averaging reduces the noise to a quarter.
+"""Decides which pixels show the subject. It works at a coarse level, where averaging reduces the noise to a quarter.
 
-The log odds of foreground against the corrected background (``pipeline.segmentation.background``), in which soft
-shadows count as background, are smoothed by mean-field sweeps. Their links are cut where the *difference* to the plate
-has an edge (Sun et al., *Background Cut*, ECCV 2006), so that edges of the backdrop cut nothing. A pixel that looks
-like the plate proves something only where the subject looks different: ``Decision.clear``. Elsewhere, and where a
-shadow might be a coat, the other cameras are asked (``pipeline.segmentation.segment``), and ``reconsider`` decides
-again.
+It computes each pixel's log odds of foreground against the corrected background (``pipeline.segmentation.background``),
+counting soft shadows as background, and smooths them by mean-field sweeps. Links between neighbours are cut where the
+*difference* to the plate has an edge (Sun et al., *Background Cut*, ECCV 2006), so edges of the backdrop itself cut
+nothing. A pixel like the plate is surely background only where the subject has another colour: ``Decision.clear``.
+Elsewhere, and where a shadow might be a coat, ``pipeline.segmentation.segment`` asks the other cameras, and
+``reconsider`` decides again.
 
-Soft shadows on the backdrop and light that the subject reflects onto it do not belong to the subject; they are found at
-the coarse level.
+Soft shadows on the backdrop, and light that the subject reflects onto it, count as background; the coarse level finds
+them.
 """
 
 from dataclasses import dataclass, replace
@@ -87,7 +87,7 @@ class Decision:
 
 
 def decide(image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...]) -> Decision:
-    """Decides which pixels of one image show the subject, by comparing it with its clean plates at a coarse level."""
+    """Decides which pixels of one image show the subject, by a comparison with its clean plates at a coarse level."""
     size = coarse_size(image.shape, COARSE_COLUMNS)
     coarse = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     background = estimate_background(image, coarse, empty_plates(plates))
@@ -118,14 +118,14 @@ def decide(image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_
 
 def doubtful(decision: Decision) -> Mask:
     """Tells which pixels outside the mask might still be the subject: those near it where the subject and the plate
-    look alike. Other cameras are asked about them."""
+    look alike. The other cameras decide about them."""
     near = dilated(decision.mask, REACH) & ~decision.mask
     return near & ~decision.clear & (decision.own_odds > -ALLOWED)
 
 
 def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"]) -> Decision:
     """Returns the decision revised by the other cameras. ``dissent`` counts, for each doubtful pixel, the cameras that
-    rule the subject out there; it is negative where they were not asked."""
+    exclude the subject there; it is negative where they were not consulted."""
     prior = np.where(dissent == 0, ALLOWED, np.where(dissent >= 3, -DENIED, 0.0))
     revised = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MAX_ODDS, MAX_ODDS)
     odds = np.where(dissent >= 0, revised, decision.odds).astype(np.float32)
@@ -137,8 +137,8 @@ def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"]) -> Decision:
 
 
 def _subject_colour_odds(image: Picture, mask: Mask, paint: Picture, chi2: Plane, variance: Picture) -> Plane:
-    """Returns the log odds that a pixel has a colour of the subject rather than the plate: the subject's colour nearby,
-    in the best shade, or any colour found in the mask."""
+    """Returns the log odds that a pixel has a colour of the subject instead of the plate's: the subject's colour nearby
+    in its best shade, or any colour inside the mask."""
     nearby = 0.5 * (chi2 - colours_apart(paint, image, variance) ** 2) - PAINT_ODDS
     bins = (image / (256 / PALETTE)).astype(np.int32).clip(0, PALETTE - 1)
     counts = np.zeros((PALETTE,) * 3, np.float32)
@@ -152,9 +152,9 @@ def _subject_colour_odds(image: Picture, mask: Mask, paint: Picture, chi2: Plane
 
 
 def find_mixtures(image: UInt8[np.ndarray, "_ _ 3"], coarse: Picture, background: Background) -> tuple[Plane, Plane]:
-    """Returns the squared difference of each coarse pixel from the plate (mean over the channels), and a measure of how
-    much the pixel mixes subject and plate, as at strands of hair: the variance of its quarters relative to that
-    difference. Quarters they are in pictures of any size, so that the measure does not depend on it."""
+    """Returns the squared difference of each coarse pixel from the plate (mean over the channels), and how much the
+    pixel mixes subject and plate, as strands of hair do: the variance of its quarters relative to that difference. A
+    pixel has four quarters at every picture size, so the measure does not depend on the size."""
     size = coarse.shape[1::-1]
     averaged = 2 * size[0] < image.shape[1]
     quarters = _quarters(image, (2 * size[0], 2 * size[1]))
@@ -168,8 +168,8 @@ def find_mixtures(image: UInt8[np.ndarray, "_ _ 3"], coarse: Picture, background
 
 
 def _quarters(image: UInt8[np.ndarray, "_ _ 3"], size: tuple[int, int]) -> Float32[np.ndarray, "_ _ 3"]:
-    """Returns the quarters of coarse pixels, an image of ``size`` (width, height): means over areas or, if the image is
-    smaller than that, interpolated."""
+    """Returns the quarters of coarse pixels, as an image of ``size`` (width, height): means over areas, or interpolated
+    values if the image is smaller."""
     method = cv2.INTER_AREA if size[0] <= image.shape[1] else cv2.INTER_LINEAR
     return cv2.resize(image, size, interpolation=method).astype(np.float32)
 
@@ -195,9 +195,9 @@ def colours_apart(colour: Picture, other: Picture, variance: Picture) -> Plane:
 
 
 def _other_colour(difference: Picture, paint: Picture, plate: Picture, variance: Picture) -> tuple[Mask, Plane]:
-    """Finds faint differences to the plate that neither a shadow nor a mixture with the subject's colour nearby
-    (``paint``) explains, so that the subject has another colour there. Also returns the chi-squared left unexplained,
-    over the mean of nine pixels."""
+    """Finds faint differences to the plate where the subject probably has another colour: neither a shadow nor a
+    mixture with the subject's colour nearby (``paint``) explains them. Also returns the remaining chi-squared, averaged
+    over nine pixels."""
     weight = 3 / variance  # of a mean over nine pixels, whose errors are not all their own
     faint = ((difference**2 * weight) @ CHANNEL_SUM < MAX_FAINT_CHI2).astype(np.float32)
     mean = cv2.blur(difference * faint[:, :, None], (3, 3)) / np.maximum(cv2.blur(faint, (3, 3)), 0.1)[:, :, None]
@@ -212,8 +212,8 @@ def _other_colour(difference: Picture, paint: Picture, plate: Picture, variance:
 
 
 def _closed(mask: Mask) -> Mask:
-    """Returns the mask with gaps of up to four coarse pixels closed. The matting opens real gaps, as between locks of
-    hair, again; where the subject has the backdrop's colour it cannot, and the mask stays whole."""
+    """Returns the mask with gaps of up to four coarse pixels closed. The matting opens real gaps again, for example
+    between locks of hair. Where the subject has the backdrop's colour, it cannot, and the mask stays whole."""
     padded = np.pad(mask, CLOSING, mode="edge")
     return eroded(dilated(padded, CLOSING), CLOSING)[CLOSING:-CLOSING, CLOSING:-CLOSING]
 
@@ -253,7 +253,7 @@ def smooth_odds(odds: Plane, image: Picture, background: Background) -> Float[np
 
 def find_shadows(image: Picture, plate: Picture, chi2: Plane, variance: Picture, odds: Plane) -> tuple[Plane, Mask]:
     """Returns the chi-squared of each pixel against the plate in its best shade, and which pixels are soft shadows or
-    reflected light: they differ from the plate, a darker or brighter shade explains them, and they begin gradually."""
+    reflected light. Those differ from the plate, a darker or brighter shade explains them, and they begin gradually."""
     ratio = ((image * plate / variance) @ CHANNEL_SUM) / np.maximum((plate**2 / variance) @ CHANNEL_SUM, 1e-6)
     strength = np.sqrt(chi2 / (2 * ANY_COLOUR_ODDS))
     best, soft = chi2, np.zeros(odds.shape, bool)
@@ -267,10 +267,10 @@ def find_shadows(image: Picture, plate: Picture, chi2: Plane, variance: Picture,
 
 
 def _soft_shadows(candidate: Mask, depth: Plane, strength: Plane) -> Mask:
-    """Returns the candidates that begin softly, with plain background beside them that is already darker. A coat begins
-    abruptly, also within a shadow, and is not included.
+    """Returns the candidates that begin gradually, next to plain background that is already darker. A coat begins
+    abruptly, even within a shadow, and is left out.
 
-    ``strength`` is the difference to the plate, 1 where it is first noticed.
+    ``strength`` is the difference to the plate; 1 is the smallest that is noticed.
     """
     across, down = (cv2.Sobel(depth, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0))
     candidate = candidate & (across**2 + down**2 < STEEP**2)
@@ -293,6 +293,6 @@ def _soft_shadows(candidate: Mask, depth: Plane, strength: Plane) -> Mask:
 
 
 def _means(values: Plane, where: Mask, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the mean value of each component, over the pixels ``where``, and how many pixels that is."""
+    """Returns the mean value of each component over the pixels ``where``, and the number of these pixels."""
     sizes = np.bincount(labels[where], minlength=count)
     return np.bincount(labels[where], values[where], count) / np.maximum(sizes, 1), sizes

@@ -24,9 +24,9 @@ def mean_field_sweeps(odds: np.ndarray, residual: np.ndarray, strength: float, s
     """Returns half the log odds (h, w) of each pixel after mean-field sweeps over its eight neighbours, by Gauss-Seidel
     in alternating order.
 
-    ``odds`` (h, w) are the log odds of each pixel by itself. Two neighbours are linked by ``strength``, less the more
-    their ``residual`` (h, w, c; standard deviations) differs: the coupling is strength exp(-|difference|^2 / 18), and
-    0.71 of that along diagonals.
+    ``odds`` (h, w) are the log odds of each pixel by itself. Two neighbours are coupled by strength exp(-|difference|^2
+    / 18), where the difference is that of their ``residual`` (h, w, c; standard deviations); along diagonals by 0.71 of
+    that.
     """
     height, width = odds.shape
     steps = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -63,8 +63,8 @@ def mean_field_sweeps(odds: np.ndarray, residual: np.ndarray, strength: float, s
 
 @njit(cache=True, nogil=True)
 def undecided_pixels(odds: np.ndarray) -> np.ndarray:
-    """Returns the pixels (flat indices) that can change: those within two pixels of one whose log odds are not clipped,
-    or differ from theirs."""
+    """Returns the pixels (flat indices) that can change. A pixel can change if, within two pixels of it, log odds are
+    not clipped or differ from its own."""
     height, width = odds.shape
     out = np.empty(height * width, np.int64)
     count = 0
@@ -95,7 +95,7 @@ def least_dissent(
     if no point is seen by ``MIN_WITNESSES`` cameras. Numbers above ``MAX_DISSENT`` are not counted further.
 
     ``origin`` (3) and ``rays`` (n, 3) are in the world frame; points lie at distances in ``span`` (mm) along them.
-    ``cameras`` are rows of ``packed_camera``; ``distances`` (k, h, w) the distances (px) to each camera's mask,
+    ``cameras`` are rows of ``packed_camera``. ``distances`` (k, h, w) are distances (px) to each camera's mask,
     negative where unknown, in images reduced by ``scales`` (k).
     """
     out = np.full(len(rays), -1, np.int8)
@@ -135,8 +135,8 @@ def least_dissent(
 
 @njit(cache=True, nogil=True, inline="always")
 def corner_of(x: int, size: int, small: int) -> tuple[int, float]:
-    """Returns the pixel of a smaller image (``small`` pixels along this side) before the centre of pixel ``x`` of a
-    larger one (``size``), and the fraction of the way to the next one."""
+    """Maps the centre of pixel ``x`` of a larger image (``size`` pixels along this side) into a smaller one
+    (``small``); returns the pixel before it and the fraction of the way to the next one."""
     at = min(max((x + 0.5) * small / size - 0.5, 0.0), small - 1.0)
     low = min(int(at), max(small - 2, 0))
     return low, at - low
@@ -171,9 +171,9 @@ def solve_alpha(
     first: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Computes how much of each pixel is subject (alpha), from image I, background B and the subject's colour F, all in
-    linear light: the least-squares solution of I - B = q F - alpha B. Here q, the brightness of the subject times
-    alpha, is near alpha and at most ``BRIGHTEST`` times it, and alpha is near the coarse ``probability``, both as
-    ``sigmas`` say.
+    linear light. It is the least-squares solution of I - B = q F - alpha B. Here q is alpha times the subject's
+    brightness: near alpha and at most ``BRIGHTEST`` alpha. Alpha is near the coarse ``probability``; ``sigmas`` weigh
+    both.
 
     Args:
         table: linear light by sRGB code.

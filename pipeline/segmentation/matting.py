@@ -1,15 +1,15 @@
 """Finds a sub-pixel contour from a coarse mask: the alpha of pixels in a band around it.
 
-With the background B of every pixel known, and the subject's colour F taken from just inside, a pixel is ``I = q F + (1
-- alpha) B`` in linear light. Here q is alpha times the local brightness of the subject, which darkens where it turns
-away from the camera. Least squares over the channels, with q close to alpha, gives alpha. The contour is where alpha is
-one half, which for an edge blurred by any symmetric optics is where the edge is.
+The background B of every pixel is known, and the subject's colour F is taken from just inside. In linear light a pixel
+is ``I = q F + (1 - alpha) B``. Here q is alpha times the local brightness of the subject, which darkens where its
+surface turns away from the camera. Least squares over the channels, with q close to alpha, gives alpha. The contour is
+where alpha is one half: for an edge blurred by any symmetric optics, that is the position of the edge.
 
-Light adds up; its sRGB codes do not: with codes the contour of dark hair was 0.25 px too far inside, on captures
-rendered by another program. Without q, that of cheeks, which darken towards their edge, was 0.2 px too far inside. B is
-first matched to the pixels just outside, so that a shadow or reflected light at the edge does not move it. F, which may
-vary (a dark edge, a lock of hair), is taken again from inside the first contour. If the colours are too similar, alpha
-follows the coarse mask.
+Colours are mixed in linear light, not in sRGB codes: with codes the contour of dark hair was 0.25 px too far inside, on
+captures rendered by another program. Without q, the contour of cheeks, which darken towards their edge, was 0.2 px too
+far inside. B is first matched to the pixels just outside, so that a shadow or reflected light at the edge does not move
+it. F may vary (a dark edge, a lock of hair), so it is taken again inside the first contour. If the colours are too
+similar, alpha follows the coarse mask.
 """
 
 from dataclasses import dataclass
@@ -57,9 +57,9 @@ class Matte:
 def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision) -> Matte:
     """Computes the subject's alpha from a coarse decision.
 
-    Where the subject's colour differs clearly from the plate, alpha is solved in a band wide enough for hair, which is
-    sparse far inside its outline. Elsewhere alpha follows the decision, which averages more pixels, and is solved at
-    its border only.
+    Where the subject's colour differs clearly from the plate, alpha is solved in a band wide enough for thin hair far
+    outside the solid head. Elsewhere alpha follows the decision, which averages more pixels, and is solved only at its
+    border.
     """
     background, mask, clear = decision.background, decision.mask, decision.clear
     probability = np.where(mask, np.maximum(decision.probability, 0.6), np.minimum(decision.probability, 0.4))
@@ -109,7 +109,7 @@ def _smooth(alpha: Plane, trust: Plane, sigma: float) -> Plane:
 def _light_outside(
     image: Float32[np.ndarray, "h w 3"], background: Background, mask: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Returns the ratio of the image to the expected background just outside the subject, spread over all pixels."""
+    """Returns the ratio of the image to the expected background just outside the subject, extended to all pixels."""
     clear = ~dilated(mask, 2)
     if not clear.any():
         return np.ones_like(image)
@@ -120,9 +120,9 @@ def _light_outside(
 def _subject_inside(
     image: UInt8[np.ndarray, "h w 3"], alpha: Plane, coarse: Float32[np.ndarray, "hc wc 3"], reduction: float
 ) -> Float32[np.ndarray, "h2 w2 3"]:
-    """Returns the subject's colour near its contour, at half resolution, spread from solid pixels inside. Of a picture
-    with less than ``FULL_REDUCTION`` pixels to a coarse one all distances shrink as the head does, and no pixel is
-    left out."""
+    """Returns the subject's colour near its contour, at half resolution, extended outwards from solid pixels inside. If
+    a coarse pixel has fewer than ``FULL_REDUCTION`` pixels of the picture, all distances shrink in proportion and no
+    pixel is left out."""
     share = min(reduction / FULL_REDUCTION, 1.0)
     step = 2 if share == 1 else 1
     size = (image.shape[1] // step, image.shape[0] // step)
@@ -136,14 +136,14 @@ def _subject_inside(
 
 
 def _share_of_edge(there: Bool[np.ndarray, "h w"], alpha: Plane) -> float:
-    """Returns the share of the pixels that the contour halves where something is ``there``; 0 without a contour."""
+    """Returns the fraction of contour pixels at which ``there`` is set; 0 without a contour."""
     edge = np.abs(alpha - 0.5) < 0.25
     return float(there[edge].mean()) if edge.any() else 0.0
 
 
 def _along_contour(contrast: Plane, alpha: Plane) -> Float32[np.ndarray, " c"]:
-    """Returns the contrast at every pixel of the contour: the pixel's own or, beside the band, its neighbours'; 0 where
-    they were not solved either."""
+    """Returns the contrast at every pixel of the contour: its own or, beside the solved band, its neighbours'. It is 0
+    where neither was solved."""
     mask = alpha > 0.5
     nearby = np.where(contrast < 0, cv2.dilate(contrast, np.ones((3, 3), np.uint8)), contrast)
     return np.maximum(nearby, np.float32(0))[mask & ~eroded(mask, 1)]

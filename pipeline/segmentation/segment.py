@@ -1,20 +1,19 @@
-"""Subtracts the background (section 5.4): from a capture to one silhouette for each camera.
+"""Subtracts the background (section 5.4): turns a capture into one silhouette for each camera.
 
-``pipeline.segmentation.foreground`` decides what is subject, with the help of other cameras where it is in doubt;
-``pipeline.segmentation.matting`` then finds the sub-pixel contour; at last the silhouettes of all cameras are compared.
-The paper says only "background subtraction". A view whose mask is unreliable is reported: ``quality.usable`` is False
-if it would harm a fit, and ``quality.warnings`` say why. Masks of the operator override everything.
+First ``pipeline.segmentation.foreground`` decides which pixels show the subject, and asks other cameras about doubtful
+ones. Then ``pipeline.segmentation.matting`` finds the sub-pixel contour. Last the silhouettes of all cameras are
+compared. The paper says only "background subtraction". An unreliable view is reported: ``quality.usable`` is False if
+its mask would harm a fit, and ``quality.warnings`` say why. Masks of the operator override everything.
 
-Whether the silhouettes agree is seen by the idea of the visual hull (figure 1). On a coarse grid of voxels every camera
-votes: a voxel that falls clearly outside its silhouette is empty. A view can be wrong in two ways. *Strange* area is
-mask where every voxel on the ray is empty for at least two of the others: a chair that was moved, a person walking by.
-*Missing* area is where all other cameras keep voxels that this one alone rejects: hair or a coat in the colour of the
-backdrop. One bad view must not make the others look bad, so that a voxel counts as empty only with two votes. Voxels
-outside an image have no vote there, and may be what a view shows.
+A coarse visual hull (figure 1) tells whether the silhouettes agree. Every camera votes on a grid of voxels: a voxel
+clearly outside the camera's silhouette is empty. A view can be wrong in two ways. *Strange* area is mask where at least
+two other cameras call every voxel on the ray empty: a moved chair, a passer-by. *Missing* area is no mask, although all
+other cameras keep voxels on the ray: hair or a coat in the colour of the backdrop. A voxel counts as empty only with
+two votes, so that one bad view does not make the others look bad. A camera has no vote on voxels outside its image.
 
-A hull contains more than the subject, the more so the fewer and the farther apart the cameras are: the hull of three
-others shows up to 11 % more than a true fourth mask. Missing area is therefore believed only if the view also
-*contradicts* the others: there is mask of theirs behind which it alone leaves no voxel. True masks contradict no other,
+A hull is larger than the subject, the more so the fewer cameras there are and the farther apart they stand: the hull of
+three cameras covers up to 11 % more than a true fourth mask. Missing area is therefore believed only if the view also
+*contradicts* the others: behind some of their mask it alone leaves no voxel. True masks never contradict each other,
 however few they are.
 """
 
@@ -112,8 +111,8 @@ def segment(capture: Capture, rig: Rig, *, report: Progress) -> dict[str, Silhou
 
 
 def _without_plates(capture: Capture, rig: Rig, report: Progress) -> dict[str, Silhouette]:
-    """Finds the silhouettes without plates or masks. With few views the search starts at the face; with more, only if
-    too few silhouettes are usable otherwise."""
+    """Finds the silhouettes without plates or masks. With few views the search starts at the face. With more views it
+    starts there only if too few silhouettes are usable otherwise."""
     few = len(rig) < SEEDED_VIEWS
     found = _searched(capture, rig, find_head_seed(capture.images, rig) if few else None, report)
     if not few and _usable_count(found) < ENOUGH_USABLE * len(rig):
@@ -129,7 +128,7 @@ def _usable_count(silhouettes: Mapping[str, Silhouette]) -> int:
 
 
 def _searched(capture: Capture, rig: Rig, head: HeadSeed | None, report: Progress) -> dict[str, Silhouette]:
-    """Returns the silhouettes of a search that starts at ``head`` or, if None, where all cameras look."""
+    """Returns the silhouettes of a search that starts at ``head`` or, if None, where all cameras are directed."""
     from pipeline.segmentation.without_plates.decide import decide_without_plates  # packages that few captures need
 
     found = decide_without_plates(
@@ -146,8 +145,8 @@ def _searched(capture: Capture, rig: Rig, head: HeadSeed | None, report: Progres
 
 
 def _doubted(silhouette: Silhouette) -> Silhouette:
-    """Returns the silhouette with its warning of a weak outline reworded for captures without plates, where a change of
-    the backdrop is no remedy."""
+    """Rewords a silhouette's warning of a weak outline for captures without plates, where changing the backdrop would
+    not help."""
     quality, weak = silhouette.quality, float(np.asarray(silhouette.quality.figures.get("weak_share", 1.0)))
     if weak <= MAX_WEAK_SHARE:
         return silhouette
@@ -165,8 +164,8 @@ def _concerns(message: Message, code: str) -> bool:
 
 
 def _as_cut(share: Float32[np.ndarray, "h w"], counted: Bool[np.ndarray, "h w"] | None = None) -> Silhouette:
-    """Returns the silhouette of a view that was cut along its edges; its outline is weak where the windows of the cut
-    disagree. ``counted`` are the pixels whose outline is judged; None for all."""
+    """Returns the silhouette of a view whose mask was cut along image edges; its outline is weak where overlapping
+    windows of the cut disagree. Only the outline of the pixels ``counted`` is judged; None means all."""
     alpha, holes = _without_specks(share, np.zeros_like(share))
     mask = alpha > 0.5
     undecided = dilated(np.abs(share - 0.5) < UNDECIDED, 1)
@@ -179,8 +178,8 @@ def _as_cut(share: Float32[np.ndarray, "h w"], counted: Bool[np.ndarray, "h w"] 
 
 
 def _operators(mask: Bool[np.ndarray, "h w"], share: UInt8[np.ndarray, "h w"] | None) -> Silhouette:
-    """Returns the silhouette of a ready mask. If the mask has soft edges (``share``), its outline is where the share is
-    one half."""
+    """Returns the silhouette of a mask that the operator supplied. If the mask has soft edges (``share``), its outline
+    is where the share is one half."""
     if share is None:
         return replace(silhouette_from_mask(mask), quality=_mask_quality(mask))
     smooth = cv2.GaussianBlur(share * np.float32(1 / 255), (0, 0), ALPHA_BLUR_PX)
@@ -192,8 +191,8 @@ def _decided(image: ImageRgb, plates: tuple[ImageRgb, ...]) -> Decision:
 
 
 def _refined(image: ImageRgb, decision: Decision, counted: Bool[np.ndarray, "h w"] | None = None) -> Silhouette:
-    """Returns the sub-pixel silhouette of a coarse decision, or an unusable one if the mask is too small. ``counted``
-    are the pixels whose outline is judged; None for all."""
+    """Returns the sub-pixel silhouette of a coarse decision, or an unusable one if the mask is too small. Only the
+    outline of the pixels ``counted`` is judged; None means all."""
     if decision.mask.mean() < MIN_SUBJECT_SHARE:
         return _nothing(image.shape[:2], decision.background)
     matte = solve_matte(image, decision)
@@ -230,10 +229,11 @@ def _silhouette(matte: Matte, decision: Decision, counted: Bool[np.ndarray, "h w
 def _without_specks(
     alpha: Float32[np.ndarray, "h w"], coarse: Float32[np.ndarray, "h w"]
 ) -> tuple[Float32[np.ndarray, "h w"], int]:
-    """Returns the alpha of the subject's own component with holes of noise filled, and the number of holes left.
+    """Returns the alpha of the subject's own component with holes from noise filled, and the number of holes left.
 
-    A hole is noise if it is small, or if the ``coarse`` probability, in which the sensor's noise averages out, is high
-    all over it: shaded skin before a backdrop of its colour. A real gap that large would show at the coarse level too.
+    A hole is noise if it is small. It is also noise if the ``coarse`` probability, which averages the sensor's noise,
+    is high all over it, as in skin in front of a backdrop of its colour. A real gap that large would show at the coarse
+    level too.
     """
     mask = alpha > 0.5
     labels, areas = _labelled(mask, 4)
@@ -269,7 +269,7 @@ def _mask_quality(mask: Bool[np.ndarray, "h w"]) -> ViewQuality:
 def _quality(
     mask: Bool[np.ndarray, "h w"], components_holes: tuple[int, int], contrast: float, weak: float, figures: dict
 ) -> ViewQuality:
-    """Judges a mask by itself: what cuts it off, its contrast and area, and the warnings that follow."""
+    """Judges a mask by itself: which borders cut it off, its contrast and area, and the warnings that follow."""
     borders = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}
     cut_off = tuple(name for name, line in borders.items() if line.sum() > 2)
     warnings, fatal = [], []
@@ -296,8 +296,8 @@ def _quality(
 
 
 def _crown_side(mask: Bool[np.ndarray, "h w"]) -> str:
-    """Returns the border beyond which the crown would lie: opposite the border through which the body leaves the
-    picture, since cameras may be turned. A body fills at a border nearly its full width; a cut crown fills less."""
+    """Returns the image border next to the crown: the one opposite the border through which the body leaves the
+    picture. Cameras may be mounted on their side. The body fills nearly all of one border; a cut crown does not."""
     across, down = mask.sum(axis=0), mask.sum(axis=1)
     widest = {"top": down.max(), "bottom": down.max(), "left": across.max(), "right": across.max()}
     touched = {"top": mask[0].sum(), "bottom": mask[-1].sum(), "left": mask[:, 0].sum(), "right": mask[:, -1].sum()}
@@ -319,8 +319,8 @@ def _nothing(shape: tuple[int, ...], background: Background) -> Silhouette:
 def count_rejecting_cameras(
     doubt: Bool[np.ndarray, "h w"], name: str, masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig
 ) -> Int8[np.ndarray, "h w"]:
-    """Counts, for each doubtful pixel of camera ``name``, how many other cameras see no subject anywhere on its ray (at
-    most ``MAX_DISSENT``); -1 for pixels that are not doubtful or are seen by too few cameras. Masks may be smaller than
+    """Counts, for each doubtful pixel of camera ``name``, the other cameras that see no subject anywhere on its ray (at
+    most ``MAX_DISSENT``); -1 for pixels that are not doubtful, or that too few cameras see. Masks may be smaller than
     the images; all are reduced by the same factor."""
     out = np.full(doubt.shape, -1, np.int8)
     others = [camera for camera in rig if camera.name != name and masks[camera.name].any()]
@@ -340,8 +340,8 @@ def count_rejecting_cameras(
 
 
 def _stacked(masks: list[np.ndarray], widths: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the distance of each pixel outside its mask (mask pixels, negative beyond the image), and how many image
-    pixels wide a mask pixel is."""
+    """Returns each pixel's distance to its camera's mask (mask pixels; 0 inside, negative beyond the image), and the
+    width of a mask pixel in image pixels."""
     height, width = max(mask.shape[0] for mask in masks), max(mask.shape[1] for mask in masks)
     out = np.full((len(masks), height, width), -1.0, np.float32)
     for k, mask in enumerate(masks):
@@ -423,8 +423,8 @@ def judge_agreement(
 
 
 def _shares(votes: Votes, k: int, mask: Bool[np.ndarray, "h w"]) -> tuple[float, float]:
-    """Returns two areas of camera k as shares of its mask: the part that other cameras exclude (strange), and what they
-    all contain but the mask lacks (missing)."""
+    """Returns two areas of camera k as fractions of its mask: the part that other cameras exclude (strange), and the
+    part that all others contain but the mask lacks (missing)."""
     small = _reduced(mask)
     size, area = small.shape[::-1], max(float(small.sum()), 1.0)
     others = np.delete(np.arange(len(votes.seen)), k)
@@ -440,8 +440,8 @@ def _shares(votes: Votes, k: int, mask: Bool[np.ndarray, "h w"]) -> tuple[float,
 
 
 def _contradicted(votes: Votes, k: int, masks: Sequence[Bool[np.ndarray, "_ _"]]) -> float:
-    """Returns, as a mean over the other cameras, the share of their mask that camera k alone leaves without any
-    voxel."""
+    """Returns the fraction of another camera's mask behind which camera k alone leaves no voxel, averaged over the
+    other cameras."""
     shares = []
     for j in range(len(votes.seen)):
         others = np.delete(np.arange(len(votes.seen)), [j, k])

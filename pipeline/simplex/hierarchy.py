@@ -1,7 +1,7 @@
 """Runs the paper's fit (sections 4.4 and 5.1): the downhill simplex, first on a coarse level, then on the working
 level.
 
-Enters: the aligned model and the silhouettes. Leaves: coefficients, which hold for the full mesh. The pose remains that
+In: the aligned model and the silhouettes. Out: coefficients, which are valid for the full mesh. The pose remains that
 of the alignment, as in the paper. The result of the coarse level is the start p_0 of the working level, and both levels
 begin with p_i = p_0 + mu_i e_i, mu_i = 3 sigma_i (three standard deviations, the unit of our coefficients).
 """
@@ -54,8 +54,8 @@ def fit_simplex(
 ) -> Fit:
     """Finds the coefficients that minimise the paper's eq. (2), starting from the mean head.
 
-    Cameras without a silhouette are left out. ``report("fit", fraction)`` may raise Cancelled. ``speaking`` says which
-    pixels count ("all", or those near the face), and ``weighted`` whether by eq. (5) or eq. (4).
+    Cameras without a silhouette are left out. ``report("fit", fraction)`` may raise Cancelled. ``speaking`` selects the
+    pixels that count ("all", or those near the face); ``weighted`` selects eq. (5) instead of eq. (4).
     """
     rig = rig.subset(name for name in silhouettes if silhouettes[name].quality.usable)
     coefficients = np.zeros(min(settings.modes, len(model.modes)))

@@ -1,8 +1,8 @@
 """Minimises a function without derivatives by the downhill simplex (section 4.4): Nelder and Mead 1965, as described by
-Press et al., Numerical Recipes, section 10.4. Nothing here knows of heads.
+Press et al., Numerical Recipes, section 10.4. This module knows nothing of heads.
 
-What the paper leaves open follows Numerical Recipes: reflection 1, expansion 2, contraction 1/2, shrinking 1/2 towards
-the best point; the search ends at a small relative spread ``2 |f_high - f_low| / (|f_high| + |f_low|)`` of the values.
+Other values are those of Numerical Recipes: reflection 1, expansion 2, contraction 1/2, shrinking 1/2 towards the best
+point. The search ends at a small relative spread ``2 |f_high - f_low| / (|f_high| + |f_low|)`` of the values.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ class Stats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Holds the best point found (``value``), why the search ended (``result``), and its statistics."""
+    """Holds the best point (``value``), why the search ended (``result``), and its statistics."""
 
     value: Float[np.ndarray, " n"]
     result: Literal["converged", "evaluation limit"]

@@ -1,18 +1,18 @@
 """Computes the paper's objective (eqs. 2 and 5): the boundary-weighted XOR of input and model silhouettes, over all
 cameras.
 
-Enters: coefficients. Leaves: one number, drawn and summed by the renderer; no image is read back.
+Enters: coefficients. Out: one number, which the renderer draws and sums; no image is read back.
 
-Which pixels count: in eq. (5) a mismatch far from the input contour has hardly any weight. That covers what the model
-lacks *inside* the outline, but not what the input has and the model cannot make. Below the cut through the neck the
-input goes on into shoulders; every pixel by which the open edge of the mesh moves down would pay off, so that the head
-would grow a neck. Hair would make an enlarged skull cheaper. So a pixel counts only if the nearest part of the aligned
-head's outline belongs to the face region (ear to ear, forehead to chin); others have weight zero. This is determined
-once for each level, from the head at its start, so that within a level the cost is a fixed function of the
-coefficients: eq. (5) with some weights zero. ``speaking="all"`` is the paper's cost to the letter.
+Not every pixel counts. In eq. (5) a mismatch far from the input contour has hardly any weight. That handles parts
+*inside* the outline that the model lacks, but not parts of the input that no model can have. Below the cut through the
+neck the input continues into shoulders; every pixel by which the open edge of the mesh moves down would reduce the
+cost, and the head would grow a neck. Hair would likewise make an enlarged skull cheaper. So a pixel counts only if the
+nearest part of the aligned head's outline belongs to the face region (ear to ear, forehead to chin); all others have
+weight zero. The pixels are chosen once for each level, from the head at its start, so that within a level the cost is a
+fixed function of the coefficients: eq. (5) with some weights zero. ``speaking="all"`` is exactly the paper's cost.
 
-As the cut through the neck does not count, it is closed with a lid, so that back faces need not be drawn: that saves 5
-of 19 ms for each evaluation. The lid adds a thousandth of the area where the cut is not flat, all of it at the cut.
+The cut through the neck does not count, so a lid closes it and back faces need not be drawn; that saves 5 of 19 ms for
+each evaluation. If the cut is not flat, the lid adds a thousandth of the area, all of it at the cut.
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,8 @@ OUTLINE_PX = 2.0  # a vertex this near to the model's outline names the region o
 
 
 class SilhouetteObjective:
-    """Computes eq. (2) at one level of the hierarchy, with the renderer's buffers for it. Close it, or use ``with``."""
+    """Computes eq. (2) at one level of the hierarchy, with the renderer's buffers for it. Call ``close`` after use, or
+    use ``with``."""
 
     def __init__(
         self,
@@ -51,8 +52,8 @@ class SilhouetteObjective:
         speaking: Literal["face", "all"] = "face",
         weighted: bool = True,
     ) -> None:
-        """Takes a ``level`` of the model and a ``scale`` of the images (0.5: half the width); ``start`` fixes which
-        pixels count. ``weighted``: eq. (5); otherwise eq. (4), in which all these pixels count alike."""
+        """Takes a ``level`` of the model and a ``scale`` of the images (0.5: half the width); ``start`` decides which
+        pixels count. ``weighted`` selects eq. (5); otherwise it is eq. (4), in which all pixels have equal weight."""
         self._turn = world_from_head.scale * world_from_head.rotation
         mean = model.levels[level].operator @ model.mean
         self._mean_world = world_from_head.apply(mean.astype(np.float64))
@@ -92,7 +93,7 @@ class SilhouetteObjective:
 
 
 def lidded(faces: Int[np.ndarray, "f 3"], face_region: Bool[np.ndarray, " v"]) -> Int[np.ndarray, "g 3"]:
-    """Closes every hole of a mesh with a fan of triangles, so that each edge belongs to two of them. Returns the
+    """Closes every hole of a mesh with a fan of triangles, so that each edge belongs to two triangles. Returns the
     triangles unchanged if a hole reaches the face region, whose outline counts, or if two holes meet."""
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()
     edges = {(a, b) for a, b in directed}
@@ -116,9 +117,8 @@ def mask_at_scale(distance: Float[np.ndarray, "h w"], scale: float) -> Bool[np.n
     draws.
 
     It is computed from the signed distance (px, negative inside), averaged over the pixel. The contour of a binary mask
-    often runs exactly through a larger pixel's centre. If all these ties fell to one side, the contour would move by
-    0.15 px all around (0.3 px where pixels of the mask are counted); so they alternate like the squares of a
-    chessboard.
+    often runs exactly through a larger pixel's centre. If all these ties were decided alike, the contour would move by
+    0.15 px all around (0.3 px where the mask's pixels are counted); so they alternate like the squares of a chessboard.
     """
     height, width = distance.shape
     smaller = cv2.resize(distance, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""Determines pose and scale of the head before its shape is known (section 4.2)."""
+"""Determines the pose and scale of the head before its shape is known (section 4.2)."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -26,10 +26,10 @@ from rig.rig import Rig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """Holds the pose of the mean head, the camera that the subject faces, and the method that found the pose.
+    """Holds the pose of the mean head, the camera that the subject faces, and the method used.
 
-    ``landmarks`` are those of the subject's face, if the pose came from them. ``rival`` says how much more the best
-    other pose costs, as a share of the cost (0.1 = 10 %), if the pose came from silhouettes.
+    ``landmarks`` are those of the subject's face, if the pose came from them. ``rival`` is the extra cost of the best
+    other pose, relative to the cost (0.1 = 10 %), if the pose came from silhouettes.
     """
 
     world_from_head: Similarity

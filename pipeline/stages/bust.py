@@ -1,4 +1,4 @@
-"""Makes the bust: all that the cameras see as one closed surface, in the photographs' colours."""
+"""Makes the bust: everything in view as one closed surface, in the photographs' colours."""
 
 from dataclasses import dataclass
 
@@ -38,9 +38,9 @@ FACE_REACH_MM = 10.0  # from the head's face: what lies farther in front of it i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapedBust:
-    """Holds the surface of the bust. Of its vertices on the face, ``face_silent_share`` (0 to 1) is the share that no
-    view's depth agrees with, and ``guessed_share`` the share that the refined head did not measure either.
-    ``likely_part`` is the part of each vertex, the most likely one where nobody sees it."""
+    """Holds the surface of the bust. Of its vertices on the face, ``face_silent_share`` (0 to 1) is the fraction
+    without support by any view's depth, and ``guessed_share`` the part of it that the refined head did not measure
+    either. ``likely_part`` is the part label of each vertex; an unseen vertex has the most likely one."""
 
     surface: BustSurface
     likely_part: UInt8[np.ndarray, " v"]
@@ -50,9 +50,9 @@ class ShapedBust:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bust:
-    """Holds the closed surface of everything that the cameras see, with its colours (sRGB). ``views`` is the number of
-    images that coloured each vertex; 0 if its colour was filled from its neighbours. ``spacing_mm`` is the grid's
-    spacing. ``atlas`` is its texture if the settings ask for GLB."""
+    """Holds the closed surface of everything in view, with its colours (sRGB). ``views`` is the number of images that
+    coloured each vertex; 0 if its colour was filled from its neighbours. ``spacing_mm`` is the grid's spacing.
+    ``atlas`` is its texture if the settings request GLB."""
 
     shaped: ShapedBust
     normals: Float[np.ndarray, "v 3"]
@@ -75,10 +75,10 @@ class Bust:
 def fuse_depth(
     context: ReconstructionContext, views: Views, head_world: Mesh, labels: PartLabels, depth: Depth
 ) -> Staged[DepthSurface | None]:
-    """Fuses the depth maps to one closed surface; where no camera sees the subject, the fitted head is used,
-    and where long hair has hardly any depth, a shell inside its outlines.
+    """Fuses the depth maps to one closed surface. Where no camera sees the subject it takes the fitted head; where long
+    hair has hardly any depth, a shell inside its outlines.
 
-    Returns None if the settings ask for the head only. Returns None with the warning ``no-bust`` if the depth maps do
+    Returns None if the settings request only the head. Returns None with the warning ``no-bust`` if the depth maps do
     not determine a surface.
     """
     settings = context.settings
@@ -112,7 +112,7 @@ def shape_bust(
     fused: DepthSurface | None,
 ) -> Staged[ShapedBust | None]:
     """Combines the fused surface with the delivered head, extends hair to its outlines, and mends the triangles.
-    Returns None for None. Warns ``bust-guessed`` if neither depth nor the head measured much of the face."""
+    Returns None if ``fused`` is None. Warns ``bust-guessed`` if neither depth nor head measured most of the face."""
     if fused is None:
         return Staged(None)
     head = HeadSkin(refined.mesh_world, refined.deviation_mm)
@@ -159,8 +159,8 @@ def colour_bust(
 def _likely_parts(
     surface: BustSurface, far_mm: Float[np.ndarray, " v"], near: Int[np.ndarray, " v"], model: HeadModel
 ) -> UInt8[np.ndarray, " v"]:
-    """Returns what each vertex most likely shows, so that what is unseen gets the colour of its like: ``HAIR`` is the
-    whole scalp, bald or not, and what lies far off the head; ``CLOTHES`` lie beyond its open border. ``far_mm`` and
+    """Returns the most likely part of each vertex, from which unseen vertices get their colour: ``HAIR`` is the whole
+    scalp, bald or not, and everything far from the head; ``CLOTHES`` lie beyond the head's open border. ``far_mm`` and
     ``near``: distance to the nearest vertex of the head, and its row."""
     part, unseen = surface.part.copy(), surface.part == Part.UNSEEN
     part[unseen] = Part.SKIN
@@ -172,7 +172,7 @@ def _likely_parts(
 @dataclass(frozen=True, slots=True, eq=False)
 class HairyHead:
     """Holds the head pushed out to its hair, with its colours (sRGB), the number of images that coloured each vertex,
-    and its texture if the settings ask for one."""
+    and its texture if the settings request one."""
 
     shell: HairShell
     normals: Float[np.ndarray, "v 3"]
@@ -184,8 +184,8 @@ class HairyHead:
 def push_out_hair(
     context: ReconstructionContext, views: Views, refined: RefinedHead, bust: Bust | None, coloured: Capture
 ) -> Staged[HairyHead | None]:
-    """Pushes the delivered head out to the bust's hair, if the settings ask for it, and colours it from the photographs
-    of ``coloured``. Returns None otherwise, and without a bust. Warns ``hair-beyond-head`` where the head's vertices do
+    """Pushes the delivered head out to the bust's hair, if the settings request it, and colours it from the photographs
+    of ``coloured``. Returns None otherwise, and without a bust. Warns ``hair-beyond-head`` if the head's vertices do
     not reach the hair."""
     settings, rig = context.settings, context.rig
     if bust is None or settings.outputs.surface != "hair":

@@ -18,7 +18,7 @@ from rig.rig import Rig
 
 @runtime_checkable
 class Segment(Protocol):
-    """Declares what computes the silhouettes of a capture: ``segment``, or one that keeps them in a cache."""
+    """Declares the function that computes the silhouettes of a capture: ``segment``, or one with a cache."""
 
     def __call__(self, capture: Capture, rig: Rig, /, *, report: Progress) -> dict[str, Silhouette]:
         """Returns the silhouette of every camera."""
@@ -27,7 +27,7 @@ class Segment(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReconstructionContext:
-    """Holds one capture with everything that decides its reconstruction, and the resources that the caller owns.
+    """Holds one capture with all inputs of its reconstruction, and the resources that the caller owns.
 
     Attributes:
         capture: the shot as it was read.
@@ -53,7 +53,7 @@ class ReconstructionContext:
 
     @property
     def guards(self) -> Guards:
-        """Returns what every check refuses through."""
+        """Returns the object through which every check refuses a capture."""
         return Guards(self.settings.anyway)
 
     def within_stage(self, name: str) -> "ReconstructionContext":

@@ -1,4 +1,4 @@
-"""Measures depth in every view from the photographs, and finds which part of it is the fitted head's surface."""
+"""Measures depth in every view from the photographs, and finds which part of it belongs to the fitted head."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ from pipeline.stereo.estimate import estimate_depth
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Depth:
-    """Holds the depth maps and what follows from them: which parts (skin, hair, clothes) the surface shows, the same
-    surface as points with normals, the points on the face, and the bias of the depth as measured on the fitted face."""
+    """Holds the depth maps and their derived values: the parts (skin, hair, clothes) of the surface, the surface as
+    points with normals, the points on the face, and the bias of the depth as measured on the fitted face."""
 
     maps: tuple[DepthMap, ...]  # none where no stage needs them
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]  # as they were matched, without highlights
@@ -34,8 +34,8 @@ class Depth:
 
 
 def is_refined(head: HeadFit, settings: Settings) -> bool:
-    """Tells whether a later stage deforms the head to the measured surface: the fit used the photographs, and the
-    settings ask for the detail ``fine``."""
+    """Tells whether a later stage deforms the head to the measured surface: the fit must have used the photographs, and
+    the settings must request the detail ``fine``."""
     return head.detail.level == "photo" and settings.detail in FINE_LEVELS
 
 

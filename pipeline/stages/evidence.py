@@ -69,7 +69,7 @@ def judge_head(
     """Measures the delivered head, and warns if it is not plausible.
 
     Refuses with UnexplainedOutlines if the head explains hardly any outline and no face in the photographs confirms its
-    pose. The settings can allow that, for subjects with long hair all around, whose outlines are all hair.
+    pose. The settings can allow such a head, for subjects with long hair all around, whose outlines are all hair.
     """
     fit, model, rig, outputs = head.fit, head.model, context.rig, context.settings.outputs
     before = start_masks(model, alignment.world_from_head, rig)
@@ -108,11 +108,11 @@ def judge_head(
 def fit_with_read_face(
     context: ReconstructionContext, head: HeadFit, displaced: DeformedSurface
 ) -> tuple[Fit, float, frozenset[int]]:
-    """Returns the fit with its expression read from the deformed head, how many standard deviations a weight must have
-    to be reported, and the expressions, by their place among the model's, that are doubtful and left out.
+    """Returns three values: the fit with the expression from the deformed head; how many standard deviations a weight
+    must have to be reported; and the indices of the doubtful expressions, which are left out.
 
-    The expression is read only if that of the fit is not neutral. The lids are always taken over if points around the
-    eye determined them, as ``told_lids`` tells them.
+    The expression is re-estimated only if the fit's is not neutral. The lids always come from the points around the
+    eye, if these determine them (see ``told_lids``).
     """
     fit, model = head.fit, head.model
     rows = blinks_of(model)
@@ -137,14 +137,14 @@ def fit_with_read_face(
 
 
 def told_lids(lids: Mapping[str, float]) -> dict[str, float]:
-    """Returns how far each eye is closed, as a weight that may be reported: lids that the points around the eye place
-    less than ``MIN_LIDS`` of the way down count as open."""
+    """Returns how far each eye is closed, as a reportable weight: lids that are less than ``MIN_LIDS`` of the way down
+    count as open."""
     return {side: share if share >= MIN_LIDS else 0.0 for side, share in lids.items()}
 
 
 def confirmed_closed(closed: frozenset[str], openings: Mapping[str, float]) -> frozenset[str]:
-    """Returns which eyes are closed: those that are on the fitted head (``closed``), corrected by the measured
-    ``openings`` of the lids where these are clear."""
+    """Returns which eyes are closed: the fitted head's (``closed``), corrected by the measured ``openings`` of the lids
+    if these are clear."""
     apart = {side for side, opening in openings.items() if opening > MAX_CLOSED_OPENING}
     return (closed | closed_by_openings(openings)) - apart
 
@@ -152,8 +152,8 @@ def confirmed_closed(closed: frozenset[str], openings: Mapping[str, float]) -> f
 def check_pose(
     context: ReconstructionContext, faces: Faces, alignment: Alignment, head: HeadFit, refined: RefinedHead
 ) -> Staged[PoseEvidence]:
-    """Compares the head's landmarks with the faces in the photographs, and the cost of its pose with that of the best
-    other pose."""
+    """Compares the head's landmarks with the faces in the photographs, and the cost of its pose with the cost of the
+    best other pose."""
     evidence, warnings = judge_pose(
         refined.mesh_world,
         head.fit.world_from_head,

@@ -1,4 +1,4 @@
-"""Finds the subject's face in the photographs: where it is, how it is turned, and 468 landmarks on it."""
+"""Finds the subject's face in the photographs: its position, its direction, and 468 landmarks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,10 +15,10 @@ from rig.capture import Capture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Faces:
-    """Holds the subject's faces in the photographs; ``subject`` is None if the settings do not ask for them.
+    """Holds the subject's faces in the photographs; ``subject`` is None if the settings disable the search.
 
-    ``eye_openings`` says how far the lids of each eye stand apart (``faces.eyes``), and ``eyes`` has the irises or why
-    they are not seen, if the views agree on the subject's face.
+    If the views agree on the face, ``eye_openings`` holds the opening of each eye (``faces.eyes``), and ``eyes`` the
+    irises or why they were not measured.
     """
 
     subject: SubjectFaces | None

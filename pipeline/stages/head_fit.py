@@ -1,6 +1,6 @@
-"""Fits the head to the outlines (section 4.4) by the solver that the settings name, and then to the photographs.
+"""Fits the head to the outlines (section 4.4) by the solver in the settings, and then to the photographs.
 
-These are two stages, ``fit_outlines`` and ``fit_head``, since the parts that pixels show are labelled in between.
+These are two stages, ``fit_outlines`` and ``fit_head``, because the pixels are labelled in between.
 """
 
 from collections.abc import Mapping
@@ -54,8 +54,7 @@ class OutlineFit:
 class HeadFit:
     """Holds a fit with its covariance, the model whose modes it uses, and the level of detail that it reached.
 
-    ``cranium`` says what makes the cranium's outline: hair, which hides it; a cap of known thickness, or skin; None
-    where nothing tells.
+    ``cranium`` names what forms the cranium's outline: hair, a cap of known thickness, or skin; None if unknown.
     """
 
     fit: Fit
@@ -79,8 +78,9 @@ def fitted_mesh(model: HeadModel, fit: Fit) -> Mesh:
 def fit_outlines(
     context: ReconstructionContext, views: Views, alignment: Alignment, cap: Cap | None
 ) -> Staged[OutlineFit]:
-    """Fits shape and pose to the silhouettes with the contour solver. If the settings name the simplex method, that
-    then fits the shape anew at the same pose. Along the ``cap``, outlines count as the skull's, by its thickness."""
+    """Fits shape and pose to the silhouettes with the contour solver. If the settings name the simplex method, it then
+    refits the shape at the same pose. Outlines along the ``cap`` are moved inwards by its thickness and count as
+    skull."""
     settings, rig = context.settings, context.rig
     bare = CapOutline(views.silhouettes, {})
     if cap is not None:
@@ -105,8 +105,8 @@ def fit_outlines(
 def refine_with_likely_face(
     outlines: ContourSolution, images: Mapping[str, ImageRgb], hair: HairProbability
 ) -> tuple[ContourSolution, Detail, frozenset[int]]:
-    """Refines the fit with the photographs. If its expression contradicts itself, refines it again without the doubtful
-    expressions, and takes that if it explains the photographs about as well. Returns the doubtful expressions, too."""
+    """Refines the fit with the photographs. If the expression contradicts itself, refines again without its doubtful
+    parts, and takes that fit if it explains the photographs equally well. Also returns the doubtful expressions."""
     solved, detail = refine_with_photographs(outlines, images, hair=hair)
     doubtful = doubtful_weights(solved.problem.model, solved.state.coefficients)
     if not doubtful:

@@ -1,4 +1,4 @@
-"""Labels what the pixels show: a cap of stated colour, and skin, hair or clothes."""
+"""Labels each pixel as skin, hair or clothes, or as a cap of stated colour."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -33,12 +33,12 @@ class PartLabels:
     cap: Cap | None = None
 
     def hiding_probability(self) -> "OnePart":
-        """Returns, for each camera, the probability at every pixel that hair, or the cap, hides the skin."""
+        """Returns, for each camera, the probability at every pixel that hair or the cap hides the skin."""
         return OnePart(self.maps, Part.HAIR, {} if self.cap is None else self.cap.masks)
 
     def shares(self, camera: Camera, points: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
-        """Returns how probably (0 to 1) a view shows skin, hair and clothes at points (world, mm). It shows skin
-        without a part map."""
+        """Returns the probabilities (0 to 1) that a view shows skin, hair and clothes at points (world, mm). Without a
+        part map everything counts as skin."""
         if camera.name not in self.maps:
             return np.tile([1.0, 0.0, 0.0], (len(points), 1))
         return parts_shown(points, self.maps[camera.name], camera)
@@ -50,8 +50,8 @@ class PartLabels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnePart(Mapping[str, Float32[ndarray, "_ _"]]):
-    """Gives the probability of one part at every pixel, by camera; it is 1 where one of the ``masks`` is true. Each map
-    is computed when it is read: all of them would take four times the memory of what they follow from."""
+    """Holds the probability of one part at every pixel, by camera; it is 1 where one of the ``masks`` is true. Each map
+    is computed when it is read, because all of them would take four times the memory of their sources."""
 
     maps: Mapping[str, PartMap]
     part: Part
@@ -72,7 +72,7 @@ class OnePart(Mapping[str, Float32[ndarray, "_ _"]]):
 
 def find_worn_cap(context: ReconstructionContext, views: Views, alignment: Alignment) -> Staged[Cap | None]:
     """Finds the cap that the settings name by its colour in the photographs, on the mean head at its pose. Returns None
-    if they name none, and with the warning ``cap-not-found`` where the photographs do not show it."""
+    if the settings name no cap; also, with the warning ``cap-not-found``, if the photographs do not show it."""
     settings = context.settings.cap
     if settings.colour is None:
         return Staged(None)

@@ -1,4 +1,4 @@
-"""Runs stages: the one place that collects their warnings and seconds and reports progress."""
+"""Runs stages, collects their warnings and seconds, and reports their progress. No other module does this."""
 
 import threading
 import time
@@ -33,7 +33,7 @@ class Pending(Generic[T]):
 
 
 class RunningStage:
-    """Holds a stage that runs: the context that its functions read, and the warnings that they leave."""
+    """Holds a running stage: the context that its functions read, and the warnings so far."""
 
     def __init__(self, context: ReconstructionContext, warnings: list[ReportWarning]) -> None:
         self.context = context
@@ -46,11 +46,11 @@ class RunningStage:
 
 
 class Recorder:
-    """Runs stages one after the other, or one beside others, and records their seconds and warnings.
+    """Runs stages in sequence, or one in parallel with others, and records their seconds and warnings.
 
-    The context's ``progress`` is called when a stage begins, and by the stage as it advances; a stage ends with
-    Cancelled if it raises that. A stage that runs beside others reports no progress, and only the time that was spent
-    waiting for it is counted: so all seconds add up to the job's. Seconds of stages with one name are added up.
+    The context's ``progress`` is called when a stage begins, and by the stage as it advances; if it raises Cancelled,
+    the stage ends. A parallel stage reports no progress, and only the time spent waiting for it counts, so all seconds
+    add up to the job's. The seconds of stages with the same name are added up.
     """
 
     def __init__(self, context: ReconstructionContext) -> None:

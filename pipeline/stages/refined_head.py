@@ -28,11 +28,11 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedHead:
-    """Holds the delivered head, free of degenerate triangles: that of the fit, or that deformed to the measured
+    """Holds the delivered head, free of degenerate triangles: the fitted head, or the one deformed to the measured
     surface.
 
     ``deviation_mm`` is the posterior standard deviation of each vertex. ``displaced`` is the deformed surface; None if
-    the fit's head is delivered.
+    the fitted head is delivered.
     """
 
     mesh_world: Mesh  # full level, mm
@@ -44,8 +44,8 @@ class RefinedHead:
 def refine_head(
     context: ReconstructionContext, views: Views, faces: Faces, head: HeadFit, labels: PartLabels, depth: Depth
 ) -> Staged[RefinedHead]:
-    """Deforms the fitted head to the measured surface. Keeps the fit's head if the settings ask for less detail, or if
-    the surface shows too little of the face."""
+    """Deforms the fitted head to the measured surface. Returns the fitted head if the settings request less detail, or
+    if the surface shows too little of the face."""
     settings, fit, model, mesh = context.settings, head.fit, head.model, head.mesh_world
     deviation_mm = vertex_deviation_mm(model, fit)
     if not is_refined(head, settings):

@@ -1,4 +1,4 @@
-"""The head's colours and texture (section 4.5)."""
+"""Computes the head's colours and texture (section 4.5)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texturing:
-    """Holds the delivered head's vertex colours, and the textures that the settings ask for."""
+    """Holds the delivered head's vertex colours, and the textures that the settings request."""
 
     normals: Float[np.ndarray, "v 3"]
     depths: Mapping[str, Float32[np.ndarray, "_ _"]]  # mm, of the head in each camera; inf beside it

@@ -1,4 +1,4 @@
-"""Finds the silhouettes (section 5.4), and decides which views take part."""
+"""Finds the silhouettes (section 5.4), and decides which views are used."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,11 +13,10 @@ from rig.capture import Capture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """Holds the capture with every picture under the right camera, and its silhouettes; views that take no part are
-    marked as not usable.
+    """Holds the capture with every picture under the right camera, and its silhouettes; excluded views are marked as
+    not usable.
 
-    ``assignment`` has an entry for each camera under whose name another's picture was filed: the name under which its
-    own was found.
+    ``assignment`` has an entry for each camera with a wrong picture: the name under which its correct one was filed.
     """
 
     capture: Capture
@@ -26,7 +25,7 @@ class Views:
 
 
 def find_views(context: ReconstructionContext) -> Staged[Views]:
-    """Finds the silhouettes of the capture and decides which views take part. Refuses with TooFewViews,
+    """Finds the silhouettes of the capture and decides which views are used. Refuses with TooFewViews,
     ExchangedPictures, WrongRig, WrongScale."""
     settings, rig = context.settings, context.rig
 
@@ -38,5 +37,5 @@ def find_views(context: ReconstructionContext) -> Staged[Views]:
 
 
 def check_lenses(context: ReconstructionContext, views: Views) -> Staged[None]:
-    """Warns if the pictures were undistorted though the rig has distortion, or the other way round."""
+    """Warns if only the rig or only the pictures have lens distortion."""
     return Staged(None, judge_distortion(views.capture.images, views.silhouettes, context.rig))

@@ -1,4 +1,4 @@
 """Measures the depth of the subject in every view from the photographs.
 
-Enters: photographs, silhouettes, the rig and the fitted head. Leaves: a ``DepthMap`` a view (mm, normals, deviation).
+In: photographs, silhouettes, the rig and the fitted head. Out: a ``DepthMap`` for each view (mm, normals, deviation).
 """

@@ -1,9 +1,9 @@
-"""What one photograph, matched with its neighbours, says of the surface: depth, normal and how far to trust them.
+"""Holds the surface from one photograph matched with its neighbours: depth, normal, and their uncertainty.
 
-The windows of dense matching give a bias. All of the surface lies a little too deep, and curved parts come out too
-flat: what protrudes (the bridge of the nose, the lips) is cut off, and hollows are filled. To first order the
-flattening is ``share`` times the height of the surface's own mean, over a window of 2.5 mm, above the surface.
-``pipeline.detail.depth_bias`` measures both on each capture.
+Matching by windows has a bias. The whole surface lies a little too deep, and curved parts come out too flat: protruding
+parts (bridge of the nose, lips) are cut off, and hollows are filled. To first order the flattening is ``share`` times a
+height: that of the surface's mean over a 2.5 mm window above the surface itself. ``pipeline.detail.depth_bias``
+measures both errors on each capture.
 """
 
 from dataclasses import dataclass
@@ -34,10 +34,10 @@ class Field:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthMap:
-    """Holds the surface that one camera sees, on the pixels of a pinhole crop about the subject.
+    """Holds the surface that one camera sees, on the pixels of a pinhole crop around the subject.
 
-    ``camera`` has no distortion; its name and pose are those of the rig's camera. A pixel is known where its deviation
-    is finite; elsewhere depth, normal and ``views`` are 0.
+    ``camera`` has no distortion; its name and pose are those of the rig's camera. A pixel is known where its standard
+    deviation is finite; elsewhere depth, normal and ``views`` are 0.
     """
 
     camera: Camera
@@ -59,8 +59,8 @@ def points_world(depth_map: DepthMap) -> Float[np.ndarray, "n 3"]:
 
 
 def placing(camera: Camera) -> tuple[Float[np.ndarray, " 4"], Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
-    """Returns what ``depth_map_kernels`` need of a camera without distortion: fx fy cx cy (px), and rotation and
-    translation (mm) of world_from_camera."""
+    """Returns the parameters of a camera without distortion for ``depth_map_kernels``: fx fy cx cy (px), and rotation
+    and translation (mm) of world_from_camera."""
     k, pose = camera.intrinsics, camera.camera_from_world.inverse()
     turn, shift = (np.ascontiguousarray(each, float) for each in (pose.rotation, pose.translation))
     return np.array([k.fx, k.fy, k.cx, k.cy]), turn, shift
@@ -79,7 +79,7 @@ def windowed_height(
     vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"], wanted: Bool[np.ndarray, " v"] | None = None
 ) -> Float[np.ndarray, " v"]:
     """Computes how far (mm, along the normal) the mean of the surface over a window lies above each vertex. Parts of
-    the window that face another way do not count. If ``wanted`` is not None, vertices outside it get 0."""
+    the window that face another way do not count. Vertices outside ``wanted`` get 0; None means all vertices."""
     order, keys, spans = sorted_into_cells(vertices, REACH_MM)
     chosen = np.ones(len(vertices), bool) if wanted is None else wanted[order]
     surface = np.concatenate([(vertices - vertices.min(axis=0)).T, normals.T])[:, order].astype(np.float32, order="C")

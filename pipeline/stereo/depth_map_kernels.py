@@ -1,10 +1,10 @@
-"""Compiled loops over the pixels of depth maps, each ray of a crop and each vertex of a surface; over fields of depth
-and slopes: doubling their size, planes fitted around each pixel, and specks.
+"""Compiled loops over the pixels of depth maps, the rays of a crop and the vertices of a surface; also over fields of
+depth and slopes: doubling their size, planes around each pixel, and specks.
 
-Specks are pieces of surface too small to be more than chance matches. Where skin has no texture, any depth along a ray
-is as good as another, and overlapping windows make the same error. They form pieces of a few windows' size, before or
-behind everything around them. Unlike a single wrong pixel, such a piece is consistent in itself, so that neither planes
-of neighbours nor a mean over neighbours removes it.
+A speck is a piece of surface so small that it may be a chance match. Where skin has no texture, all depths along a ray
+match equally well, and overlapping windows make the same error. Such errors form pieces of a few windows' size, in
+front of or behind everything around them. Unlike a single wrong pixel, a speck is consistent in itself, so neither
+planes of neighbours nor an average removes it.
 """
 
 import numpy as np
@@ -22,8 +22,8 @@ FAR_TOLERANCES = np.float32(20.0)  # along a ray: at the steepest slope the plan
 def place_known(
     depth: np.ndarray, deviation: np.ndarray, pinhole: np.ndarray, turn: np.ndarray, shift: np.ndarray
 ) -> np.ndarray:
-    """Returns the places (n, 3; world, mm) of the pixels whose ``deviation`` is finite, row by row. ``pinhole`` is fx
-    fy cx cy; ``turn`` (3, 3) and ``shift`` (3) are those of world_from_camera."""
+    """Returns the positions (n, 3; world, mm) of the pixels whose ``deviation`` is finite, row by row. ``pinhole`` is
+    fx fy cx cy; ``turn`` (3, 3) and ``shift`` (3) are those of world_from_camera."""
     height, width = depth.shape
     count = 0
     for row in range(height):
@@ -65,15 +65,15 @@ def normals_of_known(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, overlaps=False)
 def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreeing, before, apart):
-    """Fills, for every pixel (h, w) of one view: how many other views have the surface at the same point
-    (``agreeing``), how many see through it (``before``: the point lies in front of their surface), and the mean squared
-    distance to those that agree (``apart``, mm^2).
+    """Fills three arrays for the pixels (h, w) of one view: the number of other views that have the surface at the same
+    point (``agreeing``), the number that see through the point to a surface behind it (``before``), and the mean
+    squared distance to those that agree (``apart``, mm^2).
 
-    Two views agree if the distance from the other's plane is below ``tolerance_mm``, and below ``deviations`` standard
-    deviations of both (or half of ``tolerance_mm``, if that is more). A view in which something nearer hides the point
-    does not count. ``limits`` are ``tolerance_mm`` and ``deviations``. ``depth``, ``slopes`` and ``deviation`` hold all
-    views one after the other, this view from ``start`` on; ``ways`` are rows of ``Stack.homographies``, ``lenses`` fx
-    and fy of the others.
+    Two views agree if the point's distance from the other's plane is below ``tolerance_mm``, and below ``deviations``
+    standard deviations of both (or half of ``tolerance_mm``, if that is more). A view does not count if a nearer
+    surface hides the point from it. ``limits`` are ``tolerance_mm`` and ``deviations``. ``depth``, ``slopes`` and
+    ``deviation`` hold all views one after the other, this view from ``start`` on; ``ways`` are rows of
+    ``Stack.homographies``, ``lenses`` fx and fy of the others.
     """
     tolerance_mm, deviations = np.float32(limits[0]), np.float32(limits[1])
     far_mm, zero, half, one = tolerance_mm * FAR_TOLERANCES, np.float32(0.0), np.float32(0.5), np.float32(1.0)
@@ -126,7 +126,7 @@ def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreei
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _distance_at(distance_px, way, x, y):
-    """Signed distance at the nearest pixel; beyond the crop that of its edge."""
+    """Returns the signed distance at the nearest pixel; beyond the crop, at its edge."""
     width, height = int(way[WIDTH]), int(way[HEIGHT])
     column = min(max(int(x + 0.5), 0), width - 1)
     row = min(max(int(y + 0.5), 0), height - 1)
@@ -138,9 +138,9 @@ def find_depth_range(start, ways, distance_px, slack_px, low, high, step, near, 
     """Fills ``near`` and ``far`` (h, w; mm of depth, 0 for none) for the pixels of one view: the first and the last
     depth at which the point of the ray is inside the visual hull. Depths between may be outside.
 
-    Depths from ``low`` to ``high`` are tried at every ``step`` (mm). A point is inside if no view that sees it shows it
-    outside the silhouette by more than ``slack_px``, and at least one other view sees it. ``distance_px`` holds the
-    signed distances of all views, this view's from ``start`` on; ``ways`` are rows of ``Stack.homographies``.
+    Depths from ``low`` to ``high`` are tried at every ``step`` (mm). A point is inside if at least one other view sees
+    it, and none of them sees it more than ``slack_px`` outside its silhouette. ``distance_px`` holds the signed
+    distances of all views, this view's from index ``start`` on; ``ways`` are rows of ``Stack.homographies``.
     """
     height, width = near.shape
     for row in range(height):
@@ -172,12 +172,12 @@ def find_depth_range(start, ways, distance_px, slack_px, low, high, step, near, 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def windowed_heights(surface, wanted, keys, spans, window_mm, reach_mm, height_mm, first, last):
-    """Fills ``height_mm`` (v) of the ``wanted`` vertices: how far the mean of the vertices around each lies above it,
-    along its normal.
+    """Fills ``height_mm`` (v) of the ``wanted`` vertices: the height of their surroundings' mean along the normal.
 
     Weights are a Gaussian of ``window_mm`` that ends at ``reach_mm``, times the cosine between both normals where that
-    is positive. ``surface`` (6, v) are positions and normals, sorted by the cells as wide as the reach whose ``keys``
-    and ``spans`` are those of ``cells.Cells``; so are all other arrays. ``first`` and ``last`` are positions in it.
+    is positive. ``surface`` (6, v) holds positions and normals. All vertex arrays are sorted by the cells of
+    ``cells.Cells``, whose ``keys`` and ``spans`` these are; a cell is as wide as the reach. ``first`` and ``last``
+    bound the vertices, in that order.
     """
     ranges, cell = np.empty((COLUMNS, 2), np.int64), -1
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -207,9 +207,9 @@ def windowed_heights(surface, wanted, keys, spans, window_mm, reach_mm, height_m
 
 @njit(cache=True, nogil=True)
 def fill_lens_map(crop: np.ndarray, lens: np.ndarray, columns: np.ndarray, rows: np.ndarray) -> None:
-    """Fills ``columns`` and ``rows`` (h, w) with the point (px) of the photograph that each pixel of a pinhole camera
-    at the same pose shows; ``BESIDE_PX`` if there is none. ``crop`` is fx, fy, cx, cy of the pinhole; ``lens`` that of
-    the photograph (``packed_lens``)."""
+    """Fills ``columns`` and ``rows`` (h, w): the point (px) of the photograph for each pixel of a pinhole camera at the
+    same pose; ``BESIDE_PX`` if there is none. ``crop`` is fx, fy, cx, cy of the pinhole; ``lens`` that of the
+    photograph (``packed_lens``)."""
     height, width = columns.shape
     for row in range(height):
         for column in range(width):
@@ -353,9 +353,9 @@ def mark_specks(depth, slopes, gap_mm, most_px, specks):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_specks(depth, slopes, specks, sweeps):
-    """Replaces depth and slopes at the pixels of ``specks``, in place, by the smoothest surface through what surrounds
-    them (least squares of the steps between neighbours), in ``sweeps`` of Gauss-Seidel. Specks that touch nothing else
-    stay."""
+    """Replaces depth and slopes at the pixels of ``specks``, in place, by the smoothest surface through the surrounding
+    pixels (least squares of the steps between neighbours), in ``sweeps`` of Gauss-Seidel. A speck without surrounding
+    pixels stays."""
     height, width = depth.shape
     left = specks.copy()
     filled, count, ring = np.empty(height * width, np.int64), 0, -1
@@ -395,7 +395,7 @@ def _in_surface(depth, row, column):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _sum_beside(depth, row, column, left):
-    """Sum of the depths of the four neighbours that are not ``left``, and how many those are."""
+    """Returns the sum of the depths of the four neighbours that are not ``left``, and their number."""
     total, sides = 0.0, 0
     for side in range(4):
         j, i = row + (0, 0, 1, -1)[side], column + (1, -1, 0, 0)[side]

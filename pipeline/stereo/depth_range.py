@@ -1,9 +1,9 @@
-"""Finds where along each ray the subject can be: behind the visual hull's front, and before the fitted head or the
-hull's back.
+"""Finds the range of depths along each ray where the subject can be: from the visual hull's front to the fitted head or
+the hull's back.
 
-Hair lies between skull and hull, clothes lie inside the hull, and skin lies within a few mm of the fitted head, so that
-only a short range of depths has to be searched. The range is found at the smallest size. Both of its bounds are smooth
-surfaces; the search interpolates their slopes for the depths between.
+Hair lies between skull and hull, clothes inside the hull, and skin within a few mm of the fitted head, so the range is
+short. The range is found at the smallest size. Both of its bounds are smooth surfaces; the search interpolates their
+slopes for the depths between.
 """
 
 from collections.abc import Sequence
@@ -95,10 +95,10 @@ def _bounds(
 
 
 def _bound_by_head(near: Plane, far: Plane, room: Bool[np.ndarray, "h w"], head: Float[np.ndarray, "h w"]) -> None:
-    """Narrows the bounds in place to depths near the fitted head, whose depths are ``head`` (mm, infinite beside it).
+    """Narrows the bounds in place to depths near the fitted head. ``head`` holds its depths (mm, infinite beside it).
 
-    Cameras that all stand on one side leave a visual hull that begins decimetres before the face. Then the bounds come
-    from the head: from its depth at the pixel or, beside it, from its least and greatest depth.
+    If all cameras stand on one side, the visual hull begins decimetres before the face. Then the bounds come from the
+    head: from its depth at the pixel or, beside it, from its least and greatest depth.
     """
     seen = room & np.isfinite(head)
     if not seen.any() or np.median((head - near)[seen]) < LOOSE_HULL_MM:
@@ -129,7 +129,7 @@ def _enlarged(near: Plane, far: Plane, stack: Stack, view: int) -> DepthRange:
 
 
 def _extended(values: Plane, room: Bool[np.ndarray, "h w"]) -> Plane:
-    """Returns the values blurred within the room; pixels outside take the value of the nearest pixel inside."""
+    """Returns the values blurred within the depth range; pixels outside take the value of the nearest pixel inside."""
     weight = cv2.GaussianBlur(room.astype(np.float32), (0, 0), BOUND_BLUR_PX)
     smooth = cv2.GaussianBlur(np.where(room, values, np.float32(0.0)), (0, 0), BOUND_BLUR_PX) / np.maximum(weight, 1e-3)
     _, nearest = cv2.distanceTransformWithLabels(

@@ -1,22 +1,21 @@
 """Measures depth, normal and standard deviation in every view, from the photographs.
 
-Enters: photographs, silhouettes, the rig and the head fitted so far. Leaves: a ``DepthMap`` for each usable view. Every
-view is matched with its neighbours by windows that lie on slanted planes (Bleyer, Rhemann and Rother, *PatchMatch
-stereo*, 2011, https://doi.org/10.5244/C.25.14, have planes and their propagation), from coarse to fine. Unlike there,
-nothing is random: silhouettes and head bound the search (``depth_range``), depths at even steps joined by paths of
-least cost give the first estimate (``first_fields``), and from there least squares moves the windows to a fraction of a
-pixel and computes their information (Goesele et al., *Multi-view stereo for community photo
-collections*, 2007, https://doi.org/10.1109/ICCV.2007.4408933). Depths that no other view confirms are discarded
-(``agreement``).
+In: photographs, silhouettes, the rig and the head fitted so far. Out: a ``DepthMap`` for each usable view. Every view
+is matched with its neighbours, from coarse to fine, by windows on slanted planes that neighbouring pixels propagate
+(Bleyer, Rhemann and Rother, *PatchMatch stereo*, 2011, https://doi.org/10.5244/C.25.14). Unlike there, nothing is
+random. Silhouettes and head bound the search (``depth_range``). Depths at even steps, joined by paths of least cost,
+give the first estimate (``first_fields``). Least squares then moves the windows to a fraction of a pixel and computes
+their information (Goesele et al., *Multi-view stereo for community photo collections*, 2007,
+https://doi.org/10.1109/ICCV.2007.4408933). Depths that no other view confirms are discarded (``agreement``).
 
-The first depths are searched twice. The first time windows are slanted as the bounds of the range are. Where a
-photograph ends, no silhouette bounds the hull, which then stands steeper than a shirt; windows that lie so match
-nothing, though the photographs show the place well. The second time the windows of wide ranges lie as the depths found
-around them do.
+The first depths are searched twice. In the first search windows have the slant of the range's bounds. Where a
+photograph ends, no silhouette bounds the hull, and its wall is steeper than a shirt. Windows with that slant match
+nothing, although the photographs show the surface well. So in the second search the windows of wide ranges take the
+slant of the depths around them.
 
 From one size of the photographs to the next, planes are enlarged, pixels take over better planes of their neighbours,
-and each moves to the best match. A part of the information from the smaller size is kept, limited by the relief around
-the pixel: the larger windows there see shading that smaller ones do not, and miss what is smaller than they are.
+and each moves to the best match. A part of the information from the smaller size is retained, limited by the relief
+around the pixel: its larger windows see shading that smaller ones do not, but miss detail below their size.
 
 The result does not depend on the order of work: each view is refined by itself, and all are compared at the end.
 """
@@ -89,12 +88,12 @@ PIXEL_SHARE = 0.56  # of a pixel's square on the surface, brought onto the ray, 
 def take_specks_off(
     depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"], pixel_mm: float, most_px: int
 ) -> Bool[np.ndarray, "h w"]:
-    """Replaces, in place, small separate pieces of surface (at most ``most_px`` pixels) by a smooth surface through
-    what surrounds them. Returns which pixels were replaced.
+    """Replaces, in place, small separate pieces of surface (at most ``most_px`` pixels) by a smooth surface through the
+    surrounding pixels. Returns which pixels were replaced.
 
-    A piece stays if nothing is known around it: at an outline, where the surface may go on behind, or among so many
-    other pieces that together they exceed ``most_px``. (In one capture a quarter of the clothes are such neighbouring
-    pieces at the search's size; two fifths of them are right, and replacing them all lost 6 % of the clothes.)
+    A piece stays if it has no known surroundings: at an outline, where the surface may continue behind, or among many
+    other pieces that together exceed ``most_px``. (In one capture a quarter of the clothes are such neighbouring pieces
+    at the search's size. Two fifths of them are right; replacing them all lost 6 % of the clothes.)
     """
     specks = np.zeros(depth.shape, bool)
     mark_specks(depth, slopes, GAP_PX * pixel_mm, most_px, specks)
@@ -136,7 +135,7 @@ def doubled(fields: Sequence[Field], stack: Stack) -> list[Field]:
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """Holds how the planes are improved at one size of the photographs."""
+    """Holds the parameters with which planes are improved at one size of the photographs."""
 
     steps_px: tuple[int, ...]  # each pixel tries the planes of pixels that far away (odd)
     speck_px: int  # pieces of surface of so few pixels are replaced
@@ -181,8 +180,8 @@ def _refined(field: Field, matching: Matching, view: int, once: Pass) -> Field:
 
 
 def depth_maps(crops: Sequence[Crop], stack: Stack, fields: Sequence[Field]) -> tuple[DepthMap, ...]:
-    """Compares the full-size fields of all views with each other. Returns a depth map for each view with only those
-    pixels whose surface point other views confirm."""
+    """Compares the full-size fields of all views with each other. Returns a depth map for each view, which holds only
+    pixels that other views confirm."""
     matched = np.concatenate([(1.0 / np.sqrt(field.information + 1e-6)).ravel() for field in fields])
     depth = np.concatenate([field.depth.ravel() for field in fields])
     slopes = np.concatenate([field.slopes.reshape(-1, 2) for field in fields])
@@ -208,8 +207,8 @@ def depth_maps(crops: Sequence[Crop], stack: Stack, fields: Sequence[Field]) -> 
 def stated_deviation(camera: Camera, field: Field, agreeing: UInt8[np.ndarray, "h w"], apart: Plane) -> Plane:
     """Returns the standard deviation (mm) of the depth at each pixel, along the ray.
 
-    ``camera``: of the view. ``field``: depths of the view. ``agreeing``: how many other views have the surface at the
-    same point. ``apart``: mean squared distance to their surfaces, mm^2.
+    ``camera``: camera of the view. ``field``: depths of the view. ``agreeing``: number of other views that have the
+    surface at the same point. ``apart``: mean squared distance to their surfaces, mm^2.
     """
     k = camera.intrinsics
     pixel_mm = np.maximum(field.depth, 1.0) / k.fx
@@ -242,8 +241,8 @@ MAX_NEIGHBOURS = 5
 
 
 def choose_neighbours(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"]) -> list[Int[np.ndarray, " _"]]:
-    """Returns, for each camera, the indices of the cameras to match it with, by increasing angle between their lines of
-    sight; empty if there are none.
+    """Returns, for each camera, the indices of the cameras to match it with (may be empty), by increasing angle between
+    their lines of sight.
 
     Args:
         cameras: of all views.
@@ -360,8 +359,8 @@ def first_fields(matching: Matching, depth_ranges: Sequence[DepthRange]) -> list
 
 
 def slanted(room: DepthRange, field: Field, lens: float) -> DepthRange:
-    """Returns the range with the slopes of the field's surroundings for both bounds where it is wider than ``WIDE_MM``.
-    ``lens`` is the focal length in pixels."""
+    """Returns the range with new slopes of both bounds where it is wider than ``WIDE_MM``: those of the depths around
+    the pixel. ``lens`` is the focal length in pixels."""
     live = field.depth > 0.0
     if not live.any():
         return room
@@ -373,7 +372,7 @@ def slanted(room: DepthRange, field: Field, lens: float) -> DepthRange:
 
 def slopes_around(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 2"]:
     """Returns the slopes (mm a pixel, by x and y) of the plane that fits the depths around each pixel best. Depths of 0
-    are unknown; one at least is known."""
+    are unknown; at least one must be known."""
     live = depth > 0.0
     row, column = np.mgrid[: depth.shape[0], : depth.shape[1]].astype(np.float64)
     known, height = live.astype(np.float64), np.where(live, depth - depth[live].mean(), 0.0)
@@ -391,14 +390,14 @@ def slopes_around(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w
 
 def label_strides(room: DepthRange) -> Int32[np.ndarray, "h w"]:
     """Returns how many depths each pixel advances from one matched depth to the next: 1, 2, 4 and so on. A narrow range
-    needs fewer of them for the same spacing in mm."""
+    needs fewer matched depths for the same spacing in mm."""
     depth = np.clip(room.far - room.near, REACH_MM / LABELS, REACH_MM)
     return (2 ** np.floor(np.log2(REACH_MM / depth))).astype(np.int32)
 
 
 def _cheapest(cost: Float32[np.ndarray, "h w d"], room: DepthRange, strides: Int32[np.ndarray, "h w"]) -> Field:
-    """Returns the field of the labels whose aggregated path cost is least, refined within a stride by the unaggregated
-    matching costs."""
+    """Returns the field of the labels with the least aggregated path cost; the matching costs refine each within its
+    stride."""
     paths = np.empty_like(cost)
     aggregate(cost, room.far > 0.0, STEP_COST, EDGE_COST, paths)
     labels = cost.shape[2]

@@ -1,7 +1,7 @@
 """Compares windows of the views with each other, at one size of the photographs: by compiled loops, or on a GPU.
 
-Both compute the same; the loops are the reference. The shaders' arithmetic is in single precision, and the driver
-decides the order of operations, so that depths differ by hundredths of a millimetre.
+Loops and GPU compute the same; the loops are the reference. The GPU computes in single precision and in the driver's
+order of operations, so depths differ by hundredths of a millimetre.
 """
 
 from collections.abc import Iterator, Sequence
@@ -53,8 +53,8 @@ class Matcher(Protocol):
         ...
 
     def slide(self, most_px: float, depth: Plane, slopes: Float32[np.ndarray, "h w 2"]) -> tuple[Plane, Plane, Plane]:
-        """Moves each plane along its ray by a step of least squares, at most ``most_px`` pixels in the neighbours'
-        images. Returns the new depths (mm), their information (mm^-2), and how alike the windows are (0 to 1)."""
+        """Moves each plane along its ray by one least-squares step, at most ``most_px`` pixels in the neighbours'
+        images. Returns the new depths (mm), their information (mm^-2), and the correlation of the windows (0 to 1)."""
         ...
 
 
@@ -125,7 +125,7 @@ class LoopMatcher:
         )
 
     def slide(self, most_px: float, depth: Plane, slopes: Float32[np.ndarray, "h w 2"]) -> tuple[Plane, Plane, Plane]:
-        """Moves planes by a step of least squares, as ``Matcher.slide``."""
+        """Moves planes by one least-squares step, as ``Matcher.slide``."""
         place_mm, information, likeness = np.empty_like(depth), np.empty_like(depth), np.empty_like(depth)
         slide(self._sight, self._scratch, most_px, depth, slopes, place_mm, information, likeness)
         return place_mm, information, likeness
@@ -170,7 +170,7 @@ class ShaderMatcher:
         planes.fresh[:] = flags != 0
 
     def slide(self, most_px: float, depth: Plane, slopes: Float32[np.ndarray, "h w 2"]) -> tuple[Plane, Plane, Plane]:
-        """Moves planes by a step of least squares, as ``Matcher.slide``."""
+        """Moves planes by one least-squares step, as ``Matcher.slide``."""
         results = np.empty((*depth.shape, 4), np.float32)
         self._run("slide.comp", [depth, slopes, results], [2], most_px=most_px)
         return results[:, :, 0].copy(), results[:, :, 1].copy(), results[:, :, 2].copy()
@@ -178,8 +178,8 @@ class ShaderMatcher:
     def _run(
         self, shader: str, arrays: list[np.ndarray], written: list[int], *, across: int = 1, **uniforms: float
     ) -> None:
-        """Runs a shader over the view's pixels; one invocation takes ``across`` pixels of a row. ``written``: of
-        ``arrays``, which are bound after those that all shaders share."""
+        """Runs a shader over the view's pixels; one invocation takes ``across`` pixels of a row. ``written``: those of
+        ``arrays`` that it writes; they are bound after the ones that all shaders share."""
         width, height = self._size
         groups = -(-width // (across * GROUP)), -(-height // GROUP)
         first = len(self._shared)
@@ -191,7 +191,7 @@ class ShaderMatcher:
 
 def packed_ways(stack: Stack, view: int, others: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m 16"]:
     """Returns the maps from a view's pixels to other views, one row each, in the memory layout of the struct Way of
-    shaders/matching.glsl; the last three numbers of a row are integers. There is at least one row, since no GPU buffer
+    shaders/matching.glsl. The last three numbers of a row are integers. There is at least one row, since no GPU buffer
     may be empty."""
     ways = stack.homographies(view, others)
     packed = np.zeros((max(len(ways), 1), 16), np.float32)

@@ -1,14 +1,15 @@
-"""Compiled matching of one window between two views. The window lies on a plane, which the other view sees slanted.
+"""Compiled loops that match a window of one view with another view. The window lies on a plane, which the other view
+sees slanted.
 
-Scores are zero-mean normalised cross-correlations, so that gain and offset of a camera have no effect. The noise of
-both views is part of the norms, so that a window without texture correlates with nothing, even if its noise happens to.
+Scores are zero-mean normalised cross-correlations, so that gain and offset of a camera have no effect. The norms
+include the noise of both views, so a window without texture correlates with nothing, even by chance.
 
-A view to compare with, a *way*, is a row of 16 numbers (``Stack.homographies``): how a pixel and its depth map to that
-view, and where its pixels are stored. Arguments are few and small, since handing over twenty arrays takes longer than a
-window. A *shade* is the unit in which ``Stack`` stores grey values.
+A *way* is the map to another view, a row of 16 numbers (``Stack.homographies``): how a pixel and its depth map to that
+view, and where its pixels are stored. Arguments are few and small, since passing twenty arrays takes longer than
+matching a window. A *shade* is the unit in which ``Stack`` stores grey values.
 
-Of the loops, some are the first search (depths at even steps are tried along every ray, and neighbouring rays then
-agree), others improve the depths: planes taken over from neighbours, and steps of least squares.
+Some loops are the first search: they try depths at even steps along every ray, then make neighbouring rays agree. The
+others improve the depths: they take over planes from neighbours, or make least-squares steps.
 """
 
 from typing import NamedTuple
@@ -35,7 +36,7 @@ HIGH = np.uint32(16)
 
 
 class Sight(NamedTuple):
-    """Holds a view that is matched, and everything it is matched with."""
+    """Holds a view to match, and everything needed to match it with other views."""
 
     start: int  # of its first pixel
     noise: float  # shades
@@ -47,7 +48,7 @@ class Sight(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Holds arrays that the loops of one view reuse, so that they need not create any."""
+    """Holds arrays that the loops of one view reuse instead of allocating them."""
 
     window: np.ndarray  # zero-mean shades, weights
     scores: np.ndarray  # of the views that it is compared with
@@ -73,7 +74,7 @@ class Loaded(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy", allocates=False)
 def farthest(pattern):
-    """Returns the largest distance of a sample of ``pattern`` (2, s) from the window's middle, across or down, px."""
+    """Returns the largest distance (px, across or down) of a sample of ``pattern`` (2, s) from the window's middle."""
     reach = np.float32(0.0)
     for i in range(pattern.shape[1]):
         reach = max(reach, abs(pattern[0, i]), abs(pattern[1, i]))
@@ -85,8 +86,8 @@ def load_window(sight, width, height, column, row, window):
     """Fills ``window`` (2, s) with the grey values (zero mean) and weights of the samples around a pixel. Returns the
     sum of the weights, and the weighted sum of squares.
 
-    Pixels outside the subject have no weight, and those of another brightness little (half at the sight's
-    ``contrast``), so that a window at an outline or a crease holds one surface. ``width`` and ``height`` are those of
+    Pixels outside the subject have no weight. Pixels of another brightness have little (half at the sight's
+    ``contrast``), so that a window at an outline or a crease covers one surface. ``width`` and ``height`` are those of
     the view's image.
     """
     pairs, pattern, start = sight.pairs, sight.pattern, np.uint64(sight.start)
@@ -118,11 +119,11 @@ def load_window(sight, width, height, column, row, window):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def place_window(way, z, z_x, z_y, column, row, reach, place):
-    """Computes where another view sees a window that lies on a plane: of depth ``z`` (mm) at the pixel (column, row)
-    and slopes ``z_x``, ``z_y`` (mm per pixel). Returns False if that view does not see all of it.
+    """Computes where another view sees a window on a plane of depth ``z`` (mm) at the pixel (column, row) and slopes
+    ``z_x``, ``z_y`` (mm per pixel). Returns False if that view does not see all of it.
 
-    Fills ``place`` (8): the pixel x, y there; its derivatives by the pixel here, x_x, x_y, y_x, y_y; and by the depth,
-    x_z, y_z (px per mm). ``reach`` is the result of ``farthest``.
+    Fills ``place`` (8): the pixel x, y in that view; its derivatives by this view's pixel, x_x, x_y, y_x, y_y; and by
+    the depth, x_z, y_z (px per mm). ``reach`` is the result of ``farthest``.
     """
     ray0, ray1, ray2 = turned(way, column, row, 1.0)
     depth = z * ray2 + way[11]
@@ -179,7 +180,7 @@ def correlate(way, place, sight, loaded):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def match(way, sight, loaded, z, z_x, z_y, reach, place):
     """Returns the correlation of the loaded window with another view if the surface is the given plane. Returns NO_SAY
-    if that view does not see it, and AGAINST if it shows the point outside the subject. Fills ``place`` as
+    if that view does not see it, and AGAINST if that view shows the point outside the subject. Fills ``place`` as
     ``place_window`` does."""
     if not place_window(way, z, z_x, z_y, loaded.column, loaded.row, reach, place):
         return NO_SAY
@@ -193,11 +194,11 @@ def match(way, sight, loaded, z, z_x, z_y, reach, place):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def correlate_and_slide(way, place, sight, loaded, found):
-    """Fills ``found`` (3) with the correlation of the loaded window, and with what a move along the ray would change:
-    the gradient (1 / mm) and the information (1 / mm^2) of the depth.
+    """Fills ``found`` (3) with the correlation of the loaded window and, for a move along the ray, the gradient (1 /
+    mm) and the information (1 / mm^2) of the depth.
 
-    It is the least-squares fit of ``shade = gain (other + slope step) + offset``, where gain and offset are eliminated.
-    The variance of a sample is what the best gain leaves, plus noise.
+    It fits ``shade = gain (other + slope step) + offset`` by least squares, with gain and offset eliminated. The
+    variance of a sample is the residual after the best gain, plus noise.
     """
     pairs, pattern, noise = sight.pairs, sight.pattern, sight.noise
     window, total, energy = loaded.window, loaded.total, loaded.energy
@@ -242,9 +243,8 @@ def correlate_and_slide(way, place, sight, loaded, found):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def score_best_half(scores, count):
-    """Returns a cost: 1 less the mean of the better half of the first ``count`` scores (two at least), since the point
-    may be hidden from the other views. Sorts ``scores``. A single score costs ``ALONE`` more; none costs
-    ``NOT_COMPARED``."""
+    """Returns a cost: 1 minus the mean of the better half of the first ``count`` scores (two at least). The other views
+    may not see the point. Sorts ``scores``. A single score costs ``ALONE`` more; none costs ``NOT_COMPARED``."""
     for i in range(1, count):  # insertion sort, falling
         value = scores[i]
         j = i - 1
@@ -355,13 +355,13 @@ def aggregate(cost, live, small, large, out):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
 def propagate(sight, scratch, parity, steps, same_mm, fresh, depth, slopes, cost):
-    """Lets every pixel of one colour of the chequerboard (``parity``) try the planes of its neighbours of the other
-    colour, ``steps`` pixels away (odd), and keeps the best of these and its own. Changes ``fresh``, ``depth``,
+    """Lets every pixel of one colour of the chequerboard (``parity``) try the planes of the neighbours ``steps`` pixels
+    away (odd, so of the other colour), and retains the cheapest of these and its own. Changes ``fresh``, ``depth``,
     ``slopes`` and ``cost`` (h, w) in place.
 
     A cost below 0 is not yet known. A plane that differs from the current one by less than ``same_mm``, at the pixel
     and one pixel beside it, is not tried. ``fresh`` marks planes that their neighbours have not tried yet; a pixel
-    whose cost is known tries only those. Planes taken over here become fresh.
+    whose cost is known tries only those. Planes taken over in this call become fresh.
     """
     height, width = depth.shape
     window, scores, place = scratch.window, scratch.scores, scratch.place
@@ -416,11 +416,10 @@ def _is_beside(fresh, row, column, steps):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
 def slide(sight, scratch, most_px, depth, slopes, place_mm, information, likeness):
-    """Makes one step of least squares on the depth of every pixel (h, w), with all views in which it looks alike.
+    """Makes one least-squares step on the depth of every pixel (h, w), with all views whose windows correlate well.
 
-    Fills ``place_mm`` (the new depth, at most ``most_px`` away in the view that is most sensitive to it), its
-    ``information`` (mm^-2, samples taken as independent; 0 where nothing is known), and ``likeness``, the mean
-    correlation.
+    Fills ``place_mm`` (the new depth, at most ``most_px`` away in the most sensitive view), its ``information`` (mm^-2,
+    for independent samples; 0 where nothing is known), and ``likeness``, the mean correlation.
     """
     height, width = depth.shape
     ways, window, place, found = sight.ways, scratch.window, scratch.place, scratch.found

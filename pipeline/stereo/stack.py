@@ -1,5 +1,4 @@
-"""Packs all crops of one size for compiled loops: the images one after the other, and the maps from every view to every
-other.
+"""Packs all crops of one size for compiled loops: all images in sequence, and the maps from every view to every other.
 
 Compiled loops spend their time fetching pixels. So each pixel is stored with its right neighbour in one 32-bit word: a
 bilinear value needs two fetches instead of four, 1.4 ns instead of 2.3 ns a sample.
@@ -35,7 +34,7 @@ class Stack:
     shift: Float[np.ndarray, "n n 3"]
 
     def homographies(self, view: int, others: Int[np.ndarray, " m"]) -> Float[np.ndarray, "m 16"]:
-        """Returns what maps pixels of one view to each of the others, one row for each, as compiled loops take it: turn
+        """Returns the maps from the pixels of one view to other views, a row for each, as compiled loops read it: turn
         (9), shift (3), then width, height, offset and noise of the other view."""
         flat = self.turn[view, others].reshape(len(others), 9)
         return np.column_stack(

@@ -1,9 +1,9 @@
-"""Estimates the albedo: the texture without the light it was photographed in.
+"""Estimates the albedo: the texture without the light of the photographs.
 
-Enters: the head, its photograph-like texture, linear colours of all views. Leaves: the light
-(``pipeline.texturing.light``), and an image in the texture's layout of what the skin itself reflects. Highlights move
-with the camera, so that the dimmer views of a vertex show its matt colour. The texture is multiplied, in linear light,
-by a factor interpolated from the vertices: to the matt colour, divided by shading. That keeps the texels' detail.
+In: the head, its photograph-like texture, linear colours of all views. Out: the light (``pipeline.texturing.light``),
+and an image of the skin's own reflectance in the texture's layout. Highlights move with the camera, so the darker views
+of a vertex show its matt colour. The texture is multiplied, in linear light, by a factor interpolated from the
+vertices: matt colour over photographed colour, divided by the shading. The texels thus retain their detail.
 """
 
 from dataclasses import dataclass
@@ -51,9 +51,9 @@ def estimate_albedo(
     *,
     chart: ChartColours | None = None,
 ) -> tuple[Albedo | None, list[ReportWarning]]:
-    """Estimates the albedo of a textured head. Returns None and a warning if light and skin cannot be told apart.
+    """Estimates the albedo of a textured head. Returns None and a warning if light and skin cannot be separated.
 
-    With a ``chart`` the albedo has the skin's true brightness and colour. Without one both follow a convention
+    With a ``chart`` the albedo has the skin's true brightness and colour. Without a chart both follow a convention
     (``pipeline.texturing.light``).
     """
     if atlas is None or around is None or coloured.dim is None:
@@ -78,9 +78,9 @@ def estimate_albedo(
 def shine_left(
     shown: Float[np.ndarray, "v 3"], dim: Float[np.ndarray, "v 3"], seen: Bool[np.ndarray, " v"], around: Neighbourhood
 ) -> Float[np.ndarray, " v"]:
-    """Returns the share of each vertex's light that is not highlight, from ``1 - MAX_SHINE`` to 1. It compares the
-    brightness of the colours ``shown`` with that of the ``dim`` views. Colour is not compared: a highlight has the
-    colour of its lamp, and the colour of a dim view is mostly noise."""
+    """Returns the fraction of each vertex's light that is no highlight, from ``1 - MAX_SHINE`` to 1. It compares the
+    brightness of the colours ``shown`` with that of ``dim``, the colours in the darker views. Colour is not compared: a
+    highlight has the colour of its lamp, and the colour of a dim view is mostly noise."""
     ratio = dim.sum(axis=1) / np.maximum(shown.sum(axis=1), 1e-4)
     ratio = np.where(seen, ratio, 1.0)
     ratio = around.calmed(ratio[:, None], CALM)[:, 0]

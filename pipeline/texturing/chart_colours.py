@@ -1,9 +1,9 @@
 """Corrects colours by a colour chart in the clean plates.
 
-Enters: plates, of which some show the chart, and the photographs. Leaves: the photographs as a camera with true colours
-would have taken them (linear sRGB, D65, white where the chart's white is), for the texture alone; and the direction
-that the chart faced, so that the light removed from a head is the light that fell on the chart. A camera that saw no
-chart gets the mean correction of those that did; balancing the views against each other does the rest.
+In: clean plates, some of which show the chart, and the photographs. Out: photographs as a camera with true colours
+would take them (linear sRGB, D65, white where the chart is white), for the texture alone; and the direction that the
+chart faced, so that the light removed from a head is that on the chart. A camera that saw no chart gets the mean
+correction of those that did; the balancing of views corrects the rest.
 """
 
 from collections.abc import Mapping
@@ -37,7 +37,7 @@ class ChartColours:
     normal_world: Float[np.ndarray, " 3"]
 
     def matrix_of(self, name: str) -> Float[np.ndarray, "3 3"]:
-        """Returns the correction of a camera; the mean of all for one that saw no chart."""
+        """Returns the correction of a camera; a camera that saw no chart gets the mean of all."""
         correction = self.cameras.get(name)
         if correction is not None:
             return correction.matrix
@@ -85,6 +85,6 @@ def in_true_colours(
 
 
 def levelled_by_chart(light: Light, normal_world: Float[np.ndarray, " 3"]) -> Light:
-    """Returns the light scaled in each channel so that a white surface that faces as the chart did is exactly white."""
+    """Returns the light scaled in each channel so that a white surface oriented like the chart is exactly white."""
     on_chart = (harmonics(normal_world[None]) * BAND_FACTORS) @ light.coefficients
     return replace(light, coefficients=light.coefficients / on_chart[0], on_chart=True)

@@ -1,14 +1,13 @@
-"""Estimates the light that a head was photographed in, from its shading.
+"""Estimates the light in which a head was photographed, from its shading.
 
-There are nine coefficients for each channel: spherical harmonics of second order, which describe 98 % of what a matt
-surface shows of any distant light (Ramamoorthi and Hanrahan, *An Efficient Representation for Irradiance Environment
-Maps*, SIGGRAPH 2001). Light that the head hides from itself is first subtracted from the harmonics of each vertex
-(Sloan, Kautz and Snyder, *Precomputed Radiance Transfer*, SIGGRAPH 2002), so that a dark nostril changes neither light
-nor skin.
+It has nine coefficients for each channel: spherical harmonics of second order, which describe 98 % of the shading of a
+matt surface in any distant light (Ramamoorthi and Hanrahan, *An Efficient Representation for Irradiance Environment
+Maps*, SIGGRAPH 2001). Light that the head blocks is first subtracted from the harmonics of each vertex (Sloan, Kautz
+and Snyder, *Precomputed Radiance Transfer*, SIGGRAPH 2002), so a dark nostril affects neither light nor skin.
 
-Skin of the face is assumed to have one colour; brows, lips and beards are outliers. A photograph cannot distinguish a
-dark head in bright light from a bright one in dim light, so that the light's mean over the sphere is 1 in each channel.
-Light from directions that no part of the face is turned to is unknown, and is drawn to that mean.
+Skin of the face is assumed to have one colour; brows, lips and beards are outliers. A dark head in bright light and a
+bright head in dim light look the same, so the light's mean over the sphere is fixed at 1 in each channel. Light from
+directions that no part of the face sees is unknown, and tends to that mean.
 """
 
 from dataclasses import dataclass
@@ -42,7 +41,7 @@ MIN_VERTICES = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Light:
-    """Holds the light that a head was photographed in.
+    """Holds the light in which a head was photographed.
 
     Attributes:
         coefficients: radiance in the order of ``harmonics``, world frame, one column for each channel.
@@ -87,8 +86,8 @@ SURROUND = harmonics(spread_directions(DIRECTIONS)) * BAND_FACTORS  # unhidden w
 def transfer(
     mesh_world: Mesh, normals: Float[np.ndarray, "v 3"], around: Neighbourhood, directions: int = DIRECTIONS
 ) -> Float[np.ndarray, "v 9"]:
-    """Computes how bright each vertex would be if it were matt white, in a light of each harmonic alone. Light from
-    directions that the mesh hides from a vertex is missing, except for the share that the hiding surface reflects."""
+    """Computes the brightness of each vertex, as if it were matt white, in a light of each harmonic alone. Light that
+    the mesh blocks is missing, except for the fraction that the blocking surface reflects."""
     unhidden = harmonics(normals) * BAND_FACTORS
     towards = spread_directions(directions)
     basis = harmonics(towards) * (4.0 / directions)  # the sphere's 4 pi by the matt surface's pi
@@ -117,8 +116,8 @@ def _lamp_camera(mesh: Mesh, towards: Float[np.ndarray, " 3"]) -> Camera:
 def _hidden(
     camera: Camera, mesh: Mesh, rows: Int[np.ndarray, " n"], cosine: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns the share of the four nearest pixels of the lamp's depth map that hide each vertex, by more depth than
-    its own slope has in a pixel."""
+    """Returns the fraction of the four nearest pixels of the lamp's depth map that hide each vertex, that is, are
+    nearer to the lamp by more than the vertex's slope explains."""
     depth, _ = depth_map(camera, mesh.vertices, mesh.faces)
     points = mesh.vertices[rows]
     x, y = np.clip(project_points(camera, points), 0, MAP_PX - 1.001).T
@@ -169,6 +168,6 @@ def fit_light(
 
 
 def _bounds(coefficients: Float[np.ndarray, "9 3"]) -> Float[np.ndarray, "n 9"]:
-    """Returns the harmonics of directions that the fit makes darker than any studio leaves them."""
+    """Returns the harmonics of the directions that the fit makes darker than any studio is."""
     dark = (SURROUND @ coefficients).mean(axis=1) < MIN_UNHIDDEN
     return SURROUND[dark] if coefficients.any() else SURROUND[:0]

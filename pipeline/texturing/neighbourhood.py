@@ -1,9 +1,9 @@
-"""Holds which vertices of a mesh are neighbours, in the form that compiled loops read, fills in what is unknown from
-them, and levels photographs so that they meet without a visible step.
+"""Holds the neighbours of each vertex as compiled loops read them, interpolates unknown values, and corrects
+photographs so that they meet without a visible step.
 
-Waechter et al. (2014, section 4.3) look for smooth additive corrections that make both sides of every seam agree, which
-leaves free what all views have in common. Here a view's correction is a smooth field (sRGB codes) that brings it to the
-colour on which all views agree, wherever it sees the head (a screened Poisson equation), so that any views can be
+Waechter et al. (2014, section 4.3) search smooth additive corrections that make both sides of every seam agree; a
+correction common to all views stays free. Here the correction of a view is a smooth field (sRGB codes) that moves it to
+the colour on which all views agree, wherever it sees the head (a screened Poisson equation). Any views can then be
 blended.
 """
 
@@ -21,7 +21,7 @@ from pipeline.texturing.view_selection_kernels import level_view
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
     """Holds the neighbours of each vertex as compressed rows: those of vertex i are ``indices[starts[i]:starts[i +
-    1]]``. Every edge is stored twice, once in the row of each end; ``opposite`` is the position of the other copy."""
+    1]]``. Every edge is stored twice, in the rows of both ends; ``opposite`` is the position of its other entry."""
 
     starts: Int32[np.ndarray, " s"]
     indices: Int32[np.ndarray, " e"]
@@ -42,8 +42,8 @@ class Neighbourhood:
         return np.repeat(np.arange(len(self.starts) - 1, dtype=np.int32), np.diff(self.starts))
 
     def calmed(self, values: Float[np.ndarray, "v c"], rounds: int) -> Float[np.ndarray, "v c"]:
-        """Returns the values smoothed over the mesh: in each round a vertex keeps half its value and takes half the
-        mean of its neighbours'."""
+        """Returns the values smoothed over the mesh: in each round a vertex's value becomes the average of itself and
+        its neighbours' mean."""
         count = len(self.starts) - 1
         share = 0.5 / np.maximum(np.diff(self.starts), 1)
         means = sparse.csr_array((np.repeat(share, np.diff(self.starts)), self.indices, self.starts), (count, count))
@@ -74,8 +74,8 @@ def fill_unknown(
     parts: UInt8[np.ndarray, " v"] | None = None,
 ) -> Float[np.ndarray, "v c"]:
     """Fills in the values (at most four channels) of unknown vertices smoothly from their neighbours. A piece of the
-    mesh without any known vertex gets the mean of all known ones. With ``parts``, a vertex is filled from those of its
-    own part, where any is known; where two parts meet unknown, one becomes the other over some ``SEAM_RINGS``."""
+    mesh without any known vertex gets the mean of all known ones. With ``parts``, a vertex is filled from known
+    vertices of its own part, if any; where two parts meet unknown, their values are blended over ``SEAM_RINGS``."""
     if parts is None:
         return _fill(values, known, faces)
     out, sure = values.astype(float), known.copy()
@@ -114,7 +114,7 @@ def level_views(
     agreed: Float32[np.ndarray, "v 3"],
     around: Neighbourhood,
 ) -> Float32[np.ndarray, "k v 4"]:
-    """Computes what is added to each view at each vertex (sRGB codes; the fourth channel is 0) so that neighbouring
+    """Computes the correction of each view at each vertex (sRGB codes; the fourth channel is 0) with which neighbouring
     views meet without a visible step.
 
     Args:

@@ -1,4 +1,4 @@
-"""Compiled loops of ``pipeline.texturing.paint``, and those of ``neighbourhood`` that fill what no view shows."""
+"""Compiled loops of ``pipeline.texturing.paint``, and those of ``neighbourhood`` that fill unseen vertices."""
 
 from typing import NamedTuple
 
@@ -12,8 +12,7 @@ TAPS = 4
 
 
 class Pictures(NamedTuple):
-    """Holds the parts of the photographs that show the head, one after the other, and where the vertices lie in
-    them."""
+    """Holds the parts of the photographs that show the head, in sequence, and the pixel of each vertex in them."""
 
     codes: np.ndarray  # uint8 (n,), rows of pixels of three channels
     first: np.ndarray  # int64 (k,): where each begins
@@ -24,7 +23,7 @@ class Pictures(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """Holds the views of every vertex, their shares in the mean, and what is added to their colours (sRGB codes)."""
+    """Holds, for every vertex, its views, their weights in the mean, and corrections of their colours (sRGB codes)."""
 
     slots: np.ndarray  # int32 (v, s), -1: no view
     shares: np.ndarray  # float32 (v, s)
@@ -35,8 +34,8 @@ class Choice(NamedTuple):
 
 @njit(cache=True, nogil=True, inline="always")
 def sample(pictures: Pictures, k: int, x: float, y: float, out: np.ndarray) -> None:
-    """Reads the codes at the point (x, y) of view k into ``out`` (3), with a window of 4 x 4 pixels. Points outside the
-    picture get those of its border."""
+    """Reads the codes at the point (x, y) of view k into ``out`` (3), with a window of 4 x 4 pixels. A point outside
+    the picture gets the codes of the border."""
     width, height = pictures.width[k], pictures.height[k]
     x = min(max(x, 0.0), width - 1.0)
     y = min(max(y, 0.0), height - 1.0)
@@ -70,7 +69,7 @@ def sample(pictures: Pictures, k: int, x: float, y: float, out: np.ndarray) -> N
 def gather(
     corners: tuple[int, int, int], choice: Choice, view: np.ndarray, share: np.ndarray, added: np.ndarray
 ) -> int:  # fmt: skip
-    """Collects the views that colour a triangle: those of its corners that see all three of them. Returns their number
+    """Collects the views that colour a triangle: views of its corners that see all three corners. Returns their number
     n; 0 if there is none.
 
     Fills ``view`` (n), ``share`` (n, 3), the weight of each view at each corner, and ``added`` (3, 3), the correction
@@ -125,11 +124,11 @@ def paint_rows(
     image: np.ndarray, row: int, rows: int, which: np.ndarray, texels: np.ndarray, faces: np.ndarray,
     source: np.ndarray, pictures: Pictures, choice: Choice,
 ) -> None:  # fmt: skip
-    """Paints the triangles ``which`` of a texture's layout into ``rows`` rows of ``image`` (h, w, 3; blue, green, red),
-    from ``row`` on, in place.
+    """Paints the triangles ``which`` of a texture's layout in place, into ``rows`` rows of ``image`` (h, w, 3; BGR)
+    from ``row`` on.
 
-    ``texels`` (n, 2) are the corners' places in the image, ``faces`` (f, 3) the layout's triangles, and ``source`` (n)
-    the vertex of the head to which each corner belongs.
+    ``texels`` (n, 2) are the corners' positions in the image, ``faces`` (f, 3) the layout's triangles, and ``source``
+    (n) the head's vertex for each corner.
     """
     width = image.shape[1]
     code = np.zeros(3, np.float32)
@@ -183,8 +182,8 @@ def paint_rows(
 
 @njit(cache=True)
 def by_rings(starts: np.ndarray, indices: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Returns the unknown vertices in the order in which a flood from the known ones reaches them. Vertices that it
-    does not reach are left out."""
+    """Returns the unknown vertices in the order in which a flood from the known vertices reaches them. Vertices that
+    the flood does not reach are left out."""
     met = known.copy()
     queue = np.empty(len(known), np.int32)
     tail = 0
@@ -211,8 +210,8 @@ def by_rings(starts: np.ndarray, indices: np.ndarray, known: np.ndarray) -> np.n
 def first_guess(
     values: np.ndarray, starts: np.ndarray, indices: np.ndarray, order: np.ndarray, known: np.ndarray
 ) -> None:
-    """Gives every vertex of ``order`` in turn the mean of its neighbours that are ``known`` by then. Changes ``values``
-    (v, LANES) and ``known`` (v) in place."""
+    """Sets each vertex of ``order`` in turn to the mean of those neighbours that are ``known`` by then. Changes
+    ``values`` (v, LANES) and ``known`` (v) in place."""
     for v in order:
         total, count = np.zeros(LANES, np.float32), 0
         for k in range(starts[v], starts[v + 1]):
@@ -227,8 +226,8 @@ def first_guess(
 def relax(
     values: np.ndarray, starts: np.ndarray, indices: np.ndarray, order: np.ndarray, sweeps: int, factor: float
 ) -> None:
-    """Relaxes the vertices of ``order`` towards the mean of their neighbours, by over-relaxed (``factor``) Gauss-Seidel
-    sweeps forth and back. Changes ``values`` (v, LANES) in place, four numbers at once."""
+    """Moves the vertices of ``order`` towards the mean of their neighbours, by over-relaxed (``factor``) Gauss-Seidel
+    sweeps in alternating directions. Changes ``values`` (v, LANES) in place, four numbers at once."""
     for sweep in range(sweeps):
         for step in range(len(order)):
             v = order[step] if sweep % 2 == 0 else order[len(order) - 1 - step]

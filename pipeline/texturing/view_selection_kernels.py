@@ -18,7 +18,7 @@ RING_SHARE = 0.7  # of a view's quality that the neighbours decide: beside an oc
 @njit(cache=True, nogil=True)
 def ring_quality(weights: np.ndarray, starts: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """Returns the quality (v, k) of each view at each vertex: a mixture of its own weight and the smallest weight of
-    the neighbours, which is small beside occlusions. ``weights`` is (k, v)."""
+    its neighbours, which is small near occlusions. ``weights`` is (k, v)."""
     cameras, count = weights.shape
     out = np.zeros((count, cameras), np.float32)
     for v in range(count):
@@ -69,8 +69,8 @@ def propagate(
 
     ``views`` and ``costs`` (v, candidates) are the results of ``best_candidates``. ``penalty`` (e) is the cost of
     different views at both ends of a directed edge; ``starts``, ``indices`` and ``opposite`` are those of
-    ``Neighbourhood``. A message is stored at its edge for the candidates of its receiver, relative to that for any
-    other label.
+    ``Neighbourhood``. A message is stored at its edge, for the candidates of the receiving vertex, relative to the
+    message for any other label.
     """
     count, most = views.shape
     messages = np.zeros((len(indices), most), np.float32)  # of edge e = (v, w): what w tells v
@@ -149,8 +149,8 @@ def differences(
     labels: np.ndarray, views: np.ndarray, detail: np.ndarray, weights: np.ndarray, starts: np.ndarray,
     indices: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Returns, for each candidate view (v, candidates), the mean squared difference of its detail (k, v, 3; codes) from
-    that of the chosen view, over the vertex and those neighbours that both see; -1 for none."""
+    """Returns the mean squared difference in detail (k, v, 3; codes) between each candidate view (v, candidates) and
+    the chosen view, over the vertex and those neighbours that both see; -1 if there are none."""
     count, most = views.shape
     out = np.full((count, most), np.float32(-1.0), np.float32)
     for v in range(count):
@@ -177,8 +177,8 @@ def differences(
 def fill_slots(
     labels: np.ndarray, views: np.ndarray, shares: np.ndarray, slots: int
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Returns the chosen view of each vertex and those with the largest shares beside it: views (v, slots), -1 = none,
-    and their shares, which sum to 1."""
+    """Returns the chosen view of each vertex and the other views with the largest weights: views (v, slots), -1 = none,
+    and their weights, which sum to 1."""
     count, most = views.shape
     found = np.full((count, slots), -1, np.int32)
     weight = np.zeros((count, slots), np.float32)
@@ -210,7 +210,7 @@ def blend_views(weights: np.ndarray, colours: np.ndarray, outlier: float) -> tup
     linear.
 
     ``outlier`` is the difference from the median, relative to the median, at which a brighter view (a highlight) counts
-    half. A darker view (a shadow that it alone sees) counts half at twice that.
+    half. A darker view (in a shadow that only it sees) counts half at twice that.
     """
     cameras, count = weights.shape
     out = np.zeros((count, 3))
@@ -279,7 +279,7 @@ def visibility_weights(
     pixel_angle: float,
     limits: tuple[float, float, float, float],
 ) -> np.ndarray:
-    """Returns how well one camera sees each point (v), float32; 0 where it does not.
+    """Returns the weight (float32) with which one camera sees each point (v); 0 where it does not.
 
     A point counts if it lies inside the silhouette by a margin, and no nearer surface of the depth map hides it. Its
     weight is cosine^sharpness / depth^2, reduced towards the margin, and ``POOR`` times that at a flat angle or beside
@@ -328,8 +328,8 @@ def sample_colours(
     """Returns the linear colours (v, 3) of the points with a weight, from a Gaussian window of 4 x 4 pixels around each
     projection, which has less noise than a single sample.
 
-    The window averages sRGB codes, in which noise is even and a dark crease is not outshone by the light beside it.
-    ``table`` is the linear light of each code, ``sigma`` the window's width in px.
+    The window averages sRGB codes, whose noise is the same at all levels; in linear light a bright pixel would dominate
+    a dark crease. ``table`` is the linear light of each code, ``sigma`` the window's width in px.
     """
     height, width = image.shape[:2]
     out, across, down = np.zeros((len(weights), 3), np.float32), np.empty(4), np.empty(4)

@@ -1,11 +1,11 @@
-"""Computes which camera sees which point of a surface, how well, and in what colour (section 4.5).
+"""Computes which camera sees which point of a surface, with what weight, and in what colour (section 4.5).
 
-The paper requires a projection inside the silhouette and no occlusion. Real edges are blurred and fits are not exact,
-so a margin is kept to the contour (no background on the mesh) and to occluding edges of the head itself (no nose on the
-cheek behind it). There the nearest surface in a small window counts, less what the surface's own slope explains. A view
-beside an occluding edge, or at a flat angle, counts only where there is no better one.
+The paper requires a projection inside the silhouette and no occlusion. Real edges are blurred and fits are not exact.
+So a margin is kept to the contour (no background on the mesh) and to occluding edges of the head itself (no nose on the
+cheek behind it). At an occluding edge the nearest surface in a small window decides, corrected for the surface's own
+slope. A view near an occluding edge, or at a flat angle, counts only where no better view exists.
 
-Also holds which photograph colours each vertex, and the photographs packed for compiled loops.
+This module also holds the choice of photographs for each vertex, and the photographs packed for compiled loops.
 """
 
 from collections.abc import Mapping, Sequence
@@ -69,8 +69,8 @@ def see_points(
 def unclipped(colours: Float32[np.ndarray, "v 3"]) -> Float32[np.ndarray, " v"]:
     """Returns a factor for the weight of each colour: 1 well below the end of the scale, falling to almost 0 at it.
 
-    At the end of the scale nothing shows how much brighter a point is, so that a view with a longer exposure would make
-    it too dark. Where all views are clipped the result is still white.
+    A clipped value does not show how bright a point is, so a view with a longer exposure would make it too dark. Where
+    all views are clipped the result is still white.
     """
     brightest = np.maximum(np.maximum(colours[:, 0], colours[:, 1]), colours[:, 2])  # a fifth of the time of ``max``
     past = (brightest - CLIPS[0]) / (CLIPS[1] - CLIPS[0])
@@ -80,8 +80,8 @@ def unclipped(colours: Float32[np.ndarray, "v 3"]) -> Float32[np.ndarray, " v"]:
 def see_weights(
     camera: Camera, silhouette: Silhouette, depth: Float32[np.ndarray, "h w"], points: Vertices, normals: Vertices
 ) -> Float32[np.ndarray, " v"]:
-    """Returns how well ``camera`` sees each point of a surface (world frame, mm); 0 where it does not. ``depth`` is the
-    surface's depth map in that camera."""
+    """Returns the weight with which ``camera`` sees each point of a surface (world frame, mm); 0 where it does not.
+    ``depth`` is the surface's depth map in that camera."""
     pixels, depths = project_points(camera, points), camera_depths(camera, points)
     return visibility_weights(
         pixels,
@@ -98,8 +98,8 @@ def sharpened(image: Photograph, inside: Bool[np.ndarray, "h w"], amount: float)
     """Sharpens a photograph where it has detail, which removes part of the blur of the lens and of the sampling window.
     ``amount`` is that of an unsharp mask.
 
-    Plain sharpening would amplify noise as well. It is therefore scaled as in a Wiener filter: by the share of the
-    local power that is more than noise. Most of a head is smooth, so the median power over the head is taken for noise.
+    Plain sharpening would amplify noise as well. It is therefore scaled as in a Wiener filter: by the fraction of the
+    local power that exceeds noise. Most of a head is smooth, so the median power over the head is taken for noise.
     """
     box = box_around(inside, 0)
     if not amount or not inside[box].size:
@@ -116,7 +116,7 @@ def sharpened(image: Photograph, inside: Bool[np.ndarray, "h w"], amount: float)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """Holds which photographs colour each vertex.
+    """Holds the photographs that colour each vertex.
 
     Attributes:
         views: the cameras of the photographs.
@@ -135,7 +135,7 @@ class Decision:
     pictures: Pictures
 
     def choice(self, colours: UInt8[np.ndarray, "v 3"]) -> Choice:
-        """Returns the decision as the compiled loops take it. ``colours`` (sRGB codes of the vertices) are used in
+        """Returns the decision in the form of the compiled loops. ``colours`` (sRGB codes of the vertices) are used in
         triangles that no view sees."""
         filled = np.zeros((len(colours), 4), np.float32)
         filled[:, :3] = colours
@@ -143,8 +143,8 @@ class Decision:
 
 
 def window_table(sigma: float) -> Float32[np.ndarray, "_ _"]:
-    """Returns the Gaussian weights with which four neighbouring pixels are read, one row for each sub-pixel position
-    between the middle two. ``sigma`` is in pixels."""
+    """Returns the Gaussian weights for reading four neighbouring pixels, one row for each sub-pixel position between
+    the middle two. ``sigma`` is in pixels."""
     phase = np.arange(PHASES + 1) / PHASES
     weights = np.exp(-0.5 * ((np.arange(TAPS) - 1 - phase[:, None]) / sigma) ** 2)
     return (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)

@@ -1,5 +1,5 @@
 """Decides which views a job may use. Finds exchanged pictures, cameras that moved, a calibration of another rig, and
-outlines too large or small for a head.
+outlines too large or too small for a head.
 
-Enters: silhouettes and the rig. Leaves: the views that agree, corrected where the correction is certain, and warnings.
+In: silhouettes and the rig. Out: the views that agree, corrected where the correction is certain, and warnings.
 """

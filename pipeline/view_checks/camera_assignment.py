@@ -1,12 +1,12 @@
 """Checks whether every picture is filed under the camera that took it, before anything is fitted.
 
-If cables are plugged in wrongly or files renamed, two cameras hold each other's pictures, or three in a ring, or all
-are off by one. The planes through two camera centres that touch the subject touch both silhouettes (Wong and Cipolla,
-*Structure and motion from silhouettes*, ICCV 2001), but only if each silhouette belongs to its camera: right pictures
-miss by tenths of a pixel, exchanged ones by tens.
+After swapped cables or renamed files, two cameras hold each other's pictures, or three in a ring, or all names are off
+by one. A plane through two camera centres that touches the subject touches both silhouettes (Wong and Cipolla,
+*Structure and motion from silhouettes*, ICCV 2001), provided that each silhouette belongs to its camera: correct
+pictures miss by tenths of a pixel, exchanged ones by tens.
 
-Enters: silhouettes and the rig. Leaves: which picture each camera should have, and how sure that is. A camera that was
-moved, or whose mask is bad, contradicts the others with every picture, and keeps its own.
+In: silhouettes and the rig. Out: the picture that each camera should have, and how certain that is. A camera that was
+moved, or whose mask is bad, contradicts the others with every picture, and retains its own.
 """
 
 from collections.abc import Mapping, Sequence
@@ -127,8 +127,8 @@ def outlined(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Rig, list
 
 
 def tangency_errors_px(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np.ndarray, "n n 2"]:
-    """Returns by how much (px of both images together) the two tangent planes of every pair of cameras miss each other,
-    with all pictures as filed. ``hulls`` are the outlines' convex hulls, px."""
+    """Returns the error (px of both images together) between the two images of each tangent plane, two planes for each
+    pair of cameras, with all pictures as filed. ``hulls`` are the outlines' convex hulls, px."""
     cameras = list(rig)
     touches = [_touches(camera, hulls[i : i + 1], i, cameras) for i, camera in enumerate(cameras)]
     angle, step = (np.stack([touch[k][0] for touch in touches]) for k in range(2))
@@ -142,8 +142,8 @@ def _miss_px(gap: Float[np.ndarray, "*n"], step: Float[np.ndarray, "*n"]) -> Flo
 
 
 def mean_misfit(errors_px: Float[np.ndarray, "n n 2"], cut_off: float | None = None) -> Float[np.ndarray, " n"]:
-    """Returns the mean robust misfit of each camera's tangent planes. Planes that the image border hides count as
-    ``cut_off``; if that is None they do not count."""
+    """Returns the mean robust misfit of each camera's tangent planes. Planes hidden by the image border count as
+    ``cut_off``; None leaves them out."""
     there = np.isfinite(errors_px)
     of_each = np.where(there, _robust(errors_px, ROBUST_SIGMAS * _noise_px(errors_px[there])), cut_off or 0.0)
     count = there.sum(axis=(1, 2)) if cut_off is None else 2 * (len(errors_px) - 1)
@@ -151,8 +151,8 @@ def mean_misfit(errors_px: Float[np.ndarray, "n n 2"], cut_off: float | None = N
 
 
 def _judged(held: Int[np.ndarray, " n"], misfit: Float32[np.ndarray, "n n n n"], rig: Rig) -> Assignment:
-    """Returns the permutation ``held`` as an assignment; an empty one if it gains too little or a moved picture still
-    contradicts the others."""
+    """Returns the permutation ``held`` as an assignment; an empty one if it gains too little or an exchanged picture
+    still contradicts the others."""
     identity = np.arange(len(rig))
     displaced = np.flatnonzero(held != identity)
     if not len(displaced):
@@ -167,7 +167,7 @@ def _judged(held: Int[np.ndarray, " n"], misfit: Float32[np.ndarray, "n n n n"],
 
 
 def _noise_px(errors_px: Float[np.ndarray, " n"]) -> float:
-    """Estimates the standard deviation (px) of a plane's miss from the best quarter, since half of the planes may
+    """Estimates the standard deviation (px) of a plane's error from the best quarter, since half of the planes may
     belong to exchanged pictures."""
     quarter = float(np.quantile(np.abs(errors_px), 0.25)) if len(errors_px) else 0.0
     return float(np.clip(quarter / 0.3186, MIN_NOISE_PX, MAX_NOISE_PX))
@@ -179,8 +179,8 @@ def _robust(miss_px: np.ndarray, scale_px: float) -> np.ndarray:
 
 
 def _misfit_tensor(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float32[np.ndarray, "n n n n"]:
-    """Returns the robust misfit of the two outer planes of cameras i and j if camera i held picture a and camera j
-    picture b, for all i, a, j, b.
+    """Returns, for all i, a, j, b, the robust misfit of the two outer planes of cameras i and j, if camera i held
+    picture a and camera j picture b.
 
     A picture whose size is not the camera's counts as cut off.
     """
@@ -202,8 +202,8 @@ def _misfit_tensor(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float
 def _touches(
     camera: Camera, hulls: Sequence[Float[np.ndarray, "_ 2"]], index: int, cameras: Sequence[Camera]
 ) -> tuple[Float[np.ndarray, "h n 2"], Float[np.ndarray, "h n 2"]]:
-    """Returns, for each silhouette as if it were this camera's, the angles (rad) of the two outermost planes through
-    this and each other camera that touch it, and the change of angle per pixel. NaN where the image border cuts the
+    """Treats each silhouette as this camera's. Returns the angles (rad) of the two outermost planes through this and
+    each other camera that touch the silhouette, and the change of angle per pixel. NaN where the image border cuts the
     tangent off."""
     pixels, ends = np.concatenate(hulls), np.cumsum([0, *map(len, hulls)])
     rays = camera.rays_world(pixels)
@@ -239,7 +239,7 @@ def _size(camera: Camera) -> tuple[int, int]:
 
 def _least_misfit(misfit: Float32[np.ndarray, "n n n n"], rig: Rig) -> Int[np.ndarray, " n"]:
     """Finds the permutation of least misfit by exchanging two pictures at a time, from the pictures as filed. If all
-    names are off by the same number no single exchange helps, so the search also starts from those permutations."""
+    names are off by the same number, no single exchange helps; so the search also starts from those permutations."""
     count = len(rig)
     sizes = [_size(camera) for camera in rig]
     allowed = np.array([[one == two for two in sizes] for one in sizes])

@@ -1,19 +1,18 @@
-"""Checks whether a camera has moved since the calibration, for every capture before the fit, from the silhouettes
-alone.
+"""Checks, before each fit, whether a camera has moved since the calibration, from the silhouettes alone.
 
-The planes through two camera centres that touch the subject touch both silhouettes: epipolar tangency, at frontier
+A plane through two camera centres that touches the subject touches both silhouettes: epipolar tangency, at frontier
 points (Ramanathan, Steinbach and Girod 2000, the paper's reference for calibration from silhouettes). Hair and
-shoulders serve as well as skin, since the subject is rigid within a shot. Eleven cameras give about fifty such
-equations, exact to 0.2 px. A camera that was turned by a small angle shifts its whole image; all equations of that
-camera then agree on one shift.
+shoulders are as useful as skin, since the subject is rigid within a shot. Eleven cameras give about fifty such
+equations, exact to 0.2 px. A camera rotated by a small angle shifts its whole image; all equations of that camera then
+agree on one shift.
 
-A loose mask is too large on every side, while a shifted image is off in one direction: tangencies on opposite sides
-distinguish the two. In a close-up most of them are on one side, with twice the pixels per millimetre; there both
-explain the observation, the camera is reported with both, and its view is kept. Strands of hair that one camera
-resolves and another does not would be misses of several pixels. So the planes touch a curve inside the outline, which
-no strand reaches, at the same depth in mm for every camera.
+A loose mask is too large on every side, while a shifted image is off in one direction; tangencies on opposite sides
+distinguish the two. In a close-up most tangencies are on one side, with twice the pixels per millimetre. Both causes
+then explain them: the camera is reported with both, and its view is still used. Strands of hair that one camera
+resolves and another does not would cause errors of several pixels. So the planes touch a curve inside the outline,
+beyond the reach of strands, at the same depth in mm for every camera.
 
-Enters: silhouettes and the rig. Leaves: the cameras that have moved, how far, how sure.
+In: silhouettes and the rig. Out: the cameras that have moved, by how much, and with what certainty.
 """
 
 from collections.abc import Mapping
@@ -48,7 +47,7 @@ CHANCE = 0.01  # that a good camera disagrees so much with the rest (F test)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift:
-    """Holds a camera whose silhouette lies off the position that the other cameras predict.
+    """Holds a camera whose silhouette lies away from the position that the other cameras predict.
 
     Attributes:
         camera: its name.
@@ -117,7 +116,7 @@ def _judge(name: str, tangencies: list[Tangency], camera: Camera) -> Drift | Non
 
 
 def _normalised(tangencies: list[Tangency]) -> Float[np.ndarray, " n"]:
-    """Returns the miss of each tangency in standard deviations, for contours with an error of ``NOISE_FLOOR_PX``."""
+    """Returns the error of each tangency in standard deviations, for contours with an error of ``NOISE_FLOOR_PX``."""
     excess = np.array([t.excess_px[0] for t in tangencies])
     slopes = np.array([t.steepness for t in tangencies]).reshape(-1, 2)
     return excess * slopes[:, 0] / (NOISE_FLOOR_PX * np.hypot(slopes[:, 0], slopes[:, 1]))
@@ -126,10 +125,10 @@ def _normalised(tangencies: list[Tangency]) -> Float[np.ndarray, " n"]:
 @dataclass(frozen=True, slots=True, eq=False)
 class ShiftEquations:
     """Holds the equations ``normal . shift + outward * loose = excess`` of one camera's n tangencies, in its pixels.
-    Unknown are the shift of its image and by how many pixels its mask is too large all around (``loose``).
+    The unknowns are the shift of its image and the width by which its mask is too large all around (``loose``).
 
-    ``outward`` is 1 where ``normal`` points out of the subject, else -1. ``pixels`` is the error of each equation if
-    contours in both pictures are wrong by one pixel; ``contour_noise_px`` is the standard deviation of the contours.
+    ``outward`` is 1 where ``normal`` points out of the subject, else -1. ``pixels`` is the standard deviation of each
+    equation for a contour noise of one pixel in both pictures; ``contour_noise_px`` is the actual one.
     """
 
     normals: Float[np.ndarray, "n 2"]
@@ -178,7 +177,8 @@ class ShiftTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shift:
-    """Holds a shift (px) with its standard deviation (px) and its size in standard deviations, for a tight mask."""
+    """Holds a shift (px), its standard deviation (px), and its size in standard deviations; the mask is taken as
+    tight."""
 
     shift_px: Float[np.ndarray, " 2"]
     deviation_px: float
@@ -187,7 +187,7 @@ class _Shift:
 
 def _robust_shift(equations: ShiftEquations) -> _Shift:
     """Finds the shift of least robust misfit, starting from the best of those that pairs of equations propose. If all
-    equations have one direction, the shift across it stays zero."""
+    equations have one direction, the shift at right angles to it stays zero."""
     pairs = np.stack(np.triu_indices(len(equations.excess_px), 1), axis=1)
     pairs = pairs[np.abs(np.linalg.det(equations.normals[pairs])) > MIN_INDEPENDENT]
     met = np.linalg.solve(equations.normals[pairs], equations.excess_px[pairs][:, :, None])[:, :, 0]
@@ -203,8 +203,8 @@ def _robust_shift(equations: ShiftEquations) -> _Shift:
 
 
 def _beyond_loose_masks(equations: ShiftEquations, found: _Shift) -> float:
-    """Returns by how many standard deviations the shift explains the tangencies better than a loose mask does: the root
-    of the difference in cost, 0 if the loose mask does as well."""
+    """Returns by how many standard deviations the shift explains the tangencies better than a loose mask: the root of
+    the difference in cost, 0 if the loose mask explains them as well."""
     deviation_px = LOOSE_PX * float(np.median(equations.pixels))
     proposed = np.append(equations.outward * equations.excess_px, 0.0)
     loose = min(
@@ -218,14 +218,14 @@ def _cost(equations: ShiftEquations, shift_px: Float[np.ndarray, " 2"], loose_px
 
 
 def _explains(before: Float[np.ndarray, " n"], after: Float[np.ndarray, " n"]) -> bool:
-    """Tells whether the shift removes enough of the misfit, also without the equation that it improves most: a bad
+    """Tells whether the shift removes enough of the misfit, also without the equation that it improves most. A bad
     stretch of outline affects one tangent plane, a moved camera all of its planes."""
     others = np.arange(len(before)) != np.argmax(before - after)
     return all(after[k].sum() <= (1.0 - MIN_GAIN) * before[k].sum() for k in (slice(None), others))
 
 
 def _disagrees(misfits: Float[np.ndarray, " n"], rest: Float[np.ndarray, " m"]) -> bool:
-    """Tells whether the planes of the other cameras agree better among themselves than with this camera's, by more than
+    """Tells whether the other cameras' planes agree better among themselves than with this camera's, by more than
     chance allows (F test of the mean misfits)."""
     if not len(rest) or not rest.any():
         return True

@@ -1,9 +1,9 @@
 """Holds the one place through which every refusal of a capture goes.
 
-A guard refuses only where two independent kinds of evidence agree and a wrong head would be delivered otherwise.
-Missing or damaged input is no matter of evidence: it is refused where it is read.
+A guard refuses a capture only if two independent kinds of evidence agree and the head would otherwise be wrong. Missing
+or damaged input needs no such evidence: its reader refuses it.
 
-Enters: the error that a check would raise, and the face in the photographs. Leaves: that error, or a warning instead.
+In: the error that a check would raise, and the face in the photographs. Out: that error, or a warning instead.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,10 +26,10 @@ DAMAGED = ("pictures-the-same",)  # codes of refusals that leave no head possibl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceEvidence:
-    """Holds what the subject's face, of a human's size and with landmarks that meet within their noise, says about the
-    capture: where the face is, which way is up, and which views show it there.
+    """Holds the evidence of the subject's face about the capture: where the face is, which way is up, and which views
+    show it there. The face has a human's size, and its landmarks meet within their noise.
 
-    ``missed`` are the views that must show the face and do not show it there.
+    ``missed`` are the views that must show the face but do not show it there.
     """
 
     centre_world: Float[np.ndarray, " 3"]
@@ -39,16 +39,16 @@ class FaceEvidence:
 
     @property
     def up_world(self) -> Float[np.ndarray, " 3"]:
-        """Returns which way is up for the subject."""
+        """Returns the subject's upward direction."""
         return self.rotation[:, 1]
 
     def skull_world(self, from_face_mm: tuple[float, float, float]) -> Float[np.ndarray, " 3"]:
-        """Returns the point that lies ``from_face_mm`` from the face."""
+        """Returns the point ``from_face_mm`` behind the face."""
         return self.centre_world + self.rotation @ np.array(from_face_mm)
 
     @property
     def holds_the_rig(self) -> bool:
-        """Tells whether most cameras before the face see it where these cameras say it is."""
+        """Tells whether most cameras in front of the face show it where the calibration predicts it."""
         return len(self.views) > 2 * len(self.missed)
 
 
@@ -68,7 +68,7 @@ FindFace = Callable[[Mapping[str, ImageRgb], Rig], FaceEvidence | None]
 
 @dataclass(frozen=True, slots=True)
 class Guards:
-    """Is what every check refuses through. With ``anyway``, a refusal becomes a warning that the pose is in doubt."""
+    """Decides whether a capture is refused. With ``anyway``, a refusal becomes a warning of a doubtful pose."""
 
     anyway: bool = False
     find_face: FindFace = find_face_evidence

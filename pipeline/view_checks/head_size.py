@@ -1,19 +1,19 @@
-"""Checks the head that the outlines show, before a fit, from silhouettes, cameras and the subject's face: its size, and
-whether every view shows its crown as high as the others do.
+"""Checks the outlined head before a fit, from silhouettes, cameras and the subject's face: its size, and whether the
+crown has the same height in every view.
 
-Cameras from another program have an arbitrary unit if no length was given. A model fitted to a head three times too
-large lies inside the face, and every outline counts as clutter. Each outline has a diameter that needs no model: going
-down from the crown, an outline is wider than twice the distance from the crown until it is as wide as a round head's
-diameter. At the distance of the subject that is 150 to 290 mm for people, hair included.
+Cameras from another program have an arbitrary unit if no known length was supplied. If the outlines are three times too
+large, a fitted model lies inside the face, and every outline counts as clutter. The diameter of an outline needs no
+model: below the crown, an outline is wider than twice the distance from the crown, until it is as wide as a round
+head's diameter. At the subject's distance that is 150 to 290 mm for people, hair included.
 
-Up is the face's; without a face it is the pictures', or the rig's if its cameras hang on their side, whichever lets
-more outlines meet in one head. A mask may end anywhere and touch any border, so that no border says what is down. A
-face of a human's size contradicts every outline: then nothing is refused.
+Up is the face's direction. Without a face it is that of the pictures or, for cameras mounted on their side, that of the
+rig, whichever lets more outlines meet in one head. A mask may end anywhere and touch any border, so no border tells
+which way is down. A face of a human's size contradicts every outline: nothing is refused then.
 
-A crown is nearly round: planes that touch it from above, each through one camera, pass the skull's middle at nearly
-the same distance. A mask that ends below the crown has a plane that passes nearer.
+A crown is nearly round: planes that touch it from above, one through each camera, have nearly the same distance from
+the skull's middle. If a mask ends below the crown, its plane passes nearer.
 
-Enters: silhouettes, the rig and the face. Leaves: the diameter and the crowns, and the messages about them.
+In: silhouettes, the rig and the face. Out: the diameter, the heights of the crowns, and messages about them.
 """
 
 from collections.abc import Callable, Mapping
@@ -50,7 +50,7 @@ Discs = Mapping[str, tuple[Float[np.ndarray, " 2"], float]]  # by camera: middle
 
 def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig, face: FaceEvidence | None = None) -> float | None:
     """Returns the median of the head's diameter (mm) over the views whose outlines meet in one head; None if these are
-    too few, or fewer than half.
+    too few, or fewer than half of all.
 
     Args:
         silhouettes: by camera; unusable ones are ignored.
@@ -71,8 +71,8 @@ def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig, face: Face
 def _diameters_mm(
     solid: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig, up_world: Vector, face: FaceEvidence | None
 ) -> list[float]:
-    """Returns the head's diameter (mm) in each view whose disc lies where the others, or the face, say that the head
-    is; none if these are less than ``MIN_MEETING`` of the views that show a crown."""
+    """Returns the head's diameter (mm) in each view whose disc lies at the head's position in the other views or at the
+    face; none if these are less than ``MIN_MEETING`` of the views that show a crown."""
     found = {name: crown_disc(mask, turns_to_upright(rig[name], up_world)) for name, mask in solid.items()}
     discs = {name: disc for name, disc in found.items() if disc is not None}
     point = _middle(discs, rig) if face is None else face.centre_world
@@ -88,8 +88,8 @@ def _diameters_mm(
 def find_low_crowns(
     silhouettes: Mapping[str, Silhouette], rig: Rig, find_face: Callable[[], FaceEvidence | None]
 ) -> dict[str, float]:
-    """Returns how far (mm) the crown in a view lies below that in the others, for views where it is more than
-    ``MAX_LOW_MM``. The face is asked only if the outlines alone raise suspicion."""
+    """Returns how far (mm) the crown in a view lies below the other views' crown, for views where it is more than
+    ``MAX_LOW_MM``. The face is searched only if the outlines alone are suspicious."""
     solid = {name: _without_strands(s.mask) for name, s in silhouettes.items() if s.quality.usable and name in rig}
     pictures_up = -np.mean([camera.camera_from_world.rotation[1] for camera in rig], axis=0)
     found = {name: crown_disc(mask, turns_to_upright(rig[name], pictures_up)) for name, mask in solid.items()}
@@ -113,7 +113,7 @@ def _low_crowns(
 
 def crown_height_mm(mask: Mask, camera: Camera, middle_world: Vector, up_world: np.ndarray) -> float | None:
     """Returns the distance (mm) from the middle of the skull to the plane through the camera that touches the mask from
-    above; None if the mask ends at the picture's border there, or shows nothing."""
+    above; None if the mask is empty or ends at the picture's border there."""
     middle, above = camera.project(np.stack([middle_world, middle_world + 50.0 * up_world]))
     up = (above - middle) / np.linalg.norm(above - middle)
     across = np.array([-up[1], up[0]])
@@ -134,12 +134,12 @@ def crown_height_mm(mask: Mask, camera: Camera, middle_world: Vector, up_world: 
 
 
 def _mm_per_px(camera: Camera, point_world: Vector) -> float:
-    """Returns the width (mm) of a pixel in the plane of a point parallel to the picture."""
+    """Returns the width (mm) of a pixel at the distance of a point."""
     return float(camera.camera_from_world.apply(point_world)[2]) / camera.intrinsics.fx
 
 
 class WrongScale(EigenheadError):
-    """Reports outlines of a size that no head has, so that the cameras are probably not in millimetres."""
+    """Reports outlines of an impossible size; the cameras are probably not in millimetres."""
 
     def __init__(self, diameter_mm: float, *, masks_given: bool = False) -> None:
         part = masks_given and diameter_mm < HEAD_MM
@@ -194,7 +194,7 @@ def _size_message(diameter_mm: float) -> Message:
 
 def crown_disc(mask: Mask, turns: int) -> tuple[Float[np.ndarray, " 2"], float] | None:
     """Returns the middle (px) and diameter (px) of the head in a mask that is upright after ``turns`` quarter turns
-    (anticlockwise); None if its crown is not inside the picture."""
+    (anticlockwise); None if its crown lies outside the picture."""
     upright = np.rot90(mask, turns)
     rows = np.flatnonzero(upright.any(axis=1))
     if not len(rows) or rows[0] == 0:
@@ -224,14 +224,14 @@ def _without_strands(mask: Mask) -> Mask:
 
 
 def turns_to_upright(camera: Camera, up_world: Vector) -> int:
-    """Returns the number of quarter turns (anticlockwise) after which up is up in the camera's picture."""
+    """Returns the number of quarter turns (anticlockwise) that make the camera's picture upright."""
     right, down = (camera.camera_from_world.rotation @ up_world)[:2]
     return int(np.argmax([-down, right, down, -right]))  # up is at the top, right, bottom and left
 
 
 def _middle(discs: Discs, rig: Rig) -> Vector | None:
-    """Returns the point (world) on which most discs lie: the best of those where two rays pass each other, and then the
-    one nearest to the rays through all discs that it lies on. One view with a wrong outline must not move it."""
+    """Returns the point (world) on most discs. It takes the best of the points where two rays nearly meet, then the
+    point nearest to the rays through all discs that contain it. A single wrong outline must not move it."""
     if len(discs) < MIN_VIEWS:
         return None
     cameras = [rig[name] for name in discs]
@@ -246,7 +246,7 @@ def _middle(discs: Discs, rig: Rig) -> Vector | None:
 
 
 def _on_discs(points: Float[np.ndarray, "n 3"], discs: Discs, rig: Rig) -> Bool[np.ndarray, "n v"]:
-    """Tells for each point which cameras it is ahead of and, in their pictures, on the disc of."""
+    """Tells, for each point and camera, whether the point lies in front of the camera and projects into its disc."""
     on = []
     for name, (middle, diameter) in discs.items():
         off = np.linalg.norm(rig[name].project(points) - middle, axis=1)  # NaN behind a camera, which is not less

@@ -1,8 +1,8 @@
-"""Files every picture under the camera that took it, before anything is measured in it.
+"""Files every picture under the camera that took it, before anything is measured in the picture.
 
-Enters: a capture as it is filed, and a function that segments it. Leaves: capture and silhouettes as they should be
-filed, and what was found. The clean plate of another camera gives no useful mask, so plates are matched to pictures
-first, by the background that both show. Then the pictures, with their plates, are matched to cameras
+In: a capture as it was filed, and a function that segments it. Out: capture and silhouettes under the right cameras,
+and the exchanges found. Another camera's clean plate gives no useful mask, so plates are first matched to pictures by
+the background that both show. Then the pictures, with their plates, are matched to cameras
 (``pipeline.view_checks.camera_assignment``).
 """
 
@@ -46,7 +46,7 @@ Segmentation = Callable[[Capture], dict[str, Silhouette]]
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageAssignment:
     """Holds a capture and its silhouettes with every picture filed under the right camera. ``pictures`` and ``plates``
-    have an entry for each camera that had another's: the name under which its own was filed."""
+    have an entry for each camera with a wrong one: the name under which its correct one was filed."""
 
     capture: Capture
     silhouettes: Mapping[str, Silhouette]
@@ -56,8 +56,8 @@ class ImageAssignment:
 
 
 class ExchangedPictures(EigenheadError):
-    """Reports pictures filed under other cameras' names that were not corrected, because the settings refuse it or the
-    evidence is not sure enough."""
+    """Reports exchanged pictures that were not corrected, because the settings forbid it or the evidence is too
+    weak."""
 
     def __init__(self, found: Sequence[Message], *, doubtful: bool) -> None:
         reason = compose("exchange-doubtful") if doubtful else compose("exchange-not-wanted")
@@ -65,7 +65,7 @@ class ExchangedPictures(EigenheadError):
 
 
 class SamePictures(EigenheadError):
-    """Reports that several cameras hold the same picture, so that too few different ones are left."""
+    """Reports that several cameras hold the same picture and too few different ones remain."""
 
     def __init__(self, duplicates: Mapping[str, str], count: int) -> None:
         names = some_of(sorted({*duplicates, *duplicates.values()}))
@@ -86,13 +86,13 @@ def assign_images(
 ) -> ImageAssignment:
     """Segments a capture, and files exchanged pictures and plates under the right cameras.
 
-    ``capture``: as it was read. ``rig``: the cameras as calibrated. ``segmented``: computes the silhouettes of a
-    capture; called again after every change. ``exchanged``: whether to repair or refuse an exchange that is beyond
-    doubt. ``guards``: what is refused.
+    ``capture``: the capture as it was read. ``rig``: the cameras as calibrated. ``segmented``: computes the silhouettes
+    of a capture; called again after every change. ``exchanged``: whether to repair or refuse an exchange that is beyond
+    doubt. ``guards``: decides about refusals.
 
-    Refuses with: ExchangedPictures: an exchange that may not be repaired, or is not certain enough and the face
-    confirms no picture of it as filed. SamePictures: fewer than three pictures are different. WrongRig: most cameras
-    contradict the others, no exchange explains it, and the face does not hold the rig.
+    Refuses with: ExchangedPictures: an exchange that the settings forbid to repair, or one that is uncertain while the
+    face confirms no picture as filed. SamePictures: fewer than three pictures are different. WrongRig: most cameras
+    contradict the others, no exchange explains it, and the face does not confirm the rig.
     """
     overruled: list[ReportWarning] = []
     plates = misplaced_plates(capture, rig)
@@ -139,7 +139,7 @@ def assign_images(
 
 
 def _check_rig(capture: Capture, rig: Rig, distinct: Mapping[str, Silhouette], guards: Guards) -> list[ReportWarning]:
-    """Refuses another rig's cameras, unless the face holds the rig. Returns the warnings that stand in their place."""
+    """Refuses another rig's cameras, unless the face confirms the rig. Returns the warnings that replace a refusal."""
     wrong = wrong_rig(distinct, rig)
     if not wrong:
         return []
@@ -178,8 +178,8 @@ def thumbnail(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "r c 3"]
 
 
 def common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarray, "_ _ 3"]) -> float:
-    """Returns the share of the picture's pixels that show the same as the plate, apart from a difference in exposure.
-    Both are results of ``thumbnail``."""
+    """Returns the fraction of the picture's pixels that show the same as the plate, apart from a difference in
+    exposure. Both are results of ``thumbnail``."""
     if picture.shape != plate.shape:
         return 0.0
     ratio = (picture - plate).reshape(-1, 3)
@@ -189,9 +189,9 @@ def common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarra
 
 
 def duplicate_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:
-    """Returns the cameras whose picture is another camera's, perhaps encoded anew, each with that other camera.
+    """Returns the cameras whose picture is a copy of another camera's, perhaps encoded anew, each with that camera.
 
-    The picture stays with the camera whose silhouette contradicts the others least, if it contradicts them little.
+    The camera whose silhouette contradicts the others least retains the picture, if it contradicts them little.
     """
     groups: list[list[str]] = []
     for name in (name for name in rig.names if name in capture.images):
@@ -224,8 +224,8 @@ def _same(one: UInt8[np.ndarray, "_ _ 3"], two: UInt8[np.ndarray, "_ _ 3"]) -> b
 
 
 def _composed(plates: Mapping[str, str], pictures: Mapping[str, str]) -> dict[str, str]:
-    """Returns, for each camera, the name under which its plates are filed, given the exchange of plates among pictures
-    and the exchange of pictures among cameras."""
+    """Returns, for each camera, the name under which its plates are filed: the exchange of plates among pictures
+    combined with that of pictures among cameras."""
     found = {}
     for name in plates.keys() | pictures.keys():
         picture = pictures.get(name, name)
@@ -235,7 +235,7 @@ def _composed(plates: Mapping[str, str], pictures: Mapping[str, str]) -> dict[st
 
 def _filed_back(capture: Capture, pictures: Mapping[str, str], rig: Rig) -> Capture:
     """Returns the capture with pictures and plates under the right cameras. Feature points move with the pictures or
-    stay, whichever way the points contradict each other less."""
+    stay, whichever gives the smaller contradiction."""
     moved = reassign_images(capture, pictures=pictures, plates=pictures, points=pictures)
     kept = replace(moved, features=capture.features)
     return min((moved, kept), key=lambda filed: _contradiction(filed.features, rig))

@@ -1,13 +1,13 @@
-"""Checks whether the pictures are undistorted while the rig has distortion coefficients, or the other way round,
-and whether the principal points count pixels from 1. Outlines hardly show that: the tops of heads are equally far from
-the middle of all views, and all their tangencies move alike.
+"""Checks whether the pictures fit the rig's distortion: they may be undistorted while the rig has coefficients, or the
+reverse. Also checks whether the principal points count pixels from 1. Outlines hardly show such faults: heads' crowns
+are equally far from the middle of all pictures, so all tangencies move alike.
 
-Points of the subject in three views or more show it by how much their rays miss. One number is estimated with its
-standard deviation: the share of all coefficients (1 if they belong to the pictures, 0 if these were undistorted) or, if
-there are none, one radial coefficient for all cameras. So is one shift of all
-principal points, as much to the right as down.
+Points of the subject in three or more views show them by the errors of their rays. One number is estimated with its
+standard deviation: a factor on all coefficients (1 if they fit the pictures, 0 if the pictures are undistorted) or, if
+there are no coefficients, one radial coefficient for all cameras. The second number is one shift of all principal
+points, equally to the right and down.
 
-Enters: photographs, silhouettes and the rig. Leaves: a warning, or none.
+In: photographs, silhouettes and the rig. Out: a warning, or none.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -42,7 +42,7 @@ MAX_SHARE, NEAR_SIGMAS = 0.3, 3.0  # of the coefficients, of pictures without di
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Holds a number that was estimated, and its standard deviation."""
+    """Holds an estimated number and its standard deviation."""
 
     value: float
     deviation: float
@@ -51,8 +51,8 @@ class Estimate:
 def judge_distortion(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> list[ReportWarning]:
-    """Returns a warning if the pictures have no distortion although the rig has, or the other way round, or if the
-    principal points are counted from another corner."""
+    """Returns a warning if only the rig or only the pictures have distortion, or if the principal points are counted
+    from another corner."""
     usable = [name for name in rig.names if name in images and silhouettes[name].quality.usable]
     seen = _around_front(rig.subset(usable))
     if len(seen) < MIN_VIEWS or any(camera.recorded is not None for camera in seen):
@@ -77,7 +77,7 @@ def judge_distortion(
 
 
 def _judge_counting(tracks: SceneTracks, seen: Rig) -> list[ReportWarning]:
-    """Returns a warning if all principal points are off by as much to the right as down."""
+    """Returns a warning if all principal points are off equally to the right and down."""
 
     def read(shift_px: float) -> Rig:
         return seen.with_intrinsics(lambda k: replace(k, cx=k.cx - shift_px, cy=k.cy - shift_px))
@@ -89,8 +89,7 @@ def _judge_counting(tracks: SceneTracks, seen: Rig) -> list[ReportWarning]:
 
 
 def _around_front(rig: Rig) -> Rig:
-    """Returns the cameras nearest to the front one, neighbours of each other, where there are more than
-    ``MAX_VIEWS``."""
+    """Returns at most ``MAX_VIEWS`` cameras: those nearest to the front one."""
     if len(rig) <= MAX_VIEWS:
         return rig
     front = rig[rig.front_camera()].centre_world
@@ -99,7 +98,7 @@ def _around_front(rig: Rig) -> Rig:
 
 
 def estimate(tracks: SceneTracks, read: Callable[[float], Rig], values: Sequence[float] | np.ndarray) -> Estimate:
-    """Estimates one number on which a rig depends: the one at which the tracks' reprojection errors are smallest.
+    """Estimates one number on which a rig depends: the value with the smallest reprojection errors of the tracks.
     ``read`` returns the rig for a number. The search starts at the best of ``values``."""
     from scipy.optimize import fminbound  # a quarter of a second
 
@@ -130,7 +129,7 @@ def _times(lens: Distortion, share: float) -> Distortion:
 
 
 def _effect(rig: Rig, silhouettes: Mapping[str, Silhouette]) -> float:
-    """Returns by how much the lenses move the subject's farthest pixels, in shares of the picture's width: the median
+    """Returns how far the lenses move the subject's farthest pixels, as a fraction of the picture's width: the median
     over the cameras."""
     moved = []
     for camera in rig:

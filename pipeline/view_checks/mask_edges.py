@@ -1,12 +1,12 @@
-"""Checks whether given masks follow the edges in the photographs. Only this shows that all masks of a capture are too
-large by the same amount, for such outlines agree with each other; or that masks are filed under each other's names
-beside pictures that are not.
+"""Checks whether supplied masks follow the edges in the photographs. Only this check finds masks that are all too large
+by the same amount, because such outlines agree with each other. It also finds masks that are exchanged while the
+pictures are not.
 
-The edge of the photograph near an outline is where its brightness changes most. Averaged along the outline, the change
-has a peak 2 to 10 times as high as its mean if the mask belongs to the picture, and at most 2 times if not. If the peak
+The photograph's edge near an outline is where its brightness changes most. Averaged along the outline, the change has a
+peak. The peak is 2 to 10 times its mean if the mask belongs to the picture, and at most 2 times if not. If the peak
 lies beside the outline, the mask is too large or too small by that distance.
 
-Enters: photographs and silhouettes. Leaves: position and height of the peak, and messages about it.
+In: photographs and silhouettes. Out: position and height of the peak, and messages about it.
 """
 
 from collections.abc import Collection, Mapping
@@ -82,8 +82,8 @@ def edge_beside(image: ImageRgb, silhouette: Silhouette) -> Edge | None:
 
 
 def _outline(silhouette: Silhouette, reach: int) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n 2"]]:
-    """Returns pixels (x, y) of an outline farther than ``reach`` from the picture's border, and the outward direction
-    at each."""
+    """Returns the pixels (x, y) of an outline that are farther than ``reach`` from the picture's border, and the
+    outward direction at each."""
     distance = silhouette.distance
     height, width = distance.shape
     rows, columns = np.nonzero(np.abs(distance) < 0.6)
@@ -99,10 +99,10 @@ def _outline(silhouette: Silhouette, reach: int) -> tuple[Float32[np.ndarray, "n
 def masks_off_edges(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], ready: Collection[str]
 ) -> list[ReportWarning]:
-    """Returns a warning if most given masks are too large, or most too small, compared with the edges in the
+    """Returns a warning if most supplied masks are too large, or most too small, compared with the edges in the
     photographs.
 
-    ``images``: RGB, by camera. ``silhouettes``: by camera. ``ready``: cameras whose mask was given.
+    ``images``: RGB, by camera. ``silhouettes``: by camera. ``ready``: cameras whose mask was supplied.
     """
     judged = [name for name in ready if name in images and name in silhouettes and silhouettes[name].quality.usable]
     edges = [edge for name in judged if (edge := edge_beside(images[name], silhouettes[name])) is not None]
@@ -118,7 +118,7 @@ def masks_off_edges(
 def masks_alone_exchanged(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], pictures: Mapping[str, str]
 ) -> bool:
-    """Tells whether given masks are filed under other cameras' names although the photographs are filed right.
+    """Tells whether supplied masks are exchanged although the photographs are not.
 
     Args:
         images: as they are filed.
@@ -137,10 +137,10 @@ def masks_alone_exchanged(
 def turned_masks(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], ready: Collection[str]
 ) -> dict[str, Message]:
-    """Returns, by camera, what was done (a key of ``TURNS``) to each mask of ``ready`` that follows its photograph only
-    once that is undone, as to those of programs that count rows from the bottom.
+    """Finds the masks of ``ready`` that follow their photograph only after a flip or a turn, such as masks of programs
+    that count rows from the bottom. Returns, by camera, the change to undo (a key of ``TURNS``).
 
-    Of 103 right masks of eight captures none was named; flipped or turned, 101 or more were."""
+    Of 103 correct masks in eight captures it reported none; of the same masks flipped or turned, 101 or more."""
     turns = {}
     for name in (name for name in ready if name in images and name in silhouettes):
         as_given = _height_at_outline(images[name], silhouettes[name])

@@ -1,15 +1,14 @@
-"""Checks whether these cameras took the pictures, from silhouettes and calibration, before the fit.
+"""Checks before the fit whether these cameras took the pictures, from silhouettes and calibration.
 
-If most cameras contradict the others, other interpretations are tried: all pictures reflected about their principal
-points, as a mirrored rig would see them; flipped, as some cameras deliver them; turned by 180 degrees, or by 90 if
-they are square; poses written in another convention (``rig.plausibility``), which a rig whose cameras stand on a
-sphere around the world's origin does not reveal by itself; and intrinsics of pictures that were cropped, reduced or
-taken at another zoom (``LensReading``). The one under which tangent planes touch both outlines of each pair is named.
-If there is none, the calibration is another rig's, or older than a change of this one; unless many planes meet closely
-nevertheless, for then the masks are loose, with a shadow on the wall or hair that some of them lack. If a single
-camera contradicts the others, it is named.
+If most cameras contradict the others, other interpretations are tried. The pictures may be reflected about their
+principal points (a mirrored rig), flipped, or turned by 180 degrees, or by 90 if square. Poses may follow another
+convention (``rig.plausibility``), which is not obvious if the cameras stand on a sphere around the world's origin.
+Intrinsics may belong to pictures that were cropped, reduced or taken at another zoom (``LensReading``). The message
+names the interpretation under which tangent planes touch both outlines of each pair. If there is none, the calibration
+belongs to another rig, or to this one before a change. If many planes nevertheless agree closely, the masks are loose:
+they include a shadow on the wall, or some lack hair. If a single camera contradicts the others, the message names it.
 
-Enters: silhouettes and the rig. Leaves: what is wrong and what to do, or nothing.
+In: silhouettes and the rig. Out: the fault and its remedy, or nothing.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -58,9 +57,9 @@ Turn = Callable[[Pixels, Intrinsics], Pixels]
 
 
 def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None:
-    """Finds out why most cameras contradict each other: pictures turned or mirrored, a file with another convention or
-    other lenses, or another rig. Returns a message with the remedy; None if most cameras agree or the outlines are
-    merely loose.
+    """Finds out why most cameras contradict each other: pictures are turned or mirrored, the file has another
+    convention or other lenses, or it belongs to another rig. Returns a message with the remedy; None if most cameras
+    agree or only the outlines are loose.
 
     Args:
         silhouettes: by camera; views without a usable mask are ignored.
@@ -130,12 +129,11 @@ class LensReading:
 
     @property
     def is_other(self) -> bool:
-        """Tells whether the intrinsics differ from the calibrated ones by more than loose outlines alone would
-        cause."""
+        """Tells whether the intrinsics differ from the calibrated ones by more than loose outlines explain."""
         return bool(abs(np.log(self.factor)) >= OTHER_FACTOR or max(map(abs, self.shift)) >= OTHER_SHIFT)
 
     def message(self) -> Message:
-        """Returns the message that refuses the rig and says by how much its lenses differ."""
+        """Returns the message that refuses the rig and states the difference of its lenses."""
         k = self.rig.cameras[0].intrinsics
         changes = []
         if abs(self.factor - 1.0) >= MIN_FACTOR:
@@ -199,17 +197,17 @@ def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | N
 
 
 def _median_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
-    """Returns the median over the cameras of the mean robust misfit (0 to 1) of each one's planes; NaN if too few
-    cameras have enough planes."""
+    """Returns the median over the cameras of each one's mean robust misfit (0 to 1); NaN if too few cameras have enough
+    planes."""
     errors_px = tangency_errors_px(hulls, rig)
     speaking = np.isfinite(errors_px).sum(axis=(1, 2)) >= MIN_PLANES
     return float(np.median(mean_misfit(errors_px)[speaking])) if speaking.sum() >= MIN_CAMERAS else np.nan
 
 
 def are_loose(missed: Float[np.ndarray, "c c p"]) -> bool:
-    """Tells whether so many planes meet closely that these cameras must have taken the pictures, however loose the
-    masks. ``missed`` is by how much each plane misses each other camera's outline, shares of the picture's width; NaN
-    for none."""
+    """Tells whether so many planes agree closely that these cameras must have taken the pictures, however loose the
+    masks. ``missed`` is the error of each plane at each other camera's outline, as a fraction of the picture's width;
+    NaN for none."""
     quarter, half = np.nanquantile(missed, (0.25, 0.5))
     return bool(quarter <= MAX_LOOSE_QUARTER and (half <= LOOSE_HALF or quarter <= LOOSE_BIMODAL * half))
 

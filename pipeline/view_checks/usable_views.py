@@ -1,8 +1,8 @@
-"""Decides which views of a capture take part, and why the others do not: all that can be known before a fit.
+"""Decides, before a fit, which views of a capture are used, and why the others are not.
 
-Enters: a capture, its rig, and a function that segments it. Leaves: every picture under its own camera, silhouettes of
-which the unreliable ones are marked, and the warnings that say why. ``reconstruct`` begins with it; ``eigenhead check``
-does nothing else.
+In: a capture, its rig, and a function that segments it. Out: every picture under its own camera, silhouettes with the
+unreliable ones marked, and warnings with the reasons. ``reconstruct`` begins with this step; ``eigenhead check`` runs
+only this step.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -64,9 +64,9 @@ class TooFewViews(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UsableViews:
-    """Holds a capture with every picture under the right camera, and its silhouettes; views that take no part are
-    marked as not usable. ``pictures`` has an entry for each camera that had another's picture: the name under which its
-    own was filed."""
+    """Holds a capture with every picture under the right camera, and its silhouettes; excluded views are marked as not
+    usable. ``pictures`` has an entry for each camera with a wrong picture: the name under which its correct one was
+    filed."""
 
     capture: Capture
     silhouettes: Mapping[str, Silhouette]
@@ -82,15 +82,14 @@ def usable_views(
     exchanged: Literal["repair", "refuse"],
     guards: Guards = STRICT,
 ) -> UsableViews:
-    """Segments a capture, files exchanged pictures right, and marks views that contradict the others as not usable.
+    """Segments a capture, files exchanged pictures correctly, and marks views that contradict the others as not usable.
 
-    ``capture``: as it was read. ``rig``: the cameras as calibrated. ``segmented``: computes the silhouettes of a
-    capture. ``exchanged``: whether to repair or refuse an exchange of pictures that is beyond doubt. ``guards``: what
-    is refused.
+    ``capture``: the capture as it was read. ``rig``: the cameras as calibrated. ``segmented``: computes the silhouettes
+    of a capture. ``exchanged``: whether to repair or refuse an exchange of pictures that is beyond doubt. ``guards``:
+    decides about refusals.
 
-    Refuses with: ExchangedPictures, WrongRig: as of ``assign_images``. WrongScale: as of ``judge_head_size``.
-    TooFewViews: fewer than ``MIN_VIEWS`` silhouettes are usable, or, of a subject whose face is found, fewer than
-    ``MIN_VIEWS_OF_FACE``.
+    Refuses with: ExchangedPictures, WrongRig: see ``assign_images``. WrongScale: see ``judge_head_size``. TooFewViews:
+    fewer than ``MIN_VIEWS`` silhouettes are usable (``MIN_VIEWS_OF_FACE`` if the subject's face is found).
     """
     assigned = assign_images(capture, rig, segmented, exchanged=exchanged, guards=guards)
     find_face = cache(lambda: guards.find_face(assigned.capture.images, rig))
@@ -125,8 +124,8 @@ def usable_views(
 def without_moved_cameras(
     silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[dict[str, Silhouette], dict[str, ReportWarning]]:
-    """Marks the views of cameras that moved since the calibration as not usable. Also returns warnings by camera: for
-    each of these, and for each camera whose mask may be loose instead."""
+    """Marks the views of cameras that moved since the calibration as not usable. Also returns warnings by camera, for
+    each moved camera and for each camera whose mask may be loose instead."""
     kept, warnings = dict(silhouettes), dict[str, ReportWarning]()
     for drift in find_drift(silhouettes, rig):
         if drift.moved:
@@ -140,8 +139,8 @@ def without_moved_cameras(
 
 
 def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
-    """Returns the warnings about the quality of single views as warnings of the report. One that holds for many views
-    is given once."""
+    """Returns the warnings about the quality of single views as warnings of the report. A warning that holds for many
+    views appears once."""
     remarks_by_code: dict[str, list[Message]] = {"view-left-out": [], "view": [], "mask-doubtful": []}
     for name, silhouette in silhouettes.items():
         quality = silhouette.quality
@@ -188,8 +187,8 @@ MIN_PIXELS, MIN_COMPARED = 500, 3  # of a subject, and views, that tell anything
 def with_picture_faults(
     silhouettes: Mapping[str, Silhouette], capture: Capture, suspects: Collection[str], rig: Rig
 ) -> dict[str, Silhouette]:
-    """Returns silhouettes in which the fault of a suspect's picture replaces the warnings that follow from it. Views
-    with a turned picture are not usable."""
+    """Returns the silhouettes with the warnings of each suspect replaced by their cause, the fault of its picture.
+    Views with a turned picture are not usable."""
     found = dict(silhouettes)
     blurred = blurred_views(capture.images, silhouettes) if suspects else {}
     misfits = own_misfit({camera: s for camera, s in silhouettes.items() if s.quality.usable}, rig) if suspects else {}
@@ -204,12 +203,12 @@ def with_picture_faults(
 
 
 def _turns(image: np.ndarray) -> dict[Message, np.ndarray]:
-    """Returns a picture or a mask turned by 180 degrees and flipped, by what was done to it."""
+    """Returns a picture or a mask turned by 180 degrees and flipped, each with a message about the change."""
     return {turn: np.ascontiguousarray(image[ways]) for turn, ways in TURNS.items()}
 
 
 def turned_against_plate(capture: Capture, name: str) -> Message | None:
-    """Returns the fault of a picture that shows its clean plate only once it is turned by 180 degrees or flipped."""
+    """Returns the fault of a picture that matches its clean plate only after a turn by 180 degrees or a flip."""
     plates = capture.backgrounds.get(name, ())
     if name not in capture.images or not plates:
         return None
@@ -222,8 +221,8 @@ def turned_against_plate(capture: Capture, name: str) -> Message | None:
 
 
 def turned_against_others(silhouettes: Mapping[str, Silhouette], name: str, rig: Rig) -> Message | None:
-    """Returns the fault of a picture, turned together with its plate, whose outline agrees with those of the other
-    cameras only once it is turned by 180 degrees or flipped."""
+    """Returns the fault of a picture that, together with its plate, agrees with the other cameras' outlines only after
+    a turn by 180 degrees or a flip."""
     others = {camera: s for camera, s in silhouettes.items() if s.quality.usable and camera != name}
     if len(others) < MIN_COMPARED or not silhouettes[name].mask.any():
         return None
@@ -256,8 +255,8 @@ def blurred_views(images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silh
 
 
 def plates_brightness(capture: Capture) -> float | None:
-    """Returns how many times as bright as the pictures the clean plates are, in linear light; None where that is no
-    other exposure. The subject covers less than half of a picture, so that the median is of the backdrop."""
+    """Returns the brightness of the clean plates divided by that of the pictures, in linear light; None if the
+    exposures are equal. The subject covers less than half of a picture, so the median is that of the backdrop."""
     ratios = []
     for name, plates in capture.backgrounds.items():
         if name in capture.images and plates and plates[0].shape == capture.images[name].shape:
@@ -271,7 +270,7 @@ def plates_brightness(capture: Capture) -> float | None:
 
 
 def _detail(image: ImageRgb, silhouette: Silhouette) -> float | None:
-    """Returns how much (levels) the subject's pixels change within a few pixels; None where too few are seen."""
+    """Returns the variation (levels) of the subject's pixels within a few pixels; None if too few are visible."""
     inside = silhouette.distance < -INSET_PX
     if np.count_nonzero(inside) < MIN_PIXELS:
         return None

@@ -1,6 +1,6 @@
-"""Implements what an operator does with a rig: `eigenhead rig check`, `preview`, `capture`, and taking clean plates.
+"""Implements an operator's commands: `eigenhead rig check`, `preview`, `capture`, and taking clean plates.
 
-Each function is one command: it opens a session, works, and closes it. It prints nothing."""
+Each function is one command: it opens a session, does its work, and closes the session. It prints nothing."""
 
 import itertools
 import json
@@ -37,7 +37,7 @@ COLUMNS = ("camera", "found", "resolution", "fps", "exposure", "sharpness", "syn
 
 
 class NoCalibration(EigenheadError):
-    """Reports that the rig has no calibration, so that no capture folder, which holds cameras.json, can be written."""
+    """Reports a rig without calibration: a capture folder needs cameras.json, so none can be written."""
 
     def __init__(self) -> None:
         super().__init__(compose("rig-without-calibration"))
@@ -46,7 +46,7 @@ class NoCalibration(EigenheadError):
 @dataclass(frozen=True, slots=True)
 class RigCheck:
     """Holds the result of a check: ``rows`` has a row of texts for each camera, in the order of ``COLUMNS``; ``faults``
-    lists everything that is wrong."""
+    lists every fault."""
 
     rows: tuple[tuple[str, ...], ...]
     faults: tuple[Fault, ...]
@@ -58,7 +58,7 @@ class RigCheck:
 
 
 def check(config: RigConfig, make_driver: MakeDriver = driver_for) -> RigCheck:
-    """Opens all devices of a rig and takes a test shot that is not kept (`eigenhead rig check`)."""
+    """Opens all devices of a rig and takes a test shot, which is not stored (`eigenhead rig check`)."""
     with RigSession(config, make_driver) as session:
         session.warm_up()
         shot = session.shoot()
@@ -81,8 +81,8 @@ def capture(
     """Takes one shot and writes it as the capture folder ``out`` (`eigenhead rig capture`). ``report`` is called with
     "warm up", "shot" and "done".
 
-    Raises ShotFailed, and writes nothing, where the shot is no complete capture; NoCalibration; and InputError where
-    ``out`` exists and is not empty. Warnings are in the shot that is returned and in the folder's shot.json.
+    Raises ShotFailed, and writes nothing, if the shot is no complete capture; NoCalibration; and InputError if ``out``
+    exists and is not empty. Warnings are in the shot that is returned and in the folder's shot.json.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(str(out), [compose("folder-exists")])
@@ -114,8 +114,8 @@ def board_shots(
     (`eigenhead rig board`).
 
     Yields for each shot its name, the cameras whose pictures were written, and the faults. Waits ``pause_s`` before
-    each shot, so that the board can be moved. Names of shots that ``out`` already holds are not used again. Raises
-    ShotFailed where no camera delivers.
+    each shot, so that the board can be moved. Names of shots already in ``out`` are not used again. Raises ShotFailed
+    where no camera delivers.
     """
     taken = {path.stem for path in out.glob("*/*.png")}
     names = (name for name in map("shot{:03}".format, itertools.count()) if name not in taken)
@@ -133,8 +133,8 @@ def board_shot(session: RigSession) -> Shot:
     """Takes one shot of a calibration board with a session that is open and warm. Needs neither calibration nor clean
     plates.
 
-    Returns the pictures of the cameras that deliver, and the faults except those that the board itself causes by hiding
-    the background. Raises ShotFailed if no camera delivers.
+    Returns the pictures of the cameras that deliver, and the faults, except those that the board causes by covering the
+    background. Raises ShotFailed if no camera delivers.
     """
     shot = session.shoot()
     faults = tuple(fault for fault in shot.faults if fault.code not in HIDDEN_BY_BOARD)
@@ -146,7 +146,7 @@ def board_shot(session: RigSession) -> Shot:
 
 
 def take_plates(config: RigConfig, make_driver: MakeDriver = driver_for) -> Plates:
-    """Takes new clean plates of the empty studio and puts them to use. Raises ShotFailed, and leaves the old plates in
+    """Takes new clean plates of the empty studio and starts to use them. Raises ShotFailed; then the old plates stay in
     use."""
     with RigSession(config, make_driver) as session:
         session.warm_up()

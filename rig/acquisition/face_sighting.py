@@ -1,7 +1,7 @@
-"""Turns what was found of the subject's face in the pictures of a shot into remarks for the operator.
+"""Turns detections of the subject's face in a shot into remarks for the operator.
 
 ``pipeline.faces`` finds the face and makes the ``FaceSighting``. Remarks are no faults: a head can be reconstructed
-from a shot with the face turned away, and of a statue in which no network finds one."""
+with the face turned away, or from a statue in which no network finds a face."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ EXPLAINING = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class FaceSighting:
-    """Holds which pictures show the subject's face and which way the face looks.
+    """Holds which pictures show the subject's face, and the direction of the face.
 
-    ``searched``: number of pictures searched; ``missing``: cameras that the face is turned to but whose pictures do not
-    show it; ``left_deg`` and ``up_deg``: how far the face looks to the subject's left and up, seen from the camera
-    ``front``. Both are None where there is no face, or where the cameras stand all around and none is the front.
-    ``remarks``: what else the face shows, such as closed eyes.
+    ``searched``: number of pictures searched; ``missing``: cameras in front of the face whose pictures do not show it;
+    ``left_deg`` and ``up_deg``: angles of the face to the subject's left and up, seen from the camera ``front``. Both
+    are None without a face, or if the cameras stand all around and none is the front. ``remarks``: further
+    observations, such as closed eyes.
     """
 
     searched: int
@@ -37,8 +37,8 @@ class FaceSighting:
 
 
 def face_remarks(sighting: FaceSighting | None, faults: Iterable[Fault]) -> tuple[Message, ...]:
-    """Returns remarks on which cameras do not show the face, and which way it looks. Cameras with a fault among
-    ``EXPLAINING`` are left out; there are no remarks where the whole rig has one."""
+    """Returns remarks on which cameras do not show the face, and on its direction. Cameras with a fault in
+    ``EXPLAINING`` are left out; there are no remarks if the whole rig has one."""
     explained = {fault.camera for fault in faults if fault.code in EXPLAINING}
     if sighting is None or None in explained:
         return ()
@@ -54,7 +54,7 @@ def face_remarks(sighting: FaceSighting | None, faults: Iterable[Fault]) -> tupl
 
 
 def _ways(sighting: FaceSighting) -> list[Message]:
-    """Returns where the face looks if it is turned by more than ``TURNED_DEG``: left or right, then up or down."""
+    """Returns the direction of the face if it is turned by more than ``TURNED_DEG``: left or right, then up or down."""
     left, up = sighting.left_deg or 0.0, sighting.up_deg or 0.0
     ways = []
     if abs(left) > TURNED_DEG:

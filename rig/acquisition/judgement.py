@@ -1,7 +1,6 @@
-"""Judges the pictures of a shot: light, focus, and what the cameras look at. All are pure functions of pictures, clean
-plates and settings. New clean plates must show an empty studio before they replace others: by what moves while they are
-taken, by their light, and by comparison with the plates in use.
-"""
+"""Judges the pictures of a shot: light, focus, and the cameras' views. All functions are pure functions of pictures,
+clean plates and settings. New clean plates replace the old ones only if they show an empty studio: they are tested
+for motion while they are taken, for light, and by comparison with the plates in use."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -55,8 +54,7 @@ def examine(images: Mapping[str, ImageRgb], plates: Plates) -> dict[str, Picture
 def judge(
     images: Mapping[str, ImageRgb], checks: Mapping[str, PictureCheck], plates: Plates, shot: ShotConfig
 ) -> list[Fault]:
-    """Returns the faults that the pictures of a shot show, found by measurement and by comparison
-    with the clean plates."""
+    """Returns the faults that the pictures of a shot show, by measurement and by comparison with the clean plates."""
     levels = {name: plate_level(plates.first.get(name)) for name in checks}
     return judge_checks(
         checks, levels, shot, lambda name, registration: _whose_view(name, images[name], registration, plates)
@@ -94,7 +92,7 @@ def judge_checks(
 def _light_faults(
     checks: Mapping[str, PictureCheck], levels: Mapping[str, float], shot: ShotConfig
 ) -> tuple[list[Fault], dict[str, bool]]:
-    """Returns the faults of light, and for each camera whether it has enough light to judge its view."""
+    """Returns the faults of the light, and for each camera whether it has enough light for its view to be judged."""
     ratios = {name: check.exposure.mean / levels[name] for name, check in checks.items() if name in levels}
     common = median(ratios.values()) if len(ratios) >= 3 else 1.0
     faults: list[Fault] = []
@@ -135,7 +133,7 @@ def _whose_view(name: str, image: ImageRgb, registration: Registration, plates: 
 
 
 class PlatesRefused(ShotFailed):
-    """Reports that new clean plates show a person. They are kept as the version ``version``; the old plates stay in
+    """Reports that new clean plates show a person. They are stored as the version ``version``; the old plates stay in
     use."""
 
     def __init__(self, faults: Sequence[Fault], version: str) -> None:
@@ -144,8 +142,8 @@ class PlatesRefused(ShotFailed):
 
 
 def plate_faults(taken: Mapping[str, Sequence[ImageRgb]], live: Collection[str], shot: ShotConfig) -> list[Fault]:
-    """Returns the faults that pictures of the empty studio show by themselves. ``live``: cameras whose pictures come
-    from a sensor and are not recorded."""
+    """Returns the faults that pictures of the empty studio show without comparison to other plates. ``live``: cameras
+    with a sensor, as opposed to recorded pictures."""
     faults = []
     for name, images in taken.items():
         if name in live and any(np.array_equal(images[0], other) for other in images[1:2]):
@@ -159,7 +157,7 @@ def plate_faults(taken: Mapping[str, Sequence[ImageRgb]], live: Collection[str],
 
 def occupied(taken: Mapping[str, Sequence[ImageRgb]], before: Plates) -> list[Fault]:
     """Returns a fault for each camera whose new plate differs from the plate in use as if a person sat there. Returns
-    none where fewer than ``SEEN_SHARE`` of the cameras do."""
+    none if fewer than ``SEEN_SHARE`` of the cameras show such a difference."""
     compared = [name for name in taken if name in before and taken[name][0].shape == before.first[name].shape]
     positions = {name: find_subject(taken[name][0], before.first[name]) for name in compared}
     faults = [

@@ -1,4 +1,4 @@
-"""Stores clean plates: pictures of the empty studio, several of each camera, kept beside rig.toml.
+"""Stores clean plates: several pictures of the empty studio for each camera, next to rig.toml.
 
     plates/<camera>/000.png ...     (or plates/<camera>.png: what a capture folder's background/ holds is accepted too)
     plates/plates.json              when they were taken, the noise of each camera
@@ -68,8 +68,8 @@ def read_plates(folder: Path, names: tuple[str, ...]) -> Plates:
 
 @dataclass(frozen=True, slots=True)
 class PlatesVersion:
-    """Describes a set of clean plates that is kept. ``taken``: UTC, ISO 8601; ``refused``: the faults for which the
-    plates were not put to use."""
+    """Describes a stored set of clean plates. ``taken``: UTC, ISO 8601; ``refused``: the faults because of which the
+    plates are not in use."""
 
     id: str
     taken: str
@@ -79,14 +79,14 @@ class PlatesVersion:
 
 
 def write_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]]) -> Plates:
-    """Writes new clean plates and puts them to use. The plates in ``folder`` become a version, once the new ones are
-    complete."""
+    """Writes new clean plates and starts to use them. Once they are complete, the old plates in ``folder`` become a
+    version."""
     return use_plates(folder, keep_plates(folder, images), tuple(images))
 
 
 def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refused: tuple[Message, ...] = ()) -> str:
-    """Writes clean plates as a version beside those in use, and returns the version's id. ``refused``: why they are not
-    put to use."""
+    """Writes clean plates as a version that is not in use, and returns the version's id. ``refused``: the faults that
+    prevent their use."""
     moment = datetime.now(UTC)
     identity = moment.strftime("%Y%m%dT%H%M%S%fZ")
     _remove_unfinished(folder)
@@ -106,8 +106,8 @@ def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refuse
 
 
 def use_plates(folder: Path, version: str, names: tuple[str, ...]) -> Plates:
-    """Puts a kept version of the clean plates to use; the plates in use become a version. Raises InputError for a
-    version that is not kept."""
+    """Starts to use a stored version of the clean plates; the plates in use become a version. Raises InputError for an
+    unknown version."""
     wanted, stored = (_versions(folder) / version, {entry.id: entry for entry in plates_versions(folder)})
     if version in stored and stored[version].in_use:
         return read_plates(folder, names)
@@ -137,7 +137,7 @@ def _remove_unfinished(folder: Path) -> None:
 
 
 def plates_versions(folder: Path) -> list[PlatesVersion]:
-    """Returns the clean plates in use and the versions kept beside them, newest first."""
+    """Returns the clean plates in use and the stored versions, newest first."""
     folders = [path for path in _versions(folder).glob("*Z") if path.is_dir()] if _versions(folder).is_dir() else []
     versions = [_version_of(path) for path in folders]
     if folder.is_dir():

@@ -4,8 +4,8 @@
         session.warm_up()
         shot = session.shoot()
 
-Every wait has a deadline, and no camera delays another: each has a thread of its own (rig.drivers.feed). Failures are
-faults of the shot; an exception means that there is no shot at all (ShotFailed, InputError).
+Every wait has a deadline, and no camera delays another: each has its own thread (rig.drivers.feed). Failures are faults
+of the shot; an exception means that there is no shot at all (ShotFailed, InputError).
 """
 
 import threading
@@ -47,7 +47,7 @@ class _Release:
 
 
 class RigSession:
-    """Owns the devices of a rig while a block runs. ``close`` ends all threads except those that hang in a driver."""
+    """Owns the devices of a rig while a block runs. ``close`` ends all threads except those blocked in a driver."""
 
     def __init__(self, config: RigConfig, make_driver: MakeDriver = driver_for) -> None:
         self.config = config
@@ -89,7 +89,7 @@ class RigSession:
             feed.wait_opened(deadline_s)
 
     def close(self) -> tuple[str, ...]:
-        """Switches the lamps off and closes all. Returns the cameras whose driver hangs. Safe to call twice."""
+        """Switches the lamps off and closes all devices. Returns the cameras whose driver hangs. Safe to call twice."""
         if self._box is not None:
             if not self.config.lights.keep_on:
                 self._try_box(lambda box: box.set_lights(0))
@@ -104,11 +104,11 @@ class RigSession:
         return hanging
 
     def states(self) -> Mapping[str, FeedState]:
-        """Returns what is known of each camera now, by name. Cameras without a driver are left out."""
+        """Returns the current state of each camera, by name. Cameras without a driver are left out."""
         return {name: feed.state() for name, feed in self._feeds.items()}
 
     def trigger_error(self) -> Message | None:
-        """Returns why the trigger box cannot be used; None where it can, or where rig.toml names none."""
+        """Returns why the trigger box cannot be used; None if it can, or if rig.toml names none."""
         return None if self._box_error is None else self._box_error.message
 
     def warm_up(self) -> None:
@@ -141,8 +141,8 @@ class RigSession:
             return shot
 
     def take_plates(self) -> Plates:
-        """Takes clean plates of the empty studio and puts them to use. Raises ShotFailed, or PlatesRefused if they show
-        somebody whom the old plates do not; the old plates then stay in use."""
+        """Takes clean plates of the empty studio and starts to use them. Raises ShotFailed, or PlatesRefused if they
+        show a person whom the old plates do not show; the old plates then stay in use."""
         with self._busy:
             self._lights_on()
             self._silent_until_s.clear()
@@ -164,7 +164,7 @@ class RigSession:
             return self.plates
 
     def use_plates(self, version: str) -> Plates:
-        """Puts a kept version of the clean plates to use again. Raises InputError for a version that is not kept."""
+        """Starts to use a stored version of the clean plates. Raises InputError for an unknown version."""
         with self._busy:
             self.plates = use_plates(self.config.plates_folder, version, self.config.names)
             return self.plates
@@ -212,7 +212,7 @@ class RigSession:
             time.sleep(self.config.lights.settle_s)
 
     def _glance(self) -> None:
-        """Notes the picture of each camera before the release; if the same one follows it, the stream is frozen."""
+        """Stores the picture of each camera before the release; if the same picture follows, the stream is frozen."""
         now_s = time.monotonic()
         running = {name: s.period_s for name, feed in self._feeds.items() if (s := feed.state()).period_s is not None}
         for name in running:
@@ -228,8 +228,8 @@ class RigSession:
     def _next_frames(self, deadline_s: float, only: Collection[str] | None = None) -> dict[str, Frame]:
         """Returns the next frame of every camera. Cameras that wait for a trigger get one if they have no live view.
 
-        A camera that sent nothing last time is not waited for during ``_SILENT_S``; its frames are taken if they
-        come."""
+        A camera that sent nothing last time is not waited for during ``_SILENT_S``; a frame that arrives anyway is
+        used."""
         now_s = time.monotonic()
         feeds = {name: feed for name, feed in self._feeds.items() if only is None or name in only}
         for feed in feeds.values():
@@ -252,7 +252,7 @@ class RigSession:
         return received
 
     def _fire(self) -> Fired | None:
-        """Arms and fires the box. Returns None, and keeps the error, if that fails."""
+        """Arms and fires the box. Returns None, and stores the error, if that fails."""
         trigger = self.config.trigger
         mask = sum(1 << c.channel for c in self.config.cameras if c.trigger == "external" and c.channel is not None)
         fired: list[Fired] = []
@@ -267,7 +267,7 @@ class RigSession:
         return fired[0] if self._try_box(act) else None
 
     def _release(self) -> _Release:
-        """Releases the shot and returns its moment: the box's or, without a box in rig.toml, that of the command."""
+        """Releases the shot and returns its time: the box's or, without a box in rig.toml, that of the command."""
         now_s = time.monotonic()
         for feed in self._feeds.values():
             feed.want(now_s)
@@ -391,6 +391,6 @@ class RigSession:
 
 
 def _without_consequences(faults: list[Fault]) -> tuple[Fault, ...]:
-    """Leaves out faults that follow from others: a dark picture is not also unsharp or displaced."""
+    """Removes faults that follow from others: a dark picture is not also reported as unsharp or displaced."""
     dark = {fault.camera for fault in faults if fault.code == "dark"}
     return tuple(fault for fault in faults if not (fault.camera in dark and fault.code in ("blurred", "view")))

@@ -1,6 +1,6 @@
-"""Defines a shot: pictures, a certificate of how far they belong to one moment, and all faults with their codes.
+"""Defines a shot: pictures, a certificate of their simultaneity, and all faults with their codes.
 
-Timing is judged here, by pure functions of frames; pictures are judged in rig.acquisition.judgement;
+This module judges timing by pure functions of frames; rig.acquisition.judgement judges pictures;
 rig.acquisition.session takes the shot."""
 
 from collections.abc import Mapping, Sequence
@@ -56,7 +56,7 @@ class FaultDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Holds one fault: its code (see ``REMEDIES``), camera that has it (None: the whole rig), and what was measured."""
+    """Holds one fault: its code (see ``REMEDIES``), its camera (None: the whole rig), and the measurement."""
 
     code: str
     camera: str | None
@@ -83,11 +83,11 @@ class Fault:
         }
 
     def measured(self) -> Message:
-        """Returns a message with the camera and what was measured."""
+        """Returns a message with the camera and the measurement."""
         return compose("fault-measured", camera=self.camera or "rig", measured=self.detail)
 
     def message(self) -> Message:
-        """Returns one message with the camera, the fault, what was measured and the remedy."""
+        """Returns one message with the camera, the fault, the measurement and the remedy."""
         camera = self.camera or "rig"
         return compose("fault-told", camera=camera, fault=self.code, measured=self.detail, remedy=self.remedy)
 
@@ -96,12 +96,12 @@ class Fault:
 
 
 def read_fault(document: Mapping[str, Any]) -> Fault:
-    """Reads a fault from ``Fault.document``, also from an earlier version's, in which the detail is a text."""
+    """Reads a fault from ``Fault.document``, also from an earlier version's, whose detail is a text."""
     return Fault(document["code"], document["camera"], read_message(document.get("detail_message", document["detail"])))
 
 
 class ShotFailed(EigenheadError):
-    """Reports a shot that is no capture. ``faults`` holds all that was found wrong."""
+    """Reports a shot that is not usable as a capture. ``faults`` holds every fault."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self.faults = tuple(faults)
@@ -110,8 +110,8 @@ class ShotFailed(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class CameraSync:
-    """Holds the timing of one camera in a shot. ``skew_s``: how long after its due time the frame arrived; due is the
-    trigger plus output delay and configured latency."""
+    """Holds the timing of one camera in a shot. ``skew_s``: delay of the frame's arrival after its due time, which is
+    the trigger plus output delay and configured latency."""
 
     camera: str
     status: Status
@@ -141,7 +141,7 @@ class SyncDocument(TypedDict):
 
 
 class CheckDocument(TypedDict):
-    """Holds what was measured on one picture as plain values for JSON."""
+    """Holds the measurements of one picture as plain values for JSON."""
 
     mean: float
     clipped_share: float
@@ -161,8 +161,8 @@ class ShotDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class SyncCertificate:
-    """Holds how far the pictures of a shot belong to one moment. ``trigger_s`` is that moment (time.monotonic, s), None
-    where nothing fired."""
+    """Holds how simultaneous the pictures of a shot are. ``trigger_s`` is the moment of the release (time.monotonic,
+    s); None if there was none."""
 
     trigger_s: float | None
     trigger_utc: str
@@ -172,7 +172,7 @@ class SyncCertificate:
 
     @property
     def spread_s(self) -> float | None:
-        """Returns the time (s) from the earliest to the latest picture of the shot; None where fewer than two came."""
+        """Returns the time (s) from the earliest to the latest picture of the shot; None if fewer than two arrived."""
         skews = [camera.skew_s for camera in self.cameras if camera.skew_s is not None]
         return max(skews) - min(skews) if len(skews) > 1 else None
 
@@ -204,8 +204,7 @@ class SyncCertificate:
 
 @dataclass(frozen=True, slots=True)
 class PictureCheck:
-    """Holds what was measured on one picture. ``registration`` is None without a clean plate and
-    for a black picture."""
+    """Holds the measurements of one picture. ``registration`` is None without a clean plate and for a black picture."""
 
     exposure: Exposure
     blur_px: float | None
@@ -234,7 +233,7 @@ class Shot:
 
     @property
     def complete(self) -> bool:
-        """Tells whether the shot can be reconstructed: no fault is more than a warning."""
+        """Tells whether the shot can be reconstructed: all its faults are warnings."""
         return not any(fault.is_error for fault in self.faults)
 
     def document(self) -> ShotDocument:
@@ -251,8 +250,8 @@ class Shot:
 class Timing:
     """Holds when the frame of one camera was due (time.monotonic, s) and the period of the camera's live view (s).
 
-    ``triggered``: an output of the box releases the frame; otherwise the next frame counts, whenever it arrives.
-    ``recorded``: the picture comes from a recording and belongs to no moment of today.
+    ``triggered``: an output of the box releases the frame; otherwise the next frame to arrive counts. ``recorded``: the
+    picture comes from a recording and has no time of today.
     """
 
     due_s: float
@@ -270,7 +269,7 @@ def certify(
     uncertainty_s: float,
     skew_most_s: float,
 ) -> tuple[SyncCertificate, list[Fault]]:
-    """Returns the certificate of a shot and its faults of time: "late-trigger", "late" and "dropped". ``frames`` and
+    """Returns the certificate of a shot and its timing faults: "late-trigger", "late" and "dropped". ``frames`` and
     ``timings`` are by camera."""
     skews = {name: frame.time_s - timings[name].due_s for name, frame in frames.items() if frame is not None}
     if trigger_s is None:

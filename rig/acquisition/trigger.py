@@ -1,9 +1,9 @@
 """Drives the trigger box over pyserial by its line protocol (docs/rig.md).
 
 A request is ``@SS BODY*CCCC\\n`` and its reply ``#SS BODY*CCCC\\n``: SS is a sequence number (two hex digits), CCCC the
-CRC-16/CCITT-FALSE of ``SS BODY``. The start character resynchronises a receiver at any moment, so noise between lines
-costs nothing; a damaged line is dropped in silence and the client sends it again under the same sequence number, which
-the box answers from memory without acting twice. Requests and replies start differently so that an echo is no reply.
+CRC-16/CCITT-FALSE of ``SS BODY``. A start character resynchronises a receiver at any moment, so noise between lines has
+no effect. A damaged line is ignored; the client repeats it under its sequence number, and the box repeats its reply
+from memory without acting twice. Requests and replies start with different characters, so an echo is no reply.
 """
 
 import string
@@ -21,7 +21,7 @@ BUSY_S = 1.5  # longest release: delay and pulse take up to 0.5 s each, and the 
 
 
 class TriggerError(EigenheadError):
-    """Reports that the trigger box could not do what was requested; the base of all errors of this module."""
+    """Reports that the trigger box could not do what was requested; all other errors of this module derive from it."""
 
 
 class TriggerUnplugged(TriggerError):
@@ -56,7 +56,7 @@ class TriggerRefused(TriggerError):
 
 @dataclass(frozen=True, slots=True)
 class BoxIdentity:
-    """Holds what the box answers to IDENTIFY."""
+    """Holds the box's answer to IDENTIFY."""
 
     firmware: str
     serial: str
@@ -66,7 +66,7 @@ class BoxIdentity:
 
 @dataclass(frozen=True, slots=True)
 class BoxStatus:
-    """Holds what the box answers to STATUS. ``bad_lines``: number of lines that it dropped for noise on the cable."""
+    """Holds the box's answer to STATUS. ``bad_lines``: number of lines that it ignored as noise."""
 
     state: str
     shots: int
@@ -76,24 +76,24 @@ class BoxStatus:
 
 @dataclass(frozen=True, slots=True)
 class BoxClock:
-    """Holds one comparison of clocks: the host's time (time.monotonic, s) at the box's microsecond ``box_us``, and by
-    how much the host's time may be off (s)."""
+    """Holds one comparison of clocks: the host's time (time.monotonic, s) at the box's microsecond ``box_us``, and its
+    uncertainty (s)."""
 
     host_s: float
     box_us: int
     uncertainty_s: float
 
     def host_from_box(self, box_us: int) -> float:
-        """Returns the host's time (time.monotonic, s) at a box time less than 35 minutes away, also across the wrap of
-        the 32-bit counter."""
+        """Returns the host's time (time.monotonic, s) for a box time within 35 minutes, also across the overflow of the
+        32-bit counter."""
         difference = (box_us - self.box_us + CLOCK_PERIOD_US // 2) % CLOCK_PERIOD_US - CLOCK_PERIOD_US // 2
         return self.host_s + difference * 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Fired:
-    """Holds one release: when the box raised its outputs (time.monotonic, s), by how much that may be off, when the
-    host asked for it, and the box's count of shots."""
+    """Holds one release: when the box raised its outputs (time.monotonic, s), the uncertainty of that time, when the
+    host requested it, and the box's count of shots."""
 
     time_s: float
     uncertainty_s: float
@@ -106,7 +106,7 @@ class TriggerBox:
     request.
 
     ``port`` is a serial port (a /dev/serial/by-id path survives a reboot) or the pty of a simulated box. Opening waits
-    up to ``boot_s``: many boards restart when their port is opened and need two seconds until they listen.
+    up to ``boot_s``: many boards restart when their port is opened and accept commands only two seconds later.
     """
 
     def __init__(
@@ -176,8 +176,8 @@ class TriggerBox:
     def synchronise(self, rounds: int = 5) -> BoxClock:
         """Compares the box's clock with time.monotonic and returns the best of ``rounds`` comparisons.
 
-        Cristian's method (Distributed Computing 3, 1989): the box read its clock within the round trip; the shortest
-        of several bounds it best. Half that trip is the uncertainty.
+        Cristian's method (Distributed Computing 3, 1989): the box read its clock during the round trip, so the shortest
+        of several round trips gives the narrowest bound. Half that trip is the uncertainty.
         """
         best: BoxClock | None = None
         for _ in range(rounds):
@@ -202,7 +202,7 @@ class TriggerBox:
             raise WrongDevice(self.port, " ".join(words)) from error
 
     def _command(self, body: str, attempts: int | None = None) -> list[str]:
-        """Sends ``body`` until it is answered, also while the box is busy with a release. Returns the words after
+        """Sends ``body`` until the box answers, also while the box is busy with a release. Returns the words after
         OK."""
         until_s = time.monotonic() + BUSY_S
         while True:

@@ -1,6 +1,6 @@
-"""Judges whether a capture is worth reconstructing, for shots (while the subject is still there) and uploads alike.
+"""Judges whether a capture is worth reconstructing, both for shots (while the subject is still there) and for uploads.
 
-Cameras are measured one at a time, so that judging a large rig takes the memory of one camera."""
+Cameras are measured one at a time, so a large rig needs the memory of one camera only."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ SOUND_SHARE = 0.75  # 8 of 11 cameras still surround a head; with fewer, one sid
 
 
 class SubjectDocument(TypedDict):
-    """Holds where the subject is in a picture, as plain values. ``outline``: corners in pixels of the picture."""
+    """Holds the subject's position in a picture, as plain values. ``outline``: corners, px."""
 
     share: float
     cut_off: list[str]
@@ -33,7 +33,7 @@ class SubjectDocument(TypedDict):
 
 
 class ViewDocument(TypedDict, total=False):
-    """Holds what was measured of one camera's picture; what was not measured is absent."""
+    """Holds the measurements of one camera's picture; missing measurements are absent."""
 
     mean: float
     clipped_share: float
@@ -70,8 +70,8 @@ class ViewCheck:
 def check_view(
     image: ImageRgb, plate: ImageRgb | None, mask: Bool[np.ndarray, "h w"] | None, *, place_only: bool = False
 ) -> ViewCheck:
-    """Measures one camera's picture and finds the subject in it. ``place_only``: only the subject is looked for,
-    because the shot has measured the rest."""
+    """Measures one camera's picture and finds the subject in it. ``place_only``: only search the subject, because the
+    shot has measured the rest."""
     if mask is not None and mask.shape == image.shape[:2]:
         position = subject_of_mask(mask)
     else:
@@ -90,16 +90,16 @@ def view_faults(views: Mapping[str, ViewCheck], limits: ShotConfig) -> list[Faul
 
 
 def without_consequences(faults: Iterable[Fault]) -> list[Fault]:
-    """Returns the faults without those that another fault of the same camera explains: with a wrong background, for
-    example, no subject is found."""
+    """Removes faults that another fault of the same camera explains: with a wrong background, for example, no subject
+    is found."""
     known = [*faults]
     displaced = {fault.camera for fault in known if fault.code in DISPLACED} - {None}
     return [fault for fault in known if not (fault.code in PLACE_FAULTS and fault.camera in displaced)]
 
 
 def verdict_of(faults: Iterable[Fault], cameras: Collection[str]) -> Verdict:
-    """Returns the verdict on a capture: ``good`` without a fault; ``poor`` if the rig as a whole has a fault, or if too
-    few of the ``cameras`` have none; else ``usable``."""
+    """Returns the verdict on a capture: ``good`` without any fault; ``poor`` if the rig as a whole has a fault, or if
+    too few of the ``cameras`` are free of faults; otherwise ``usable``."""
     named = {fault.camera for fault in faults}
     if not named:
         return "good"

@@ -1,5 +1,5 @@
-"""Defines the interface of camera drivers and their errors, and finds the driver that rig.toml names for a camera: its
-module, and with it any vendor's library, is imported only then.
+"""Defines the interface of camera drivers and their errors, and finds the driver that rig.toml names for a camera. The
+driver's module, and with it any vendor's library, is imported only then.
 
 ``grab`` waits for the camera's next frame and returns when it arrived; ``retrieve`` decodes that frame. They are two
 calls because most frames of a stream are never used, and decoding them all would make the arrival times late.
@@ -23,8 +23,8 @@ from rig.messages.message import Message, compose
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """Holds when a frame arrived (time.monotonic, s; the earliest moment that the driver can know) and the frame's
-    running number."""
+    """Holds when a frame arrived (time.monotonic, s; the earliest moment known to the driver) and the frame's running
+    number."""
 
     time_s: float
     sequence: int
@@ -48,11 +48,11 @@ class Driver(Protocol):
     """Its pictures come from a sensor, so that two equal ones mean a frozen stream."""
 
     def open(self, timeout_s: float) -> None:
-        """Finds the camera with the identity that rig.toml gives, and starts it. Raises CameraNotFound."""
+        """Finds the camera with the identity in rig.toml, and starts it. Raises CameraNotFound."""
         ...
 
     def configure(self) -> tuple[Message, ...]:
-        """Applies the settings of rig.toml. Returns one message for each setting that the camera did not take."""
+        """Applies the settings of rig.toml. Returns one message for each setting that the camera refused."""
         ...
 
     def grab(self, timeout_s: float) -> Arrival:
@@ -130,8 +130,8 @@ def driver_for(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class Pace:
-    """Ticks ``fps`` times a second from its creation on. Ticks that nobody waited for are lost, as frames of a camera
-    are."""
+    """Ticks ``fps`` times a second from its creation on. Ticks that nobody waited for are lost, like frames of a
+    camera."""
 
     def __init__(self, fps: float) -> None:
         self._period_s = 1.0 / fps

@@ -1,7 +1,7 @@
-"""Runs one camera in its own thread: opens it, grabs frames without pause, and hands them over when they are wanted.
+"""Runs one camera in its own thread: opens it, grabs frames continuously, and passes them on when requested.
 
-A driver may hang inside a vendor's library, where nothing can stop it. So every camera has its own thread, nobody waits
-for it without a deadline, and a thread that does not end is abandoned: it is a daemon, and its feed reports that.
+A driver may block forever inside a vendor's library, where nothing can stop it. So every camera has its own thread, and
+every wait has a deadline. A thread that does not end is abandoned: it is a daemon, and its feed reports that.
 """
 
 import contextlib
@@ -24,8 +24,8 @@ _KEPT = 32  # frames that wait to be collected: half a second at 60 a second
 
 @dataclass(frozen=True, slots=True)
 class FeedState:
-    """Holds what is known of one camera at a moment. Times are in seconds of time.monotonic. ``unmet`` are the settings
-    that the camera did not take."""
+    """Holds the state of one camera at a moment. Times are in seconds of time.monotonic. ``unmet`` are the settings
+    that the camera refused."""
 
     opened: bool
     frames: int  # since it was opened
@@ -66,14 +66,14 @@ class CameraFeed:
         self._stop.set()
 
     def close(self, deadline_s: float) -> bool:
-        """Ends the thread. Returns False if the driver hangs, so that its thread had to be abandoned."""
+        """Ends the thread. Returns False if the driver is blocked, so that its thread had to be abandoned."""
         self.stop()
         if self._thread.ident is not None:
             self._thread.join(max(0.0, deadline_s - time.monotonic()))
         return not self._thread.is_alive()
 
     def state(self) -> FeedState:
-        """Returns what is known of the camera at this moment."""
+        """Returns the camera's current state."""
         with self._changed:
             gaps = [b - a for a, b in zip(list(self._arrivals_s)[:-1], list(self._arrivals_s)[1:], strict=True)]
             return FeedState(
@@ -98,26 +98,26 @@ class CameraFeed:
             return self._count >= count
 
     def want(self, from_s: float) -> None:
-        """Keeps, decoded, the frames that arrive after ``from_s`` (time.monotonic), until ``collect`` takes one. Frames
-        kept before are dropped."""
+        """Decodes and stores the frames that arrive after ``from_s`` (time.monotonic), until ``collect`` takes one.
+        Earlier frames are dropped."""
         with self._changed:
             self._frames.clear()
             self._wanted_from_s, self._due_s = from_s, None
 
     def due(self, earliest_s: float) -> None:
-        """Declares that the first frame that arrives at ``earliest_s`` (time.monotonic) or later is the one that is
-        wanted. Later frames are not decoded."""
+        """Declares that the wanted frame is the first one that arrives at ``earliest_s`` (time.monotonic) or later.
+        Later frames are not decoded."""
         with self._changed:
             self._due_s = earliest_s
 
     def unwant(self) -> None:
-        """Drops the frames kept so far, and stops decoding frames."""
+        """Drops the stored frames, and stops decoding frames."""
         with self._changed:
             self._frames.clear()
             self._wanted_from_s = self._due_s = None
 
     def collect(self, earliest_s: float, deadline_s: float) -> Frame | None:
-        """Returns the first kept frame that arrived at ``earliest_s`` or later; None if none has arrived by the
+        """Returns the first stored frame that arrived at ``earliest_s`` or later; None if none has arrived by the
         deadline."""
 
         def first() -> Frame | None:
@@ -128,7 +128,7 @@ class CameraFeed:
             return first()
 
     def trigger(self) -> None:
-        """Asks a camera with a software trigger for a picture. The request is passed on by the camera's thread."""
+        """Asks a camera with a software trigger for a picture. The camera's thread passes the request on."""
         self._release.set()
 
     def _run(self) -> None:

@@ -1,11 +1,11 @@
-"""GigE Vision and USB3 Vision cameras through Aravis (Debian: libaravis-0.8-0).
+"""Drives GigE Vision and USB3 Vision cameras through Aravis (Debian: libaravis-0.8-0).
 
 ``identity`` is the serial number, or the device's id or MAC address as `arv-tool-0.8` lists them. With ``trigger =
 "external"`` the camera waits for Line1, with ``"software"`` for a command, with ``"free"`` it runs at ``fps``.
 
-The few functions of libaravis-0.8 that this takes are called through ctypes, typed, with GError as an exception: one
-shared library from the distribution is all that asks for, while PyGObject has to be compiled against the girepository
-headers in every virtual environment. Source of the signatures: https://aravisproject.github.io/aravis/aravis-stable/
+The few functions of libaravis-0.8 that are needed are called through ctypes, typed, with GError as an exception. That
+needs one shared library from the distribution only, while PyGObject would have to be compiled in every virtual
+environment. Source of the signatures: https://aravisproject.github.io/aravis/aravis-stable/
 """
 
 import contextlib
@@ -127,7 +127,7 @@ class Aravis:
         return result
 
     def release(self, pointer: int) -> None:
-        """Gives a reference to a GObject back to the library."""
+        """Returns a reference to a GObject to the library."""
         self._gobject.g_object_unref(pointer)
 
     def pixels(self, buffer: int) -> UInt8[np.ndarray, " n"]:
@@ -139,7 +139,7 @@ class Aravis:
 
 @cache
 def library() -> Aravis:
-    """Returns the library, which is loaded once. Raises OSError where it is not installed."""
+    """Returns the library; it is loaded only once. Raises OSError where it is not installed."""
     return Aravis()
 
 
@@ -177,8 +177,8 @@ class GenicamDriver:
             raise CameraNotFound(self._camera, str(error)) from error
 
     def configure(self) -> tuple[Message, ...]:
-        """Returns one message for each setting that the camera did not take. ``open`` has applied them, since picture
-        sizes cannot change once the stream runs."""
+        """Returns one message for each setting that the camera refused. ``open`` has applied them, since picture sizes
+        cannot change once the stream runs."""
         return self._unmet  # applied before the acquisition started: sizes cannot change after it
 
     def grab(self, timeout_s: float) -> Arrival:
@@ -200,8 +200,8 @@ class GenicamDriver:
         raise GrabTimeout(self._camera, timeout_s)
 
     def retrieve(self) -> ImageRgb:
-        """Decodes the frame of the last ``grab``. Raises CameraLost if there is none, and DriverError for a pixel
-        format that is not known."""
+        """Decodes the frame of the last ``grab``. Raises CameraLost if there is none, and DriverError for an unknown
+        pixel format."""
         if self._buffer is None:
             raise CameraLost(self._camera, compose("no-frame-grabbed"))
         width = self._aravis.call("arv_buffer_get_image_width", self._buffer)
@@ -298,7 +298,7 @@ class GenicamDriver:
         self._aravis.call("arv_camera_start_acquisition", self._device)
 
     def _stamp_s(self, buffer: int) -> float:
-        """Returns the host's stamp of the buffer, taken in Aravis's own thread, on the clock of time.monotonic."""
+        """Returns the host's time stamp of the buffer, taken in Aravis's own thread, converted to time.monotonic."""
         now_s = time.monotonic()
         age_s = (time.time_ns() - self._aravis.call("arv_buffer_get_system_timestamp", buffer)) * 1e-9
         return now_s - age_s if 0 <= age_s < 1.0 else now_s

@@ -1,8 +1,8 @@
-"""DSLRs and other PTP cameras through python-gphoto2 (extra ``gphoto``).
+"""Drives DSLRs and other PTP cameras through python-gphoto2 (extra ``gphoto``).
 
-``identity`` is the camera's serial number, or a network address ``ptpip:192.168.1.7``. A picture is a file that the
-camera adds: at the trigger box's remote cable (``trigger = "external"``) or at a command (``"software"``).
-Set the camera to JPEG; its memory card is not used.
+``identity`` is the camera's serial number, or a network address ``ptpip:192.168.1.7``. Each picture is a new file on
+the camera, taken at the trigger box's remote cable (``trigger = "external"``) or at a command (``"software"``). Set the
+camera to JPEG; its memory card is not used.
 """
 
 import importlib
@@ -73,8 +73,8 @@ class GphotoDriver:
         return tuple(unmet)
 
     def grab(self, timeout_s: float) -> Arrival:
-        """Waits until the camera adds a picture. Its arrival is when libgphoto2 reports it. Raises GrabTimeout,
-        CameraLost."""
+        """Waits until the camera adds a picture. Its arrival is the time at which libgphoto2 reports it. Raises
+        GrabTimeout, CameraLost."""
         deadline_s = time.monotonic() + timeout_s
         try:
             while (left_s := deadline_s - time.monotonic()) > 0:
@@ -161,7 +161,7 @@ class GphotoDriver:
         return device
 
     def _set(self, name: str, value: Any) -> bool:
-        """Sets one configuration value, to the nearest of its choices where it is a number."""
+        """Sets one configuration value; a number is set to the nearest available choice."""
         try:
             widget = self._opened().get_single_config(name)
             choices = list(widget.get_choices()) if widget.get_type() == self._gp.GP_WIDGET_RADIO else []
@@ -176,12 +176,12 @@ class GphotoDriver:
 
 
 def _serial_of(camera: CameraConfig) -> str:
-    """Returns the serial number without leading zeros: cameras write them, the labels on their bodies do not."""
+    """Returns the serial number without leading zeros, which cameras report but do not print on their bodies."""
     return camera.identity.lstrip("0")
 
 
 def _nearest_choice(value: Any, choices: list[str]) -> str | None:
-    """Returns the choice that is ``value``, or for a number the one within a third of a stop of it."""
+    """Returns the choice equal to ``value``; for a number, the nearest one within a third of a stop."""
     if isinstance(value, str):
         return value if value in choices else None
     numbers = [(abs(number / value - 1), choice) for choice in choices if (number := _number(choice)) is not None]

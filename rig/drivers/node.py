@@ -1,4 +1,4 @@
-"""Cameras of Raspberry Pis that run deploy/raspberry_pi/node.py: motion JPEG with settings and a software trigger.
+"""Drives cameras of Raspberry Pis with deploy/raspberry_pi/node.py: motion JPEG with settings and a software trigger.
 
 ``identity`` is the node's address, ``http://pi03.local:8080``.
 """
@@ -28,7 +28,7 @@ class NodeDriver(MjpegDriver):
         return f"{self._root()}/stream?{urlencode(wanted)}"
 
     def configure(self) -> tuple[Message, ...]:
-        """Returns one message for each setting that the node's camera does not take."""
+        """Returns one message for each setting that the node's camera refuses."""
         unmet = self.header("X-Unmet").split(",")
         return tuple(
             compose("setting-refused", setting=key, value=str(getattr(self._camera, key))) for key in unmet if key

@@ -1,10 +1,10 @@
-"""Cameras through OpenCV: UVC and other V4L2 cameras by their stable path, RTSP by address, motion JPEG over HTTP.
+"""Drives cameras by OpenCV: UVC and other V4L2 cameras by stable path, RTSP by address, motion JPEG over HTTP.
 
-V4L2 stamps its buffers with CLOCK_MONOTONIC, which is time.monotonic; that stamp is used where it is plausible.
+V4L2 stamps its buffers with CLOCK_MONOTONIC, the same clock as time.monotonic; a plausible stamp is used.
 
 Motion JPEG is a multipart/x-mixed-replace body (RFC 2046, section 5.1). OpenCV's own reader decodes every frame before
-it reports it. Here a frame's arrival is when the kernel received its header, whenever this program reads it, and a
-frame is decoded only if it is wanted.
+it reports it. Here a frame's arrival is the time at which the kernel received its header, and a frame is decoded only
+if it is requested.
 """
 
 import base64
@@ -214,12 +214,12 @@ class MjpegDriver:
         return self._camera.identity
 
     def header(self, name: str) -> str:
-        """Returns a header of the open stream's answer, or an empty text."""
+        """Returns a header of the open stream's response, or an empty text."""
         found = re.search(rf"(?im)^{name}:(.*)$", self._stream.head.decode("latin-1") if self._stream else "")
         return found.group(1).strip() if found else ""
 
     def configure(self) -> tuple[Message, ...]:
-        """Returns one message for each setting in rig.toml of exposure, gain or white balance: none of them can be set
+        """Returns one message for each setting of exposure, gain or white balance in rig.toml, because none can be set
         over HTTP."""
         requested = [
             key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None
@@ -282,8 +282,8 @@ class VideoCaptureDriver:
         self._capture = capture
 
     def configure(self) -> tuple[Message, ...]:
-        """Applies the settings of rig.toml. Returns one message for each that the device did not take; 5 % off counts
-        as taken."""
+        """Applies the settings of rig.toml. Returns one message for each that the device refused; a difference up to 5
+        % counts as accepted."""
         capture = self._opened()
         unmet = [
             compose("setting-not-taken", setting=key, value=str(wanted), actual=capture.get(prop))
@@ -368,7 +368,7 @@ def decode_jpeg(camera: CameraConfig, data: bytes) -> ImageRgb:
 
 
 def _is_taken(prop: int, wanted: float, actual: float) -> bool:
-    """Tells whether a value was set: within a twentieth, as cameras have steps; exactly for a pixel format."""
+    """Tells whether a value was set: to a twentieth, because cameras have steps; exactly for a pixel format."""
     return abs(actual - wanted) <= (0.0 if prop == cv2.CAP_PROP_FOURCC else _NEAR * abs(wanted))
 
 

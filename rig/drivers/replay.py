@@ -1,7 +1,7 @@
-"""Delivers a picture of a recorded capture instead of a camera's, repeatedly at the camera's rate.
+"""Delivers a picture from a recorded capture in place of a camera's, repeatedly at the camera's rate.
 
-``identity`` is the capture's folder, relative to rig.toml, and after a # the name of the camera there if it differs.
-With ``plates = "FOLDER/background"`` in rig.toml, a recorded shot can be taken through a whole session.
+``identity`` is the capture's folder, relative to rig.toml, followed by # and the camera's name in the capture if it
+differs. With ``plates = "FOLDER/background"`` in rig.toml, a whole session can run on a recorded shot.
 """
 
 from pathlib import Path
@@ -58,5 +58,5 @@ class ReplayDriver(PacedDriver):
         return self._image
 
     def close(self) -> None:
-        """Forgets the recorded picture."""
+        """Drops the recorded picture."""
         self._image = self._pace = None

@@ -1,8 +1,8 @@
 """Drives a camera of the simulated studio inside this process, without network or trigger box.
 
-``identity`` is a head's mesh file, relative to rig.toml, and after a # the name of the studio's camera if it differs.
-The head sits in the default studio, and each camera photographs it at its rate. For cameras that act as devices with a
-trigger box, serve the studio (``rig.studio.devices.serve``).
+``identity`` is a head's mesh file, relative to rig.toml, followed by # and the name of the studio's camera if it
+differs. The head sits in the default studio, and each camera photographs it at its rate. ``rig.studio.devices.serve``
+simulates cameras as separate devices with a trigger box.
 """
 
 import time
@@ -45,7 +45,7 @@ class SimulatedDriver(PacedDriver):
         self._pace = Pace(self._camera.fps or _FPS)
 
     def configure(self) -> tuple[Message, ...]:
-        """Returns one message for each setting in rig.toml of exposure, gain or white balance, which a simulated camera
+        """Returns one message for each setting of exposure, gain or white balance in rig.toml, which a simulated camera
         lacks."""
         requested = [
             key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None
@@ -53,13 +53,13 @@ class SimulatedDriver(PacedDriver):
         return tuple(compose("no-setting-of-simulated", setting=key) for key in requested)
 
     def retrieve(self) -> ImageRgb:
-        """Renders and returns the picture that the camera sees now. Raises CameraLost if it is not open."""
+        """Renders and returns the camera's current view. Raises CameraLost if it is not open."""
         if self._source is None or self._pace is None:
             raise CameraLost(self._camera, compose("camera-not-open"))
         return self._source(self._view, time.monotonic())
 
     def close(self) -> None:
-        """Stops the camera; the studio is kept."""
+        """Stops the camera but keeps the studio."""
         self._pace = None
 
     def _build(self) -> ImageSource:

@@ -1,8 +1,8 @@
-"""Reads rig.toml: the cameras, trigger box and lights of a rig, and the limits that a shot must keep.
+"""Reads rig.toml: the cameras, trigger box and lights of a rig, and the limits for a shot.
 
 Every table is a frozen dataclass whose fields are the keys. An unknown key is refused, and the nearest known one is
 suggested. A camera is identified by something that survives a reboot (serial number, /dev/v4l/by-id or by-path,
-address), never by an index, since indices change. deploy/rig.example.toml shows every key."""
+address), never by an index, because indices change. deploy/rig.example.toml shows every key."""
 
 import dataclasses
 import re
@@ -55,7 +55,7 @@ _SHOT_BOUNDS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraConfig:
-    """Holds one table [[cameras]] of rig.toml. Settings that are left out stay as they are in the camera."""
+    """Holds one table [[cameras]] of rig.toml. Omitted settings stay as they are in the camera."""
 
     name: str
     driver: DriverName
@@ -132,7 +132,7 @@ class RigConfig:
 
     @property
     def calibration_file(self) -> Path | None:
-        """Returns the calibration that this rig uses, if it names one."""
+        """Returns the calibration that this rig uses; None if it names none."""
         return None if self.calibration is None else self.folder / self.calibration
 
     @property
@@ -246,6 +246,6 @@ def _outside(table: object, bounds: Mapping[str, tuple[float, float]], where: st
 
 
 def _hinted(fault: Message, word: Any, known: Iterable[Any]) -> Message:
-    """Adds to a fault the known word that was probably meant, if one is similar."""
+    """Adds to a fault the known word that was probably meant, if a similar one exists."""
     near = suggest(str(word), map(str, known), min_likeness=0.5)
     return compose("did-you-mean", fault=fault, nearest=f"{near[0]!r}") if near else fault

@@ -1,5 +1,4 @@
-"""Encodes and decodes the trigger box's protocol ``eigenhead-trigger/1``: one message a line
-(docs/rig.md)."""
+"""Encodes and decodes the trigger box's protocol ``eigenhead-trigger/1``: one message in each line (docs/rig.md)."""
 
 from collections.abc import Iterator
 
@@ -44,7 +43,7 @@ def decode_payload(line: bytes) -> tuple[int, str] | None:
 class LineReader:
     """Splits a byte stream into valid lines that begin with ``start``, and counts damaged ones.
 
-    Bytes outside lines (noise, or another device's output) are kept in ``stray``, the last 80 of them."""
+    The last 80 bytes outside lines (noise, or another device's output) are in ``stray``."""
 
     def __init__(self, start: bytes) -> None:
         self._start = start[0]

@@ -1,12 +1,12 @@
-"""Defines the one type of everything that the program reports to somebody: warnings, faults, refusals, failures.
+"""Defines the one type for everything that the program reports: warnings, faults, refusals, failures.
 
 A code is stable; its template (``rig/messages/english``) may be reworded at any time: ``{name}`` is replaced by a
 parameter, ``{name:.1f}`` by a number, "one | several" are the forms for a count. Format specifications are those of
-Python that the console's ``messages.js`` knows, too (``SPECIFICATIONS``). ``word`` marks a value that is translated,
-such as the state of a job, unlike a name.
+Python that the console's ``messages.js`` also supports (``SPECIFICATIONS``). ``word`` marks a value that is translated,
+such as the state of a job; names are not translated.
 
 A new message needs: its code and template in a module of ``rig/messages/english``, its German in
-``server/console/static/messages_de.js``, and ``compose(code, ...)`` where it is used. Tests hold the three together.
+``server/console/static/messages_de.js``, and ``compose(code, ...)`` where it is used. Tests check that the three agree.
 """
 
 import math
@@ -29,13 +29,13 @@ FORMS = " | "
 
 
 def fields_of(template: str) -> dict[str, str]:
-    """Returns the format specification of every field: "" without one, ``count`` if the template has forms for it."""
+    """Returns the format specification of every field: "" without one; ``count`` if the template has forms."""
     fields = {name: specification or "" for name, specification in FIELD.findall(template)}
     return {"count": "", **fields} if FORMS in template else fields
 
 
 def render(template: str, parameters: Mapping[str, Any]) -> str:
-    """Fills a template in. Raises KeyError for a field without a parameter."""
+    """Fills in a template. Raises KeyError for a field without a parameter."""
     forms = template.split(FORMS)
     form = forms[0] if len(forms) == 1 or parameters["count"] == 1 else forms[-1]
     return FIELD.sub(lambda field: _written(parameters[field[1]], field[2] or ""), form)
@@ -108,14 +108,14 @@ class Message:
         return hash((self.code, self.text))
 
     def document(self) -> MessageDocument:
-        """Returns the message for JSON; what cannot be written as UTF-8 is escaped."""
+        """Returns the message for JSON; characters that UTF-8 cannot encode are escaped."""
         parameters = {name: _document(value) for name, value in self.parameters.items()}
         return {"code": self.code, "message": printable(self.text), "parameters": parameters}
 
 
 def compose(code: str, /, **parameters: Raw) -> Message:
-    """Makes the message of a code. Its parameters must be exactly those that the template names: others, and a code
-    that the catalogue lacks, are programming errors (AssertionError, KeyError)."""
+    """Makes the message of a code. Its parameters must be exactly those in the template. Other parameters, or an
+    unknown code, are programming errors (AssertionError, KeyError)."""
     template, values = CATALOGUE[code], {name: _parameter(value) for name, value in parameters.items()}
     assert values.keys() == fields_of(template).keys(), f"{code}: {sorted(values)} for {template!r}"
     return Message(code, values, render(template, values))
@@ -132,7 +132,7 @@ def message_of(message: Message | str) -> Message:
 
 
 def read_message(document: object) -> Message:
-    """Reads what ``Message.document`` wrote, and the texts and ``{code, message}`` of earlier versions. Raises
+    """Reads the output of ``Message.document``, and the texts and ``{code, message}`` of earlier versions. Raises
     ValueError for anything else."""
     if isinstance(document, str):
         return verbatim(document)
@@ -201,6 +201,6 @@ def say_once(faults: Sequence[Message | str], names: Iterable[str], *, named_mos
 
 
 def some_of(names: Sequence[str], most: int = NAMED_MOST) -> Sequence[str] | Message:
-    """Returns the first few names, and a note of how many more there are, for use in a message."""
+    """Returns the first few names, and a note with the number of the others, for use in a message."""
     more = len(names) - most
     return compose("names-and-more", names=names[:most], more=more) if more > 0 else names

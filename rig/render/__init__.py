@@ -1,1 +1,1 @@
-"""Drawing with OpenGL on EGL: the one room that knows moderngl."""
+"""Draws with OpenGL on EGL; no other package uses moderngl."""

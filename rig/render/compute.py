@@ -1,7 +1,7 @@
 """Runs compute shaders: calculations on arrays on the GPU.
 
-It uses OpenGL 4.3 on EGL, as the silhouettes do, so that no other driver is needed. Without a GPU, Mesa's software
-renderer runs the same shaders, slower than compiled loops.
+It uses OpenGL 4.3 on EGL, like the silhouettes, so no other driver is needed. Without a GPU, Mesa's software renderer
+runs the same shaders, slower than compiled loops.
 """
 
 import contextlib
@@ -69,7 +69,7 @@ class ComputeDevice:
         self.close()
 
     def close(self) -> None:
-        """Frees the context and all that it holds."""
+        """Frees the context and its resources."""
         with self._lock:
             self._gl.release()
 
@@ -133,7 +133,7 @@ class ComputeDevice:
 
 
 def open_device(name: DeviceName, renderer: str) -> ComputeDevice | None:
-    """Returns the device to compute on; None stands for the processor.
+    """Returns the device for computations; None means the CPU.
 
     Args:
         name: ``gl`` takes any OpenGL, ``auto`` a GPU if there is one.
@@ -153,5 +153,5 @@ def open_device(name: DeviceName, renderer: str) -> ComputeDevice | None:
 
 
 def is_software(renderer: str) -> bool:
-    """Tells whether a renderer's description is that of a program that draws on the processor."""
+    """Tells whether a renderer's description names a software renderer."""
     return any(word in renderer.lower() for word in SOFTWARE)

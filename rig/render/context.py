@@ -1,13 +1,13 @@
-"""Provides the one EGL context and its shader programs, and bridges two conventions in which OpenGL differs from this
+"""Provides the EGL context and its shader programs, and handles two conventions in which OpenGL differs from this
 project.
 
-Row order: OpenGL counts rows from below. Everything in ``rig.render`` draws image row v into framebuffer row v (the
-projection in ``shaders/camera.glsl`` maps v = 0 to y = -1). Reading back, lowest row first, thus gives row 0 on top; no
-image is flipped. In exchange anticlockwise triangles arrive clockwise, so that the context takes clockwise
-as front.
+Row order: OpenGL counts rows from the bottom. Everything in ``rig.render`` draws image row v into framebuffer row v
+(the projection in ``shaders/camera.glsl`` maps v = 0 to y = -1). Reading back, lowest row first, thus gives row 0 at
+the top; no image is flipped. As a consequence, anticlockwise triangles become clockwise, so the context treats
+clockwise as front.
 
-Pixel centre: a fragment's centre is at half-integer window coordinates, while pixel (0, 0) of this project is a centre,
-so that the shader adds 1/2.
+Pixel centre: a fragment's centre is at half-integer window coordinates, while pixel (0, 0) of this project is a centre;
+so the shader adds 1/2.
 """
 
 import contextlib
@@ -53,11 +53,11 @@ class WrongThread(EigenheadError):
 
 
 class Owned(contextlib.ExitStack):
-    """Frees every GPU resource that was passed through a call of it, in reverse order, when the block ends. moderngl
-    frees nothing by itself."""
+    """Frees every GPU resource that was passed through a call of it, in reverse order, at the end of the block.
+    moderngl frees nothing by itself."""
 
     def __call__(self, resource: Resource) -> Resource:
-        """Returns the resource, which will be freed when the block ends."""
+        """Returns the resource, which is freed at the end of the block."""
         self.callback(resource.release)
         return resource
 
@@ -93,8 +93,8 @@ class GlContext:
     def drawing(
         self, target: moderngl.Framebuffer, *, clip: bool = True, cull: bool = False, depth: bool = False
     ) -> Iterator[None]:
-        """Directs drawing in the block to ``target``: with ``clip`` only inside tiles and beyond near planes, with
-        ``cull`` without back faces, with ``depth`` with a depth test."""
+        """Draws to ``target`` in the block: ``clip`` limits drawing to tiles and beyond near planes, ``cull`` omits
+        back faces, ``depth`` adds a depth test."""
         planes = CLIP_PLANES if clip else ()
         for plane in planes:
             self.gl.enable_direct(plane)
@@ -108,7 +108,7 @@ class GlContext:
             self._rest.use()  # moderngl keeps binding the last target, and fails once that is released
 
     def program(self, vertex: str, fragment: str, geometry: str | None = None) -> moderngl.Program:
-        """Returns the shader program made of these files of ``shaders/``; it is compiled once."""
+        """Returns the shader program from these files of ``shaders/``; it is compiled once."""
         key = (vertex, fragment, geometry or "")
         if key not in self._programs:
             self._programs[key] = self.gl.program(

@@ -1,11 +1,11 @@
-"""Draws what the simulated studio photographs: the light that a painted and lit subject sends to the lens.
+"""Draws the photographs of the simulated studio: the light from a painted and lit subject to the lens.
 
 Colour and irradiance come from the caller, for each vertex. Finer structure is a function of the position on the
 subject, evaluated at each pixel (``shaders/grain.glsl``), so that all views agree on every pore. A mild highlight moves
 with the view. Radiance is linear, and a pixel is the mean of several samples.
 
 llvmpipe computes both sides of every branch: shading brows and lips at each pixel would take 2.5 us a pixel, three
-times as long as now.
+times the present time.
 """
 
 from collections.abc import Sequence
@@ -43,8 +43,8 @@ class Grain:
 class Part:
     """Holds a piece of the subject, in the world frame.
 
-    ``places`` are the coordinates on which its fine structure depends. ``paint`` is linear albedo and the strength of
-    the fine structure. ``irradiance`` is linear RGB, in which white paper is 1.
+    ``places`` are the coordinates for its fine structure. ``paint`` is linear albedo and the strength of the fine
+    structure. ``irradiance`` is linear RGB, in which white paper is 1.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -72,7 +72,7 @@ def draw_photographs(
     context: GlContext, rig: Rig, parts: Sequence[Part], gallery: Gallery, samples: int
 ) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
     """Draws the parts in each camera: linear RGB multiplied by coverage, and coverage (float32). Cameras are drawn one
-    at a time, since the samples of one take 25 MB."""
+    at a time, because the samples of one take 25 MB."""
     origin = rig.centre_world()
     box = np.concatenate([box_points(part.vertices) for part in parts])
     pictures = {}
@@ -88,7 +88,7 @@ def draw_photographs(
 
 
 def draw_vertex_radiance(context: GlContext, part: Part, gallery: Gallery) -> Float[np.ndarray, "v 3"]:
-    """Returns the linear RGB (float32) that ``draw_photographs`` shows of each vertex, without highlights."""
+    """Returns the linear RGB (float32) of each vertex as in ``draw_photographs``, without highlights."""
     count = len(part.vertices)
     size = (VERTEX_ROW, -(-count // VERTEX_ROW))
     with context.current() as gl, Owned() as owned:

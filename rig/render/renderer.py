@@ -1,11 +1,11 @@
-"""Provides the renderer, which its owner creates, passes on, and closes; and draws depth maps with it, for visibility
-(section 4.5: is a vertex occluded in an image?) and for shadows.
+"""Provides the renderer, which its owner creates, passes on, and closes. It draws depth maps for visibility (section
+4.5: is a vertex occluded in an image?) and for shadows.
 
-Silhouettes of the model are drawn in all cameras, and their boundary-weighted XOR with the input's is computed (section
+It also draws the model's silhouettes in all cameras, and computes their boundary-weighted XOR with the input's (section
 4.3, eqs. 4 and 5). All cameras share one atlas, which a single instanced draw fills. The sum of ``w |S - Sm|`` is taken
 in two steps: the GPU adds blocks of 8 x 8 pixels in single precision, in a fixed order; the blocks' sums are read back
 and added in double precision. So the relative error of a cost is below 64 * 2^-24 = 4e-6, equal masks cost exactly 0,
-and the same input always gives the same number. Blocks that the model cannot reach cost what they cost an empty model.
+and the same input always gives the same number. Blocks that the model cannot reach have the cost of an empty model.
 
 Measured on two cores with Mesa's llvmpipe, eleven views of 512 x 384 and 4,900 triangles: 8 ms to draw, 2 ms to add.
 Atomic additions (in a varying order), a compute shader over a copied mask, and mipmaps were slower or no better.
@@ -112,7 +112,7 @@ def _straight(premultiplied: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Surface:
-    """Holds what the GPU has of one page: the mask to draw into, the weights, and the block sums."""
+    """Holds the GPU resources of one page: the mask to draw into, the weights, and the block sums."""
 
     page: Page
     mask: moderngl.Framebuffer
@@ -126,8 +126,8 @@ class _Surface:
 
 
 class SilhouetteSet:
-    """Prepares cameras and triangles for many evaluations in which only the vertices change. Close it, or use
-    ``with``."""
+    """Prepares cameras and triangles for many evaluations in which only the vertices change. Call ``close`` after use,
+    or use ``with``."""
 
     def __init__(self, context: GlContext, rig: Rig, faces: Int[np.ndarray, "f 3"]) -> None:
         """``rig`` at the resolution to draw in."""
@@ -158,7 +158,7 @@ class SilhouetteSet:
         self._surfaces = []
 
     def masks(self, vertices_world: Float[np.ndarray, "v 3"]) -> dict[str, Bool[np.ndarray, "_ _"]]:
-        """Returns the mask of the mesh in each camera: which pixel centres it covers."""
+        """Returns the mask of the mesh in each camera: the pixel centres that it covers."""
         silhouettes = {}
         with self._context.current():
             self._draw(vertices_world)
@@ -280,10 +280,10 @@ class SilhouetteSet:
 
 
 def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
-    """Tells whether a mesh is closed: every edge has its counterpart. Its front faces alone then make the whole
+    """Tells whether a mesh is closed: every edge has its counterpart. Its front faces alone then form the whole
     silhouette.
 
-    A line enters such a surface as often as it leaves it, so every pixel that a back face covers has a front face too.
+    A line enters such a surface as often as it leaves it, so every pixel under a back face is also under a front face.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     base = int(edges.max(initial=0)) + 1
@@ -359,7 +359,7 @@ def _draw_page(
 
 
 class Renderer:
-    """Draws meshes as the cameras of a rig see them, lens distortion included. It belongs to one thread of one process.
+    """Draws meshes in the views of a rig's cameras, lens distortion included. It belongs to one thread of one process.
 
     ``with Renderer.create() as renderer: ...``. Raises EglUnavailable if OpenGL cannot start, and WrongThread if it is
     used in another thread. Meshes are in the world frame, mm; images have row 0 on top. ``scale`` draws the same views
@@ -385,8 +385,8 @@ class Renderer:
         self.context.close()
 
     def silhouette_set(self, rig: Rig, faces: Int[np.ndarray, "f 3"], scale: float = 1.0) -> SilhouetteSet:
-        """Prepares many evaluations of one mesh topology in all cameras: its masks, and their weighted XOR with given
-        ones."""
+        """Prepares many evaluations of one mesh topology in all cameras: its masks, and their weighted XOR with input
+        masks."""
         return SilhouetteSet(self.context, rig.scaled(scale) if scale != 1.0 else rig, faces)
 
     def depth(

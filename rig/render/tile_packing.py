@@ -1,4 +1,4 @@
-"""Packs the images of all cameras into as few textures as OpenGL allows, and the cameras' values for shaders."""
+"""Packs the images of all cameras into as few textures as OpenGL allows, and the cameras' parameters for shaders."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -77,8 +77,8 @@ def _page(placed: list[tuple[int, tuple[int, int, int, int]]]) -> Page:
 
 
 def lens_limit(camera: Camera) -> float:
-    """Returns the radius of a ray (``X / Z``) beyond which no point appears in the image: twice that of the farthest
-    corner."""
+    """Returns the radius of a ray (``X / Z``) beyond which no point appears in the image: twice the radius of the
+    farthest corner."""
     k = camera.intrinsics
     corners = np.array([(x, y) for x in (-0.5, k.width - 0.5) for y in (-0.5, k.height - 0.5)])
     radii = np.linalg.norm(camera.undistort(corners), axis=1)
@@ -93,7 +93,7 @@ def instances(
     origin_world: Float[np.ndarray, " 3"],
     depth_ranges: Float[np.ndarray, "n 2"] | None = None,
 ) -> Float[np.ndarray, "k 30"]:
-    """Returns a row of shader inputs for each tile of ``page``. The shader then takes points relative to
+    """Returns a row of shader inputs for each tile of ``page``. The shader then expects points relative to
     ``origin_world``.
 
     ``depth_ranges``: nearest and farthest depth of the scene in each camera (mm); None draws without a depth buffer.
@@ -114,7 +114,7 @@ def instances(
 
 def box_points(vertices: Float[np.ndarray, "v 3"], per_edge: int = 9) -> Float[np.ndarray, "p 3"]:
     """Returns points on the twelve edges of the vertices' bounding box. Seen from outside the box, their outline
-    contains that of the mesh."""
+    contains the mesh's outline."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     steps = np.linspace(0.0, 1.0, per_edge)
     corners = np.array([(a, b) for a in (0.0, 1.0) for b in (0.0, 1.0)])

@@ -1,9 +1,9 @@
 """Finds the captures of a batch below a folder, or reads them from a list with subject, session and settings.
 
 A capture's name is the path of its result below ``OUT``. A list is a text file with one capture a line (``#`` begins a
-comment), or a CSV file whose first row names its columns; relative paths start at the list's folder.
-A batch is divided among machines that do not communicate by a stable hash of the captures' names. The
-SHA-256 of a capture tells a later run whether its result is up to date."""
+comment), or a CSV file whose first row names its columns; relative paths start at the list's folder. A stable hash of
+the captures' names divides a batch among machines that do not communicate. The SHA-256 of a capture tells a later run
+whether its result is up to date."""
 
 import csv
 import hashlib
@@ -36,8 +36,8 @@ SHARDS_MOST = 100_000
 
 @dataclass(frozen=True, slots=True)
 class BatchCapture:
-    """Holds one capture of a batch. ``name``: name of the result's folder, relative to ``OUT``; ``settings``: those of
-    this capture, which override the batch's."""
+    """Holds one capture of a batch. ``name``: name of the result's folder, relative to ``OUT``; ``settings``: settings
+    of this capture, which override the batch's."""
 
     name: str
     path: Path
@@ -49,8 +49,8 @@ class BatchCapture:
 def find_captures(folder: Path, out: Path) -> tuple[BatchCapture, ...]:
     """Finds all captures below a folder, sorted by name. ``out`` and folders of results are skipped.
 
-    Raises InputError if there is none, if the folder itself is one, and naming all captures whose results would share a
-    folder.
+    Raises InputError if there is none, if the folder itself is a capture, and if the results of several captures would
+    have one folder (it names all of them).
     """
     if is_capture(folder) and (find_rig_file(folder) is not None or entry(folder, "images").is_dir()):
         raise InputError(folder.name, [compose("batch-folder-is-capture")])
@@ -200,8 +200,8 @@ def _settings_of(text: str, folder: Path) -> dict[str, object]:
 
 
 def _name_faults(captures: list[BatchCapture], places: list[str]) -> list[Message]:
-    """Returns faults of names that cannot be folders below OUT, that would be the same folder, or one inside
-    another."""
+    """Returns faults of names: a name that cannot be a folder below OUT, two equal names, and a folder inside another
+    capture's folder."""
     faults: list[Message] = []
     folded: dict[str, list[str]] = {}
     for capture, position in zip(captures, places, strict=True):
@@ -222,7 +222,7 @@ def _name_faults(captures: list[BatchCapture], places: list[str]) -> list[Messag
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """Holds one share of a batch, to be made by one machine: ``number`` (from 1) of ``count`` shares."""
+    """Describes the part of a batch that one machine makes: part ``number`` (from 1) of ``count``."""
 
     number: int
     count: int
@@ -231,7 +231,7 @@ class Shard:
         return f"{self.number}/{self.count}"
 
     def takes(self, name: str) -> bool:
-        """Returns whether the capture with this name belongs to this share. Each capture belongs to exactly one."""
+        """Returns whether the capture with this name belongs to this part. Each capture belongs to exactly one part."""
         digest = hashlib.sha256(name.encode()).digest()
         return int.from_bytes(digest[:8], "big") % self.count == self.number - 1
 
@@ -240,7 +240,7 @@ WHOLE = Shard(1, 1)
 
 
 def read_shard(text: str) -> Shard:
-    """Reads a share from the text K/N, where K is from 1 to N. Raises InputError."""
+    """Reads a part of a batch from the text K/N, where K is from 1 to N. Raises InputError."""
     parts = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text.strip())
     number, count = (int(parts[1]), int(parts[2])) if parts else (0, 0)
     if not 1 <= number <= count <= SHARDS_MOST:

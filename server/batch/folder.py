@@ -32,14 +32,14 @@ FOUND_FILES = ("cameras.json", "calibration.json", "calibration.html", "masks") 
 
 
 class ForeignFiles(EigenheadError):
-    """Reports that the folder of a result holds files that are no part of a result, so that it must not be replaced."""
+    """Reports that the folder of a result holds other files too, so it must not be replaced."""
 
     def __init__(self, folder: Path, names: list[str]) -> None:
         super().__init__(compose("batch-foreign-files", folder=str(folder), names=names[:5]))
 
 
 class ShareTaken(EigenheadError):
-    """Reports that another process works on the share already."""
+    """Reports that another process works on this part of the batch already."""
 
     def __init__(self, share: str) -> None:
         super().__init__(compose("batch-share-taken", share=share))
@@ -47,8 +47,8 @@ class ShareTaken(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Holds what a result was made from, as SHA-256 of the capture's files, the settings and the model, and the
-    program's version. A result is not made again for another ``version`` alone."""
+    """Holds the origin of a result: the SHA-256 of the capture's files, of the settings and of the model, and the
+    program's version. A difference in ``version`` alone is no reason to make a result again."""
 
     input_sha256: str
     settings_sha256: str
@@ -62,7 +62,7 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class FailureRecord:
-    """Holds why the latest attempt at a capture failed."""
+    """Holds the reason for which the latest attempt at a capture failed."""
 
     kind: str
     message: Message
@@ -72,8 +72,8 @@ class FailureRecord:
 
 
 class BatchFolder:
-    """Manages the paths and records of the folder ``out`` that a batch fills. One process works on a share at a
-    time."""
+    """Manages the paths and records of the folder ``out`` that a batch fills. One process works on a part of the batch
+    at a time."""
 
     def __init__(self, out: Path) -> None:
         self.out = out
@@ -82,8 +82,8 @@ class BatchFolder:
 
     @contextmanager
     def share(self, shard: Shard) -> Iterator[None]:
-        """Holds a share during the block, and removes what processes that have ended left: attempts, and folders that
-        are empty. Raises ShareTaken if another process has the share."""
+        """Locks a part of the batch during the block, and removes the attempts and empty folders of processes that have
+        ended. Raises ShareTaken if another process has the lock."""
         try:
             with self._lock(_lock_name(shard), wait=False) as held:
                 if not held:
@@ -95,7 +95,7 @@ class BatchFolder:
             self._tidy()
 
     def _tidy(self) -> None:
-        """Removes the attempts of shares that no process has, and empty folders."""
+        """Removes attempts that no running process owns, and empty folders."""
         alive = set[str]()
         for lock in self.work.glob("*.lock"):
             with self._lock(lock.stem, wait=False) as free:
@@ -109,14 +109,14 @@ class BatchFolder:
 
     @contextmanager
     def table(self) -> Iterator[None]:
-        """Holds the right to write the table during the block. Waits for another process that has it."""
+        """Locks the table for writing during the block. Waits until no other process holds the lock."""
         with self._lock("table", wait=True):
             yield
 
     @contextmanager
     def _lock(self, name: str, *, wait: bool) -> Iterator[bool]:
-        """Locks a file in ``.batch`` during the block and removes it then; the kernel ends a lock with its process, on
-        NFS too. Yields whether this process has the lock."""
+        """Locks a file in ``.batch`` during the block and removes it then; the kernel releases a lock when its process
+        ends, on NFS too. Yields whether this process has the lock."""
         path = self.work / f"{name}.lock"
         file = _locked(path, wait=wait)
         try:
@@ -157,7 +157,7 @@ class BatchFolder:
         """Renames the finished result of an attempt to its final place, replacing an earlier result of that name, and
         removes the failure record.
 
-        Raises ForeignFiles, and OSError if a process with another division into shares has just published it.
+        Raises ForeignFiles, and OSError if a process that divides the batch differently has just published it.
         """
         complete, target = attempt / "result", self.result(name)
         self.check_replaceable(name)
@@ -172,7 +172,7 @@ class BatchFolder:
         self.failure_file(name).unlink(missing_ok=True)
 
     def check_replaceable(self, name: str) -> None:
-        """Raises ForeignFiles if the folder of a result holds files that are no part of a result."""
+        """Raises ForeignFiles if the folder of a result holds other files too."""
         try:
             entries = sorted(path.name for path in self.result(name).iterdir())
         except FileNotFoundError:

@@ -1,7 +1,7 @@
-"""Runs a batch: each worker takes one capture after the other, in a child process that keeps models and compiled loops.
+"""Runs a batch: each worker processes its captures in one child process, which keeps models and compiled loops.
 
-A crash of a child, or a fault of a capture, is a failure of that capture only. If this process ends at any moment,
-every result is complete or absent, and the next run removes what was left unfinished."""
+A crash of a child, or a fault of a capture, fails that capture only. If this process ends at any moment, every result
+is complete or absent, and the next run removes what was left unfinished."""
 
 import os
 import shutil
@@ -86,7 +86,7 @@ class Observer(Protocol):
 
 
 class BatchRun:
-    """Makes the missing results of a batch, or of one share of it, in this process and its children."""
+    """Makes the missing results of a batch, or of one part of it, in this process and its children."""
 
     def __init__(
         self,
@@ -107,10 +107,10 @@ class BatchRun:
 
     def run(self, publish_table: Callable[[], object]) -> list[Outcome]:
         """Makes the results that are missing and returns how each capture ended, in the order of the tasks. It may be
-        killed at any moment; the next run makes what is missing then.
+        killed at any moment; the next run then makes the missing results.
 
         ``publish_table`` is called at the end, never by two processes at a time. Raises ShareTaken if another process
-        works on the same share, and OSError if the folder cannot be written.
+        works on the same part, and OSError if the folder cannot be written.
         """
         with self._folder.share(self._shard):
             self._examine()
@@ -142,7 +142,7 @@ class BatchRun:
         return Origin(input_sha256, task.settings_sha256, task.model_sha256, task.version)
 
     def _work_off(self) -> None:
-        """Starts the workers, and stops them where somebody interrupts this process."""
+        """Starts the workers, and stops them if somebody interrupts this process."""
         with ThreadPoolExecutor(self._workers, thread_name_prefix="worker") as pool:
             at_work = [pool.submit(self._serve) for _ in range(self._workers)]
             try:
@@ -184,7 +184,7 @@ class BatchRun:
         return Outcome(name, "failed", time.monotonic() - began, failure)
 
     def _make(self, task: "BatchTask", origin: Origin, child: Child) -> None:
-        """Makes a result in a folder of its own and lays it down. Raises Cancelled where this process is to stop."""
+        """Makes a result in a temporary folder and then publishes it. Raises Cancelled if this process is to stop."""
         name = task.capture.name
         self._folder.check_replaceable(name)
         attempt = self._folder.new_attempt(self._shard)
@@ -219,7 +219,7 @@ CGROUP = Path("/sys/fs/cgroup")
 
 
 def worker_count(cores: int, free_bytes: int, captures: int) -> int:
-    """Computes the default number of workers: one for each core, as far as memory allows, and at least one."""
+    """Computes the default number of workers: one for each core if memory allows, fewer otherwise, and at least one."""
     return max(1, min(cores, free_bytes // WORKER_BYTES, captures))
 
 

@@ -1,8 +1,7 @@
 """Draws the contact sheet of a batch: one self-contained HTML file (``server.batch.sheet_pdf``: as a PDF).
 
 Each head has three views of its turntable, its name, figures and warnings. Red marks warnings that question the head
-itself, amber those about missing input, grey the rest. The sheet contains no times, so that equal results give equal
-bytes.
+itself, amber those about missing input, grey the rest. The sheet contains no times, so equal results give equal bytes.
 """
 
 import base64
@@ -108,8 +107,7 @@ def sheet_html(title: str, cards: Sequence[Card]) -> str:
 
 
 def sheet_lines(title: str, cards: Sequence[Card]) -> Iterator[str]:
-    """Yields the parts of ``sheet_html`` one by one, so that the pictures of a thousand heads are never held at
-    once."""
+    """Yields the parts of ``sheet_html`` one by one, so memory never holds the pictures of a thousand heads."""
     yield '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
     yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
     yield f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>"

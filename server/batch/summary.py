@@ -1,4 +1,4 @@
-"""Writes the table and the contact sheet of all results in a batch's folder, whichever process made them."""
+"""Writes the table and the contact sheet of all results in a batch's folder, including those of other processes."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ SHEET, SHEET_PDF = "sheet.html", "sheet.pdf"
 
 
 def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]:
-    """Writes the table and the sheets of all captures of a batch, including those of other shares, and returns the
+    """Writes the table and the sheets of all captures of a batch, including those of other parts, and returns the
     files. Each file is replaced atomically. Raises OSError."""
     folder.forget_failures_but_of({task.capture.name for task in tasks})
     columns = columns_of(expressions_of(task.model for task in tasks))

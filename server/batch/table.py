@@ -1,7 +1,7 @@
 """Builds the table of a batch: one row for each capture, with the columns of ``columns_of``.
 
-Enters: reports of results and records of failures. Leaves: plain values. Lengths are mm, in the world frame; there are
-no angles. A cell is None if the capture has no such value. The table is written as CSV and, if pyarrow is installed, as
+In: reports of results and records of failures. Leaves: plain values. Lengths are mm, in the world frame; there are no
+angles. A cell is None if the capture has no such value. The table is written as CSV and, if pyarrow is installed, as
 Parquet with units.
 """
 
@@ -177,8 +177,8 @@ def _of_report(report: Mapping[str, Any]) -> Row:
 
 
 def _expression(report: Mapping[str, Any], columns: Sequence[Column]) -> Row:
-    """Returns weights and standard deviations of the model's expressions. Those missing from the report have weight
-    0."""
+    """Returns weights and standard deviations of the model's expressions. Expressions missing from the report have
+    weight 0."""
     row: Row = {
         column.name: 0.0
         for column in columns
@@ -253,5 +253,5 @@ def _cell(value: Value) -> str:
 
 
 def _encodable(value: Value) -> Value:
-    """Escapes text that UTF-8 cannot encode, since names of files need not be UTF-8."""
+    """Escapes text that UTF-8 cannot encode, since file names are not always UTF-8."""
     return printable(value) if isinstance(value, str) else value

@@ -1,4 +1,4 @@
-"""What all commands share: types of options, the service's settings, a progress bar, and the answer on stdout."""
+"""Provides for all commands: types of options, the service's settings, a progress bar, and the answer on stdout."""
 
 import errno
 import json
@@ -61,7 +61,7 @@ QUIET = Event()  # set by --quiet: neither progress nor warnings are shown
 
 
 def use_threads(value: int | None) -> None:
-    """Sets the variable EIGENHEAD_THREADS from ``--threads``, so that this process and its children use as many."""
+    """Sets the variable EIGENHEAD_THREADS from ``--threads``, so that this process and its children use that number."""
     if value is not None:
         os.environ["EIGENHEAD_THREADS"] = str(value)
 
@@ -72,7 +72,7 @@ def file_in(help_text: str) -> Any:
 
 
 def switch(name: str, help_text: str) -> Any:
-    """Returns a typer option that is given or not, without a negative form."""
+    """Returns a typer option without a value and without a negative form."""
     return typer.Option(name, help=help_text)
 
 
@@ -184,8 +184,8 @@ def prepare_folder(path: Path) -> None:
 
 @contextmanager
 def terminated_like_interrupted() -> Iterator[None]:
-    """Makes SIGTERM end the block as Ctrl-C does, so that nothing unfinished is left. Schedulers send it some seconds
-    before SIGKILL."""
+    """Makes SIGTERM end the block as Ctrl-C does, so nothing unfinished remains. Schedulers send it some seconds before
+    SIGKILL."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -200,8 +200,8 @@ def terminated_like_interrupted() -> Iterator[None]:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Yields a function that shows progress (stage, fraction 0 to 1) as a bar on standard error. If that is no
-    terminal, it writes a line every ``LINE_S``."""
+    """Yields a function that shows progress (stage, fraction 0 to 1) as a bar on standard error. If standard error is
+    no terminal, it writes a line every ``LINE_S``."""
     if QUIET.is_set() or not sys.stderr.isatty():
         yield _line_writer()
         return

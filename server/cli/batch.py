@@ -183,8 +183,8 @@ Clock = Callable[[], float]
 
 
 class BatchProgress:
-    """Counts finished captures, of which ``workers`` run at once. Estimates the remaining time from their mean
-    duration, and from ``expected_s`` until the first is done. ``clock`` returns seconds and never goes back."""
+    """Counts finished captures; ``workers`` of them run at once. Estimates the remaining time from their mean duration,
+    and from ``expected_s`` until the first is done. ``clock`` returns seconds and never goes back."""
 
     def __init__(self, captures: int, workers: int, expected_s: float, clock: Clock = time.monotonic) -> None:
         self._captures, self._workers, self._expected_s, self._clock = captures, workers, expected_s, clock
@@ -198,7 +198,7 @@ class BatchProgress:
         self._running[name] = since, min(1.0, max(0.0, share))
 
     def end(self, name: str, *, failed: bool) -> None:
-        """Records that a capture has ended. The duration of one that failed does not count for the estimate."""
+        """Records that a capture has ended. The duration of a failed capture does not count for the estimate."""
         since, _ = self._running.pop(name, (self._clock(), 0.0))
         self.ended += 1
         self.failed += failed
@@ -206,12 +206,12 @@ class BatchProgress:
             self._took.append(self._clock() - since)
 
     def share(self) -> float:
-        """Returns the share of the whole batch that is done, from 0 to 1."""
+        """Returns the fraction of the whole batch that is done, from 0 to 1."""
         begun = sum(share for _, share in self._running.values())
         return min(1.0, (self.ended + begun) / max(1, self._captures))
 
     def remaining_s(self) -> float:
-        """Estimates the remaining seconds, as if all workers stayed at work."""
+        """Estimates the remaining seconds, assuming that all workers stay busy."""
         mean_s = sum(self._took) / len(self._took) if self._took else self._expected_s
         waiting = max(0, self._captures - self.ended - len(self._running))
         begun = [mean_s * (1.0 - share) for _, share in self._running.values()]
@@ -220,7 +220,7 @@ class BatchProgress:
 
 
 def told_time(seconds: float) -> str:
-    """Formats a duration in seconds, minutes or hours, as coarsely as an estimate deserves."""
+    """Formats a duration in seconds, minutes or hours, rounded as coarsely as an estimate deserves."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
@@ -253,8 +253,8 @@ class BatchDisplay:
             yield cls(workers, expected_s, bar)
 
     def prepare(self, tasks: "Sequence[BatchTask]") -> None:
-        """Compiles the numerical loops that the batch needs and that are not compiled on this machine yet, so that not
-        every worker compiles them for itself."""
+        """Compiles the numerical loops that the batch needs and this machine lacks, so that not every worker compiles
+        them again."""
         from pipeline.settings import settings_from_document
         from server.tasks.prepare import prepare_kernels
 
@@ -268,7 +268,7 @@ class BatchDisplay:
         self._show()
 
     def report(self, name: str, share: float) -> None:
-        """Shows that ``share`` (0 to 1) of a capture is done."""
+        """Shows the fraction of a capture that is done (``share``, 0 to 1)."""
         self._progress.report(name, share)
         self._show()
 

@@ -2,7 +2,7 @@
 
 Files, cameras, clean plates and feature points are checked as the service checks an upload (``server.tasks.ingest``):
 if these checks find no fault, the outlines are extracted and used to check pictures and cameras. A fault of this
-machine is no fault of the capture and is raised as an error."""
+machine, unlike a fault of the capture, is raised as an error."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -88,7 +88,7 @@ def _plan_for_photographs(folder: Path, report: Progress) -> tuple[list[str], li
 
 
 def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
-    """Decodes the pictures one after the other. Raises InputError naming every one that is damaged or too large."""
+    """Decodes the pictures one after the other. Raises InputError naming every picture that is damaged or too large."""
     faults = []
     for number, path in enumerate(files):
         report("check", number / len(files))

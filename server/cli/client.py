@@ -1,4 +1,4 @@
-"""A Python client of the service, which resumes uploads, waits with progress, and checks downloads.
+"""Provides a Python client of the service, which resumes uploads, waits with progress, and checks downloads.
 
 with Client("http://127.0.0.1:8600") as client:
     capture = client.upload(Path("capture"))
@@ -60,8 +60,8 @@ class JobEnded(EigenheadError):
 
 
 class Client:
-    """Calls one service. A request that fails by a broken connection or a busy service is repeated for ``patience_s``
-    seconds. A refused request is not."""
+    """Calls one service. If a connection breaks or the service is busy, a request is repeated for ``patience_s``
+    seconds. A refused request is not repeated."""
 
     def __init__(self, url: str, key: str | None = None, *, patience_s: float = 30.0, timeout_s: float = 300.0) -> None:
         headers = {"Authorization": f"Bearer {key}"} if key else {}

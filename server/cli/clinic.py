@@ -1,5 +1,5 @@
-"""Implements ``eigenhead compare``, ``register`` and ``measure``: two visits of a person, a head on the surface of a
-CT, and what helmets, masks and spectacles are fitted by."""
+"""Implements ``eigenhead compare`` (two visits of a person), ``register`` (a head on the surface of a CT) and
+``measure`` (lengths by which helmets, masks and spectacles are fitted)."""
 
 from collections.abc import Mapping
 from datetime import date

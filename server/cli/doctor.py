@@ -147,8 +147,8 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _results(settings: ServiceSettings) -> tuple[bool, str]:
-    """Names the jobs that succeeded but whose result folder is missing, removed by hand or not in a restored backup,
-    and files whose content is not what the job made: the newest first, for ``COMPARE_S`` seconds."""
+    """Checks the results of succeeded jobs, the newest first, for ``COMPARE_S`` seconds; names jobs without a result
+    folder (removed by hand, or missing from a restored backup), and files with changed content."""
     kind = _kind(settings)
     connection = _connected(settings)
     if connection is None:
@@ -234,7 +234,7 @@ def _rig(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _stores(settings: ServiceSettings) -> tuple[bool, str]:
-    """Lists the first object of each place; only a delivery shows whether the service may write there."""
+    """Lists the first object of each object store; only a delivery shows whether the service may write there."""
     stores = [place for place in (settings.captures_store, settings.results_store) if place is not None]
     places = dict.fromkeys([*settings.import_prefixes, *settings.deliver_prefixes, *stores])
     if not places:

@@ -36,7 +36,7 @@ app = typer.Typer(rich_markup_mode=None)
 
 
 class LimitsMissed(EigenheadError):
-    """Reports that a figure exceeds its limit. Report and certificate have been written by then."""
+    """Reports that a figure exceeds its limit. Report and certificate have already been written."""
 
     def __init__(self, document: "VerificationReport", out: Path) -> None:
         missed = [
@@ -54,7 +54,7 @@ def _templates() -> tuple[str, ...]:
 
 
 def format_names(value: str | None) -> str | None:
-    """Checks a list of file formats separated by commas and returns it without blanks. Raises typer.BadParameter for a
+    """Checks a list of file formats separated by commas and returns it without spaces. Raises typer.BadParameter for a
     name that is none of ``FORMATS``."""
     from pipeline.settings import FORMATS
 
@@ -272,8 +272,8 @@ def verify_captures(
     limits: "Limits",
     report: Progress,
 ) -> "VerificationReport":
-    """Judges captures of a mannequin, or their results, by the scan ``reference``. Writes report.json and
-    certificate.pdf into ``out``, and results of captures into ``out/results``.
+    """Judges captures of a mannequin, or their results, by comparison with the scan ``reference``. Writes report.json
+    and certificate.pdf into ``out``, and results of captures into ``out/results``.
 
     The reference is checked before anything is reconstructed. Raises InputError, also if results were made with
     different models, and the errors of the pipeline.
@@ -314,8 +314,8 @@ def verify_captures(
 
 
 def read_limits(path: Path | None) -> "Limits":
-    """Reads limits from a TOML or JSON file. Those that it omits, or all without a file, have their defaults. Raises
-    InputError."""
+    """Reads limits from a TOML or JSON file. Limits that the file omits, or all without a file, have their defaults.
+    Raises InputError."""
     from pipeline.applications.verification.judgement import limits_from_document
     from server.tasks.settings_file import settings_document
 
@@ -334,7 +334,7 @@ def verification_lines(document: "VerificationReport", out: Path) -> list[str]:
 
 
 def capture_names(captures: Sequence[Path]) -> list[str]:
-    """Returns the captures' names. Raises InputError if two are alike."""
+    """Returns the captures' names. Raises InputError if two names are equal."""
     names = [path.resolve().name.removesuffix(".gz").removesuffix(".tar").removesuffix(".zip") for path in captures]
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:

@@ -26,7 +26,7 @@ THREADS, ALONE = "Of compiled loops; all processors by default.", "No progress a
 
 
 class Commands(TyperGroup):
-    """Lists the commands by what they are for. Gives each the options of all, and each example a line of its own."""
+    """Lists the commands by purpose. Adds the common options to each, and prints each example on a line."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
@@ -40,7 +40,7 @@ class Commands(TyperGroup):
             ]
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Writes a section for each room."""
+        """Writes a section for each group of commands."""
         width = formatter.width - 6 - max(map(len, self.commands))
         for title, names in ROOMS.values():
             with formatter.section(title):
@@ -48,7 +48,7 @@ class Commands(TyperGroup):
 
 
 def _option(name: str, use: Callable[[Any], None], help_text: str, **kind: Any) -> TyperOption:
-    """Returns an option of every command: ``use`` takes its value, the command does not."""
+    """Returns an option of every command; the function ``use`` receives its value, the command does not."""
     return TyperOption(param_decls=[name], callback=lambda *of: use(of[-1]), help=help_text, expose_value=False, **kind)
 
 

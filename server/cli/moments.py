@@ -1,4 +1,4 @@
-"""Implements the commands for one person and many moments: take, sequence, clock."""
+"""Implements the commands for one person at many moments: take, sequence, clock."""
 
 import json
 from contextlib import ExitStack
@@ -114,7 +114,7 @@ def sequence(
 
 
 def film_sequence(out: Path, frames: int, seed: int, preset: "Preset", json_out: bool) -> None:
-    """Films a moving subject of the simulated studio before its cameras, pictures of 640 x 480, into ``out``."""
+    """Films a moving subject of the simulated studio with 640 x 480 cameras, and writes the pictures into ``out``."""
     import numpy as np
 
     from pipeline.applications.moments.footage import TRACKED_PIXELS

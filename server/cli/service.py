@@ -60,7 +60,7 @@ def worker(
 
 
 def _worker_lives(settings: "ServiceSettings") -> bool:
-    """Tells whether a worker of this host is alive; yes where the database does not answer, which workers outlast."""
+    """Returns whether a worker of this host is alive; True if the database is away, since workers survive that."""
     import platform
 
     import sqlalchemy as sa

@@ -110,7 +110,7 @@ def simulate(
 
 
 def _check_use(gaze: tuple[float, float] | None, *, served_board: bool) -> None:
-    """Raises typer.BadParameter for eyes that look too far aside, and for a board of the running studio."""
+    """Raises typer.BadParameter for eyes turned too far aside, and for a board with ``--serve``."""
     if gaze is not None and not max(map(abs, gaze)) <= MAX_GAZE_DEG:
         raise typer.BadParameter(f"at most {MAX_GAZE_DEG} degrees", param_hint="--gaze")
     if served_board:
@@ -145,8 +145,8 @@ def _check_planted(faults: list[str], expression: list[str]) -> None:
 
 
 def _photograph_board(out: Path, board_file: Path | None, seed: int, overwrite: bool, json_out: bool) -> None:
-    """Writes ``BOARD_SHOTS`` pictures of the board by each of the studio's cameras as <camera>/<shot>.png, and
-    board.toml; the true cameras beside them."""
+    """Writes ``BOARD_SHOTS`` pictures of the board by each of the studio's cameras as <camera>/<shot>.png, board.toml,
+    and beside them the true cameras."""
     import numpy as np
 
     from calibration.board.board import Board, board_poses, photograph_board, read_board, write_board

@@ -1,4 +1,4 @@
-"""The operator's pages at ``/``: rig, captures, features, jobs, result, calibration and others.
+"""Provides the operator's pages at ``/``: rig, captures, features, jobs, result, calibration and others.
 
 NiceGUI serves them beside the HTTP API and holds one socket to each open page. Each page is a Vue component,
 ``pages/<name>.js``, that draws a ``state`` document and sends events. The module ``pages/<name>.py`` makes that

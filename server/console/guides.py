@@ -1,7 +1,7 @@
 """Computes aids for picking one feature point in several views: epipolar guides, the triangulated point, the model's
 landmark.
 
-Everything is a function of a rig and pixels. Lens distortion is kept, so that a guide is a curve.
+Everything is computed from a rig and pixels alone. A guide includes lens distortion, so it is a curve.
 """
 
 from collections.abc import Collection, Mapping
@@ -44,8 +44,8 @@ def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) ->
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """Holds what follows from the pixels picked for one point. ``position`` (world frame, mm) is None if it cannot be
-    triangulated."""
+    """Holds the triangulation of one point from its picked pixels. ``position`` (world frame, mm) is None if it cannot
+    be triangulated."""
 
     position: Float[np.ndarray, " 3"] | None
     reprojected: dict[str, list[float]]
@@ -54,8 +54,8 @@ class Located:
 
 
 class Guides:
-    """Computes the aids for picking feature points in the pictures of one rig. It keeps results and computes again only
-    what a change affects, so that a click costs the same however many points there are."""
+    """Computes the aids for picking feature points in the pictures of one rig. It keeps results and recomputes only
+    those that a change affects, so the cost of a click does not grow with the number of points."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -121,8 +121,8 @@ class Guides:
 
 
 def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) -> Located:
-    """Triangulates one point from the pixels picked in several views, and finds those that contradict the others, which
-    a job would leave out."""
+    """Triangulates one point from the pixels picked in several views, and finds the pixels that contradict the others;
+    a job would leave these out."""
     try:
         landmark = triangulate(views, rig, noise_px=CLICK_NOISE_PX)
     except NoPoint:
@@ -136,8 +136,8 @@ def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) ->
 def predicted(
     rig: Rig, located: Mapping[str, Float[np.ndarray, " 3"]], landmarks: Mapping[str, Float[np.ndarray, " 3"]]
 ) -> dict[str, dict[str, list[float]]]:
-    """Predicts the pixels of the model's landmarks in every view. The mean head is placed by the points in ``located``
-    (world frame, mm). Returns nothing if fewer than three of them are landmarks, or they lie on a line."""
+    """Predicts the pixels of the model's landmarks in every view. The points in ``located`` (world frame, mm) determine
+    the pose of the mean head. Returns nothing if fewer than three of them are landmarks, or if these lie on a line."""
     names = [name for name in located if name in landmarks]
     if len(names) < POINTS_LEAST:
         return {}
@@ -185,5 +185,5 @@ def _near_image(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> np.ndarray:
 
 
 def _together(remarks: tuple[Message, ...]) -> Message | None:
-    """Joins all remarks to one; returns None without any."""
+    """Joins all remarks to one; returns None if there are none."""
     return compose("several", messages=remarks) if len(remarks) > 1 else next(iter(remarks), None)

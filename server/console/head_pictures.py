@@ -1,9 +1,9 @@
-"""Draws pictures of a job's head when they are first requested, one at a time, and keeps them beside the result, so
-that they are removed with the job.
+"""Draws pictures of a job's head at the first request, one at a time, and keeps them beside the result; they are
+removed with the job.
 
 The page Result shows ``first-view.jpg`` (some 30 kB) until the browser has loaded and drawn the 3 MB of the head.
 Position, lens and light are those of ``pages/result.js`` and ``static/views.js``: three-quarter view, light "studio",
-texture. Lists tell people and heads apart at a glance by ``portrait.jpg``.
+texture. Lists show ``portrait.jpg``, by which people and heads are told apart at a glance.
 """
 
 import json
@@ -58,8 +58,8 @@ def result_folder(service: Service, job_id: str) -> Path:
 
 
 def _local_folder(service: Service, job_id: str) -> Path:
-    """Returns where a job's result lies in the data folder. What was drawn of it lies beside that folder, even after
-    its files went to the store. Raises as ``result_folder``."""
+    """Returns the folder of a job's result in the data folder. Drawn pictures lie beside that folder, even after its
+    files were moved to the store. Raises as ``result_folder``."""
     state = service.jobs.state(job_id)
     if state != "succeeded":
         raise Conflict("no-result", compose("job-without-result", state=state))
@@ -82,16 +82,15 @@ def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
 
 
 def draw_first_view(service: Service, job_id: str) -> None:
-    """Draws the first view of a head that is about to be opened, so that it is ready when the page requests it. Raises
-    nothing if the head is gone."""
+    """Draws the first view of a head before the page requests it. Raises nothing if the head is gone."""
     with suppress(EigenheadError, OSError):  # removed meanwhile, or a result without a head: the page tells
         head_picture(service, job_id, "first-view.jpg")
 
 
 @cache
 def warm_up() -> None:
-    """Imports and runs the code that reads and draws heads, once a process, so that the first head does not wait a
-    second for it."""
+    """Imports and runs the code that reads and draws heads, once a process, so that the first request does not take a
+    second longer."""
     corners = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]])
     corner = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32))
     with suppress(OSError), TemporaryDirectory() as folder:  # on a full disk the first head waits
@@ -159,7 +158,7 @@ def portrait(result: Path) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def placed(result: Path) -> RigidTransform:
-    """Returns the rigid transform head_from_world of a result's report; the identity if the report has none."""
+    """Returns the transform head_from_world (rigid) of a result's report; the identity if the report has none."""
     try:
         pose = json.loads((result / "report.json").read_text())["world_from_head"]
     except (FileNotFoundError, KeyError):

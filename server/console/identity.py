@@ -1,8 +1,8 @@
-"""Identifies who uses a page: anybody on this machine while there are no API keys, otherwise who has given a key.
+"""Identifies the user of a page: anybody on this machine while there are no API keys, otherwise a key's owner.
 
 The key itself is not stored. The user storage of the browser's session (a file in the data folder, named by a signed
-cookie) holds the key's id, and every refresh of a page looks the key up in the database. So a removed key ends its
-pages, and a sign-in outlives a restart of the service.
+cookie) holds the key's id, and every refresh of a page looks the key up in the database. So a removed key ends access
+to its pages, and a sign-in survives a restart of the service.
 """
 
 import secrets
@@ -25,7 +25,7 @@ KEY_ID = "key_id"
 
 
 def service_of_pages() -> Service:
-    """Returns the running service. It lives as long as the pages do."""
+    """Returns the running service. It exists as long as the pages do."""
     return pages.state.eigenhead.state.service
 
 
@@ -49,8 +49,8 @@ def permit(caller: Caller | None, scope: str) -> Caller:
 
 
 def cookie_secret(data: Path) -> str:
-    """Returns the secret that signs session cookies. It is made once and kept in the data folder, so that a restart
-    signs nobody out."""
+    """Returns the secret that signs session cookies. It is made once and kept in the data folder, so nobody is signed
+    out by a restart."""
     path = data / "console" / "secret"
     if not path.is_file() or not path.stat().st_size:  # an empty one is left where a full disk met the first start
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)

@@ -1,4 +1,4 @@
-"""The live view: one thread takes pictures while somebody watches, and every open page gets them."""
+"""Provides the live view: one thread takes pictures while somebody watches, and every open page gets them."""
 
 import asyncio
 import json

@@ -3,7 +3,7 @@ results, numbers by vertex.
 
 Each route identifies the caller by the browser's session, as the API does by an API key.
 
-A head can be seen through a camera of the rig: the camera's pose in the head's frame, and its photograph without lens
+For the view through a camera of the rig they send its pose in the head's frame, and its photograph without lens
 distortion, onto which a pinhole camera draws the mesh exactly.
 """
 
@@ -135,7 +135,7 @@ def checks(who: Reader, capture_id: str) -> Response:
 
 @pages.get("/console/captures/{capture_id}/holdings")
 def holdings(who: Reader, capture_id: str) -> Response:
-    """Returns what removing the capture would take away and what would stay."""
+    """Returns which data a removal of the capture would delete and which would stay."""
     return JSONResponse(who[0].captures.holdings(capture_id).model_dump(), headers={"Cache-Control": "no-store"})
 
 
@@ -147,8 +147,8 @@ def image(who: Reader, request: Request, capture_id: str, camera: str) -> Respon
 
 @pages.get("/console/captures/{capture_id}/{camera}.silhouette.png")
 def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
-    """Returns the outline of the subject in a camera's picture. The first request of a capture draws those of all its
-    cameras."""
+    """Returns the outline of the subject in a camera's picture. The first request for a capture draws the outlines of
+    all its cameras."""
     service = who[0]
     name = Path(_image_name(service.store.capture(capture_id), camera)).stem
     folder = service.store.cache_of(capture_id) / "outlines"
@@ -339,7 +339,7 @@ def _image_name(record: CaptureRecord, camera: str) -> str:
 
 
 def _capture_files(service: Service, job_id: str) -> tuple[Path, CaptureRecord]:
-    """Raises NotFound for a job without a capture that is still there."""
+    """Returns the result's folder and the capture's record. Raises NotFound if the job's capture is gone."""
     capture = service.jobs.get(job_id).capture_id or ""
     return service.store.capture_files(capture), service.store.capture(capture)
 
@@ -375,8 +375,8 @@ def outline(mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "y x 4"]:
 
 def camera_views(rig: Rig, report: Report) -> list[JsonObject]:
     """Returns every camera of a capture as seen from the head, as a pinhole camera (px) with ``camera_from_head``: rows
-    of a 4 x 4 matrix (metres) in the frame of head.glb. The head's pose is that of ``report``, its size the true one:
-    x_world = R x_head + s t."""
+    of a 4 x 4 matrix (metres) in the frame of head.glb. The pose is that of ``report``, the size the true one: x_world
+    = R x_head + s t."""
     pose = report["world_from_head"]
     shift = np.array(pose["translation"]) * pose["scale"]
     world_from_head = RigidTransform(np.array(pose["rotation"]), shift)

@@ -30,9 +30,9 @@ FOLDERS = ("/_nicegui", "/console/", "/features/", "/result/")
 
 
 def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
-    """Adds the pages to the service's app, at ``/``. Addresses that are no pages stay with the API.
+    """Adds the pages to the service's app, at ``/``. Addresses of no page stay with the API.
 
-    NiceGUI has one app in a process. Of several services in one process, the last one has the pages.
+    NiceGUI has one app a process. If several services run in one process, the last one has the pages.
     """
     from server.console import media  # noqa: F401 - they add their routes to NiceGUI's app
     from server.console.pages import (  # noqa: F401
@@ -85,8 +85,8 @@ def path_below(scope: Scope) -> str:
 
 
 def style_first(inner: ASGIApp) -> ASGIApp:
-    """Returns the app with its pages' scripts at a low priority: at 400 kbit/s they would take the line from the style
-    sheets that the first text waits for."""
+    """Returns the app with a low priority for its pages' scripts: at 400 kbit/s they would delay the style sheets that
+    the first text needs."""
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
         async def ordered(message: Message) -> None:
@@ -103,7 +103,7 @@ def style_first(inner: ASGIApp) -> ASGIApp:
 
 
 class PagesMount(Mount):
-    """Serves the pages at their paths only, and refuses requests that another web page made a browser send."""
+    """Serves the pages at their paths only, and refuses requests that a foreign web page made a browser send."""
 
     def __init__(self, mounted: Mount, settings: ServiceSettings) -> None:
         super().__init__(mounted.path, app=mounted.app)
@@ -111,7 +111,7 @@ class PagesMount(Mount):
         self._packing = GZipMiddleware(style_first(mounted.app), minimum_size=1024, compresslevel=6)
 
     def matches(self, scope: Scope) -> tuple[Match, Scope]:
-        """Tells Starlette whether a request is for the pages: its path is in ``PAGES`` or below ``FOLDERS``."""
+        """Returns Starlette's match for a request: full if its path is in ``PAGES`` or below ``FOLDERS``."""
         if scope["type"] in ("http", "websocket"):
             path = path_below(scope)
             if path not in PAGES and not path.startswith(FOLDERS):

@@ -1,5 +1,5 @@
-"""Holds what all pages share: a component that shows a state document, actions that run in threads, cached
-values, and messages of refusals shortened, since nobody sends a document again on a page."""
+"""Provides for all pages: a component that shows a state document, actions that run in threads, cached values, and
+shortened messages of refusals, since nobody sends a document again from a page."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -66,10 +66,10 @@ class Action:
 
 @dataclass
 class Cache:
-    """Keeps values that all open pages share, so that they agree and ten pages cost as much as one.
+    """Keeps values that all open pages show, so they agree and ten pages cost no more than one.
 
-    A value is kept at least ``KEEP_TIMES`` times as long as it took to make, but for that no longer than
-    ``KEEP_MOST_S`` seconds. So making it takes a tenth of the time at most.
+    A value is kept at least ``KEEP_TIMES`` times its computing time, but by this rule at most ``KEEP_MOST_S`` seconds.
+    So computing it takes at most a tenth of the time.
     """
 
     _values: dict[Any, tuple[float, float, Any]] = field(default_factory=dict)
@@ -78,8 +78,8 @@ class Cache:
     _forgets: int = 0
 
     def get(self, key: Any, age_s: float, make: MAKE) -> Any:
-        """Returns the value of ``key``. It is made anew by ``make`` if it is older than ``age_s`` seconds, and by one
-        thread at a time. Blocks. Raises what ``make`` raises."""
+        """Returns the value of ``key``. If it is older than ``age_s`` seconds, ``make`` computes it anew, in one thread
+        at a time. Blocks. Raises what ``make`` raises."""
         with self._lock:
             key_lock = self._locks.setdefault(key, Lock())
         with key_lock:
@@ -94,8 +94,8 @@ class Cache:
             return value
 
     def forget(self, *kinds: str) -> None:
-        """Drops the values whose key is one of ``kinds``, or is a tuple that begins with one. Values that are being
-        made meanwhile are not kept."""
+        """Drops the values whose key is one of ``kinds``, or is a tuple that begins with one. Values that are just
+        being computed are not kept."""
         self._forgets += 1
         for key in list(self._values):
             if (key[0] if isinstance(key, tuple) else key) in kinds:
@@ -110,7 +110,7 @@ class Cache:
                 self._locks.pop(key, None)
 
     def clear(self) -> None:
-        """Drops all values, so that the next look of every page reads them anew."""
+        """Drops all values, so that each page reads them anew at its next refresh."""
         with self._lock:
             self._forgets += 1
             self._values.clear()
@@ -160,8 +160,8 @@ class Page(Element):
         return ()
 
     async def refresh(self) -> None:
-        """Reads the state of the page and sends it to the browser if it has changed. An error is shown once, and the
-        page keeps its last state."""
+        """Reads the state of the page and sends it to the browser if it differs from the last one. An error is shown
+        once, and the page keeps its last state."""
         try:
             async with self._looking:  # what was read before a choice must not be shown after it
                 state = await anyio.to_thread.run_sync(self.look, limiter=_threads, abandon_on_cancel=True)
@@ -188,7 +188,7 @@ class Page(Element):
             self.frame.show(status=status)
 
     def started(self, *jobs: str, opens: bool = False) -> None:
-        """Notes jobs that an action has queued, so that this tab of the browser follows them. ``opens``: the head is
+        """Records jobs that an action has queued, so that this tab of the browser follows them. ``opens``: the head is
         shown when it is ready."""
         self._started = ([*jobs], opens)
 
@@ -276,7 +276,7 @@ def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: M
 
 
 def said_unless_refused(said: Message, done: BulkOut) -> Message:
-    """Returns what is said of an action on many things. Raises InvalidInput with the reasons if some were refused."""
+    """Returns the message about an action on many things. Raises InvalidInput with the reasons if some were refused."""
     if done.refused:
         faults = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
         raise InvalidInput("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
@@ -303,8 +303,8 @@ async def signed_in() -> Caller | None:
 
 
 def serve_page(name: str, page: type[Page], *, paths: Sequence[str], choices: Sequence[str] = ()) -> None:
-    """Serves ``page`` at its paths. What an address says of the names ``choices``, behind its ``?`` or in a path's
-    braces, is the page's first choice: what is selected, searched, and in which order."""
+    """Serves ``page`` at its paths. The values of the names ``choices`` in an address, behind its ``?`` or in the path,
+    are the page's first choice: the selection, the search, and the order."""
 
     async def serve(request: Request) -> RedirectResponse | None:
         said = {**request.query_params, **request.path_params}
@@ -330,8 +330,8 @@ async def show(name: str, page: type[Page], **initial: str | None) -> RedirectRe
 
 
 def followed_jobs(service: Service, ids: Sequence[str]) -> list[JsonObject]:
-    """Returns the progress of the jobs with these ids, in their order. The state of one that was removed is ``gone``.
-    The answer is shared by all pages."""
+    """Returns the progress of the jobs with these ids, in their order. A removed job has the state ``gone``. All pages
+    use the same answer."""
 
     def make() -> list[JsonObject]:
         known = {job.id: job for job in service.jobs.of(ids)}
@@ -346,10 +346,10 @@ def followed_jobs(service: Service, ids: Sequence[str]) -> list[JsonObject]:
 
 
 def status_of(service: Service, caller: Caller) -> JsonObject | None:
-    """Returns what every page shows of the service. Returns None if the caller's API key was removed.
+    """Returns the part of the service's state that every page shows. Returns None if the caller's API key was removed.
 
-    ``faults``: what to do, by the part that is not well; ``starting``: parts that will be well soon; ``jobs``: how many
-    are queued or run; ``empty``: there is no capture; ``local``: the caller has no API key and needs none."""
+    ``faults``: what to do, by faulty part; ``starting``: parts that will be ready soon; ``jobs``: how many are queued
+    or run; ``empty``: there is no capture; ``local``: the caller has no API key and needs none."""
     if caller_of(service, {"key_id": caller.key}) is None:
         return None
 

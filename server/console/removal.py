@@ -1,8 +1,8 @@
-"""Removal with undo: a thing disappears from the pages at once and is removed a little later, unless somebody takes
-that back.
+"""Implements removal with undo: a thing disappears from the pages at once and is removed a little later, unless
+somebody undoes that.
 
-What waits is kept in the process only. If the service ends meanwhile, nothing is removed and the thing appears again,
-which is the safe side.
+Waiting removals exist in this process only. If the service ends before, nothing is removed and the thing appears again,
+which is the safe outcome.
 """
 
 import threading
@@ -20,8 +20,8 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Removal:
-    """Holds a removal that can still be taken back. ``scope``: what a caller needs for that; ``ids``: everything that
-    is removed."""
+    """Holds a removal that can still be undone. ``scope``: the scope that a caller needs to undo it; ``ids``:
+    everything that is removed."""
 
     title: Message
     scope: str
@@ -31,7 +31,7 @@ class Removal:
 
 @dataclass
 class Removals:
-    """Holds the removals that can still be taken back, by id. ``identity in removals`` tells whether a thing is being
+    """Holds the removals that can still be undone, by id. ``identity in removals`` tells whether a thing is being
     removed. Thread-safe."""
 
     wait_s: float = UNDO_S
@@ -44,8 +44,8 @@ class Removals:
     def add(
         self, identity: str, remove: Callable[[], None], title: Message, scope: str, also: Iterable[str] = ()
     ) -> None:
-        """Adds a removal; ``remove`` is called after ``wait_s`` seconds unless it is taken back. ``also``: ids of
-        further things that it removes. Does nothing if the thing is being removed already."""
+        """Adds a removal; ``remove`` is called after ``wait_s`` seconds unless it is undone. ``also``: ids of further
+        things that it removes. Does nothing if the thing is being removed already."""
         timer = threading.Timer(self.wait_s, self._remove, (identity, remove))
         timer.daemon = True
         with self._lock:
@@ -54,7 +54,7 @@ class Removals:
                 timer.start()
 
     def undo(self, identity: str) -> bool:
-        """Takes a removal back. Returns whether it was still waiting."""
+        """Undoes a removal. Returns whether it was still waiting."""
         with self._lock:
             removal = self._waiting.pop(identity, None)
         if removal is not None:
@@ -62,7 +62,7 @@ class Removals:
         return removal is not None
 
     def waiting(self) -> dict[str, Removal]:
-        """Returns the removals that can still be taken back, by the id with which they were added."""
+        """Returns the removals that can still be undone, by the id with which they were added."""
         with self._lock:
             return dict(self._waiting)
 

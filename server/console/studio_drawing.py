@@ -1,7 +1,7 @@
 """Draws the live view of the simulated studio, in a child process of its own, so that a shot does not stop it.
 
-The studio is drawn once; each picture adds fresh sensor noise only. Cameras are binned for that, as real ones are for a
-live view. From time to time one camera is exposed at full size to measure its sharpness.
+The studio is drawn once; each picture adds fresh sensor noise only. For this, cameras use binning, as real ones do for
+a live view. From time to time one camera is exposed at full size to measure its sharpness.
 """
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The appearance of all pages: colours and sizes are in ``static/theme.css``, and every page starts with
+"""Defines the appearance of all pages: colours and sizes are in ``static/theme.css``, and every page starts with
 ``page_frame``."""
 
 from collections.abc import Awaitable, Callable, Iterable, Iterator
@@ -36,7 +36,7 @@ Answer = Callable[[Any], Awaitable[Any]]
 
 
 class Frame(Element, component="static/frame.js"):
-    """Shows what surrounds every page: navigation, status of the service, messages, and the keys that work
+    """Shows the parts around every page: navigation, status of the service, messages, and the keys that work
     everywhere."""
 
     def __init__(self, current: str) -> None:
@@ -45,8 +45,8 @@ class Frame(Element, component="static/frame.js"):
         self.props.update(links=links, current=current, status={}, removed=[], followed=[])
 
     def show(self, **changed: Any) -> None:
-        """Updates what the frame shows: the ``status`` of the service, things that are being ``removed`` and can be
-        taken back, or the progress of ``followed`` jobs."""
+        """Updates the frame: the ``status`` of the service, ``removed`` things whose removal can be undone, or the
+        progress of ``followed`` jobs."""
         if any(self.props[name] != value for name, value in changed.items()):
             self.props.update(changed)
             self.update()
@@ -66,8 +66,8 @@ def install() -> None:
 
 @contextmanager
 def page_frame(current: str) -> Iterator[Frame]:
-    """Yields the frame of the page ``current`` and sets the page's title and colours. What the block makes appears
-    inside the frame."""
+    """Yields the frame of the page ``current`` and sets the page's title and colours. Elements that the block makes
+    appear inside the frame."""
     title = next((title for name, _, title in PAGES if name == current), "Sign in")
     ui.page_title(f"{title} - eigenhead")
     ui.colors(primary=ACCENT, dark="#14171c", dark_page="#0d0f12")

@@ -156,8 +156,8 @@ class Watch:
 
 
 class Conditions:
-    """Answers HEAD as GET without the content, tags the state of what can be changed (ETag), and refuses with 412 a
-    change whose ``If-Match`` names another state."""
+    """Answers HEAD like GET without the content, adds an ETag to resources that can be changed, and refuses a change
+    with 412 if its ``If-Match`` names another state."""
 
     def __init__(self, app: ASGIApp, routes: Sequence[APIRoute]) -> None:
         self._app, self._routes = app, routes
@@ -191,7 +191,7 @@ class Conditions:
         return {method for route in fitting for method in route.methods or ()}
 
     async def _state(self, scope: Scope, receive: Receive) -> tuple[Message, bytes, str]:
-        """Returns the start and content of what a GET answers, and the tag of what it found, empty where nothing."""
+        """Returns the start and content of a GET's answer, and the resource's tag (empty if there is none)."""
         sent: list[Message] = []
 
         async def take(message: Message) -> None:
@@ -207,7 +207,7 @@ async def _no_content() -> Message:
 
 
 async def _send_start(send: Send, message: Message) -> None:
-    """Sends the start of an answer, and that it has no content."""
+    """Sends the start of an answer without content."""
     if message["type"] == "http.response.start":
         await send(message)
         await send({"type": "http.response.body"})
@@ -238,12 +238,12 @@ async def _measure_lag(metrics: Metrics) -> None:
 
 class JsonBodies:
     """Guards the routes that take a JSON body: identifies the caller, reads the body, at most ``most`` bytes, and
-    passes the request on. It answers others with a problem document: 401 or 403 for the caller, 413 for the size, 415
-    for a form.
+    passes the request on. It answers bad requests with a problem document: 401 or 403 for the caller, 413 for the size,
+    415 for a form.
 
     FastAPI reads the whole body of a route that declares one before it runs the route's dependencies, so a dependency
-    comes too late. Routes that read their body themselves, above all uploads, are passed through: their dependencies
-    run first, and they have limits of their own."""
+    comes too late. Routes that read their body themselves, mainly uploads, are passed through: their dependencies run
+    first, and they have limits of their own."""
 
     def __init__(
         self, app: ASGIApp, routes: Sequence[APIRoute], most: int = JSON_BYTES, body_s: float = IDLE_TIMEOUT_S
@@ -252,7 +252,7 @@ class JsonBodies:
         self._app, self._routes, self._most, self._body_s = app, routes, most, body_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handles one ASGI connection. What is no request with a JSON body is passed on unread."""
+        """Handles one ASGI connection. A request without a JSON body is passed on unread."""
         fitting = (route for route in self._routes if route.matches(scope)[0] is Match.FULL)
         route = next(fitting, None) if scope["type"] == "http" else None
         if route is None or route.body_field is None:
@@ -314,7 +314,7 @@ class DrainRequestBody:
         self._app, self._patience_s, self._linger_s = app, patience_s, linger_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handles one ASGI connection. What is no HTTP request, or will be kept alive, is passed on as it is."""
+        """Handles one ASGI connection. Others, and those that will be kept alive, are passed on unchanged."""
         if scope["type"] != "http" or not _closes(scope):
             await self._app(scope, receive, send)
             return

@@ -1,6 +1,6 @@
 """Identifies the caller of a request by the API key in its Authorization header.
 
-On a loopback address, as long as no key exists, everybody on this machine is a caller with all scopes. Requests that a
+On a loopback address, while no key exists, everybody on this machine is a caller with all scopes. Requests that a
 foreign web page makes a browser send are then refused by their Host and Origin headers.
 """
 
@@ -96,13 +96,13 @@ def _check_origin(request: Request) -> None:
 
 
 class FairShares:
-    """Serves the requests of each caller one after the other, so that thousands of one key delay those of another by
-    one of them. Side by side they would end no sooner: they wait for Python's one lock (2,000 took 13.1 s two at once,
-    7.8 one by one).
+    """Serves the requests of each caller one by one, so a caller with thousands delays another caller by one. Serving
+    them in parallel is no faster, since they wait for Python's lock (2,000 took 13.1 s two at once, 7.8 one by one).
 
-    A caller is known by his key once it was accepted, and by his address before. The next one's turn comes when an
-    answer begins, when a request waits for a long body, and after ``SLOW_S`` seconds if fewer than ``SLOW_MOST`` did.
-    A caller whose streams, slow downloads and uploads hold a ``SHARE`` of all connections is refused more (429).
+    A caller is identified by his key once it was accepted, and by his address before. The next request's turn comes
+    when an answer begins, when a request waits for a long body, and after ``SLOW_S`` seconds if fewer than
+    ``SLOW_MOST`` requests were that slow. A caller whose streams, slow downloads and uploads use the fraction ``SHARE``
+    of all connections gets no more (429).
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -111,7 +111,7 @@ class FairShares:
         self._lines: WeakValueDictionary[str, _Line] = WeakValueDictionary()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handles one ASGI connection. What is no request to the API is passed on."""
+        """Handles one ASGI connection. Requests that are not to the API are passed on."""
         if scope["type"] != "http" or not scope["path"].startswith("/v1/"):
             await self._app(scope, receive, send)
             return

@@ -1,9 +1,9 @@
-"""Bounds what a connection may cost before anybody has shown a key: bytes and seconds to the end of a header, the pace
-of a body and of the reader of an answer, and the number of connections.
+"""Limits the cost of a connection before anybody has shown a key: bytes and seconds of a header, the pace of a body and
+of the reader of an answer, and the number of connections.
 
 uvicorn's parser, httptools, joins a header that arrives in pieces quadratically and bounds neither it nor the time that
 it takes. h11 bounds the header, at 139 us of CPU a request against 60 us, and leaves the time open. So bytes are
-counted here, in front of the parser. A limit that passes closes the connection; a header that is too long is answered.
+counted here, in front of the parser. A connection beyond its time is closed; a header that is too long is answered.
 """
 
 import resource
@@ -29,9 +29,9 @@ PIPELINED_MOST = 16  # requests that wait behind the one that is answered
 class BoundedConnection(HttpToolsProtocol):
     """Serves a connection, as uvicorn does, within the limits of this module.
 
-    Of too many connections, or too many of one address (half of all), one that waits for a header is closed for a new
-    one: of the address that has the most, the one that has waited longest. If all of addresses with as many as the new
-    one's are in the midst of a request, the new one is closed.
+    If there are too many connections, or too many of one address (half of all), an idle one is closed for a new one: of
+    the address with the most connections, the one that has waited longest for a header. If no such connection is idle,
+    the new one is closed.
     """
 
     _timer: TimerHandle | None = None
@@ -40,7 +40,7 @@ class BoundedConnection(HttpToolsProtocol):
     _unparsed = _received = 0
 
     def connection_made(self, transport: BaseTransport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Takes a new connection, or closes it or an idle one if there are too many."""
+        """Accepts a new connection, or closes it or an idle one if there are too many."""
         super().connection_made(cast(Transport, transport))
         self.since = self.loop.time()
         self._await_header()
@@ -61,13 +61,13 @@ class BoundedConnection(HttpToolsProtocol):
         self.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Ends the time that ran."""
+        """Cancels the timer of the connection."""
         self._set_timer(None)
         self.resume_writing()
         super().connection_lost(exc)
 
     def pause_writing(self) -> None:
-        """Begins the time in which the client has to take something of an answer."""
+        """Starts the time within which the client must read part of an answer."""
         self._stalled = self.loop.call_later(STALL_S, self.drop)
         super().pause_writing()
 
@@ -78,7 +78,7 @@ class BoundedConnection(HttpToolsProtocol):
         super().resume_writing()
 
     def data_received(self, data: bytes) -> None:
-        """Passes bytes to the parser as long as it makes a header or a body of them."""
+        """Passes bytes to the parser while it can make a header or a body of them."""
         self._unparsed += len(data)
         self._received += len(data)
         if self._in_header and self._timer is None:
@@ -88,7 +88,7 @@ class BoundedConnection(HttpToolsProtocol):
             self._refuse(Problem(431, "header-too-large", compose("header-too-large", bytes=HEADER_BYTES)))
 
     def on_headers_complete(self) -> None:
-        """Begins a request, and the time in which its body has to bring something."""
+        """Begins a request, and the time within which some of its body must arrive."""
         self._in_header, self._unparsed = False, 0
         self._keep_pace()
         if len(self.pipeline) >= PIPELINED_MOST:
@@ -96,18 +96,18 @@ class BoundedConnection(HttpToolsProtocol):
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
-        """Takes a piece of a body."""
+        """Receives a piece of a body."""
         self._unparsed = 0
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """Ends a request. The next one's time begins with its first byte; until then uvicorn's keep-alive counts."""
+        """Ends a request. The next one's time begins with its first byte; until then uvicorn's keep-alive applies."""
         self._in_header, self._unparsed, self.since = True, 0, self.loop.time()
         self._set_timer(None)
         super().on_message_complete()
 
     def handle_websocket_upgrade(self) -> None:
-        """Hands the connection over: a WebSocket has pings of its own."""
+        """Hands the connection over: a WebSocket has its own pings."""
         self._set_timer(None)
         super().handle_websocket_upgrade()
 
@@ -127,7 +127,7 @@ class BoundedConnection(HttpToolsProtocol):
         self._set_timer(self.loop.call_later(HEADER_S, self.drop))
 
     def _keep_pace(self) -> None:
-        """Checks after ``PACE_S`` seconds that the body went on, unless this side did not read meanwhile."""
+        """Checks after ``PACE_S`` seconds that the body made progress, unless this side did not read meanwhile."""
         before = self._received
 
         def check() -> None:
@@ -152,7 +152,7 @@ class BoundedConnection(HttpToolsProtocol):
 
 
 def connections_most() -> int:
-    """Returns how many connections may be open: as many as the limit of open files allows where each of them sends a
-    file, at most ``CONNECTIONS_MOST``."""
+    """Returns how many connections may be open: at most ``CONNECTIONS_MOST``, and so few that each can open a file
+    within the limit of open files."""
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     return min(CONNECTIONS_MOST, max(files - DESCRIPTORS_SPARED, files // 2) // 2)

@@ -1,5 +1,5 @@
-"""Defines what requests of HTTP have in common, those about captures, sessions, jobs, the rig and calibrations, and
-answers that the services do not make themselves: captures, results and lists."""
+"""Defines documents of HTTP: requests about captures, sessions, jobs, the rig and calibrations, and those answers that
+no service makes: captures, results and lists."""
 
 import base64
 import binascii
@@ -31,19 +31,19 @@ Sought = Annotated[str, Query(max_length=200, pattern=PLAIN, description="words 
 
 
 class WarningOut(MessageOut):
-    """Holds a warning with its code and parameters, as report.json has it."""
+    """Holds a warning with its code and parameters, as in report.json."""
 
     code: str = Field(description="as in docs/operator.md, among them scale-assumed, view-left-out, views-many")
 
 
 class Received(BaseModel):
-    """Refuses unknown keys; the base of all request bodies."""
+    """Refuses unknown keys; it is the base of all request bodies."""
 
     model_config = ConfigDict(extra="forbid")
 
 
 def example(*documents: JsonObject) -> ConfigDict:
-    """Returns the configuration of a request that the description of HTTP shows by these examples."""
+    """Returns the configuration of a request whose OpenAPI description shows these examples."""
     return ConfigDict(json_schema_extra={"examples": [*documents]})
 
 
@@ -196,7 +196,7 @@ class FaultOut(Answer):
 
 
 class CaptureOut(Answer):
-    """Describes a capture: its pictures, what people wrote about it, and the verdict on it."""
+    """Describes a capture: its pictures, people's notes on it, and the verdict on it."""
 
     id: str
     created: Moment
@@ -277,7 +277,7 @@ Ids = Annotated[list[Id], Field(min_length=1, max_length=1000)]
 
 
 class CaptureBulk(Received):
-    """Requests one action on many captures. Each of them succeeds or is refused by itself."""
+    """Requests one action on many captures. Each capture succeeds or is refused independently."""
 
     model_config = example({"action": "remove", "ids": [EXAMPLE_ID]})
 
@@ -293,7 +293,7 @@ class CaptureBulk(Received):
 
 
 class JobBulk(Received):
-    """Requests one action on many jobs. Each of them succeeds or is refused by itself."""
+    """Requests one action on many jobs. Each job succeeds or is refused independently."""
 
     model_config = example({"action": "cancel", "ids": [EXAMPLE_ID]})
 
@@ -312,7 +312,7 @@ class NewExport(Received):
     albedo: bool = Field(False, description="also texture/albedo.png")
 
     def outputs(self) -> dict[str, object]:
-        """Returns the settings of the pipeline's outputs that say the same."""
+        """Returns the equivalent settings of the pipeline's outputs."""
         albedo = "file" if self.albedo else "none"
         return {"formats": [self.form], "template": self.template, "morphs": self.morphs, "albedo": albedo}
 
@@ -347,7 +347,7 @@ class Lights(Received):
 
 
 class CaptureChecks(Answer):
-    """Holds what was measured on each camera's picture, by camera. It is empty for captures of earlier versions."""
+    """Holds the measurements of each camera's picture, by camera. It is empty for captures of earlier versions."""
 
     cameras: dict[str, ViewChecksOut]
 
@@ -387,7 +387,7 @@ class BackgroundOut(Answer):
 
 
 class NewCalibration(Received):
-    """Requests a calibration from shots that the rig took of the board or, from a scene, of anything."""
+    """Requests a calibration from shots by the rig, of the board or of any scene."""
 
     model_config = example(
         {"board": {"kind": "charuco", "columns": 12, "rows": 9, "square_mm": 30.0}, "captures": [EXAMPLE_ID]},

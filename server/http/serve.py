@@ -62,7 +62,7 @@ class WorkerProcess:
 
     def _start(self) -> "subprocess.Popen[bytes]":
         """Starts a worker with SIGINT blocked, which its children inherit. Ctrl-C reaches all processes of a terminal;
-        it is meant for the service, which then ends its worker."""
+        only the service reacts to it and then ends its worker."""
         command = python_command("cli", "worker", "--until-eof")
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:

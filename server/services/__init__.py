@@ -1,1 +1,1 @@
-"""The rules of the service, whoever asks: captures, sessions, jobs, calibrations, rigs, keys, webhooks, retention."""
+"""Implements the service's rules: captures, sessions, jobs, calibrations, rigs, keys, webhooks, retention."""

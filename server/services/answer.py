@@ -1,5 +1,5 @@
-"""Declares what the documents of the service have in common. The services return them, HTTP answers them as JSON, and
-pages show them."""
+"""Declares the common part of the service's documents. The services return them, HTTP answers them as JSON, and pages
+show them."""
 
 from typing import Annotated, Any, Literal
 
@@ -45,14 +45,14 @@ class MessageOut(BaseModel):
 
 
 class Answer(BaseModel):
-    """Declares what all documents of the service share: they also read their fields from a record that has the same."""
+    """Is the base of all documents of the service; they can also be read from a record with equal fields."""
 
     model_config = ConfigDict(frozen=True, from_attributes=True)
 
 
 def as_data(field: str, form: Any = MessageOut) -> Any:
-    """Returns a field of an ``Answer`` that holds as data what ``field`` says as text. ``form``: ``MessageOut``, with
-    ``| None`` where there may be none, or a list of it."""
+    """Returns a field of an ``Answer`` that holds as data the message that ``field`` holds as text. ``form``:
+    ``MessageOut``, with ``| None`` if there may be none, or a list of it."""
 
     def read(self: Answer) -> Any:
         said = getattr(self, field)

@@ -1,9 +1,9 @@
-"""Batches: many captures, one job each, in the same queues as other jobs and behind them.
+"""Implements batches: many captures, one job each, in the same queues as other jobs and behind them.
 
-A batch states what is to become of its captures. ``Batches.serve``, which the service calls every ``poll_s`` seconds,
-makes it so. It keeps at most ``FED_MOST`` jobs of batches in each queue, so that a batch of ten thousand captures does
-not fill the queue. It takes the queued jobs of a paused batch back and cancels the jobs of a cancelled one. Whatever
-interrupts a call, the next call continues from the rows in the database.
+A batch states the wanted outcome for its captures. ``Batches.serve``, which the service calls every ``poll_s`` seconds,
+brings it about. It keeps at most ``FED_MOST`` jobs of batches in each queue, so a batch of ten thousand captures does
+not fill the queue. It withdraws the queued jobs of a paused batch and cancels the jobs of a cancelled one. After any
+interruption of a call, the next call continues from the rows in the database.
 """
 
 import json
@@ -139,7 +139,7 @@ class Batches:
         return self._batches(self._index.of(ids))
 
     def pause(self, identity: str) -> BatchOut:
-        """Starts no further job of a batch; jobs that run already continue. Queued jobs are taken back at the next call
+        """Starts no further job of a batch; jobs that run already continue. Queued jobs are withdrawn at the next call
         of ``serve``. Raises NotFound, and Conflict for a batch that has ended."""
         return self._change(identity, "paused")
 
@@ -171,7 +171,7 @@ class Batches:
         self._index.remove(identity)
 
     def serve(self) -> None:
-        """Starts, takes back and cancels jobs until they agree with what the owners of all batches want, and notes
+        """Starts, withdraws and cancels jobs until they agree with the wishes of the owners of all batches, and records
         which batches have finished.
 
         The service calls it every ``poll_s`` seconds. It may run in several processes at once: the jobs of a batch are
@@ -255,7 +255,7 @@ class Batches:
         return faults
 
     def _feed(self, row: BatchRow, limit: int) -> int:
-        """Gives jobs to the next captures of a batch, all in one transaction. Returns how many."""
+        """Queues jobs for the next captures of a batch, all in one transaction. Returns how many."""
         try:
             self._store.reserve(0, self._settings.free_bytes)
         except DiskFull:
@@ -286,7 +286,7 @@ class Batches:
                     self._webhooks.announce(job_id, "cancelled", self._jobs.client.enqueue)
 
     def _take_back(self, identity: str, jobs: Sequence[str]) -> None:
-        """Removes recalled jobs, so that their captures wait again; one that has ended meanwhile stays."""
+        """Removes recalled jobs, so their captures wait again; a job that has ended meanwhile stays."""
         for job_id in jobs:
             taken = True
             with suppress(NotFound):  # erased, or removed before this was noted

@@ -1,4 +1,4 @@
-"""Does one action on many things, each of which succeeds or is refused by itself."""
+"""Applies one action to many things, each of which succeeds or is refused independently."""
 
 from collections.abc import Callable, Iterable
 
@@ -29,7 +29,7 @@ class BulkOut(Answer):
 
 def each(ids: Iterable[str], action: Callable[[str], object]) -> BulkOut:
     """Calls ``action`` once for every different id and collects the outcomes. A refusal for one id does not stop the
-    others. Exceptions that are no EigenheadError pass through."""
+    others. Exceptions other than EigenheadError pass through."""
     done, refused = [], []
     for identity in dict.fromkeys(ids):
         try:

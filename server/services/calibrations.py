@@ -1,5 +1,5 @@
-"""Calibrations: pictures of a board or of a scene are stored, a durable job estimates the rig from them, and one of the
-results is put to use.
+"""Implements calibrations: pictures of a board or of a scene are stored, a durable job estimates the rig from them, and
+one of the results is selected for use.
 
 <data>/calibrations/<id>/record.json  board.toml  images/<camera>/<shot>.<ext>  result/cameras.json  calibration.json
 
@@ -138,20 +138,19 @@ class Calibrations:
         self._client.delete_workflow(identity)
 
     def check_usable(self, identity: str) -> None:
-        """Raises Conflict for a calibration whose verdict is poor, naming what it lacks; NotFound for an unknown
-        one."""
+        """Raises Conflict with the reasons for a calibration whose verdict is poor, and NotFound for an unknown one."""
         found = self.get(identity)
         if found.verdict == "poor":
             detail = compose("calibration-poor")
             raise Conflict("calibration-poor", detail, found.missing)
 
     def in_use(self) -> str | None:
-        """Returns the SHA-256 of the cameras.json of the calibration in use; None if none was put to use."""
+        """Returns the SHA-256 of the cameras.json of the calibration in use; None if none was selected."""
         path = self._store.data / "rig" / "in_use"
         return path.read_text() if path.is_file() else None
 
     def mark_in_use(self, identity: str) -> None:
-        """Notes, in one atomic write, that the rig uses this calibration. Raises NotFound, and Conflict if the
+        """Records, in one atomic write, that the rig uses this calibration. Raises NotFound, and Conflict if the
         calibration has not succeeded."""
         digest = sha256_of(self.result(identity, "cameras.json"))
         write_atomically(self._store.data / "rig" / "in_use", digest.encode())
@@ -182,5 +181,5 @@ def link_shots(store: Store, folder: Path, captures: list[str]) -> None:
 
 
 def _messages(kept: Iterable[object]) -> tuple[Message, ...]:
-    """Reads messages; those of earlier versions are texts."""
+    """Reads messages; earlier versions stored them as texts."""
     return tuple(read_message(one) for one in kept)

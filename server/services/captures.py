@@ -41,8 +41,8 @@ POINTS = TypeAdapter(Points)
 
 @dataclass(frozen=True, slots=True)
 class CaptureMetadata:
-    """Holds what people write about a capture: its session, label, the subject's expression, and tags. Raises
-    InputError for texts that are too long or hold control characters."""
+    """Holds people's notes on a capture: its session, label, the subject's expression, and tags. Raises InputError for
+    texts that are too long or hold control characters."""
 
     session: str | None = None
     label: str = ""
@@ -79,7 +79,7 @@ class Captures:
         """Takes a shot with the rig, checks its pictures in a child process and stores it as a capture.
 
         ``board``: the shot shows the calibration board; it needs no consent and gets no verdict. ``seed`` chooses the
-        subject of the simulated studio. Raises DiskFull, Unavailable naming what the shot lacks, InputError for a seed
+        subject of the simulated studio. Raises DiskFull, Unavailable naming the missing pictures, InputError for a seed
         of a real rig, NotFound for an unknown session, and Conflict if consent is missing.
         """
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
@@ -277,8 +277,8 @@ class Captures:
         self._library.scrub()
 
     def _check_consent(self, session: str | None, *, board: bool = False) -> None:
-        """Raises NotFound; Conflict where the service asks for consent and the session has no note of it: a ``board``
-        needs none."""
+        """Raises NotFound for an unknown session, and Conflict if the service requires consent and the session has no
+        note of it; a ``board`` needs none."""
         consent = "" if session is None else self._store.session(session).consent
         if self._settings.ask_consent and not consent.strip() and not board:
             detail = compose("consent-missing")

@@ -1,7 +1,7 @@
-"""Delivering results to object stores: where a job may deliver, and what the job engine keeps of a delivery.
+"""Delivers results to object stores: a job's permitted places, and the job engine's record of a delivery.
 
-A delivery is a workflow of the job engine, so that it survives what a job survives, and waits for a store that is away.
-A result lies in a folder of its job's id; the manifest, ``delivery.json``, comes last: once it is there, all is.
+A delivery is a workflow of the job engine: it survives restarts, and waits for a store that does not answer. A result
+lies in a folder named by its job's id; the manifest, ``delivery.json``, is written last.
 """
 
 import time
@@ -37,8 +37,8 @@ UNDER_WAY = ("waiting", "delivering")
 
 
 def destination(url: str, settings: ServiceSettings) -> str:
-    """Returns a place that a caller names, with a slash at its end. Raises Forbidden where the service delivers
-    nowhere, and InvalidInput ("url-refused")."""
+    """Returns a place named by a caller, with a slash at its end. Raises Forbidden if the service has no place to
+    deliver to, and InvalidInput ("url-refused")."""
     if not settings.deliver_prefixes:
         raise Forbidden("deliveries-off", compose("deliveries-off"))
     place = url if url.endswith("/") else f"{url}/"
@@ -62,13 +62,13 @@ def delivery_id(job_id: str) -> str:
 
 
 def place_of(wanted: DeliveryRequest) -> str:
-    """Returns where a job's result lies once it is delivered."""
+    """Returns the place where a job's result lies once it is delivered."""
     return f"{wanted['to']}{wanted['job_id']}/"
 
 
 @dataclass(frozen=True, slots=True)
 class Deliveries:
-    """Reads and removes what the job engine keeps of deliveries. Methods block on the database."""
+    """Reads and removes the job engine's records of deliveries. Methods block on the database."""
 
     client: DBOSClient
 
@@ -87,7 +87,7 @@ class Deliveries:
         }
 
     def forget(self, job_id: str) -> None:
-        """Ends the delivery of a job, if any, and removes its row; what was delivered stays where it is."""
+        """Ends the delivery of a job, if any, and removes its row; delivered files stay."""
         self.client.cancel_workflow(delivery_id(job_id))
         self.client.delete_workflow(delivery_id(job_id))
 
@@ -95,7 +95,7 @@ class Deliveries:
 def delivery_of(
     job_id: str, state: str, request: JobRequest | None, begun: Mapping[str, DeliveryOut]
 ) -> DeliveryOut | None:
-    """Returns the delivery of a job in this state: the one that was begun, else the one that it asks for."""
+    """Returns the delivery of a job in this state: the one that has begun, otherwise the one that the job requests."""
     if job_id in begun or request is None or "deliver_to" not in request:
         return begun.get(job_id)
     place = f"{request['deliver_to']}{job_id}/"

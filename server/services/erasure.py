@@ -1,5 +1,5 @@
-"""Erases captures for good: pictures, heads, caches and rows of the job database; and tells beforehand what a removal
-would take."""
+"""Erases captures permanently: pictures, heads, caches and rows of the job database; and lists beforehand what a
+removal would delete."""
 
 import time
 from collections.abc import Collection
@@ -50,8 +50,8 @@ def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: 
 
 
 def _await_workers(store: Store, jobs: Collection[str]) -> None:
-    """Waits until no worker writes to the jobs: then none has the folder of an attempt. A worker that still wrote would
-    restore erased files. One that was killed will not write either, but leaves its folder."""
+    """Waits until no worker writes to the jobs, that is until none has the folder of an attempt. Otherwise a worker
+    could restore erased files. A killed worker does not write any more, but leaves its folder."""
     deadline = time.monotonic() + CANCEL_S
     folders = [store.folder("jobs", job) for job in jobs]
     while any([*folder.glob("attempt-*")] for folder in folders) and time.monotonic() < deadline:

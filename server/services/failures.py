@@ -1,7 +1,7 @@
 """Describes how a job failed: the exception that the job engine stores, and the failure that clients get.
 
 The job engine keeps requests, results and errors as JSON (``SERIALIZER``). Rows of versions before 0.3 are pickled;
-reading them builds plain values and JobFailed only, so that a row runs no code whoever wrote it.
+reading them builds only plain values and JobFailed, so no row can run code.
 """
 
 import base64
@@ -38,7 +38,7 @@ class JobFailed(EigenheadError):
         return self.detail.text
 
     def __setstate__(self, state: object) -> None:
-        """Earlier versions stored the attributes as well, as texts; the arguments say all of it."""
+        """Ignores attributes, which earlier versions also stored as texts; the arguments hold all of it."""
 
 
 class _PlainUnpickler(pickle.Unpickler):
@@ -67,7 +67,7 @@ def _read(kept: Message | Kept) -> Message:
 
 
 def failure(row: WorkflowStatus) -> JobError:
-    """Returns why the job of a workflow's row failed. An error that is no JobFailed is logged and becomes
+    """Returns why the job of a workflow's row failed. An error other than JobFailed is logged and becomes
     "internal-error"; a job that took too many workers down becomes "worker-died"."""
     error = row.error
     if (failed := restored(error)) is not None:

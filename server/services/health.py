@@ -1,4 +1,4 @@
-"""Checks whether the service can do its work, and says what to do where it cannot."""
+"""Checks whether the service can do its work, and states the remedy if it cannot."""
 
 import os
 import resource
@@ -80,7 +80,7 @@ def _workers(service: Service) -> CheckOut:
 
 
 def _queues(service: Service) -> CheckOut:
-    """Names queues whose jobs wait for a worker that nobody has started. The service is still ready for other work."""
+    """Names queues whose jobs wait without a worker. The service is still ready for other work."""
     try:
         queued = service.jobs.index.queued()
         idle = {queue: found.jobs for queue, found in queued.items() if service.jobs.queue_notice(queue)}
@@ -92,7 +92,7 @@ def _queues(service: Service) -> CheckOut:
 
 
 def check_egl(service: Service) -> None:
-    """Makes an OpenGL context in a child process and keeps the finding for ``readiness``. This takes a second or more,
+    """Makes an OpenGL context in a child process and stores the finding for ``readiness``. This takes a second or more,
     during which the call blocks; a process does it once."""
     try:
         with service.children.one() as child:
@@ -122,8 +122,8 @@ def _retention(service: Service) -> CheckOut:
 
 
 def check_store(service: Service) -> None:
-    """Asks the stores of captures and results whether they answer, and keeps the finding for ``readiness``. Blocks
-    while one is silent. Jobs wait for a store that is away, so that this is no reason to send the service none."""
+    """Asks the stores of captures and results whether they answer, and stores the finding for ``readiness``. Blocks
+    while a store does not answer. Jobs wait for such a store, so the service stays ready."""
     places = store_places(service)
     if not places:
         return

@@ -1,4 +1,4 @@
-"""Jobs as the job engine keeps them: names of its workflows, and what its rows say in our words."""
+"""Translates the job engine's rows of jobs: names of its workflows, and the contents of its rows in our terms."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -48,7 +48,7 @@ def by_state(query: JobQuery) -> JobQuery:
 
 
 def request_of(row: WorkflowStatus) -> JobRequest | None:
-    """Returns a copy of what the job was asked for; None where its input cannot be read."""
+    """Returns a copy of a job's request; None if its input cannot be read."""
     return cast(JobRequest, dict(row.input["args"][0])) if row.input else None
 
 

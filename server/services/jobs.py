@@ -1,4 +1,4 @@
-"""Jobs as everybody but the worker uses them: submit, query, cancel, restart, delete.
+"""Provides jobs to everybody but the worker: submit, query, cancel, restart, delete.
 
 The job engine's row of a workflow is the only record of a job: the workflow's id is the job's, its input the request,
 its status the state. Progress comes from the event log, files from the data folder.
@@ -163,7 +163,7 @@ class Jobs:
         return job_id
 
     def _asks_the_same(self, first: JobRequest | None, request: JobRequest) -> bool:
-        """Tells whether both requests want the same of the same pictures; an upload sent again is another capture."""
+        """Returns whether two requests want the same work on the same pictures, of whatever capture."""
         if first is None or {**json.loads(json.dumps(request)), "capture_id": first["capture_id"]} != first:
             return False
         captures = [self._store.found("captures", each["capture_id"]) for each in (first, request)]
@@ -175,7 +175,7 @@ class Jobs:
         return self._jobs([self._known(job_id)])[0]
 
     def request(self, job_id: str) -> JobRequest | None:
-        """Returns what a job was submitted with, or None if that cannot be read. Raises NotFound."""
+        """Returns the request of a job, or None if it cannot be read. Raises NotFound."""
         return request_of(self._known(job_id))
 
     def state(self, job_id: str) -> State:
@@ -264,7 +264,7 @@ class Jobs:
         return [job_id for job_id in done if job_id not in there or not self._result(job_id).is_dir()]
 
     def orphans(self) -> list[str]:
-        """Lists folders of results that no job of the database has made: the database is another one, or was lost."""
+        """Lists folders of results without a job in the database: the database is another one, or was lost."""
         there = [job_id for job_id in self._store.ids("jobs") if self._result(job_id).is_dir()]
         known = {job_id for some in portions(there) for job_id in self.index.known(some)}
         return [job_id for job_id in there if job_id not in known]
@@ -295,9 +295,9 @@ class Jobs:
             raise NotFound(compose("thing-job"), job_id)
 
     def restart(self, job_id: str, wanted: ReconstructionRequest, *, key: str = "local") -> JobOut:
-        """Queues a new job for the capture of an earlier job, and notes the earlier job's id in it. Model and settings
-        that are None in ``wanted`` are the earlier job's. Raises InputError for wrong ones, NotFound if the job or its
-        capture is gone, and TooMany."""
+        """Queues a new job for the capture of an earlier job, and records the earlier job's id in it. Model and
+        settings that are None in ``wanted`` are the earlier job's. Raises InputError for wrong ones, NotFound if the
+        job or its capture is gone, and TooMany."""
         wanted.check()
         row = self._known(job_id)
         request = request_of(row)
@@ -347,8 +347,8 @@ class Jobs:
             raise TooMany("too-many-jobs", detail, retry_after_s=10)
 
     def queue_notice(self, queue: str | None) -> Message | None:
-        """Returns a message if no live worker serves a queue, so that its jobs cannot begin. Returns None if one
-        does."""
+        """Returns a message if no live worker serves a queue, so that its jobs cannot begin. Returns None if a live
+        worker serves it."""
         with self._engine.connect() as connection:
             alive = alive_workers(connection, self._settings.silent_s)
             if connection.scalar(sa.select(sa.func.count()).where(alive, workers.c.queue == queue)):

@@ -1,8 +1,8 @@
-"""API keys and their scopes, which say what a caller may do.
+"""Manages API keys and their scopes; the scopes state which actions a caller may do.
 
 A key is ``eh_<id>_<secret>``. The database holds the SHA-256 of the secret alone. The secret has 256 random bits, so a
 slow hash would not make it harder to guess. Without any key the service answers its own machine only and refuses to
-listen to others.
+listen to other machines.
 """
 
 import hashlib
@@ -41,7 +41,7 @@ class KeysLost(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Holds who sends a request: the id of the API key ("local" where the service has no keys), and its scopes."""
+    """Holds the sender of a request: the id of the API key ("local" if the service has no keys), and its scopes."""
 
     key: str
     scopes: frozenset[str]
@@ -73,8 +73,8 @@ class Keys:
         self._engine = engine
 
     def add_for(self, caller: Caller, name: str, scopes: tuple[str, ...]) -> str:
-        """Makes an API key for a caller who has one, as in ``add``. Raises Forbidden on a service without keys: its
-        first key would lock out whoever else uses it, and any process of the machine could make it."""
+        """Makes an API key for a caller who already has one, as in ``add``. Raises Forbidden on a service without keys:
+        any process of the machine could make the first key, and it would lock out all other users."""
         if caller.key == LOCAL:
             raise Forbidden("first-key", compose("first-key-by-command"))
         return self.add(name, scopes)
@@ -118,8 +118,8 @@ class Keys:
 
 
 def check_address(settings: ServiceSettings, keys: Keys) -> None:
-    """Raises KeylessAddress if the settings have the service listen to other machines and there is no API key, and
-    KeysLost if there is none any more though nobody removed it."""
+    """Raises KeylessAddress if the service would listen to other machines without an API key, and KeysLost if the keys
+    are gone though nobody removed them."""
     if keys.any():
         note_keys(settings.data, keys)
     elif not settings.is_private:
@@ -129,7 +129,7 @@ def check_address(settings: ServiceSettings, keys: Keys) -> None:
 
 
 def note_keys(data: Path, keys: Keys) -> None:
-    """Notes in the data folder whether its service has API keys, so that a lost database does not open it to all."""
+    """Records in the data folder whether its service has API keys, so that a lost database does not open it to all."""
     if not keys.any():
         (data / HAS_KEYS).unlink(missing_ok=True)
     elif not (data / HAS_KEYS).exists():

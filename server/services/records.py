@@ -32,7 +32,7 @@ class FileOut(Answer):
 
 
 class DeliveryOut(Answer):
-    """Says where a job's result is delivered to."""
+    """States where a job's result is delivered."""
 
     to: str = Field(description="where the files lie once they are delivered; delivery.json is the last of them")
     state: Literal["waiting", "delivering", "delivered", "failed", "cancelled"]
@@ -185,7 +185,7 @@ class CameraSettingsOut(Answer):
 
 @dataclass(frozen=True, slots=True)
 class CleanPlates:
-    """Holds of which cameras clean plates were taken, and how many of each. ``note`` is for the operator."""
+    """Holds the cameras of the clean plates, and the number of plates of each. ``note`` is for the operator."""
 
     cameras: tuple[str, ...]
     plates: int

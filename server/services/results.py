@@ -1,8 +1,8 @@
-"""Results of jobs in an object store, and what of them lies in the data folder.
+"""Manages results of jobs in an object store, and the copies in the data folder.
 
-Where a store is configured, a job has succeeded only once its result is there, too, and the data folder is a cache: its
-large files go, those unused longest first, and come back when somebody asks for them. Small ones (reports, pictures of
-tables and sheets) stay. Without a store everything lies in the data folder, as it was made.
+If a store is configured, a job has succeeded only once its result is also there, and the data folder is a cache: large
+files that were unused longest are removed first, and fetched again on request. Small ones (reports, pictures of tables
+and sheets) stay. Without a store the data folder holds everything.
 """
 
 import os
@@ -69,8 +69,8 @@ class Results:
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
     def file(self, job_id: str, name: str, entry: FileEntry) -> StoredFile:
-        """Returns a file of a result, which is fetched where the data folder lacks it. Raises Unavailable where the
-        store does not give it, Conflict where it is not there, and DiskFull."""
+        """Returns a file of a result, fetched from the store if the data folder lacks it. Raises Unavailable if the
+        store fails, Conflict if it lacks the file, and DiskFull."""
         path = self._path(job_id, name)
         try:
             if time.time() - path.stat().st_mtime > UNUSED_S:
@@ -81,7 +81,7 @@ class Results:
         return StoredFile(path, entry["sha256"])
 
     def compare(self, job_id: str, files: Mapping[str, FileEntry]) -> None:
-        """Reads a job's files anew and notes those in ``damaged`` whose content is not what the job made."""
+        """Reads a job's files anew and adds to ``damaged`` those whose content has changed."""
         for name, entry in files.items():
             path, said = self._path(job_id, name), f"{job_id}/{name}"
             self.damaged.discard(said)

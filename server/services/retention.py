@@ -1,4 +1,4 @@
-"""Retention: removes old jobs, captures and caches by age, by count and by free space.
+"""Implements retention: removes old jobs, captures and caches by age, by count and by free space.
 
 It never touches what a queued or running job needs, nor files that the service did not make itself. It trusts the clock
 only as far as the last sweep and the machine's uptime bear it out: where the clock seems to have jumped, nothing is
@@ -84,9 +84,9 @@ def sweep(service: Service) -> dict[str, int]:
 
 
 def _trusts_clock(service: Service) -> bool:
-    """Compares the clock with the last sweep's. Since then it may have gone a day further than the machine ran; after a
-    restart of the machine it may have gone further than anything is kept, unless half of all records, and ``MANY`` at
-    least, would go at once. Else ``STOPPED`` is written, and holds until somebody removes it."""
+    """Compares the clock with the last sweep's. Since then the clock may have advanced by at most a day more than the
+    machine ran; after a restart of the machine any advance is accepted, unless half of all records, and at least
+    ``MANY``, would be removed at once. Otherwise ``STOPPED`` is written, and holds until somebody removes it."""
     stopped, path = service.settings.data / STOPPED, service.settings.data / LAST_SWEEP
     now, up, boot = time.time(), time.clock_gettime(time.CLOCK_BOOTTIME), BOOT.read_text().strip()
     with suppress(FileNotFoundError, ValueError, KeyError, TypeError):
@@ -274,8 +274,8 @@ def _deliveries(service: Service) -> int:
 
 
 def _find_missing(service: Service) -> None:
-    """Finds results that somebody else removed or changed, or that a backup lacks, for readiness. One job's files are
-    compared at each sweep, in turn."""
+    """Finds results that somebody else removed or changed, or that are missing from a backup, for readiness. One job's
+    files are compared at each sweep, in turn."""
     missing, done = service.jobs.without_result(), service.jobs.index.newest_first(STATUSES["succeeded"])
     damaged = service.jobs.results.damaged
     if done:

@@ -1,7 +1,7 @@
-"""The rig behind ``POST /v1/captures``: the simulated studio, or real cameras that a rig.toml names.
+"""Implements the rig behind ``POST /v1/captures``: the simulated studio, or real cameras that a rig.toml names.
 
-A calibration that was put to use lies in ``<data>/rig/cameras.json``. Every later capture gets a copy of it. Until
-there is one, captures get the rig's own: the studio's layout, or the file that rig.toml names.
+The calibration in use lies in ``<data>/rig/cameras.json``. Every later capture gets a copy of it. Until there is one,
+captures get the default: the studio's layout, or the file that rig.toml names.
 """
 
 import json
@@ -75,7 +75,7 @@ class RealRig:
         return rig_state(self._config.name, "real", cameras, faults, None if rig is None else "own")
 
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument:
-        """Takes a shot and writes the capture, with links to the clean plates, or copies of them where the disk has no
+        """Takes a shot and writes the capture, with links to the clean plates, or copies of them if the disk has no
         links. Nothing is written if a camera failed.
 
         Raises InputError for a seed, and Unavailable if the rig has no calibration (unless ``board`` is set), cannot be
@@ -165,7 +165,7 @@ class RealRig:
         return RigAdjustment({})
 
     def _adjust(self, wanted: RigAdjustment) -> None:
-        """Keeps the adjustment; a rig that is open is opened anew, which is how drivers take settings."""
+        """Stores the adjustment; an open rig is opened anew, because drivers take settings only then."""
         config = adjusted(self._from_file, wanted.cameras, wanted.lights)
         self._adjusted.parent.mkdir(exist_ok=True)
         write_atomically(self._adjusted, json.dumps(RIG_ADJUSTMENT.document(wanted), indent=1).encode())
@@ -176,8 +176,8 @@ class RealRig:
                 self._opened()
 
     def take_background(self) -> CleanPlates:
-        """Takes clean plates with all cameras and puts them to use. Raises Unavailable if cameras fail. Raises Conflict
-        if the plates show a person; they are kept as a version that ``use_plates`` can put to use all the same."""
+        """Takes clean plates with all cameras and uses them for later captures. Raises Unavailable if cameras fail.
+        Raises Conflict if the plates show a person; they are kept as a version that ``use_plates`` can still select."""
         with self._lock:
             try:
                 plates = self._opened().take_plates()
@@ -195,8 +195,8 @@ class RealRig:
         return plates_versions(self._config.plates_folder)
 
     def use_plates(self, version: str) -> None:
-        """Puts a version of the clean plates to use. Raises NotFound for an unknown version, and Unavailable if the rig
-        cannot be opened."""
+        """Selects a version of the clean plates for later captures. Raises NotFound for an unknown version, and
+        Unavailable if the rig cannot be opened."""
         with self._lock:
             if all(kept.id != version for kept in self.plates()):
                 raise NotFound(compose("thing-plates-version"), version, compose("hint-plates"))
@@ -234,7 +234,7 @@ class RealRig:
         return self._session
 
     def calibrated(self) -> Rig | None:
-        """Returns the cameras as calibrated; None where they are not."""
+        """Returns the calibrated cameras; None without a calibration."""
         if self._calibration.is_file():
             return read_rig(self._calibration)
         with suppress(InputError):
@@ -258,7 +258,7 @@ class SimulatedRig:
         return rig_state("simulated", "simulated", cameras, [], "own" if self._calibration.is_file() else "studio")
 
     def calibrated(self) -> Rig:
-        """Returns the calibration that was put to use, or the studio's own layout."""
+        """Returns the calibration in use, or the studio's own layout."""
         return read_rig(self._calibration) if self._calibration.is_file() else self._rig()
 
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> JsonObject:
@@ -343,8 +343,7 @@ def check_camera(camera: str, names: tuple[str, ...]) -> None:
 
 
 def check_names(rig: Rig, names: tuple[str, ...]) -> None:
-    """Raises Conflict, naming the cameras that only one of both has, unless a calibration is of the cameras
-    ``names``."""
+    """Raises Conflict unless a calibration has exactly the cameras ``names``; it names the differences."""
     if set(rig.names) != set(names):
         differing = sorted(set(rig.names) ^ set(names))
         faults = [compose("camera-in-one-alone", camera=name) for name in differing]

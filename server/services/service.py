@@ -48,7 +48,7 @@ class CheckOut(Answer):
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """Holds the parts of one service process. ``known`` keeps findings that take long to make, by name."""
+    """Holds the parts of one service process. ``known`` caches slow findings, by name."""
 
     settings: ServiceSettings
     store: Store
@@ -78,8 +78,8 @@ class Service:
         self.engine.dispose()
 
     def accept_pictures(self, source: str, archive: Path, folder: Path, label: str) -> CalibrationOut:
-        """Unpacks an archive of pictures and queues a calibration: of IMAGES/ and board.toml, or where ``source`` is
-        "scene" of photographs. ``folder`` is a folder of ``Store.incoming``. Raises InputError naming every fault, and
+        """Unpacks an archive of pictures and queues a calibration: of IMAGES/ and board.toml or, if ``source`` is
+        "scene", of photographs. ``folder`` is a folder of ``Store.incoming``. Raises InputError naming every fault, and
         DiskFull."""
         limits, target = self.captures.archive_limits(archive), folder / "calibration" / "pictures"
         target.mkdir(parents=True)
@@ -128,8 +128,8 @@ class Service:
         return self.jobs.get(job_id)
 
     def export(self, job_id: str, outputs: Mapping[str, object]) -> bytes:
-        """Returns the files that the settings ``outputs`` name of a finished head, as a .zip. Raises NotFound, Conflict
-        for a job without result, InputError for settings that are not allowed, and DiskFull."""
+        """Returns a .zip with the files of a finished head that the settings ``outputs`` name. Raises NotFound,
+        Conflict for a job without result, InputError for settings that are not allowed, and DiskFull."""
         folder, job = self.jobs.result_folder(job_id), self.jobs.get(job_id)
         ReconstructionRequest(job.model, {"outputs": outputs}).check()
         with self.store.incoming() as scratch, self.children.one() as child:

@@ -1,4 +1,4 @@
-"""Sessions: captures of one subject with the note of their consent, and their erasure."""
+"""Manages sessions, that is captures of one subject with the note of consent, and their erasure."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -92,8 +92,8 @@ class Sessions:
         """Cancels the jobs of a session, then removes every trace of it: pictures, results, caches and rows of the job
         database.
 
-        The session's record goes last, so an interrupted erasure can be repeated. Captures that arrive meanwhile are
-        removed, too. Raises NotFound, and Unavailable while a worker still writes.
+        The session's record is removed last, so an interrupted erasure can be repeated. Captures that arrive meanwhile
+        are removed, too. Raises NotFound, and Unavailable while a worker still writes.
         """
         self._store.session(identity)
         self._erase_captures(identity)

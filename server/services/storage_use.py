@@ -1,4 +1,4 @@
-"""Counts the bytes that captures, results, caches and so on take in the data folder."""
+"""Counts the bytes of captures, results, caches and other kinds in the data folder."""
 
 import os
 import shutil

@@ -1,8 +1,8 @@
 """Looks after the store of captures: what waits for it goes there, what is dead is removed, and what it has goes from
 the data folder where that holds too much.
 
-A data folder whose captures have no records is a worker's own. It is a cache as a whole: what was erased goes from it,
-too.
+A data folder whose captures have no records is a worker's own. Such a folder is only a cache: erased captures are
+removed from it, too.
 """
 
 import time
@@ -25,8 +25,8 @@ log = structlog.get_logger()
 
 
 def tend_captures(store: Store, jobs: Jobs, most: int) -> int:
-    """Stores captures that wait for the store, removes what nothing refers to any more, and bounds the data folder. A
-    store that is away ends it; the next call goes on. Returns how many blobs were removed."""
+    """Stores captures that wait for the store, removes what nothing refers to any more, and bounds the data folder. If
+    the store does not answer, the next call continues. Returns how many blobs were removed."""
     blobs, removed = store.blobs, 0
     if blobs is None:
         return 0
@@ -45,8 +45,8 @@ def tend_captures(store: Store, jobs: Jobs, most: int) -> int:
 
 
 def bound_captures(store: Store, most: int, is_used: Callable[[str], bool]) -> int:
-    """Removes large files of captures that were not used for long from the data folder, until all of them take
-    ``most`` bytes. Each is compared with its object before. Returns of how many captures."""
+    """Removes large files of captures that were not used for long from the data folder, until all of them take ``most``
+    bytes. Each is first compared with its object. Returns the number of their captures."""
     assert store.blobs is not None
     found, total, removed = [], 0, 0
     for identity in store.ids("captures"):
@@ -72,8 +72,7 @@ def bound_captures(store: Store, most: int, is_used: Callable[[str], bool]) -> i
 
 
 def forget_erased(store: Store) -> int:
-    """Removes from a worker's own data folder what it has of captures that the service has no more. Returns of how
-    many."""
+    """Removes from a worker's own data folder the captures that the service has no more. Returns how many they were."""
     assert store.blobs is not None
     mine = {*store.ids("captures"), *store.ids("cache/captures")}
     mine = {identity for identity in mine if not (store.folder("captures", identity) / "record.json").exists()}

@@ -1,4 +1,4 @@
-"""Lists templates for callers of the service: which there are, how well they fit, which models have them."""
+"""Lists templates for callers of the service: their names, how well they fit, and their models."""
 
 from collections.abc import Mapping
 
@@ -37,7 +37,7 @@ class TemplateOut(Answer):
 
 
 def templates_at_hand() -> list[TemplateOut]:
-    """Returns the available templates, sorted by name. One whose file cannot be used has a ``fault`` and nothing else.
+    """Returns the available templates, sorted by name. A template whose file cannot be used has only a ``fault``.
     Raises OSError if a model's file disappears while it is read."""
     found, digests = [], None
     for name, path in list_templates().items():

@@ -20,8 +20,8 @@ UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")  # Unicode's classes of cont
 
 def check_texts(texts: Mapping[str, str | None], subject: str = "form") -> None:
     """Raises InputError naming the field of every text that is longer than ``TEXT_MOST`` characters or holds characters
-    that a database cannot store. Fields that are None are skipped. ``subject`` names in the error what the fields
-    belong to ("form", "request")."""
+    that a database cannot store. Fields that are None are skipped. ``subject`` names in the error the owner of the
+    fields ("form", "request")."""
     faults = []
     for name, text in texts.items():
         if text is not None and len(text) > TEXT_MOST:

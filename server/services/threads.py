@@ -26,7 +26,7 @@ class Threads:
     """Runs blocking functions in two thread pools apart from the web framework's. Fifty waiting uploads then do not
     delay a request for a job's status.
 
-    ``checks``: checks at once, of which one key has all but one at most; ``check_s``: the longest that one may take.
+    ``checks``: number of checks at once (one key may use all but one); ``check_s``: longest duration of one.
     """
 
     def __init__(self, disk: int = 8, checks: int = 2, check_s: float = 900.0) -> None:
@@ -47,10 +47,10 @@ class Threads:
         hung_up: Callable[[], Awaitable[None]] | None = None,
     ) -> T:
         """Runs a function that unpacks or checks an upload in a thread and returns its result. Its work in child
-        processes ends after ``check_s`` seconds, and once ``hung_up()`` has returned: then nobody waits for it.
+        processes ends after ``check_s`` seconds, or once ``hung_up()`` has returned because nobody waits for it.
 
-        At most ``checks`` run at once; others wait. Raises TooMany if too many of this key wait, InvalidInput if the
-        time or the memory does not suffice, and Conflict for a client who is gone.
+        At most ``checks`` run at once; others wait. Raises TooMany if too many requests of this key wait, InvalidInput
+        if the time or the memory does not suffice, and Conflict if the client has disconnected.
         """
         if self._in_line[key] >= IN_LINE_MOST:
             raise TooMany("too-many-checks", compose("too-many-checks", most=IN_LINE_MOST), retry_after_s=AGAIN_S)

@@ -60,8 +60,8 @@ class ResumableUploads:
         raise NotFound(compose("thing-upload"), identity)
 
     def offset(self, record: UploadRecord) -> int:
-        """Returns how many bytes of an upload were received. That is all of them once the capture was made, when the
-        data is deleted already."""
+        """Returns how many bytes of an upload were received. Once the capture was made, that is all of them, although
+        the data is deleted already."""
         if record.capture is not None:
             return record.length
         return self.data(record).stat().st_size

@@ -37,7 +37,7 @@ class Webhooks:
     """Manages the webhooks of the service and delivers messages to them. Methods block."""
 
     def __init__(self, engine: sa.Engine, origins: Collection[str] = ()) -> None:
-        """``origins``: where a job's own webhook may be."""
+        """``origins``: allowed origins of a job's own webhook."""
         self._engine, self._origins = engine, origins
 
     def add(self, url: str) -> NewWebhookOut:
@@ -71,9 +71,8 @@ class Webhooks:
         delivered_to: str | None = None,
     ) -> None:
         """Queues one message for each webhook about the state of a job, and one for the job's own webhook if it has
-        one. Each message has an id made of webhook, job and state, so that repeating the call changes nothing.
-        ``enqueue`` is the job engine's function. ``delivered_to``: where the result lies, if it was
-        delivered."""
+        one. Each message has an id made of webhook, job and state, so repeating the call changes nothing. ``enqueue``
+        is the job engine's function. ``delivered_to``: where the result lies, if it was delivered."""
         for hook_id in [*(hook.id for hook in self.all()), *([] if job_webhook is None else [OWN])]:
             identity = f"{messages_of(job_id)}{hook_id}-{state}"
             message: WebhookMessage = {"webhook": hook_id, "type": f"job.{state}", "job_id": job_id, "id": identity}
@@ -128,7 +127,7 @@ class Webhooks:
 
 
 def messages_of(job_id: str) -> str:
-    """Returns what the ids of all messages about a job begin with."""
+    """Returns the common beginning of the ids of all messages about a job."""
     return f"hook-{job_id}-"
 
 

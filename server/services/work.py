@@ -1,4 +1,4 @@
-"""Declares what a job is to do, and checks whether it can be done."""
+"""Declares the request for a job, and checks whether it can be done."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from server.storage.records import CaptureRecord, JobWebhook
 
 @dataclass(frozen=True, slots=True)
 class ReconstructionRequest:
-    """Holds what a job is to do: the model's name and the settings of the pipeline (None: the defaults), the job's
-    name, a webhook that is called at its end besides those of the service, and a place in an object store where its
-    result is delivered to."""
+    """Holds the request for a job: the model's name and the settings of the pipeline (None: the defaults), the job's
+    name, a webhook that is called at its end besides those of the service, and a place in an object store to which its
+    result is delivered."""
 
     model: str | None = None
     settings: Mapping[str, object] | None = None
@@ -71,6 +71,6 @@ def _template_faults(name: str, model: str) -> list[Message]:
 
 
 def refuse_board(record: CaptureRecord) -> None:
-    """Raises Conflict for a capture that shows the calibration board, of which no head can be made."""
+    """Raises Conflict for a capture of the calibration board, from which no head can be made."""
     if record.board:
         raise Conflict("board-shot", compose("board-shot"))

@@ -1,1 +1,1 @@
-"""Reads and writes everything that outlives a process: the database and the data folder."""
+"""Reads and writes all persistent data: the database and the data folder."""

@@ -1,7 +1,7 @@
-"""Keeps batches in the database: what each is to make, and which job makes the head of which capture.
+"""Stores batches in the database: the work of each, and the job of each capture.
 
 A batch is a row, each of its captures an item. An item without a job waits. The state of a job is never copied: queries
-join the job engine's own row, so that counts agree with the jobs at any moment. Times are milliseconds since 1970.
+join the job engine's own row, so counts always agree with the jobs. Times are milliseconds since 1970.
 """
 
 import json
@@ -27,8 +27,8 @@ NONE = "-"  # in the place of a job's id: none is to be made, since the capture 
 
 @dataclass(frozen=True, slots=True)
 class BatchRow:
-    """Holds a batch. ``wish`` is what its owner wants: running, paused or cancelled. ``finished`` is when nothing was
-    left to do (ms since 1970), None before. ``rounds`` grows whenever it finishes and whenever its failed jobs are
+    """Holds a batch. ``wish`` is its owner's wish: running, paused or cancelled. ``finished`` is the time at which no
+    work was left (ms since 1970), None before. ``rounds`` grows whenever it finishes and whenever its failed jobs are
     tried again."""
 
     id: str
@@ -59,7 +59,7 @@ class BatchItem:
 @dataclass(frozen=True, slots=True)
 class Tally:
     """Counts the items of a batch by status: the job engine's, ``waiting``, or ``gone`` if the capture or job was
-    removed. ``mean_s`` is the mean duration of the succeeded jobs, None before the first. On SQLite the engine notes
+    removed. ``mean_s`` is the mean duration of the succeeded jobs, None before the first. On SQLite the engine stores
     whole seconds."""
 
     statuses: Mapping[str, int]
@@ -161,7 +161,7 @@ class BatchIndex:
         """Returns the first ``limit`` items of a batch that have no job; none if the batch is not running.
 
         Locks the batch's row until the end of the caller's transaction, so that no other process gives these items jobs
-        or changes what the batch is to do.
+        or changes the batch's wish.
         """
         runs = sa.select(batches.c.id).where(batches.c.id == identity, batches.c.wish == "running")
         if connection.scalar(runs.with_for_update()) is None:
@@ -181,11 +181,11 @@ class BatchIndex:
             connection.execute(change.values(job_id=job), rows)
 
     def recall(self, identity: str, jobs: Collection[str]) -> None:
-        """Marks jobs of a batch to be taken back. The mark survives a kill, so that a later call can complete it."""
+        """Marks jobs of a batch for withdrawal. The mark survives a kill, so that a later call can complete it."""
         self._change_items(identity, list(jobs), {"recalled": True})
 
     def recalled(self) -> dict[str, list[str]]:
-        """Returns the jobs that are marked to be taken back, by batch."""
+        """Returns the jobs that are marked for withdrawal, by batch."""
         query, found = sa.select(batch_items.c.batch_id, batch_items.c.job_id).where(RECALLED), dict[str, list[str]]()
         with self._engine.connect() as connection:
             for row in connection.execute(query):
@@ -193,18 +193,18 @@ class BatchIndex:
         return found
 
     def settle_recall(self, identity: str, job_id: str, *, taken: bool) -> None:
-        """Removes the mark from a job. If it was taken back (``taken``), its capture waits again; otherwise it had
-        ended before and stays."""
+        """Removes the mark from a job. If it was withdrawn (``taken``), its capture waits again; otherwise it had ended
+        before and stays."""
         changed = {"recalled": False, "job_id": None} if taken else {"recalled": False}
         self._change_items(identity, [job_id], changed)
 
     def with_waiting(self) -> set[str]:
-        """Returns the ids of unfinished batches with items that wait or whose job is being taken back."""
+        """Returns the ids of unfinished batches with items that wait or whose job is being withdrawn."""
         with self._engine.connect() as connection:
             return {*connection.scalars(sa.select(batches.c.id).where(batches.c.finished.is_(None), _has_waiting()))}
 
     def change(self, identity: str, wish: Wish) -> bool:
-        """Notes whether a batch is to run, to pause or to be cancelled. Returns False, without any change, if it has
+        """Stores whether a batch is to run, to pause or to be cancelled. Returns False, without any change, if it has
         finished or was cancelled before."""
         change = sa.update(batches).where(batches.c.id == identity, batches.c.finished.is_(None))
         with self._engine.begin() as connection:
@@ -221,7 +221,7 @@ class BatchIndex:
             connection.execute(change.values(finished=moment, rounds=row.rounds + 1))
 
     def retry(self, identity: str, statuses: Collection[str]) -> int:
-        """Lets all items wait again whose job has one of the job engine's ``statuses``, and reopens the batch. Returns
+        """Makes all items wait again whose job has one of the job engine's ``statuses``, and reopens the batch. Returns
         how many."""
         item, job = batch_items.c, self._status.c
         joined = batch_items.join(self._status, job.workflow_uuid == item.job_id)
@@ -233,8 +233,8 @@ class BatchIndex:
         return len(failed)
 
     def forget_captures(self, captures: Collection[str]) -> None:
-        """Removes the ids of erased captures, and of their jobs, from the items of all batches, and the label and the
-        place of batches that have no other captures: they may name the subject."""
+        """Removes the ids of erased captures and of their jobs from all batches; removes the label and the place of a
+        batch without other captures, since they may name the subject."""
         item = batch_items.c
         with self._engine.begin() as connection:
             for some in portions(captures):
@@ -266,14 +266,14 @@ class BatchIndex:
 
 
 def _has_waiting() -> sa.ColumnElement[bool]:
-    """Tells whether items wait: two conditions, each with an index of its own."""
+    """Returns the SQL condition that items wait, made of two parts with an index each."""
     item = batch_items.c
     those = item.batch_id == batches.c.id
     return sa.or_(sa.exists().where(those, item.job_id.is_(None)), sa.exists().where(those, RECALLED))
 
 
 def _in_state(state: BatchState) -> sa.ColumnElement[bool]:
-    """A batch that was cancelled stays so; any other is finished once nothing is left to do."""
+    """Returns the SQL condition for a state: a cancelled batch stays so; any other is finished once no work is left."""
     table = batches.c
     if state == "cancelled":
         return table.wish == state

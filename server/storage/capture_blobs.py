@@ -1,8 +1,8 @@
-"""Files of captures in an object store: each content once, under ``<its SHA-256>-<16 hex digits>/content``.
+"""Stores files of captures in an object store: each content once, under ``<its SHA-256>-<16 hex digits>/content``.
 
-The database says which capture has which blob, and workers without the service's data folder read both. A blob that
-nothing refers to is marked dead in the same transaction, and nothing refers to it again: the same content that comes
-later gets a new name. So whoever removes dead blobs, at any time and any number of them, never meets one in use.
+The database maps captures to blobs; workers without the service's data folder read both. A blob without references is
+marked dead in the same transaction and is never used again: equal content that comes later gets a new name. So any
+number of processes may remove dead blobs at any time, and never remove one in use.
 """
 
 import os
@@ -36,7 +36,7 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """Holds the name of a blob, and SHA-256 and size of its content. ``stored``: it is in the store."""
+    """Holds the name of a blob, and the SHA-256 and size of its content. ``stored``: it is in the store."""
 
     id: str
     sha256: str
@@ -75,8 +75,8 @@ class CaptureBlobs:
             connection.execute(sa.update(capture_files).where(mine).values(arrived=True))
 
     def offer(self, capture: str, folder: Path, inputs: Mapping[str, str]) -> bool:
-        """Stores the files of a capture, as ``keep`` does. Returns False where the store does not take them, or the
-        capture is gone; what is there waits for the next sweep."""
+        """Stores the files of a capture, as ``keep`` does. Returns False if the store does not accept them, or the
+        capture is gone; the files then wait for the next sweep."""
         try:
             self.keep(capture, folder, inputs)
         except (StoreUnavailable, StoreDenied) as error:
@@ -87,7 +87,7 @@ class CaptureBlobs:
         return True
 
     def files(self, capture: str) -> dict[str, Blob]:
-        """Returns the blobs of a capture by the names of its files; none before all of them are in the store."""
+        """Returns the blobs of a capture by the names of its files; none until all of them are in the store."""
         query = sa.select(capture_files.c.name, capture_files.c.arrived, blobs).join(
             blobs, blobs.c.id == capture_files.c.blob_id
         )
@@ -98,13 +98,13 @@ class CaptureBlobs:
         return {row.name: Blob(row.id, row.sha256, row.bytes, row.stored) for row in rows}
 
     def is_known(self, capture: str) -> bool:
-        """Tells whether the service has a capture, though its files may not be in the store yet."""
+        """Returns whether the service has a capture, even if its files are not in the store yet."""
         with self._engine.connect() as connection:
             return connection.scalar(sa.select(sa.literal(1)).where(capture_index.c.id == capture)) is not None
 
     def restore(self, capture: str, folder: Path, inputs: Mapping[str, str] | None, admit: Admission) -> None:
-        """Fetches the files of a capture that ``folder`` lacks. ``inputs``: SHA-256 by name, None: as the database
-        says. Raises Conflict ("capture-missing") for files that are nowhere, and what ``admit`` raises."""
+        """Fetches the files of a capture that ``folder`` lacks. ``inputs``: SHA-256 by name; None: from the database.
+        Raises Conflict ("capture-missing") for files that exist nowhere, and what ``admit`` raises."""
         there = inputs is not None and all(_is_there(folder / name, sha256) for name, sha256 in inputs.items())
         known = {} if there else self.files(capture)
         wanted = {name: blob.sha256 for name, blob in known.items()} if inputs is None else inputs
@@ -128,8 +128,8 @@ class CaptureBlobs:
         return same
 
     def release(self, capture: str, *, later: bool = False) -> None:
-        """Removes what only this capture has from the store, with every version; ``later``: with the next sweep. A call
-        that fails is completed by a second one."""
+        """Removes blobs that only this capture uses from the store, with every version; ``later``: with the next sweep.
+        A call that fails is completed by a second one."""
         self._claim(capture, {}, lambda _: 0)
         if not later:
             self.bury()
@@ -152,7 +152,7 @@ class CaptureBlobs:
             return [*connection.scalars(query.limit(limit))]
 
     def bytes_of_all(self) -> int:
-        """Returns the size of the files of all captures of the service, wherever they lie."""
+        """Returns the size of the files of all captures of the service, wherever they are."""
         with self._engine.connect() as connection:
             return int(connection.scalar(sa.select(sa.func.sum(capture_index.c.bytes))) or 0)
 
@@ -167,12 +167,12 @@ class CaptureBlobs:
             self.release(capture)
 
     def known(self, ids: Collection[str]) -> set[str]:
-        """Returns those of the ids that are blobs of this database."""
+        """Returns the ids that are blobs of this database."""
         with self._engine.connect() as connection:
             return {*connection.scalars(sa.select(blobs.c.id).where(blobs.c.id.in_(ids)))}
 
     def holders(self, captures: Collection[str]) -> set[str]:
-        """Returns those of the captures that have files in the store, or are about to."""
+        """Returns the captures that have files in the store, or will have them soon."""
         query, found = sa.select(capture_files.c.capture_id).distinct(), set[str]()
         with self._engine.connect() as connection:
             for some in portions(captures):
@@ -180,8 +180,8 @@ class CaptureBlobs:
         return found
 
     def _claim(self, capture: str, inputs: Mapping[str, str], size: Callable[[str], int]) -> dict[str, Blob]:
-        """Makes these the files of a capture, and dead what only it had. Locks rows in the order of their names, so
-        that two services wait for each other."""
+        """Registers these as the files of a capture, and marks as dead the blobs that only it had. Locks rows in the
+        order of their names, so that two services do not deadlock."""
         mine = sa.select(capture_files.c.blob_id).where(capture_files.c.capture_id == capture)
         alike = sa.and_(blobs.c.sha256.in_(set(inputs.values())), ~blobs.c.dead)
         query = sa.select(blobs).where(sa.or_(blobs.c.id.in_(mine), alike)).order_by(blobs.c.id).with_for_update()
@@ -207,7 +207,7 @@ class CaptureBlobs:
         return {name: usable[sha256] for name, sha256 in inputs.items()}
 
     def _take_back(self, sent: Collection[str]) -> None:
-        """Removes what was sent of a capture that was removed meanwhile: its blobs may have been buried before."""
+        """Removes the sent files of a capture that was removed meanwhile, since nobody else would."""
         with self._engine.connect() as connection:
             alive = {*connection.scalars(sa.select(blobs.c.id).where(blobs.c.id.in_(sent), ~blobs.c.dead))}
         for blob in sent:
@@ -230,13 +230,13 @@ class CaptureBlobs:
 
 
 def open_capture_blobs(settings: ServiceSettings, engine: sa.Engine) -> CaptureBlobs | None:
-    """Opens the store of captures that the settings name; None without one."""
+    """Opens the store of captures that the settings name; returns None if there is none."""
     place = settings.captures_store
     return None if place is None else CaptureBlobs(WatchedObjects(open_objects(place, settings)), engine)
 
 
 def _is_there(path: Path, sha256: str) -> bool:
-    """Tells whether a file is there. Small ones may be replaced while their capture stays: they are compared."""
+    """Returns whether a file exists. Small ones are compared, since they may be replaced."""
     with suppress(FileNotFoundError, NotADirectoryError):
         return path.stat().st_size > SMALL_BYTES or sha256_of(path) == sha256
     return False

@@ -1,7 +1,7 @@
 """Defines the service's own tables, which lie beside the job engine's in one database (an SQLite file or PostgreSQL).
 
 Times of workers, keys and events are seconds since 1970 on the *database's* clock. Two hosts whose clocks differ then
-agree on which worker is silent.
+agree on which worker has stopped its heartbeat.
 """
 
 import os
@@ -255,7 +255,7 @@ def check_pages(engine: sa.Engine, place: str) -> None:
 
 
 def _add_columns(engine: sa.Engine) -> None:
-    """Gives tables of an earlier version the columns that they lack; all of those may be empty."""
+    """Adds missing columns to tables of an earlier version; all of those may be empty."""
     for table, name in ((job_index, "words"), (batches, "deliver_to")):
         if name not in {column["name"] for column in sa.inspect(engine).get_columns(table.name)}:
             with engine.begin() as connection:
@@ -263,7 +263,7 @@ def _add_columns(engine: sa.Engine) -> None:
 
 
 def database_identity(engine: sa.Engine) -> str:
-    """Returns the name that a database gave to itself, the same to all who call."""
+    """Returns the name that a database gave to itself, which never changes."""
     with suppress(IntegrityError), engine.begin() as connection:  # another process was first
         if connection.scalar(sa.select(identities.c.name)) is None:
             connection.execute(sa.insert(identities).values(row=1, name=secrets.token_hex(16)))

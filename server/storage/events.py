@@ -1,4 +1,4 @@
-"""Stores what happened to each job, in order: the source of progress, remaining time and the event stream of HTTP.
+"""Stores the events of each job in order, from which progress, remaining time and the event stream of HTTP are read.
 
 Failed jobs are counted by kind for the metrics; the counts stay when retention removes the jobs, so that alerts can use
 them."""
@@ -29,8 +29,8 @@ class JobEvent:
 
 
 class EventLog:
-    """Reads and writes the events of jobs. Within a job their numbers grow, from 1, also if another worker takes the
-    job over. A number is missing where its event was superseded. The last event is the job's end, under ``END``."""
+    """Reads and writes the events of jobs. Within a job their numbers grow from 1, even if another worker takes the job
+    over. A number is missing where its event was superseded. The last event is the job's end, under ``END``."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
@@ -38,7 +38,7 @@ class EventLog:
     def append(self, job_id: str, document: EventDocument, instead_of: int | None = None) -> int | None:
         """Adds an event to a job under the next number, which it returns. ``instead_of``: the number of an event that
         the new one supersedes. If another writer takes the next number first, it tries again, twenty times; after that,
-        and where the database is away, the event is dropped and it returns None: the next one tells more."""
+        and if the database does not answer, the event is dropped and it returns None, since the next one holds more."""
         event, text = events.c, json.dumps(document)
         following = sa.select(sa.func.coalesce(sa.func.max(event.seq), 0) + 1)
         following = following.where(event.job_id == job_id, event.seq < END)
@@ -62,8 +62,8 @@ class EventLog:
 
     def end(self, job_id: str, document: EventDocument, *, failure: str | None = None) -> bool:
         """Adds the end of a job, and counts ``failure``, the kind of a failed job, with it. Returns whether the job had
-        no end before; otherwise nothing changes. A worker may be killed before the job engine knows of the end; whoever
-        takes the job over then repeats the call."""
+        no end before; otherwise nothing changes. A worker may be killed before the job engine knows of the end; the
+        worker that takes the job over then repeats the call."""
         insert = self._end(job_id, document).on_conflict_do_nothing().returning(events.c.seq)
         with self._engine.begin() as connection:
             is_first = connection.scalar(insert) is not None
@@ -72,7 +72,7 @@ class EventLog:
         return is_first
 
     def replace_end(self, job_id: str, document: EventDocument) -> None:
-        """Adds the end of a job in place of one that a worker wrote and that did not come to pass."""
+        """Adds the end of a job in place of one that a worker wrote and that then did not happen."""
         insert = self._end(job_id, document)
         new = {"document": insert.excluded.document, "at": insert.excluded.at}
         with self._engine.begin() as connection:

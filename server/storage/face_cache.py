@@ -1,8 +1,8 @@
 """Caches the faces found in a capture on disk, so that the pages search each capture once.
 
 A file's name is the SHA-256 of everything that its content depends on: the capture's files, the program's version and
-code. It describes a face, so it lies where ``Store.remove_capture`` erases it with its capture, even while a search
-runs. A file that cannot be read is made anew. One that cannot be written is not kept.
+code. It describes a face, so it lies in a folder that ``Store.remove_capture`` erases with its capture, even while a
+search runs. A file that cannot be read is made anew. A result that cannot be written is not cached.
 """
 
 import hashlib

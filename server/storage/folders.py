@@ -1,4 +1,4 @@
-"""Folders: moved so that it lasts, and measured."""
+"""Moves folders durably, and measures them."""
 
 import os
 from contextlib import suppress

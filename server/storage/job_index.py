@@ -1,4 +1,4 @@
-"""Finds jobs: the service's index rows beside the job engine's own table, which alone holds a job's state.
+"""Finds jobs by the service's index rows, beside the job engine's own table, which alone holds a job's state.
 
 The engine's table is read only here and in ``batches``, by columns that its migrations keep. Everything else goes
 through the engine's client.
@@ -37,7 +37,7 @@ class JobQuery:
 
 @dataclass(frozen=True, slots=True)
 class Queued:
-    """Holds how many jobs wait in a queue, and since when the oldest does (s since 1970)."""
+    """Holds how many jobs wait in a queue, and since when the oldest waits (s since 1970)."""
 
     jobs: int
     since: float
@@ -104,7 +104,7 @@ class JobIndex:
             return {row[0]: row[1] for row in connection.execute(query)}
 
     def queued(self) -> dict[str, Queued]:
-        """Returns how many jobs wait in each queue, and since when the oldest does."""
+        """Returns how many jobs wait in each queue, and since when the oldest waits."""
         status = self._status.c
         query = sa.select(status.queue_name, sa.func.count(), sa.func.min(status.created_at))
         query = query.where(status.name == self._workflow, status.status.in_(ENQUEUED)).group_by(status.queue_name)
@@ -119,7 +119,7 @@ class JobIndex:
             return [*connection.scalars(query.order_by(status.created_at.desc()))]
 
     def places(self) -> dict[str, int]:
-        """Returns for each queued job how many jobs of its queue go before it.
+        """Returns for each queued job how many jobs of its queue run before it.
 
         Running jobs go first, then those with a lower priority number, then those queued earlier. Of jobs queued in the
         same millisecond the lower id counts as earlier, although the engine takes them in any order.
@@ -153,7 +153,7 @@ class JobIndex:
         return found
 
     def known(self, ids: Collection[str]) -> set[str]:
-        """Returns those of the ids that are jobs."""
+        """Returns the ids that are jobs."""
         status = self._status.c
         query = sa.select(status.workflow_uuid).where(status.name == self._workflow, status.workflow_uuid.in_(ids))
         with self._engine.connect() as connection:
@@ -182,7 +182,7 @@ class JobIndex:
 
 
 def engine_jobs(engine: sa.Engine) -> sa.TableClause:
-    """Returns the job engine's table of workflows, with those of its columns that are used here."""
+    """Returns the job engine's table of workflows, with the columns that are used here."""
     text, number = sa.Text(), sa.BigInteger()
     names = {"workflow_uuid": text, "status": text, "name": text, "queue_name": text, "executor_id": text}
     names |= {"created_at": number, "started_at_epoch_ms": number, "completed_at": number, "priority": number}

@@ -1,8 +1,8 @@
-"""Indexes captures and sessions in the database, so that a page of a hundred thousand is one query.
+"""Indexes captures and sessions in the database, so that one query returns a page even of a hundred thousand.
 
-The records in the data folder are the truth, and each write of a record writes its row. ``Library.reconcile``, called
-at each start, corrects rows that differ: after a backup was restored, a record was removed by hand, or with a data
-folder of an earlier version.
+The records in the data folder are authoritative, and each write of a record also writes its row. ``Library.reconcile``,
+called at each start, corrects rows that differ: after a backup was restored, a record was removed by hand, or with a
+data folder of an earlier version.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -140,7 +140,7 @@ class Library:
         return [row.id for row in rows if folded(row.label).startswith(begun)]
 
     def sessions_of(self, subject: str) -> list[str]:
-        """Lists the ids of the sessions of one subject, who is given by what ``subject_of`` returns."""
+        """Lists the ids of the sessions of one ``subject``, which is a value of ``subject_of``."""
         with self._engine.connect() as connection:
             return [*connection.scalars(sa.select(session_index.c.id).where(session_index.c.subject == subject))]
 
@@ -204,8 +204,8 @@ class Library:
         return mended
 
     def _put_fitting(self, table: sa.Table, records: Sequence[Record], changes: Mapping[str, int]) -> int:
-        """Writes the rows of records and returns how many. One whose values no column takes is left out and named in
-        the log: it must not keep the service from starting."""
+        """Writes the rows of records and returns how many. A record whose values fit no column is left out and logged,
+        so that it does not keep the service from starting."""
         try:
             self._put(table, records, changes)
         except UNFIT as error:
@@ -262,7 +262,7 @@ def sessions_with(word: str) -> sa.ColumnElement[bool]:
 
 
 def subject_of(record: SessionRecord) -> str:
-    """Returns the text by which sessions belong to one subject: the session's name, or its id where it has none."""
+    """Returns the text by which sessions belong to one subject: the session's name, or its id if it has no name."""
     return folded(record.label).strip() or record.id
 
 

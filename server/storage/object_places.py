@@ -1,9 +1,9 @@
-"""Places in object stores: which a caller may name, and the store behind each: a folder, or a bucket.
+"""Provides places in object stores: which ones a caller may name, and the store of each (a folder or a bucket).
 
 Buckets are S3-compatible and reached through botocore (the extra ``s3``). Credentials are those of AWS's own chain:
 variables, profile, or the role of machine, container or pod. Files of more than one part are uploaded in parts; the
-object appears when the last request completes it. Each request carries the SHA-256 of its bytes, each object that of
-its whole content in its metadata; what is read is compared with it.
+object appears when the last request completes it. Each request carries the SHA-256 of its bytes, and each object stores
+that of its whole content in its metadata; every read is compared with it.
 """
 
 import base64
@@ -46,7 +46,7 @@ T = TypeVar("T")
 
 @lru_cache
 def _client(endpoint: str | None, region: str | None, timeout_s: float) -> Any:
-    """Makes a client, which threads may share, in about a second."""
+    """Makes a client, which threads may share, within about a second."""
     from botocore.config import Config
     from botocore.session import Session
 
@@ -66,7 +66,7 @@ def _client(endpoint: str | None, region: str | None, timeout_s: float) -> Any:
 
 
 class DamagedTransfer(StoreUnavailable):
-    """Reports bytes that broke off or changed on their way. They are sent again at once; the client itself repeats
+    """Reports bytes that were cut off or changed in transit. They are sent again at once; the client itself repeats
     requests that got no answer."""
 
 
@@ -157,7 +157,7 @@ class S3Objects:
             self._check(key, self._read_back(key), sha256)
 
     def _is(self, key: str, size: int, sha256: str) -> bool:
-        """Tells whether an equal object is there, by the store's checksum of it or by its bytes."""
+        """Returns whether an equal object exists, by the store's checksum of it or by its bytes."""
         try:
             with self._asking(key):
                 said = self._client.head_object(**self._at(key))
@@ -210,7 +210,7 @@ class S3Objects:
 
     @contextmanager
     def _asking(self, key: str) -> Iterator[None]:
-        """Says in our words what the client raises."""
+        """Converts the client's exceptions to ours."""
         from botocore.exceptions import (
             BotoCoreError,
             ClientError,
@@ -254,7 +254,7 @@ def _base64(data: bytes) -> str:
 
 
 def key_faults(key: str) -> list[Message]:
-    """Returns what is wrong with a key, or with a prefix that ends with a slash."""
+    """Returns the faults of a key, or of a prefix that ends with a slash."""
     if any(unicodedata.category(c) in ("Cc", "Cs") for c in key) or "\\" in key:
         return [compose("key-characters")]
     if len(key.encode()) > KEY_BYTES_MOST:
@@ -278,13 +278,13 @@ def locate(url: str, prefixes: Collection[str]) -> tuple[str, str]:
 
 
 def is_object_url(url: str) -> bool:
-    """Tells whether a URL names something in a store, not on the web."""
+    """Returns whether a URL names an object in a store, not a page on the web."""
     return url.startswith(("s3://", "file://"))
 
 
 def open_objects(prefix: str, settings: ServiceSettings) -> ObjectStore:
-    """Opens the store at ``s3://bucket/prefix/`` or ``file:///folder/``, without asking it anything. Raises StoreDenied
-    where the extra for S3 is not installed."""
+    """Opens the store at ``s3://bucket/prefix/`` or ``file:///folder/``, without sending a request. Raises StoreDenied
+    if the extra for S3 is not installed."""
     if prefix.startswith("file://"):
         return FolderObjects(Path(prefix.removeprefix("file://")))
     bucket, _, below = prefix.removeprefix("s3://").partition("/")

@@ -1,6 +1,6 @@
-"""Objects: complete files under keys, in a folder or in an S3-compatible bucket.
+"""Stores objects, which are complete files under keys, in a folder or in an S3-compatible bucket.
 
-An object is visible only when it is whole, and what is read is compared with its checksum. A key is a relative path
+An object is visible only when it is complete, and each read is compared with its checksum. A key is a relative path
 with slashes. ``ObjectStore`` has two implementations: ``FolderObjects`` here, ``S3Objects`` in
 ``server.storage.object_places``.
 """
@@ -24,7 +24,7 @@ BLOCK_BYTES = 1 << 20
 
 
 class StoreUnavailable(Unavailable):
-    """Reports a store that does not answer, or gives damaged bytes; it may be well again later."""
+    """Reports a store that does not answer, or returns damaged bytes; it may recover by itself."""
 
     def __init__(self, place: str, reason: Message | str) -> None:
         detail = compose("store-unavailable", place=place, reason=_short(reason))
@@ -32,7 +32,7 @@ class StoreUnavailable(Unavailable):
 
 
 class StoreDenied(InvalidInput):
-    """Reports a store that refuses what is asked, and will again until its operator changes something."""
+    """Reports a store that refuses a request, and will refuse it until its operator changes something."""
 
     def __init__(self, place: str, reason: Message | str) -> None:
         super().__init__("store-denied", compose("store-denied", place=place, reason=_short(reason)))
@@ -62,18 +62,18 @@ class StoredObject:
 
 
 class ObjectStore(Protocol):
-    """Keeps objects below one place. Methods block, and may be called by several threads and processes at once.
+    """Stores objects below one place. Methods block, and may be called by several threads and processes at once.
 
-    Each raises StoreUnavailable where the store does not do its part, and StoreDenied where it will not.
+    Each raises StoreUnavailable if the store fails, and StoreDenied if it refuses.
     """
 
     def put(self, key: str, path: Path, sha256: str) -> None:
-        """Stores a file whose content has this SHA-256, in place of an object of the same key. Returns once the object,
-        read back, has it, too; an equal object is left as it is."""
+        """Stores a file whose content has this SHA-256, replacing an object of the same key. Returns once the stored
+        object, read back, has this SHA-256; an equal object is left as it is."""
         ...
 
     def fetch(self, key: str, path: Path, sha256: str | None = None, admit: Admission = any_size) -> str:
-        """Writes an object to the file ``path`` and returns its SHA-256, which is ``sha256`` where that is given.
+        """Writes an object to the file ``path`` and returns its SHA-256, which must be ``sha256`` if that is given.
         Raises ObjectMissing, and what ``admit`` raises."""
         ...
 
@@ -86,13 +86,13 @@ class ObjectStore(Protocol):
         ...
 
     def link(self, key: str, name: str, seconds: int) -> str | None:
-        """Returns an address at which whoever has it gets the object for so long, as a file of this name. None where
-        the store has no such addresses. Raises ObjectMissing."""
+        """Returns an address that gives anybody the object for this time, as a file of this name. Returns None if the
+        store has no such addresses. Raises ObjectMissing."""
         ...
 
     def erase(self, prefix: str) -> int:
-        """Removes all objects whose keys begin with ``prefix``, with every version of them and what unfinished uploads
-        left. Returns how many were removed."""
+        """Removes all objects whose keys begin with ``prefix``, with all versions and the parts of unfinished uploads.
+        Returns how many were removed."""
         ...
 
 
@@ -101,8 +101,8 @@ def _short(reason: Message | str) -> Message | str:
 
 
 class FolderObjects:
-    """Keeps objects in a folder, perhaps of another machine. The folder must be there: one that is not mounted is not
-    made anew in its mount point."""
+    """Stores objects in a folder, perhaps of another machine. The folder must exist: one that is not mounted is not
+    created in its mount point."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
@@ -156,7 +156,7 @@ class FolderObjects:
             yield from sorted(path.name for path in root.iterdir() if path.is_dir() and not path.is_symlink())
 
     def link(self, key: str, name: str, seconds: int) -> str | None:
-        """Returns None: the service itself sends what lies in a folder."""
+        """Returns None, since the service itself sends files of a folder."""
         return None
 
     def erase(self, prefix: str) -> int:

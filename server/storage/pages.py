@@ -1,4 +1,4 @@
-"""Pages of a list: the query, a cursor that marks where a page ended, and the condition for rows that come after.
+"""Reads pages of a list: the query, a cursor that marks where a page ended, and the condition for rows that come after.
 
 A list continues after the *place* of its last row (the value it is sorted by and, between equal values, the id), not
 after a number of rows. So rows that are added or removed meanwhile neither repeat nor drop others, and the last page is
@@ -33,7 +33,7 @@ class Page(Generic[T]):
     total: int
 
     def of(self, items: Iterable[V]) -> "Page[V]":
-        """Returns the page with these items in place of its own."""
+        """Returns the page with these items instead of its own."""
         return Page(tuple(items), self.next, self.total)
 
 

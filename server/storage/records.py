@@ -1,7 +1,7 @@
 """Defines the records of the data folder and the job database, and a name for JSON objects of any shape.
 
-A file is read into a frozen record where it enters the program; a file that lacks a field is damaged. Requests and
-results of jobs stay mappings, since the job engine keeps them unchanged across upgrades of this program.
+A file becomes a frozen record when it is read; a file that lacks a field counts as damaged. Requests and results of
+jobs stay mappings, since the job engine keeps them unchanged across upgrades of this program.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 def _read_fault(value: object) -> Fault:
-    """Reads a fault; the detail of earlier versions is a text."""
+    """Reads a fault; in earlier versions its detail is a text."""
     if isinstance(value, Fault):
         return value
     if not isinstance(value, Mapping) or not isinstance(value.get("code"), str):
@@ -52,11 +52,11 @@ class CameraSize:
 
 @dataclass(frozen=True, slots=True)
 class CaptureContent:
-    """Holds what a capture's folder contains.
+    """Holds the content of a capture's folder.
 
     ``inputs``: SHA-256 of every file; ``board``: whether the pictures show the calibration board and no head;
     ``checks``: measurements of each camera's picture; ``warnings``: those of the calibration, if the cameras were found
-    from the photographs; ``face``: what the pictures show of the subject's face (None where nobody looked).
+    from the photographs; ``face``: findings on the subject's face (None if no search was made).
     """
 
     cameras: tuple[CameraSize, ...]
@@ -72,8 +72,8 @@ class CaptureContent:
 
 @dataclass(frozen=True, slots=True)
 class CaptureRecord:
-    """Holds a capture: where it comes from, what people wrote about it, its content, the certificate of its shot, and
-    the verdict on it.
+    """Holds a capture: its source, people's notes on it, its content, the certificate of its shot, and the verdict on
+    it.
 
     ``verdict``: None if the capture was not judged (the board, captures of earlier versions); ``faults``: the reasons
     for the verdict; ``warnings``: those of the calibration and remarks on the face; ``inputs``: SHA-256 of every file
@@ -111,7 +111,7 @@ class SessionRecord:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationRecord:
-    """Holds a calibration that was requested. ``pictures``: number of pictures by camera; ``kind``: what they show,
+    """Holds a calibration that was requested. ``pictures``: number of pictures by camera; ``kind``: their subject,
     board or scene."""
 
     id: str
@@ -169,7 +169,7 @@ UPLOAD = RecordFormat(UploadRecord, "eigenhead-upload/1")
 
 
 class SubjectOut(BaseModel):
-    """Describes where the subject is in a picture. (A person of the library is ``PersonOut``.)"""
+    """Describes the subject's place in a picture. (A person of the library is ``PersonOut``.)"""
 
     share: float = Field(description="of the picture's area")
     cut_off: list[str] = Field(description="edges of the picture that cut the head: top, left, right")
@@ -177,7 +177,7 @@ class SubjectOut(BaseModel):
 
 
 class ViewChecksOut(BaseModel):
-    """Holds what was measured on one camera's picture."""
+    """Holds the measurements of one camera's picture."""
 
     mean: float | None = Field(None, description="mean value, 0 to 255")
     clipped_share: float | None = Field(None, description="of pixels at 255 in every channel")
@@ -205,7 +205,7 @@ class JobWebhook(TypedDict):
 
 
 class JobRequest(TypedDict):
-    """Holds what a job is to do, as the job engine stores it."""
+    """Holds the work of a job, as the job engine stores it."""
 
     capture_id: str
     model: str | None
@@ -217,8 +217,8 @@ class JobRequest(TypedDict):
 
 
 class DeliveryRequest(TypedDict):
-    """Holds where the result of a job is to be delivered, as the job engine stores it. ``to`` ends with a slash;
-    ``until``: when it is given up (s since 1970); ``webhook``: the job's own."""
+    """Holds the destination of a job's result, as the job engine stores it. ``to`` ends with a slash; ``until``: when
+    to give up (s since 1970); ``webhook``: the job's own."""
 
     job_id: str
     to: str
@@ -247,8 +247,8 @@ class WebhookMessage(TypedDict):
 
 
 class EventDocument(TypedDict, total=False):
-    """Holds what happened to a job: the stage that it is in, with progress (0 to 1) and remaining time (s) of the whole
-    job, or a new state. ``camera_moved``: cameras that no longer stand where they were calibrated."""
+    """Holds one event of a job: its stage, with progress (0 to 1) and remaining time (s) of the whole job, or a new
+    state. ``camera_moved``: cameras that no longer stand where they were calibrated."""
 
     state: str
     stage: str

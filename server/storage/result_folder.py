@@ -1,4 +1,4 @@
-"""Replaces the result in a folder that a user named, so that it is never half written.
+"""Replaces the result in a folder that a user named, so that the folder never holds half a result.
 
 The new result is written beside the folder and moved in when it is complete, file by file, report.json last: the folder
 itself may be a mount or a shell's working directory. All files of an earlier result are removed. Files that belong to

@@ -1,8 +1,8 @@
 """Caches the silhouettes of a capture on disk, for restarts with other settings and for the operator's pages.
 
-A file's name is the SHA-256 of everything that its content depends on: the capture's files and the code. What is read
-from it equals what ``segment`` returned, bit for bit. It shows a face, so it lies where ``Store.remove_capture`` erases
-it with its capture. A file that cannot be read is made anew. One that cannot be written is not kept.
+A file's name is the SHA-256 of everything that its content depends on: the capture's files and the code. Cached
+silhouettes equal those that ``segment`` returned, bit for bit. They show a face: ``Store.remove_capture`` erases them
+with their capture. A file that cannot be read is made anew. One that cannot be written is not cached.
 """
 
 import dataclasses
@@ -97,8 +97,8 @@ def _decoded(data: bytes) -> dict[str, Silhouette]:
 
 
 def _steps(values: Float32[np.ndarray, "h w"]) -> bytes:
-    """Returns differences of bit patterns along rows, first bytes first: distances rise evenly, which gives long
-    runs."""
+    """Returns differences of bit patterns along rows, highest bytes first: distances rise evenly, which compresses
+    well."""
     bits = np.ascontiguousarray(values).view(np.int32)
     return np.diff(bits, axis=1, prepend=np.int32(0)).view(np.uint8).reshape(-1, 4).T.tobytes()
 

@@ -1,4 +1,4 @@
-"""Artefacts on disk: captures, sessions, results.
+"""Stores captures, sessions and results on disk.
 
     <data>/captures/<id>/record.json  files/...          one folder a capture, as docs/capture-format.md has it;
                                                          checks.json has what was measured of each camera's picture
@@ -12,8 +12,8 @@
     <data>/last-sweep.json  retention-stopped.txt         what retention knows of the clock
     <data>/has-keys                                      see server.services.keys
 
-A folder appears under its final name in one rename, after everything in it reached the disk. What is in the data folder
-and is not named above was put there by somebody else: it is never read and never deleted.
+A folder appears under its final name in one rename, after everything in it reached the disk. Other files in the data
+folder were put there by somebody else: they are never read and never deleted.
 """
 
 import hashlib
@@ -65,7 +65,7 @@ def new_id() -> str:
 
 
 def repeatable_id(key: str, idempotency_key: str) -> str:
-    """Returns the id of whatever an API key requests under an Idempotency-Key: the same one each time."""
+    """Returns the id of the thing that an API key requests under an Idempotency-Key: the same one each time."""
     return hashlib.sha256(f"{key}\0{idempotency_key}".encode()).hexdigest()[:28]
 
 
@@ -82,7 +82,7 @@ class StoredFile:
     sha256: str
 
     def is_intact(self) -> bool:
-        """Tells whether the file has this content. It is read once, and again when its time, size or inode changes."""
+        """Returns whether its content matches. It is read once, and again when its time, size or inode changes."""
         said = self.path.stat()
         return _digest(self.path, said.st_mtime_ns, said.st_size, said.st_ino) == self.sha256
 
@@ -108,7 +108,7 @@ class Store:
     def __init__(
         self, data: Path, index: Library | None = None, blobs: CaptureBlobs | None = None, spare: int = 0
     ) -> None:
-        """``blobs``: where files of captures are kept, too; ``spare``: bytes that fetching them leaves free."""
+        """``blobs``: second place for files of captures; ``spare``: bytes to keep free when fetching them."""
         self.data, self._index, self.blobs, self._spare = data, index, blobs, spare
         self._changing = threading.Lock()  # two changes of one record must not lose one of them
         for name in FOLDERS:
@@ -151,14 +151,14 @@ class Store:
 
     def add_capture(self, folder: Path, record: CaptureRecord) -> None:
         """Writes a capture's record into ``folder``, which holds ``files/``, and moves the folder to its final place in
-        one rename. After a kill the capture is complete or absent. Its files go to the store of captures, too."""
+        one rename. After a kill the capture is complete or absent. Its files are also sent to the store of captures."""
         write_atomically(folder / "record.json", _encoded(CAPTURE.document(record)))
         move_durably(folder, self.folder("captures", record.id))
         self._tell(record)
         self.share(record)
 
     def share(self, record: CaptureRecord) -> bool:
-        """Stores the files of a capture where a store is configured, as in ``CaptureBlobs.offer``."""
+        """Stores the files of a capture if a store is configured, as in ``CaptureBlobs.offer``."""
         if self.blobs is None:
             return True
         done = self.blobs.offer(record.id, self.folder("captures", record.id) / "files", record.inputs)
@@ -167,8 +167,8 @@ class Store:
         return done
 
     def capture_files(self, identity: str) -> Path:
-        """Returns the folder of a capture's files, fetched from the store of captures where they lack here. Raises
-        NotFound, Unavailable, DiskFull, and Conflict for files that are nowhere."""
+        """Returns the folder of a capture's files, after fetching missing ones from the store of captures. Raises
+        NotFound, Unavailable, DiskFull, and Conflict for files that exist nowhere."""
         folder = self.folder("captures", identity) / "files"
         if self.blobs is not None:
             record = self.found("captures", identity)
@@ -179,8 +179,8 @@ class Store:
         return folder
 
     def found(self, kind: str, identity: str) -> CaptureRecord | SessionRecord | None:
-        """Returns the record of a capture or session (``kind``: "captures", "sessions"). Returns None where it is
-        missing or damaged."""
+        """Returns the record of a capture or session (``kind``: "captures", "sessions"). Returns None if it is missing
+        or damaged."""
         with suppress(NotFound):
             return self.capture(identity) if kind == "captures" else self.session(identity)
         return None
@@ -216,7 +216,7 @@ class Store:
         write_atomically(folder / "checks.json", _encoded(checks))
 
     def checks(self, identity: str) -> dict[str, ViewDocument]:
-        """Returns the measurements of a capture's pictures by camera; none for a capture of an earlier version or where
+        """Returns the measurements of a capture's pictures by camera; none for a capture of an earlier version or if
         the file is damaged. Raises NotFound."""
         with suppress(FileNotFoundError, ValueError, RecursionError):
             return read_checks(json.loads((self.folder("captures", identity) / "checks.json").read_bytes()))
@@ -253,9 +253,9 @@ class Store:
                 raise NotFound(_THINGS[kind], identity) from error
 
     def remove_capture(self, identity: str, *, later: bool = False) -> None:
-        """Removes a capture and everything cached of it, which shows the face as well; first what the store of captures
-        has of it. Raises Unavailable where that does not answer; a second call completes it. ``later``: the next sweep
-        removes that part."""
+        """Removes a capture and everything cached of it, which shows the face as well; its files in the store of
+        captures go first. Raises Unavailable if that does not answer; a second call completes the removal. ``later``:
+        the next sweep removes that part."""
         if self.blobs is not None:
             self.blobs.release(identity, later=later)
         with self._change("captures", identity):
@@ -277,7 +277,7 @@ class Store:
         return ""
 
     def cache_of(self, identity: str) -> Path:
-        """Returns the folder in which silhouettes, thumbnails and the like of a capture are cached."""
+        """Returns the folder in which a capture's silhouettes, thumbnails and similar files are cached."""
         return self.folder("cache/captures", identity)
 
     def add_session(self, record: SessionRecord) -> None:
@@ -311,8 +311,8 @@ class Store:
         return self._read("sessions", identity, SESSION)
 
     def remove(self, path: Path) -> None:
-        """Deletes a file or folder. It is first renamed into ``trash``, so that it is gone from sight even if the
-        deletion is interrupted. Does nothing if it does not exist."""
+        """Deletes a file or folder. It is first renamed into ``trash``, so it disappears even if the deletion is
+        interrupted. Does nothing if it does not exist."""
         target = self.data / "trash" / f"{new_id()}"
         try:
             path.rename(target)
@@ -323,8 +323,8 @@ class Store:
         shutil.rmtree(target, ignore_errors=True) if target.is_dir() else target.unlink(missing_ok=True)
 
     def sweep(self, older_s: float) -> int:
-        """Deletes what crashes left in ``incoming`` and ``trash``, and half-written files, if untouched for ``older_s``
-        seconds. Returns how many were deleted."""
+        """Deletes files that crashes left in ``incoming`` and ``trash``, and half-written files, if untouched for
+        ``older_s`` seconds. Returns how many were deleted."""
         removed = 0
         for kind in ("incoming", "trash"):
             for identity in self.ids(kind):
@@ -341,7 +341,7 @@ class Store:
         return removed
 
     def _unfinished(self) -> Iterator[Path]:
-        """Yields unfinished files of the folders and of the things in them; deeper ones go with their thing."""
+        """Yields unfinished files of the folders and of things in them; deeper ones go with their thing."""
         for kind in FOLDERS:
             yield from unfinished(self.data / kind)
             for entry in os.scandir(self.data / kind):

@@ -1,4 +1,4 @@
-"""Counts what is asked of an object store, how each request ended, and how long they took."""
+"""Counts the requests to an object store, their outcomes, and their seconds."""
 
 import threading
 import time
@@ -29,8 +29,8 @@ class WatchedObjects:
         self._operations, self._seconds = Counter[tuple[str, str]](), Counter[str]()
 
     def operations(self) -> dict[tuple[str, str], int]:
-        """Returns how many operations ended how. An outcome is done, missing, unavailable, denied or refused (of a full
-        disk, say)."""
+        """Returns the number of operations by name and outcome. An outcome is done, missing, unavailable, denied or
+        refused (for example by a full disk)."""
         with self._lock:
             return dict(self._operations)
 

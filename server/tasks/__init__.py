@@ -1,1 +1,1 @@
-"""Heavy work, and the child processes that it runs in: functions of files, which know no service."""
+"""Contains heavy work, and the child processes in which it runs; it does not depend on the service."""

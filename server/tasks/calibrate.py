@@ -1,5 +1,5 @@
-"""The tasks of a calibration, which run in a child process: they take in an archive of pictures and compute a rig with
-its report.
+"""Implements the tasks of a calibration, which run in a child process: they unpack an archive of pictures and compute a
+rig with its report.
 
 A folder with board.toml shows a calibration board; any other shows a scene.
 """
@@ -31,7 +31,7 @@ of the work corrects. Matching goes by pairs, so that more of them take longer."
 
 def expected(folder: Path) -> dict[str, float]:
     """Estimates the seconds of each stage of a calibration from the number of pictures, before it begins. Larger
-    pictures take longer than that."""
+    pictures take longer than this estimate."""
     pictures = sum(path.is_file() for path in (folder / "images").rglob("*"))
     if not is_of_board(folder):
         return {stage: took * pictures for stage, took in SCENE_STAGES_S.items()}
@@ -121,7 +121,7 @@ def calibrate_folder(
 
     ``previous``: the last cameras.json, with which the result is compared; ``cache``: folder of detected corners;
     ``front``: the camera that the subject faces (None: guessed). Returns the outcome for the calibration's record.
-    Raises InputError, also with the reasons why checks refuse the result.
+    Raises InputError, which also states the reasons if checks refuse the result.
     """
     if not is_of_board(Path(folder)):
         return _calibrate_scene(report, Path(folder), Path(result), front)

@@ -1,8 +1,8 @@
-"""A warm child process that does one piece of heavy work after another.
+"""Implements a warm child process that does one task after the other.
 
 Heavy work (reconstruction, checking images, rendering the simulated studio) runs outside the process that answers
-requests or keeps a worker's heartbeat. So neither a GL context nor Python's interpreter lock delays that process, a
-crash in native code costs one job only, and work that does not react to a cancellation can be killed.
+requests or sends a worker's heartbeat. So neither a GL context nor Python's interpreter lock delays that process, a
+crash in native code costs one job only, and a task that does not react to a cancellation can be killed.
 
 The child runs this module and is connected by a socket. It ends when the socket closes, so it never outlives its
 parent.
@@ -59,7 +59,7 @@ class WorkFailed(EigenheadError):
 
 
 class WorkerContext:
-    """Keeps resources of a child process, such as a model or a renderer, from one piece of work to the next."""
+    """Keeps resources of a child process, such as a model or a renderer, from one task to the next."""
 
     def __init__(self) -> None:
         self._stack = ExitStack()
@@ -186,8 +186,8 @@ class Child:
 class ChildProcessPool:
     """Lends a fixed number of child processes to many threads. Each child serves one thread at a time.
 
-    A child whose work is given up is killed, and the next one starts for a second: a caller is lent the child that
-    worked for him last, so that those who give up wait for new ones and others do not.
+    A child whose task is abandoned is killed, and its successor needs a second to start: each caller gets the child
+    that worked for him last, so only those who abandon tasks wait.
     """
 
     def __init__(self, count: int, niceness: int = 0, memory: int = 0) -> None:
@@ -197,8 +197,8 @@ class ChildProcessPool:
 
     @contextmanager
     def one(self, timeout_s: float | None = None) -> Iterator[Child]:
-        """Yields a child that no other thread has during the block: that of ``CALLER``, one of nobody's, or a running
-        one. Raises queue.Empty if none is free within ``timeout_s`` seconds."""
+        """Yields a child that no other thread uses during the block: that of ``CALLER``, a child of nobody, or a
+        running one. Raises queue.Empty if none is free within ``timeout_s`` seconds."""
         caller = CALLER.get()
         with self._freed:
             if not self._freed.wait_for(lambda: self._free, timeout_s):
@@ -241,7 +241,7 @@ def _described(error: BaseException) -> tuple[str, str, Message, str, tuple[Mess
 
 
 def _lacks_memory(error: BaseException) -> bool:
-    """Tells whether memory was refused: by Python, by OpenCV (its StsNoMem is -4), or for a thread's stack."""
+    """Returns whether memory was refused: by Python, by OpenCV (its StsNoMem is -4), or for a thread's stack."""
     no_thread = isinstance(error, RuntimeError) and "start new thread" in str(error)
     return isinstance(error, MemoryError) or getattr(error, "code", None) == -4 or no_thread
 

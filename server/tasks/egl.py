@@ -1,4 +1,4 @@
-"""Tries whether this machine has OpenGL, for drawing and for computing; runs in a child process."""
+"""Tests whether this machine has OpenGL, for drawing and for computing; runs in a child process."""
 
 from rig.progress import Progress
 from server.tasks.child import WorkerContext

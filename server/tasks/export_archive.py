@@ -1,4 +1,4 @@
-"""The task of an export over HTTP: a finished head in another format, as one archive."""
+"""Implements the task of an export over HTTP: a finished head in another format, as one archive."""
 
 import tempfile
 import zipfile
@@ -12,8 +12,8 @@ from server.tasks.child import WorkerContext
 def export_archive(
     context: WorkerContext, report: Progress, *, result: str, archive: str, outputs: Mapping[str, object]
 ) -> None:
-    """Writes the files that ``outputs`` names of the result in the folder ``result`` to a .zip. Raises InputError, and
-    what the writers raise."""
+    """Writes the files that ``outputs`` names from the result in the folder ``result`` to a .zip. Raises InputError,
+    and what the writers raise."""
     from pipeline.settings import settings_from_document
     from server.tasks.export_result import export_result
 

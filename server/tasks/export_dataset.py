@@ -1,7 +1,7 @@
 """Writes a capture folder as a data set of views for another program.
 
-Cameras, masks and the choice of views are those of a reconstruction. Cameras and masks that the capture lacks are
-estimated and kept beside the data set, or copied from the result that it is exported with.
+Cameras, masks and the choice of views are as in a reconstruction. Missing cameras and masks are estimated and stored
+beside the data set, or copied from the given result.
 """
 
 import json
@@ -76,7 +76,7 @@ def export_folder(
 
 
 def _read_result(result: Path) -> tuple[Mapping[str, str], Mesh]:
-    """Returns what a result was made of (SHA-256 by file) and its head. Raises InputError."""
+    """Returns the input files of a result (SHA-256 by file) and its head. Raises InputError."""
     try:
         inputs = json.loads((result / "report.json").read_text(encoding="utf-8"))["inputs"]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -92,7 +92,7 @@ def _read_flame(result: Path, form: DatasetFormat) -> FlameParam | None:
 
 def _take_over_found(result: Path, kept: Path) -> str | None:
     """Copies cameras and masks that a reconstruction found, so that the data set has the world frame of its head.
-    Returns the front camera that was chosen then."""
+    Returns the front camera that was chosen for it."""
     from server.tasks.photographs import CACHE, CAMERAS, FIGURES, PAGE
 
     kept.mkdir(parents=True, exist_ok=True)
@@ -109,7 +109,7 @@ def _take_over_found(result: Path, kept: Path) -> str | None:
 
 
 def _differences(inputs: Mapping[str, str], digests: Mapping[str, str]) -> list[Message]:
-    """Returns a fault for each file of pictures and cameras that is another than the result's."""
+    """Returns a fault for each picture and camera file that differs from the result's."""
     files = [name for name in digests if not name.startswith(NOT_OF_CAMERAS)]
     return [compose("result-of-other-file", file=name) for name in files if inputs.get(name) != digests[name]]
 

@@ -1,4 +1,4 @@
-"""Writes files of a finished result in other formats, by the writers that wrote the result."""
+"""Writes files of a finished result in other formats, with the writers of the pipeline."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -63,8 +63,8 @@ def export_result(folder: Path, out: Path, outputs: OutputSettings) -> list[str]
 
 
 def _read_reconstruction(folder: Path, model: HeadModel, outputs: OutputSettings) -> Reconstruction:
-    """Returns what a result folder says of its head. Fields that only its photographs could fill are empty. Raises
-    InputError."""
+    """Returns the reconstruction that a result folder describes. Fields that only its photographs could fill are empty.
+    Raises InputError."""
     visit, report = read_visit(folder, model.name), read_report(folder)
     mesh, head_from_world = visit.measured.mesh_world, visit.measured.head_from_world
     try:
@@ -109,7 +109,7 @@ def _read_reconstruction(folder: Path, model: HeadModel, outputs: OutputSettings
 
 
 def _eye(eye: EyeReport) -> Iris | UnseenEye:
-    """Returns an eye of a report, without its deviations."""
+    """Returns an eye of a report, without its standard deviations."""
     iris, radius, gaze = eye["iris"], eye["radius"], eye["gaze"]
     if iris is None or radius is None or gaze is None:
         return UnseenEye("closed" if eye["cause"] == "closed" else "unclear")
@@ -118,8 +118,8 @@ def _eye(eye: EyeReport) -> Iris | UnseenEye:
 
 
 def _read_textures(folder: Path, bare: Texturing, model: HeadModel, mesh: Mesh, outputs: OutputSettings) -> Texturing:
-    """Returns the texturing with the head's texture, the maps of its skin, and its albedo if that is wanted. An albedo
-    that the result lacks is estimated without other views, so that highlights stay in it."""
+    """Returns the texturing with the head's texture, the maps of its skin, and its albedo if that is wanted. A missing
+    albedo is estimated without other views, so highlights stay in it."""
     image = _head_image(folder)
     if image is None:
         return bare

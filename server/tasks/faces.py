@@ -91,7 +91,7 @@ def _face_of(face: "FaceDetection", camera: Camera, recorded: Camera, best: "Fac
 
 
 def _suggested(context: WorkerContext, face: "MatchedFaces", rig: Rig, recorded: Rig) -> PixelsOfPoints:
-    """Returns the seven points by landmarks of the default model; none without their places among the face's points."""
+    """Returns the seven points by landmarks of the default model; none if the face has no such points."""
     from pipeline.alignment.feature_checks import suggest_points
     from pipeline.faces.landmark_map import NoLandmarkMap, landmark_map
     from pipeline.head_model.landmarks import SEVEN_POINTS

@@ -1,7 +1,7 @@
 """Checks an uploaded archive or a capture folder before it is accepted; runs in a child process.
 
-Files are checked camera by camera, so that a rig of 64 large cameras needs the memory of one; the outlines of an
-upload, at the size that jobs work at, or smaller.
+Files are checked camera by camera, so a rig of 64 large cameras needs the memory of one; outlines of an upload are
+checked at the working size of jobs, or smaller.
 """
 
 import json
@@ -102,7 +102,7 @@ def ingest_archive(
 
 
 def _beside(face: FaceSighting | None, findings: tuple[ReportWarning, ...]) -> FaceSighting | None:
-    """Drops remarks on the face in small pictures that the whole check makes, too."""
+    """Drops remarks on the face in small pictures that the full check also makes."""
     said = {finding.code for finding in findings}
     return face and replace(face, remarks=tuple(remark for remark in face.remarks if remark.code not in said))
 
@@ -110,9 +110,9 @@ def _beside(face: FaceSighting | None, findings: tuple[ReportWarning, ...]) -> F
 def _outline_findings(
     root: Path, cameras: int, networks: FaceNetworks | None, report: Progress
 ) -> tuple[ReportWarning, ...]:
-    """Returns what ``eigenhead check`` warns of. Raises InputError for cameras that contradict the pictures. Too few
-    usable outlines are a warning here: they are a matter of the photographs, which nobody can take again, and of a
-    job's settings."""
+    """Returns the warnings of ``eigenhead check``. Raises InputError for cameras that contradict the pictures. Too few
+    usable outlines are a warning here, because they depend on photographs that nobody can take again, and on a job's
+    settings."""
     from pipeline.settings import Settings
     from pipeline.view_checks.usable_views import TooFewViews
 
@@ -130,8 +130,8 @@ def _outline_findings(
 def check_views(
     shot: Capture, rig: Rig, chosen: "Settings", networks: FaceNetworks | None, *, report: Progress
 ) -> tuple[ReportWarning, ...]:
-    """Returns what outlines and faces say about a capture's pictures and cameras, and all remarks on its files; nobody
-    looks for the face without ``networks``. Raises what the checks refuse with."""
+    """Returns findings of outlines and faces on a capture's pictures and cameras, and all remarks on its files; faces
+    are searched only with ``networks``. Raises the refusals of the checks."""
     from pipeline.faces.subject import SearchEffort, find_subject
     from pipeline.segmentation.segment import segment
     from pipeline.settings import OutputSettings
@@ -156,8 +156,8 @@ def check_views(
 
 
 def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportWarning, ...]:
-    """Leaves cameras.json and calibration.json beside photographs that came alone, and only those that joined. Raises
-    InputError with the views that did not."""
+    """Estimates cameras.json and calibration.json for photographs without cameras, and keeps only the photographs that
+    joined. Raises InputError with the views that did not."""
     from calibration.result import CalibrationRefused
 
     files = [path for path in picture_folder(root).rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
@@ -174,9 +174,8 @@ def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportW
 
 
 def _filed_names(root: Path) -> dict[str, str]:
-    """Returns the names by which the service asks for files, by those that they have in the archive:
-    images/<camera>.<ext>, masks/<camera>.<ext>, texture_sets/<set>/<camera>.<ext>, background/<camera>.<ext> or
-    background/<camera>/<anything>."""
+    """Maps the names in the archive to those that the service uses: images/<camera>.<ext>, masks/<camera>.<ext>,
+    texture_sets/<set>/<camera>.<ext>, background/<camera>.<ext> or background/<camera>/<anything>."""
     (rig_file, *_), read, files, _ = open_capture(root)
     filed = {rig_file.name: CAMERAS} if rig_file == entry(root, CAMERAS) else {}
     for name in read.rig.names:
@@ -190,7 +189,7 @@ def _filed_names(root: Path) -> dict[str, str]:
 
 
 def _leave_out(root: Path, rig: Rig) -> None:
-    """Removes what belongs to views that did not join, which the warnings name."""
+    """Removes the files of views that did not join; the warnings name these views."""
     sets = [path for path in (root / TEXTURE_SETS).glob("*") if path.is_dir()]
     for folder in (picture_folder(root), *(root / kind for kind in BESIDE_PICTURES), *sets):
         for path in [*folder.iterdir()] if folder.is_dir() else ():
@@ -200,7 +199,7 @@ def _leave_out(root: Path, rig: Rig) -> None:
 
 
 def _with_calibration(found: CaptureContent, root: Path, warnings: tuple[ReportWarning, ...]) -> CaptureContent:
-    """Adds the figures of the calibration, from which a job reads the calibration's remarks."""
+    """Adds the figures of the calibration, from which a job reads remarks on it."""
     inputs = dict(sorted({**found.inputs, FIGURES: sha256_of(root / FIGURES)}.items()))
     return replace(found, inputs=inputs, bytes=found.bytes + (root / FIGURES).stat().st_size, warnings=warnings)
 
@@ -334,9 +333,9 @@ def _read_view(
     files: ShotFiles,
     digests: dict[str, str],
 ) -> tuple[Capture, bool]:
-    """Reads the files of the one camera of ``rig``, never more than two of its pictures at once, adds their SHA-256 to
-    ``digests``, and to ``lost`` what cannot be used. Returns the picture with its first plate and its mask, and whether
-    the picture is, pixel for pixel, one of its clean plates: noise never repeats."""
+    """Reads the files of the one camera of ``rig``, at most two of its pictures at once, adds their SHA-256 to
+    ``digests``, and unusable files to ``lost``. Returns the picture with its first plate and its mask, and whether the
+    picture equals one of its clean plates pixel for pixel, which noise makes impossible for a real shot."""
     (name,) = rig.names
     first, *others = files.plates.get(name, ()) or (None,)
     plates = {} if first is None else {name: (first,)}
@@ -371,7 +370,8 @@ def check_features(context: WorkerContext, report: Progress, *, folder: str, poi
 
 
 def _size_faults(root: Path, files: ShotFiles, camera: Camera, image_pixels: int) -> list[Message]:
-    """Sizes as the headers say, before anything is decoded: a small file may claim any size."""
+    """Returns faults of sizes as stated in file headers, before anything is decoded, since a small file may claim any
+    size."""
     faults, pixels = list[Message](), 0
     for _, path in files.of_camera(camera.name):
         name = path.relative_to(root).as_posix()

@@ -1,8 +1,8 @@
 """Moves a subject of the simulated studio: it nods, turns, speaks and blinks, or sits still.
 
-Enters: a person of a head model, a rig and a number of frames. Leaves: the pictures of every frame, and the truth of
-each: weights, pose and vertices. Backdrops, sensors, light, hair and shirt stay as they are over all frames; hair and
-shirt turn with the head. The noise of every picture is its own.
+In: a person of a head model, a rig and a number of frames. Out: the pictures of every frame, and their ground truth:
+weights, pose and vertices. Backdrops, sensors, light, hair and shirt stay as they are over all frames; hair and shirt
+turn with the head. The noise of every picture is its own.
 """
 
 import io
@@ -50,7 +50,7 @@ Weights = Mapping[str, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """Holds what a subject does at one frame: the weights of a model's expressions that are not 0, and its pose."""
+    """Holds a subject's state at one frame: the non-zero weights of a model's expressions, and its pose."""
 
     weights: Weights
     world_from_head: Similarity
@@ -58,7 +58,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Person:
-    """Holds who moves: a model's head by its coefficients, and the seed of hair, shirt, backdrops and motion."""
+    """Holds the moving person: coefficients of a model's head, and the seed of hair, shirt, backdrops and motion."""
 
     model: HeadModel
     coefficients: Float[np.ndarray, " m"]
@@ -72,7 +72,7 @@ class Person:
 
 
 def move(person: Person, frames: int, centre_world: Float[np.ndarray, " 3"], *, still: bool = False) -> list[Pose]:
-    """Returns what a person does at each of ``frames``, ``1 / FPS`` s apart. ``still``: it keeps its first pose."""
+    """Returns a person's states at ``frames`` times, ``1 / FPS`` s apart. ``still``: it keeps its first pose."""
     rng = np.random.default_rng((person.seed, 1))
     time, phases = np.arange(frames) / FPS, rng.uniform(0.0, 2.0 * np.pi, 6)
     swings = np.sin(2.0 * np.pi * np.outer(time, (0.45, 0.21, 0.13, 0.17, 0.11, 0.07)) + phases)
@@ -98,7 +98,7 @@ def move(person: Person, frames: int, centre_world: Float[np.ndarray, " 3"], *, 
 
 
 def of_model(model: HeadModel, weights: Weights) -> dict[str, float]:
-    """Returns weights by Apple's names as weights of the model's own expressions."""
+    """Converts weights by Apple's names to weights of the model's own expressions."""
     parts = arkit_parts(model.expressions.names)
     return {model.expressions.names[row]: w for name, w in weights.items() if w > 0.0 for row in parts[name]}
 
@@ -112,7 +112,7 @@ class Film:
         self._views: dict[str, View] = {}
 
     def light(self, pose: Pose) -> dict[str, View]:
-        """Returns what the cameras see of the person at one moment."""
+        """Returns the cameras' views of the person at one moment."""
         dressed = dress(
             self.renderer,
             self.person.subject(pose.weights),
@@ -150,7 +150,7 @@ class Film:
 
 
 def film(film: Film, poses: list[Pose], report: Callable[[float], None]) -> Iterator[dict[str, ImageRgb]]:
-    """Yields the pictures of every pose. A pose that is that of the frame before is not lit anew."""
+    """Yields the pictures of every pose. A pose equal to that of the frame before is not rendered anew."""
     before, views = None, {}
     for number, pose in enumerate(poses):
         report(number / len(poses))

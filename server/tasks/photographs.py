@@ -1,7 +1,7 @@
-"""Turns a folder of photographs, with scale.json or without, into a capture: its cameras are estimated and kept.
+"""Turns a folder of photographs, with or without scale.json, into a capture: its cameras are estimated and stored.
 
-Each step leaves its result in the folder ``kept``: cameras.json, calibration.json (figures, and SHA-256 of what they
-were made from), calibration.html, masks/. A second run with the same photographs reads them from there.
+Each step writes its result to the folder ``kept``: cameras.json, calibration.json (figures, and SHA-256 of the input
+files), calibration.html, masks/. A second run with the same photographs reads them from there.
 """
 
 import json
@@ -109,7 +109,7 @@ def read_scaled_capture(folder: Path, *, pixels_most: int | None = WORK_PIXELS) 
 
 
 def full_size_pictures(folder: Path, kept: Path) -> ReadImage:
-    """Returns a function that reads a capture's pictures at the size of their files. Cameras that were estimated lie in
+    """Returns a function that reads a capture's pictures at the size of their files. Estimated cameras lie in
     ``kept``."""
     root = capture_root(folder)
     read = read_rig_of(find_rig_file(root) or kept / CAMERAS)
@@ -117,8 +117,8 @@ def full_size_pictures(folder: Path, kept: Path) -> ReadImage:
 
 
 def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: Progress) -> tuple[ReportWarning, ...]:
-    """Calibrates the cameras of photographs and writes cameras.json and the report to ``kept``. Does nothing if those
-    are there from the same photographs. Returns the warnings. Raises InputError and CalibrationRefused."""
+    """Calibrates the cameras of photographs and writes cameras.json and the report to ``kept``. Does nothing if the
+    same photographs were calibrated before. Returns the warnings. Raises InputError and CalibrationRefused."""
     made_of = _made_of(root, front)
     if (told_before := calibration_warnings(kept, made_of)) is not None:
         return told_before
@@ -168,8 +168,8 @@ def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
 
 
 def keep_masks(kept: Path, capture: Capture, rig: Rig, *, report: Progress) -> dict[str, Silhouette]:
-    """Returns the silhouettes of a capture. If they had to be estimated from the photographs alone, they are also
-    written to masks/ in ``kept``. A second run finds them in the hidden folder ``CACHE`` there."""
+    """Returns the silhouettes of a capture. Masks that were estimated from the photographs alone are also written to
+    masks/ in ``kept``. A second run finds them in the hidden folder ``CACHE`` there."""
     from pipeline.segmentation.segment import segment
     from server.storage.silhouette_cache import SUFFIX, segment_once
 
@@ -190,7 +190,7 @@ def keep_masks(kept: Path, capture: Capture, rig: Rig, *, report: Progress) -> d
 
 
 def _of_file(mask: Bool[np.ndarray, "h w"], k: Intrinsics) -> UInt8[np.ndarray, "y x"]:
-    """Returns a mask in the size of its picture's file, which may have been read smaller."""
+    """Returns a mask in the size of its picture's file, since the picture may have been read smaller."""
     large = cv2.resize(mask.astype(np.uint8) * np.uint8(255), (k.width, k.height), interpolation=cv2.INTER_LINEAR)
     return (large > 127).astype(np.uint8) * np.uint8(255)
 

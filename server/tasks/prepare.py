@@ -1,7 +1,7 @@
-"""Compiles numerical loops ahead, those that ``pipeline.compute.kernel_list`` lists, in several processes, so that no
-job waits for them.
+"""Compiles numerical loops ahead (those in ``pipeline.compute.kernel_list``), in several processes, so that no job
+waits for them.
 
-The installation does it (``eigenhead prepare``). A command that finds a loop missing does it before its work.
+The installation does it (``eigenhead prepare``). A command that finds a loop missing compiles it before its work.
 """
 
 import errno
@@ -49,10 +49,10 @@ def compile_kernel(context: WorkerContext, report: Progress, *, line: str) -> bo
 def prepare_kernels(report: Progress, settings: "Settings | None" = None) -> Prepared:
     """Compiles the listed loops that the cache folder lacks, in several processes, and logs one line about it.
 
-    Where nothing can be kept, it logs that and compiles nothing: each process will compile for itself.
-    ``report`` is called with "compiling 12 of 49 loops" and the share done, from several threads, one at a time; what
-    it raises ends the work, and what was compiled until then is kept. Loops that a job of the ``settings`` does not
-    call are left out. Returns how many loops were compiled, are missing, and are listed."""
+    If the cache folder cannot be written, it logs that and compiles nothing: each process will compile for itself.
+    ``report`` is called with "compiling 12 of 49 loops" and the fraction done, from several threads, one at a time; its
+    exceptions end the work, and loops compiled until then are kept. Loops that a job of the ``settings`` does not call
+    are left out. Returns how many loops were compiled, are missing, and are listed."""
     from pipeline.compute.kernel_list import by_module, listed_kernels
     from pipeline.settings import FINE_LEVELS
 
@@ -104,7 +104,7 @@ class _Work:
 
 
 def _can_keep() -> bool:
-    """Tells whether the cache folder can be written; if not, a line in the log says so."""
+    """Returns whether the cache folder can be written; if not, a line in the log states it."""
     from rig.jit import say_not_kept
 
     try:

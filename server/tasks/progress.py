@@ -1,4 +1,4 @@
-"""Computes one progress and one remaining time of a job from the progress of its stages.
+"""Computes a job's progress and remaining time from the progress of its stages.
 
 The pipeline reports a stage and a fraction of it; some stages report no fraction. A stage that continues after another
 interrupted it counts as a stage of its own: "fit" interrupted by "parts" continues as "fit again". The expected seconds
@@ -28,7 +28,7 @@ log = structlog.get_logger()
 
 class JobProgress:
     """Computes progress and remaining time of one job from the reports of its stages. ``expected``: seconds of each
-    stage, in the order in which they come; ``clock`` returns seconds and never goes back."""
+    stage, in their order; ``clock`` returns seconds and never goes back."""
 
     def __init__(self, expected: Mapping[str, float], clock: Clock = time.monotonic) -> None:
         self._expected, self._clock = dict(expected), clock
@@ -38,7 +38,7 @@ class JobProgress:
         self._fraction, self._progress = 0.0, 0.0
 
     def report(self, stage: str, fraction: float) -> None:
-        """Records that a stage is under way and which fraction of it is done, 0 to 1."""
+        """Records that a stage is running and which fraction of it is done, 0 to 1."""
         if stage != self.stage:
             self._close()
             self.stage, self._since = stage, self._clock()
@@ -59,7 +59,7 @@ class JobProgress:
         return (self._rest_of_stage() + self._to_come()) * self._pace()
 
     def progress(self) -> float:
-        """Returns the share of the job that is done, 0 to 0.99. It never falls. Each stage counts by its expected
+        """Returns the fraction of the job that is done, 0 to 0.99. It never falls. Each stage counts by its expected
         time."""
         done = sum(took for stage, took in self._expected.items() if stage in self.seconds and stage != self._visit)
         expected_s, spent = self._expected.get(self._visit, 0.0), self._spent_s() / self._pace()
@@ -68,7 +68,7 @@ class JobProgress:
         return self._progress
 
     def _rest_of_stage(self) -> float:
-        """Returns the expected seconds: the rest of the usual ones or, if more, those by the stage's own fraction."""
+        """Returns the expected seconds of the stage's rest: by its usual duration or, if more, by its own fraction."""
         spent, usual = self._spent_s() / self._pace(), self._expected.get(self._visit, 0.0)
         rest = max(usual - spent, OVERTIME * usual)
         if FRACTION_LEAST < self._fraction < 1:
@@ -89,7 +89,7 @@ class JobProgress:
         return self.seconds.get(self._visit, 0.0) + self._clock() - self._since
 
     def _leave_out_before(self, visit: str) -> None:
-        """Stages that this job has passed over will not come."""
+        """Removes stages that this job has skipped from the expected ones."""
         order = list(self._expected)
         if visit in order:
             for earlier in order[: order.index(visit)]:
@@ -103,8 +103,8 @@ class JobProgress:
 
 class ProgressMeter:
     """Writes the progress and remaining time of a job to its events: when a stage begins, and then at most every
-    ``every_s`` seconds. The event of a stage's beginning stays; any other supersedes the one before it, so that a long
-    job has as few events as a short one."""
+    ``every_s`` seconds. The event of a stage's beginning stays; any other replaces the one before it, so a long job has
+    as few events as a short one."""
 
     def __init__(self, log: "EventLog", job_id: str, progress: JobProgress, every_s: float = EVERY_S) -> None:
         self._log, self._job_id, self._progress, self._every_s = log, job_id, progress, every_s
@@ -117,7 +117,7 @@ class ProgressMeter:
         self.tick()
 
     def tick(self) -> None:
-        """Writes an event if one is due. To be called often during stages that report no progress themselves."""
+        """Writes an event if one is due. Call it often during stages that report no progress themselves."""
         stage, now = self._progress.stage, time.monotonic()
         if not stage or (stage == self._last[0] and now - self._last[1] < self._every_s):
             return

@@ -44,7 +44,7 @@ def reconstruct_capture(
     settings: Mapping[str, object],
 ) -> None:
     """Reconstructs the capture folder ``capture`` and writes the result to the folder ``result``. Silhouettes are
-    cached in the folder ``cache``. The service's setting ``work`` may name another function of these parameters.
+    cached in the folder ``cache``. The service's setting ``work`` may name another function with these parameters.
 
     Raises InputError for an input that cannot be used, other EigenheadErrors of the pipeline, OSError for a full disk,
     and Cancelled if ``report`` raises it.
@@ -153,8 +153,8 @@ def run_job(
     segment: "Segment",
     preparation: Progress,
 ) -> None:
-    """Reconstructs a capture that was read, and writes the result to the folder ``out``. ``folders`` are those of the
-    capture's files and of cameras that were estimated; ``preparation`` receives the progress of compiling loops.
+    """Reconstructs a capture that was read, and writes the result to the folder ``out``. ``folders`` hold the capture's
+    files and estimated cameras; ``preparation`` receives the progress of compiling loops.
 
     Raises the errors of the pipeline, OSError for a full disk, and Cancelled if ``report`` raises it.
     """
@@ -208,8 +208,8 @@ MOST_THREADS = 8  # of a processor that a GPU is faster than: of an H200 two thr
 
 def matching_device(context: WorkerContext, chosen: "Settings", renderer: "Renderer") -> "ComputeDevice | None":
     """Opens the compute device that ``chosen.device`` names, once a process. Returns None if the processor compares:
-    with the device ``cpu``, and with ``auto`` without a GPU or with more than ``MOST_THREADS`` threads. Raises
-    ComputeUnavailable if ``gl`` was chosen and is not there."""
+    with the device ``cpu``, and with ``auto`` if there is no GPU or more than ``MOST_THREADS`` threads. Raises
+    ComputeUnavailable if ``gl`` was chosen and is missing."""
     from pipeline.compute.threads import thread_count
     from rig.render.compute import open_device
 
@@ -224,7 +224,7 @@ def matching_device(context: WorkerContext, chosen: "Settings", renderer: "Rende
 
 
 def _with_scale(warnings: "tuple[ReportWarning, ...]", scale_sigma: float) -> "tuple[ReportWarning, ...]":
-    """Adds a warning of a scale that is an estimate, unless the calibration has warned of it."""
+    """Adds a warning of an estimated scale, unless the calibration has warned of it."""
     if scale_sigma <= SURE_SCALE or any(warning.code == "scale-assumed" for warning in warnings):
         return warnings
     return (compose("scale-assumed", scale=compose("scale-estimated", share=scale_sigma)), *warnings)

@@ -27,12 +27,12 @@ from server.tasks.reconstruct import folder_of
 def refine_locally(
     captures: Sequence[Path], *, calibration: Path | None, focal: bool, model: str | None, report: Progress
 ) -> RefinementRun:
-    """Refines the calibration that the captures share, or the file ``calibration``, by the captures' silhouettes; with
-    a head ``model`` also by the rims of fitted heads. ``focal``: refines focal lengths, too.
+    """Refines the common calibration of the captures, or the file ``calibration``, by the captures' silhouettes; with a
+    head ``model`` also by the rims of fitted heads. ``focal``: refines focal lengths, too.
 
-    A camera that the drift watch finds moved in a capture is left out of that capture: it must be calibrated anew with
-    the board. Raises InputError for captures that cannot be read or are not of one rig, TooFewCaptures for fewer than
-    two and, with a model, TooFewFeatures, WrongFeatures and NoSubject.
+    A camera that moved according to the drift watch is left out of that capture: it must be calibrated anew with the
+    board. Raises InputError for captures that cannot be read or are not of one rig, TooFewCaptures for fewer than two
+    and, with a model, TooFewFeatures, WrongFeatures and NoSubject.
     """
     if len(captures) < 2:
         raise TooFewCaptures(len(captures))

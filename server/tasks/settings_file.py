@@ -25,7 +25,7 @@ def read_settings_file(path: Path) -> dict[str, object]:
 
 
 def reason_of(error: OSError | ValueError | RecursionError) -> str:
-    """Returns why a file cannot be read, without the file's path."""
+    """Returns the reason why a file cannot be read, without the file's path."""
     return getattr(error, "strerror", None) or str(error)
 
 

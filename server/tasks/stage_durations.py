@@ -1,7 +1,7 @@
 """Learns how long each stage of a reconstruction takes on this machine, for each kind of job.
 
-A job's seconds follow from what it makes and from the pixels of its photographs (``COSTS_S``); what is learnt is how
-many times longer each stage takes here. The service's workers and the command line share one file,
+A job's seconds are first computed from its products and the pixels of its photographs (``COSTS_S``); the learnt values
+are factors by which each stage takes longer here. The service's workers and the command line share one file,
 ``cache_folder()/stage-paces.json``.
 """
 
@@ -44,16 +44,16 @@ PACE_MOST = 1000.0  # what a damaged file may at most say of a stage
 
 
 def kind_of(settings: Settings) -> str:
-    """Returns the kind of a job as text such as "contour photo both": the settings that decide which stages it has and
-    how long they take."""
+    """Returns the kind of a job as text such as "contour photo both": the settings that determine its stages and their
+    durations."""
     words = [settings.method, settings.detail or "fine", settings.outputs.surface]
     words += ["morphs"] * settings.outputs.morphs + ["template"] * bool(settings.outputs.template)
     return " ".join(words)
 
 
 def megapixels_of(capture: Path) -> float:
-    """Returns how many megapixels a job reads of a capture's folder, by its first photograph; ``USUAL_MEGAPIXELS`` for
-    an archive, and where that cannot be read."""
+    """Returns the megapixels that a job reads of a capture's folder, by its first photograph; ``USUAL_MEGAPIXELS`` for
+    an archive and for unreadable files."""
     with suppress(InputError, OSError):
         if pictures := listed_pictures(picture_folder(capture_root(capture))):
             width, height = picture_size(pictures[0])
@@ -73,23 +73,23 @@ def first_guess(settings: Settings, megapixels: float = USUAL_MEGAPIXELS) -> dic
 
 
 class StageDurations:
-    """Learns how many times longer than the first guess each stage of a job takes, and keeps that in ``file``. If the
-    file cannot be written, it is known to this process only."""
+    """Learns how many times longer than the first guess each stage of a job takes, and stores that in ``file``. If the
+    file cannot be written, the values last as long as this process."""
 
     def __init__(self, file: Path | None = None) -> None:
         self._file = file or cache_folder() / "stage-paces.json"
         self._learnt: dict[str, dict[str, float]] = {}
 
     def of(self, settings: Settings, megapixels: float = USUAL_MEGAPIXELS) -> dict[str, float]:
-        """Returns the expected seconds of each stage, in order. For a kind of job that this machine never ran, they are
-        the first guess at the usual pace of other kinds."""
+        """Returns the expected seconds of each stage, in order. For a new kind of job they are the first guess, scaled
+        by the pace of other kinds."""
         learnt, guess = self._read(), first_guess(settings, megapixels)
         known, every = learnt.get(kind_of(settings), {}), [pace for of in learnt.values() for pace in of.values()]
         usual = median(every) if every else 1.0
         return {stage: known.get(stage, usual) * seconds for stage, seconds in guess.items()}
 
     def learn(self, settings: Settings, seconds: Mapping[str, float], megapixels: float = USUAL_MEGAPIXELS) -> None:
-        """Mixes the measured seconds of a job's stages into what is expected of its kind, with the weight
+        """Mixes the measured seconds of a job's stages into the expectation for its kind, with the weight
         ``LEARNING``."""
         learnt, guess = self._read(), first_guess(settings, megapixels)
         before, stages = learnt.get(kind_of(settings), {}), guess.keys() & seconds.keys()

@@ -62,21 +62,21 @@ def subject_of(text: str, model: HeadModel, rng: np.random.Generator, expression
 
 @dataclass(frozen=True, slots=True)
 class SubjectChoice:
-    """Says who sits in the studio: the text and the expression that ``subject_of`` reads, and where the eyes look
-    (azimuth and elevation), None for the model's own eyes."""
+    """Describes the subject in the studio: the text and the expression that ``subject_of`` reads, and the gaze (azimuth
+    and elevation), None for the model's own eyes."""
 
     text: str
     expression: Sequence[str] = ()
     gaze_deg: tuple[float, float] | None = None
 
     def drawn(self, model: HeadModel, seed: int, rng: np.random.Generator) -> Subject:
-        """Makes the subject as ``subject_of`` and ``turn_eyes`` do, with their errors."""
+        """Makes the subject with ``subject_of`` and ``turn_eyes`` and raises their errors."""
         return turn_eyes(subject_of(self.text, model, rng, self.expression), self.gaze_deg, seed)
 
 
 def turn_eyes(subject: Subject, gaze_deg: tuple[float, float] | None, seed: int) -> Subject:
-    """Returns a subject with eyeballs that look along ``gaze_deg`` (azimuth and elevation), their colour drawn by
-    ``seed``; the subject as it is where that is None. Raises InputError for a head without landmarks."""
+    """Returns a subject with eyeballs that look along ``gaze_deg`` (azimuth and elevation) and have a colour drawn by
+    ``seed``; if that is None, the subject itself. Raises InputError for a head without landmarks."""
     return subject if gaze_deg is None else with_gaze(subject, *gaze_deg, np.random.default_rng((seed, 1)))
 
 

@@ -1,5 +1,5 @@
-"""Limits the pause between two pieces of a request's body. A client that vanished sends nothing more, and would
-otherwise keep its connection and its locks for ever."""
+"""Limits the pause between two pieces of a request's body. A vanished client sends nothing more, and would otherwise
+keep its connection and its locks for ever."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager

@@ -154,7 +154,7 @@ def problem_from(error: Exception) -> Problem:
 
 
 def _fault_of(error: Mapping[str, Any]) -> Message:
-    """Words a fault that pydantic found. For a body that is no JSON pydantic says nothing helpful, so it is worded
+    """Words a fault found by pydantic. For a body that is no JSON, pydantic's text is not helpful, so it is worded
     here."""
     where, fault = ".".join(map(str, error["loc"])), error["msg"]
     if error["loc"] == ("body",) and error["type"] == "model_attributes_type":

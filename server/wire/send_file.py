@@ -71,7 +71,7 @@ def send_archive(
 
 
 def send_zip(data: bytes) -> Response:
-    """Returns the response that carries a .zip that was made for it."""
+    """Returns the response that carries a .zip made for this request."""
     headers = {"Cache-Control": "no-store", "Content-Disposition": "attachment"}
     return Response(data, headers=headers, media_type="application/zip")
 

@@ -1,1 +1,1 @@
-"""The process that takes jobs from a queue, and takes over those of workers that died."""
+"""Implements the process that takes jobs from a queue, and takes over those of workers that died."""

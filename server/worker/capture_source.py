@@ -1,7 +1,7 @@
-"""Where a worker has the files of a capture from: the data folder, or the store of captures, which may keep it waiting.
+"""Finds the files of a capture for a worker: in the data folder, or after a wait in the store of captures.
 
-A worker with a data folder of its own keeps there what it fetched, as far as ``captures_bytes`` go and until the
-capture is erased; results of its jobs go from there, since they lie in the store.
+A worker with its own data folder keeps fetched files up to ``captures_bytes`` and until the capture is erased; results
+of its jobs are removed there, since they lie in the store.
 """
 
 import threading
@@ -30,7 +30,7 @@ log = structlog.get_logger()
 
 
 class CaptureSource:
-    """Gives a worker the files of captures. ``runs`` tells whether a job is still to run."""
+    """Gives a worker the files of captures. ``runs`` returns whether a job should still run."""
 
     def __init__(
         self, store: Store, settings: ServiceSettings, runs: Callable[[str], bool], stop: threading.Event
@@ -39,7 +39,7 @@ class CaptureSource:
         self._used = Counter[str]()
 
     def check(self, capture: str) -> None:
-        """Raises JobFailed for a capture that does not exist, and where the disk has no room for a job."""
+        """Raises JobFailed for a capture that does not exist, and if the disk has no room for a job."""
         try:
             record = self._store.found("captures", capture)
             if record is None and not (self._store.blobs and self._store.blobs.is_known(capture)):
@@ -50,8 +50,8 @@ class CaptureSource:
 
     @contextmanager
     def files(self, job_id: str, capture: str) -> Iterator[Path]:
-        """Yields the folder of a capture's files, which stay there during the block. Waits for a store that is away,
-        and for a capture that is on its way there. Raises Cancelled, WorkerStopped, and JobFailed."""
+        """Yields the folder of a capture's files, which stay there during the block. Waits for a store that does not
+        answer, and for a capture that is still being stored. Raises Cancelled, WorkerStopped, and JobFailed."""
         self._used[capture] += 1
         try:
             yield self._awaited(job_id, capture)
@@ -59,12 +59,12 @@ class CaptureSource:
             self._used[capture] -= 1
 
     def leave(self, job_id: str, capture: str) -> None:
-        """Removes the folder of a job that has ended from a data folder that is the worker's own."""
+        """Removes the folder of an ended job from the worker's own data folder."""
         if self._is_own and not (self._store.folder("captures", capture) / "record.json").exists():
             self._store.remove(self._store.folder("jobs", job_id))
 
     def tidy_forever(self) -> None:
-        """Bounds a data folder of the worker's own every ``TIDY_S`` seconds, until the worker stops."""
+        """Limits the size of the worker's own data folder every ``TIDY_S`` seconds, until the worker stops."""
         while self._is_own and not self._stop.wait(TIDY_S):
             try:
                 forget_erased(self._store)
@@ -74,7 +74,7 @@ class CaptureSource:
 
     @property
     def _is_own(self) -> bool:
-        """Tells whether a capture without a record means that the data folder is not the service's."""
+        """Returns whether the data folder is the worker's own, if a capture has no record."""
         return self._store.blobs is not None and self._settings.results_store is not None
 
     def _is_busy(self, capture: str) -> bool:

@@ -1,4 +1,4 @@
-"""Delivers the result of a job to an object store, file by file, and its manifest last."""
+"""Delivers the result of a job to an object store, file by file, with its manifest last."""
 
 import json
 import tempfile
@@ -70,8 +70,8 @@ class Deliverer:
         insist(self._stop, lambda: self._webhooks.announce(wanted["job_id"], state, enqueue, hook, place))
 
     def deliver(self, wanted: DeliveryRequest) -> bool:
-        """Delivers a job's result, and waits for a store that is away. Returns False where the job or its delivery was
-        removed meanwhile. Raises JobFailed where it cannot be delivered and once ``until`` is over, and
+        """Delivers a job's result, and waits for a store that does not answer. Returns False if the job or its delivery
+        was removed meanwhile. Raises JobFailed if it cannot be delivered and once ``until`` has passed, and
         WorkerStopped."""
         pause_s, folder = FIRST_PAUSE_S, self._store.folder("jobs", wanted["job_id"])
         was_there = folder.exists()
@@ -116,8 +116,8 @@ class Deliverer:
         return True
 
     def _take_back(self, objects: ObjectStore, key: str) -> Literal[False]:
-        """Removes what was sent of a result that is gone: nobody was told of it, and it shows a face. An earlier
-        delivery that came to its end stays."""
+        """Removes the sent files of a result that is gone: nobody was told of it, and it shows a face. An earlier
+        complete delivery stays."""
         try:
             if all(entry.key != f"{key}{MANIFEST}" for entry in objects.entries(key)):
                 objects.erase(key)
@@ -126,7 +126,7 @@ class Deliverer:
         return False
 
     def _put(self, objects: ObjectStore, key: str, name: str, file: StoredFile) -> None:
-        """Raises JobFailed for a file that is not what the job made, so that nobody waits for the store to mend it."""
+        """Stores a file; raises JobFailed if its content has changed, since waiting for the store would not help."""
         try:
             if sha256_of(file.path) == file.sha256:
                 return objects.put(f"{key}{name}", file.path, file.sha256)

@@ -1,4 +1,4 @@
-"""Pauses of a worker's steps, which its stop ends."""
+"""Provides pauses of a worker's steps that end when the worker stops."""
 
 import threading
 from collections.abc import Callable
@@ -15,19 +15,19 @@ log = structlog.get_logger()
 
 
 class WorkerStopped(BaseException):
-    """Ends a step whose worker stops, or for which the engine could not write to the database. It is no Exception: the
-    engine would record one as the failure of the job, which another worker, or this one later, is to go on with."""
+    """Ends a step if its worker stops, or if the engine could not write to the database. It is no Exception: the engine
+    would record one as the failure of the job, but a worker is to continue the job later."""
 
 
 def pause(stop: threading.Event, seconds: float) -> None:
-    """Waits so many seconds. Raises WorkerStopped as soon as ``stop`` is set."""
+    """Waits for ``seconds``. Raises WorkerStopped as soon as ``stop`` is set."""
     if stop.wait(seconds):
         raise WorkerStopped
 
 
 def insist(stop: threading.Event, action: Callable[[], T]) -> T:
-    """Calls ``action``, again and again while the database is away; what it does may then be done twice. Raises
-    WorkerStopped, and what else ``action`` raises."""
+    """Calls ``action`` repeatedly while the database does not answer; the action may then happen twice. Raises
+    WorkerStopped, and other errors of ``action``."""
     pause_s = FIRST_PAUSE_S
     while True:
         try:

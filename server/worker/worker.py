@@ -1,16 +1,16 @@
-"""The worker: takes jobs from a queue, runs each in a child process, and takes over the jobs of workers that died.
+"""The worker: takes jobs from a queue, runs each in a child process, and takes over jobs of dead workers.
 
 A job is three durable steps around one ``reconstruct()``. *Ingest* checks that the capture exists and the disk has
-space. *Fit* has the child write a complete result folder under a name of this attempt. *Publish* renames that folder.
-If a worker is killed in a step, another worker starts this step again. The bytes of a result do not depend on the
-worker, so it does no harm if two workers do the same step.
+space. *Fit* makes the child write a complete result folder under a name of this attempt. *Publish* renames that folder.
+If a worker is killed in a step, another worker repeats this step. The bytes of a result do not depend on the worker, so
+it does no harm if two workers do the same step.
 
 Every worker writes a heartbeat row. A worker that finds another dead (stopped, its process gone on the same machine, or
 silent for ``silent_s``) puts its jobs back into their queue. The engine changes only rows that still belong to the dead
-worker, so several workers may do this at once. One statement on the table of the job engine (DBOS) does it, before a
-new worker takes its first job: so an interrupted job keeps its place. The engine's own ways do not serve:
-resume_workflow takes a job from whoever has it by now, revives a cancelled one and forgets how many workers the job
-took down; its recovery is private, and begins only when jobs are taken already.
+worker, so several workers may do this at once. One statement on the table of the job engine (DBOS) does this before a
+new worker takes its first job, so an interrupted job keeps its place. The engine's own methods do not suffice:
+resume_workflow takes a job from its current worker, revives a cancelled one and forgets how many workers the job took
+down; its recovery is private, and begins only after jobs are taken.
 """
 
 import json
@@ -132,8 +132,8 @@ class Worker:
         log.info("worker ready", worker=self.id, queue=self.settings.queue, concurrency=limit)
 
     def run_until_stopped(self) -> None:
-        """Runs jobs until ``stop`` is called, then ends the process. A job that is running then is taken over by
-        another worker."""
+        """Runs jobs until ``stop`` is called, then ends the process. Another worker takes over a job that is running
+        then."""
         while not self._stop.wait(0.5):
             pass
         with suppress(SQLAlchemyError), self.engine.begin() as connection:
@@ -207,7 +207,7 @@ class Worker:
 
     @contextmanager
     def _noted(self) -> Iterator[None]:
-        """Notes the id of a workflow while it runs. One whose writes the database refuses ends without a verdict."""
+        """Records the id of a running workflow. One whose writes the database refuses ends without a verdict."""
         identity = DBOS.workflow_id or ""
         self._here.add(identity)
         try:
@@ -232,8 +232,8 @@ class Worker:
     def fit(self, job_id: str, request: JobRequest) -> str:
         """Reconstructs a job's capture in a child process. Returns the name of the folder with the complete result.
 
-        Raises JobFailed for what no repetition would mend, and Cancelled. After any error the attempt's folder is
-        removed.
+        Raises JobFailed for failures that a repetition would not mend, and Cancelled. After any error the attempt's
+        folder is removed.
         """
         name = f"attempt-{secrets.token_hex(6)}"
         folder = self.store.folder("jobs", job_id) / name
@@ -247,8 +247,8 @@ class Worker:
         return name
 
     def _fit_in_memory(self, job_id: str, request: JobRequest, folder: Path) -> None:
-        """Runs a job's work; once more where its child was out of memory, or killed with signal 9, as the system does
-        where memory is short; and then at the level photo, which report.json tells. Raises what that ends with, too."""
+        """Runs a job's work, again if its child was out of memory or killed with signal 9 (as the system does if memory
+        is short), and then at level photo, which report.json states. Raises the error of the last attempt."""
         settings = request.get("settings") or {}
         tries = [settings, settings]
         if settings.get("detail") in PHOTO_LEVELS and settings.get("detail") != "photo":
@@ -293,8 +293,8 @@ class Worker:
 
     def calibrate(self, identity: str) -> JsonObject:
         """Computes one calibration in a child process and returns its outcome. The result is written under a temporary
-        name and renamed at the end. Pictures of a scene are removed then, and also after a failure that no repetition
-        would mend (JobFailed)."""
+        name and renamed at the end. Pictures of a scene are then removed, and also after a failure that a repetition
+        would not mend (JobFailed)."""
         folder = self.store.folder("calibrations", identity)
         in_use = self.settings.data / "rig" / "cameras.json"
         attempt = folder / f"attempt-{secrets.token_hex(6)}"
@@ -386,8 +386,8 @@ class Worker:
                 connection.execute(sa.insert(workers).values(**row, **seen))
 
     def _take_over(self) -> None:
-        """Puts the jobs of dead workers, and lost ones of this one, back. Idempotent, and safe for any number of
-        workers at once."""
+        """Puts the jobs of dead workers, and lost jobs of this one, back into their queues. It may be repeated, and any
+        number of workers may call it at once."""
         dead = dead_workers(self.engine, self.settings.silent_s, except_id=self.id)
         for job_id in [*take_over(self.engine, dead), *self._take_back_lost()]:
             log.warning("job taken over", job=job_id)
@@ -410,7 +410,7 @@ class Worker:
 
 
 class _StateWatch:
-    """Tells whether a job is still to run, by the database, which is asked a few times a second."""
+    """Returns whether a job should still run; it asks the database a few times a second."""
 
     def __init__(self, every_s: float) -> None:
         self._every_s = every_s
@@ -485,8 +485,8 @@ def _put_back(engine: sa.Engine, job: sa.TableClause, which: sa.ColumnElement[bo
 class Outcomes:
     """Writes how one worker's jobs ended: the last event, the count of failures, and messages to webhooks.
 
-    All of it may be done again, since a worker may be killed before the job engine knows that the job has ended; and it
-    waits for a database that is away, since a job whose end nobody wrote would seem to run."""
+    Each write may be repeated, since a worker may be killed before the job engine knows that the job has ended; it
+    waits for a database that does not answer, since a job without an end would seem to run."""
 
     def __init__(self, engine: sa.Engine, store: Store, webhooks: Webhooks, stop: threading.Event) -> None:
         self._engine, self._store, self._webhooks, self._stop = engine, store, webhooks, stop
@@ -506,8 +506,8 @@ class Outcomes:
         self._announce(job_id, state, webhook)
 
     def publish_set_aside(self) -> list[str]:
-        """Writes the end of each job that took down as many workers as it may, which no worker lives to write. Returns
-        their ids."""
+        """Writes the end of each job that took down the permitted number of workers, because no worker is alive to
+        write it. Returns their ids."""
         status, event = engine_jobs(self._engine).c, events.c
         ended = sa.select(event.job_id).where(
             event.job_id == status.workflow_uuid, event.seq == END, event.document.contains('"failed"')
@@ -535,7 +535,7 @@ def warnings_of(report: Path) -> list[MessageDocument]:
 
 
 def add_warning(report: Path, warning: Message) -> None:
-    """Adds a warning to a report.json; does nothing where another kind of work wrote none."""
+    """Adds a warning to a report.json; does nothing if the work wrote none."""
     with suppress(FileNotFoundError):
         document = json.loads(report.read_bytes())
         document["warnings"] = [*document["warnings"], warning.document()]

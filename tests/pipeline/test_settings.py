@@ -19,7 +19,7 @@ def nested(depth: int) -> list[Any]:
 @pytest.mark.parametrize(
     ("document", "fault"),
     [
-        ({"front": "\ud800"}, r"front is '\ud800', wanted a text"),
+        ({"front": "\ud800"}, r"front is '\ud800', expected a text"),
         ({"fail_on": ["\ud800"]}, "fail_on[0] is "),
         ({"\ud800": 1}, r"unknown key '\ud800'"),
         ({"outputs": {"\ud800": 1}}, r"unknown key 'outputs.\ud800'"),
@@ -31,7 +31,7 @@ def nested(depth: int) -> list[Any]:
         ({"bust": {"spacing_mm": 10**5000}}, "bust.spacing_mm is too large a value"),
         ({"bust": {"spacing_mm": True}}, "bust.spacing_mm is True"),
         ({"cap": {"colour": "nude"}}, "cap.colour: 'nude' is neither #rrggbb nor one of black"),
-        ({"cap": {"thickness_mm": 12}}, "cap.thickness_mm is 12, wanted 0 to 10"),
+        ({"cap": {"thickness_mm": 12}}, "cap.thickness_mm is 12, expected 0 to 10"),
         ({"bust": {"spacing_mm": float("nan")}}, "bust.spacing_mm is nan"),
         ({"front": nested(100_000)}, "front is too large a value"),
     ],

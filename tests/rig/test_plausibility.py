@@ -130,7 +130,7 @@ def test_a_focal_length_in_mm_is_named_and_not_its_lens():
 @pytest.mark.parametrize(
     ("written", "word"),
     [
-        (lambda pose: pose.inverse(), "world_from_camera: "),
+        (lambda pose: pose.inverse(), "world_from_camera "),
         (lambda pose: RigidTransform(pose.rotation, pose.inverse().translation), "place in translation"),
         (lambda pose: RigidTransform(GL @ pose.rotation, GL @ pose.translation), "y up and z backwards"),
         (

@@ -1,4 +1,4 @@
-"""Hands finished heads to clinics: a patient's axes, two visits compared, and a head laid on the surface of a CT.
+"""Prepares finished heads for clinics: a patient's axes, two visits compared, a head registered to the surface of a CT.
 
-Enters: result folders, and meshes of other programs in mm. Leaves: meshes, landmarks, tables and pictures.
+In: result folders, and meshes of other programs in mm. Out: meshes, landmarks, tables and pictures.
 """

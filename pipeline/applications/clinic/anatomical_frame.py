@@ -1,10 +1,10 @@
-"""Moves a head to LPS or RAS axes, oriented by the head frame or by the Frankfurt plane.
+"""Moves a head to LPS or RAS axes, with the orientation of the head frame or of the Frankfurt plane.
 
-The Frankfurt plane holds both porions (the upper edges of the ears' openings) and the lowest points of the orbits'
-rims, the orbitalia. Both are bone, which photographs do not show. Where nobody marked them they are substituted, and
-``AnatomicalFrame.sources`` says so: tragion for porion, as ISO 7250-1 does on the living, and for orbitale a point
+The Frankfurt plane passes through both porions (the upper edges of the ears' openings) and both orbitalia (the lowest
+points of the orbits' rims). Both are points of bone, which photographs do not show. Unmarked points are substituted, as
+``AnatomicalFrame.sources`` records: tragion for porion, as ISO 7250-1 does on the living, and for orbitale a point
 ``ORBITALE_BELOW_EYE_MM`` below the middle between the eye's corners. The plane's origin is midway between the porions;
-x follows their line.
+its x axis is the line through them.
 """
 
 from collections.abc import Mapping
@@ -35,9 +35,9 @@ TRAGION_STD_MM = 3.0  # of the tragion above or below the porion
 class AnatomicalFrame:
     """Holds the motion into a patient's axes.
 
-    ``sources`` says of each point of the Frankfurt plane whether it was marked or what stands for it. ``tilt_deg`` is
-    the turn of the head frame's horizontal plane to it about the line of the ears, positive where the nose rises;
-    ``tilt_std_deg`` its standard deviation. Without a plane both are None.
+    ``sources`` tells, for each point of the Frankfurt plane, whether it was marked or what replaces it. ``tilt_deg`` is
+    the angle between the head frame's horizontal plane and the Frankfurt plane, about the line through the ears,
+    positive where the nose rises; ``tilt_std_deg`` is its standard deviation. Without a plane both are None.
     """
 
     axes: Axes
@@ -49,13 +49,13 @@ class AnatomicalFrame:
 
 
 def head_axes(measured: Measured, axes: Axes) -> AnatomicalFrame:
-    """Returns the patient's axes in the head frame's own attitude, with its origin."""
+    """Returns the patient's axes with the head frame's own orientation and origin."""
     turn = RigidTransform(axes_turn(axes, "LPS") @ LPS_FROM_HEAD, np.zeros(3))
     return AnatomicalFrame(axes, "head", turn @ measured.head_from_world, {})
 
 
 def frankfurt_axes(measured: Measured, axes: Axes, marked: Mapping[str, Vector] | None = None) -> AnatomicalFrame:
-    """Returns the patient's axes in the Frankfurt plane. Raises InputError if points lie where no head has them.
+    """Returns the patient's axes in the Frankfurt plane. Raises InputError if points lie where no head has such points.
 
     Args:
         measured: the result.
@@ -93,8 +93,8 @@ def frankfurt_axes(measured: Measured, axes: Axes, marked: Mapping[str, Vector] 
 
 
 def _plane_points(measured: Measured, marked: Mapping[str, Vector]) -> tuple[dict[str, Vector], dict[str, str]]:
-    """Returns the four points (world frame) and where each comes from. Raises InputError for heads without the
-    landmarks that stand for those that nobody marked."""
+    """Returns the four points (world frame) and the source of each. Raises InputError for heads without the landmarks
+    that replace unmarked points."""
     points, sources = dict(marked), dict.fromkeys(marked, "marked")
     needed = {"porion": ("tragion",), "orbitale": ("exocanthion", "endocanthion")}
     lacking = [
@@ -118,7 +118,7 @@ def _plane_points(measured: Measured, marked: Mapping[str, Vector]) -> tuple[dic
 
 
 def _below_eye(measured: Measured, side: str) -> Vector:
-    """Returns the point straight below an eye in the head frame, as deep as the skin there (world frame)."""
+    """Returns the point straight below an eye in the head frame, at the depth of the skin there (world frame)."""
     corners = [measured.landmarks[f"{corner}_{side}"] for corner in ("exocanthion", "endocanthion")]
     target = measured.head_from_world.apply(np.mean(corners, axis=0)) - (0.0, ORBITALE_BELOW_EYE_MM, 0.0)
     head = measured.head_from_world.apply(measured.mesh_world.vertices)

@@ -1,14 +1,14 @@
-"""Compares two visits of one person: where the head changed by more than both results are sure of; and writes that.
+"""Compares two visits of one person: computes where the head changed by more than the uncertainty of both results, and
+writes files about it.
 
 The later head is aligned rigidly to the earlier one on the forehead and the bridge of the nose, which neither
-expression nor jaw move. Then each vertex of the earlier head has its signed distance (mm) to the later surface:
-positive where that lies outside. A change counts where it exceeds ``SURE`` times the combined standard deviation: that
-of both surfaces there and of the alignment, as independent errors.
+expression nor jaw moves. Then each vertex of the earlier head gets its signed distance (mm) to the later surface,
+positive where the later surface lies outside. A change is significant if it exceeds ``SURE`` times the combined
+standard deviation: that of both surfaces there and of the alignment, as independent errors.
 
-Written are compare.json, tables, the map of differences as PLY and GLB, pictures, and a PDF.
+The files are compare.json, tables, the map of differences as PLY and GLB, pictures, and a PDF.
 
-Colours are those of a certificate: red where the later head lies outside, blue where it lies inside, and grey where the
-difference is below what both results are sure of.
+Colours: red where the later head lies outside, blue where it lies inside, grey where the difference is not significant.
 """
 
 import csv
@@ -85,8 +85,8 @@ FILES = (
 
 @dataclass(frozen=True, slots=True)
 class RegionChange:
-    """Holds the change (mm) of a region, by area. ``changed_share`` is the share of the area that changed for sure,
-    ``volume_ml`` what lies between the surfaces there: positive where it grew."""
+    """Holds the change (mm) of a region, weighted by area. ``changed_share`` is the fraction of the area with a
+    significant change; ``volume_ml`` is the volume between the surfaces there, positive where it grew."""
 
     mean_mm: float
     median_mm: float  # of the distances, as ``p95_mm``
@@ -98,7 +98,7 @@ class RegionChange:
 
 @dataclass(frozen=True, slots=True)
 class LengthChange:
-    """Holds a measurement of both visits, and the later less the earlier one with its standard deviation (mm; None
+    """Holds a measurement of both visits, and its change (later minus earlier) with its standard deviation (mm; None
     where a result has none)."""
 
     earlier: Measurement
@@ -108,14 +108,14 @@ class LengthChange:
 
     @property
     def is_sure(self) -> bool:
-        """Tells whether it changed by more than ``SURE`` standard deviations."""
+        """Tells whether the measurement changed by more than ``SURE`` standard deviations."""
         return self.std_mm is not None and abs(self.change_mm) > SURE * self.std_mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Holds what two visits differ in. Rows are vertices of the earlier head; ``distance_mm`` is NaN where the later
-    one has no counterpart."""
+    """Holds the differences between two visits. Rows are vertices of the earlier head; ``distance_mm`` is NaN where the
+    later head has no counterpart."""
 
     earlier: Visit
     later: Visit
@@ -127,18 +127,18 @@ class Comparison:
 
     @property
     def changed(self) -> Bool[np.ndarray, " v"]:
-        """Tells where the surface changed for sure."""
+        """Tells where the surface changed significantly."""
         return np.abs(np.nan_to_num(self.distance_mm)) > SURE * self.std_mm
 
     @property
     def sure_mm(self) -> Float[np.ndarray, " v"]:
-        """Returns the distances with NaN where no change is sure."""
+        """Returns the distances, with NaN where the change is not significant."""
         return np.where(self.changed, self.distance_mm, np.nan)
 
     @property
     def warnings(self) -> tuple[Message, ...]:
-        """Returns what makes the comparison doubtful: either head, and forehead and bridge of the nose that differ for
-        sure."""
+        """Returns what makes the comparison doubtful: warnings of either head, and a significant difference of forehead
+        and bridge of the nose."""
         share, doubts = self.regions["stable"].changed_share, (*self.earlier.warnings, *self.later.warnings)
         return (*doubts, compose("maybe-other-person", share=share)) if share > MAX_STABLE_CHANGED else doubts
 
@@ -183,7 +183,7 @@ def length_changes(earlier: Visit, later: Visit) -> dict[str, LengthChange]:
 
 
 def _start(earlier: Visit, later: Visit) -> RigidTransform:
-    """Returns later_from_earlier by the landmarks that both have, else by the two head frames."""
+    """Returns later_from_earlier by the landmarks that both have; without any, by the two head frames."""
     marks = earlier.measured.landmarks, later.measured.landmarks
     names = [name for name in START_NAMES if all(name in of for of in marks)]
     if len(names) < MIN_MARKS:
@@ -215,8 +215,8 @@ def _regions(
 
 
 def write_comparison(folder: Path, comparison: Comparison, date: str) -> dict[str, Any]:
-    """Writes all ``FILES``, compare.json last, and returns what it says; ``date`` (ISO) is that of the comparison.
-    Raises OSError."""
+    """Writes all ``FILES``, compare.json last, and returns the content of compare.json; ``date`` (ISO) is that of the
+    comparison. Raises OSError."""
     document = comparison_document(comparison, date)
     end_mm = document["scale_end_mm"]
     colours = heat_colours(comparison.sure_mm, end_mm)
@@ -231,7 +231,7 @@ def write_comparison(folder: Path, comparison: Comparison, date: str) -> dict[st
 
 
 def comparison_document(comparison: Comparison, date: str) -> dict[str, Any]:
-    """Returns what compare.json says."""
+    """Returns the content of compare.json."""
     fit = comparison.fit
     return {
         "format": FORMAT,
@@ -266,7 +266,7 @@ def comparison_document(comparison: Comparison, date: str) -> dict[str, Any]:
 
 
 def pictures(comparison: Comparison, colours: UInt8[np.ndarray, "v 3"]) -> list[tuple[str, list[Resized]]]:
-    """Draws the earlier head, the later one in its place, and the differences, each from ``AZIMUTHS_DEG``."""
+    """Draws the earlier head, the aligned later one, and the differences, each from ``AZIMUTHS_DEG``."""
     before, after = comparison.earlier.measured, comparison.later.measured
     head = before.head_from_world.apply(before.mesh_world.vertices)
     back = before.head_from_world @ comparison.fit.motion.inverse()

@@ -1,20 +1,20 @@
-"""Measures what helmets, masks and spectacles are fitted by, on a delivered head, with standard deviations; and the
-size of a helmet, mask or frame for it: each size's probability, by the measure's deviation.
+"""Measures a delivered head for the fitting of helmets, masks and spectacles, with standard deviations. Also chooses a
+size of such a product: it computes each size's probability from the measure and its standard deviation.
 
-Names are those of ISO 7250-1 and ISO 8559-1 where these have one (``ISO_NAMES``). Measures are taken in the Frankfurt
-plane's attitude (``anatomical_frame``), as a person holds the head:
+Names are those of ISO 7250-1 and ISO 8559-1, if these define one (``ISO_NAMES``). Measures are taken with the Frankfurt
+plane level (``anatomical_frame``), as a person holds the head:
 
-- head circumference: the tape around the section that holds glabella and opisthocranion and is level from side to side;
-  it lies on the section's convex hull, ears left out;
-- nose-bridge width: of the level section ``BRIDGE_BELOW_NASION_MM`` below nasion, ``PAD_DEPTH_MM`` behind its crest,
-  where the pads of spectacles lie; splay angle: of each flank there to straight ahead; frontal angle: of each flank
-  to the vertical, by the width at two heights;
-- frame angle: of the line that touches brow and cheek before each eye to the vertical, positive where the lower rim of
-  spectacles comes nearer to the face (pantoscopic).
+- head circumference: the tape around the section through glabella and opisthocranion that is level from side to side;
+  it lies on the section's convex hull, without ears;
+- nose-bridge width: in the level section ``BRIDGE_BELOW_NASION_MM`` below nasion, at the depth ``PAD_DEPTH_MM`` behind
+  its crest, where the pads of spectacles lie. Splay angle: between each flank there and straight ahead. Frontal angle:
+  between each flank and the vertical, from the widths at two heights;
+- frame angle: between the vertical and the line that touches brow and cheek in front of each eye, positive where the
+  lower rim of spectacles comes nearer to the face (pantoscopic).
 
-Standard deviations are those of ``DRAWS`` heads: the result's own deviation along the normals (``quality`` of
-head.ply), times a smooth random field with the correlation that the head models have (``gaussian_process.SCALES``).
-That of the frame angle has the plane's own tilt, too, and lengths that of the cameras' scale.
+Standard deviations come from ``DRAWS`` random heads: the result's standard deviation along the normals (``quality`` of
+head.ply), times a smooth random field with the correlation of the head models (``gaussian_process.SCALES``). The frame
+angle's also includes the plane's own tilt, and that of lengths the cameras' scale.
 
 A table of sizes is a TOML file:
 
@@ -83,8 +83,8 @@ class SizeTable:
 
 @dataclass(frozen=True, slots=True)
 class SizeChoice:
-    """Holds the probability of each size of a table. ``best`` is the likeliest; ``none`` the probability that no size
-    fits."""
+    """Holds the probability of each size of a table. ``best`` is the most probable size; ``none`` is the probability
+    that no size fits."""
 
     table: str
     measure: str
@@ -93,12 +93,12 @@ class SizeChoice:
 
     @property
     def best(self) -> str:
-        """Returns the likeliest size."""
+        """Returns the most probable size."""
         return max(self.probabilities, key=lambda size: self.probabilities[size])
 
 
 def read_size_tables(path: Path, measures: Set[str]) -> list[SizeTable]:
-    """Reads a file of tables by these measures. Raises InputError naming every fault."""
+    """Reads a file of size tables for these measures. Raises InputError naming every fault."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -127,7 +127,7 @@ def read_size_tables(path: Path, measures: Set[str]) -> list[SizeTable]:
 
 
 def choose_size(table: SizeTable, value: float, std: float) -> SizeChoice:
-    """Returns how likely each size of a table fits a measure with a normal error."""
+    """Returns the probability that each size of a table fits a measure with a normal error."""
     wanted, spread = value + table.allowance, max(std, MIN_STD)
     found = {
         size: float(ndtr((high - wanted) / spread) - ndtr((low - wanted) / spread))
@@ -137,7 +137,7 @@ def choose_size(table: SizeTable, value: float, std: float) -> SizeChoice:
 
 
 def _faults(number: int, entry: Any) -> list[Message]:
-    """Returns what is wrong with a table of the file."""
+    """Returns the faults of one table of the file."""
     if not isinstance(entry, dict):
         return [compose("size-key-wrong", number=number, key="table")]
     wrong = [key for key in ("name", "measure") if not isinstance(entry.get(key), str) or not entry[key]]
@@ -191,7 +191,7 @@ class UprightHead:
 
 
 def fitting_measures(visit: Visit) -> dict[str, Fitted]:
-    """Returns every measure that the head allows. Raises InputError for heads without the landmarks of the plane."""
+    """Returns every measure that the head permits. Raises InputError for heads without the landmarks of the plane."""
     measured = visit.measured
     frame = frankfurt_axes(measured, "RAS")
     motion = frame.patient_from_world
@@ -240,12 +240,12 @@ def head_circumference(head: UprightHead) -> float | None:
 
 
 def bridge_width(head: UprightHead) -> float | None:
-    """Returns the width of the nose's bridge where pads lie, mm."""
+    """Returns the width of the nose's bridge at the pads of spectacles, mm."""
     return _width(head, BRIDGE_BELOW_NASION_MM, PAD_DEPTH_MM)
 
 
 def splay_angle(head: UprightHead) -> float | None:
-    """Returns the mean angle of the bridge's flanks to straight ahead, degrees."""
+    """Returns the mean angle between the bridge's flanks and straight ahead, degrees."""
     narrow, wide = (_width(head, BRIDGE_BELOW_NASION_MM, depth) for depth in FLANK_DEPTHS_MM)
     return (
         None if narrow is None or wide is None else _half_angle(wide - narrow, FLANK_DEPTHS_MM[1] - FLANK_DEPTHS_MM[0])
@@ -253,7 +253,7 @@ def splay_angle(head: UprightHead) -> float | None:
 
 
 def frontal_angle(head: UprightHead) -> float | None:
-    """Returns the mean angle of the bridge's flanks to the vertical, degrees, positive where it widens downwards."""
+    """Returns the mean angle between the bridge's flanks and the vertical, degrees; positive if it widens downwards."""
     crest = _crest(head, FLANK_HEIGHTS_MM[0])
     if crest is None:
         return None
@@ -263,7 +263,7 @@ def frontal_angle(head: UprightHead) -> float | None:
 
 
 def frame_angle(head: UprightHead) -> float | None:
-    """Returns the mean tilt of the lines that touch brow and cheek before both eyes, degrees."""
+    """Returns the mean tilt of the lines that touch brow and cheek in front of both eyes, degrees."""
     found = [_brow_to_cheek(head, side) for side in ("right", "left")]
     return None if None in found else float(np.mean([angle for angle in found if angle is not None]))
 
@@ -278,7 +278,7 @@ MEASURES: Mapping[str, Callable[[UprightHead], float | None]] = {
 
 
 def section(vertices: Points, faces: np.ndarray, origin: Float[np.ndarray, " 3"], normal: np.ndarray) -> Points:
-    """Returns the points where the edges of triangles pass a plane."""
+    """Returns the points where edges of triangles cross a plane."""
     height = (vertices - origin) @ normal
     above = height > 0.0
     first, second, third = (above[faces[:, corner]] for corner in range(3))
@@ -291,7 +291,7 @@ def section(vertices: Points, faces: np.ndarray, origin: Float[np.ndarray, " 3"]
 
 
 def hull_perimeter(points: Float[np.ndarray, "n 2"]) -> float | None:
-    """Returns the length of a tape around points of a plane, None if they lie on a line."""
+    """Returns the length of a tape around points of a plane; None if they lie on a line."""
     try:
         return float(ConvexHull(points).area)  # the length of the border, in two dimensions
     except (QhullError, ValueError):
@@ -317,7 +317,7 @@ def _crest(head: UprightHead, below_mm: float) -> float | None:
 
 
 def _width(head: UprightHead, below_mm: float, depth_mm: float | None, plane: float | None = None) -> float | None:
-    """Returns the distance between the flanks in a section, at a depth behind its crest or in an upright plane."""
+    """Returns the distance between the flanks of a section, at a depth behind its crest or in an upright plane."""
     points = _nose_section(head, below_mm)
     if len(points) < 4:
         return None

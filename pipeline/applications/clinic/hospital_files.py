@@ -1,7 +1,7 @@
-"""Writes a head for a hospital's programs, without name and date: a closed STL in a DICOM object, a NIfTI mask.
+"""Writes a head for a hospital's programs, without name and date: a closed STL in a DICOM object, or a NIfTI mask.
 
-DICOM: PS3.3 A.85.1 (Encapsulated STL), LPS, mm. The face stays recognisable, and the object says so; the patient has
-the pseudonym that the caller chooses. NIfTI-1: RAS, mm, 1 in the head and 0 outside. One head always gives the same
+DICOM: PS3.3 A.85.1 (Encapsulated STL), LPS, mm. The face stays recognisable, and the object declares that; the patient
+has a pseudonym chosen by the caller. NIfTI-1: RAS, mm, 1 in the head and 0 outside. The same head always gives the same
 bytes.
 """
 
@@ -51,8 +51,8 @@ def clinic_module(name: str) -> Any:
 def write_hospital_files(
     folder: Path, visit: Visit, frame: AnatomicalFrame, form: HospitalFormat, patient: str
 ) -> dict[str, Any]:
-    """Writes head.dcm, or a mask with a name as BIDS has it, and frame.json, which it returns. ``frame`` is in the
-    format's axes, ``patient`` of letters and digits. Raises NoClinic, NotAManifold and OSError."""
+    """Writes head.dcm, or a mask with a BIDS name, and frame.json; returns the content of frame.json. ``frame`` is in
+    the format's axes; ``patient`` consists of letters and digits. Raises NoClinic, NotAManifold and OSError."""
     if form == "dicom":
         write_atomically(folder / "head.dcm", dicom_bytes(visit, frame, patient))
     else:
@@ -72,7 +72,7 @@ def close_head(visit: Visit, frame: AnatomicalFrame) -> Mesh:
 
 
 def dicom_bytes(visit: Visit, frame: AnatomicalFrame, patient: str) -> bytes:
-    """Returns the head as a DICOM object of the patient with the pseudonym ``patient``. Its identifiers follow from the
+    """Returns the head as a DICOM object of a patient with the pseudonym ``patient``. Its identifiers follow from the
     surface and the pseudonym. Raises NoClinic and NotAManifold."""
     pydicom, uids = clinic_module("pydicom"), clinic_module("pydicom.uid")
     surface = stl_bytes(close_head(visit, frame))
@@ -137,7 +137,7 @@ def nifti_bytes(visit: Visit, frame: AnatomicalFrame) -> bytes:
 def fill_voxels(closed: Mesh) -> tuple[UInt8[np.ndarray, "x y z"], Float[np.ndarray, "4 4"]]:
     """Returns which voxels have their centre within a closed mesh (mm), and the affine from voxels to mm.
 
-    Along each row of voxels upwards a centre lies inside after an odd number of surfaces.
+    Along each upward row of voxels, a centre is inside after an odd number of surfaces.
     """
     low = np.floor(closed.vertices.min(axis=0) / VOXEL_MM) - 1.0
     size = (np.ceil(closed.vertices.max(axis=0) / VOXEL_MM) - low + 2.0).astype(int)

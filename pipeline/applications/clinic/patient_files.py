@@ -1,7 +1,7 @@
 """Writes a head in a patient's axes: head.ply with ``SPACE`` in its header, landmarks.mrk.json and frame.json.
 
-3D Slicer reads ``SPACE=LPS`` or ``SPACE=RAS`` of a comment of the PLY, and the list's own ``coordinateSystem``, so that
-both lie over each other and over volumes in the same axes.
+3D Slicer reads ``SPACE=LPS`` or ``SPACE=RAS`` from a comment of the PLY, and the list's own ``coordinateSystem``; so
+both overlay each other and volumes in the same axes.
 """
 
 import json
@@ -30,7 +30,7 @@ GREY = 200
 
 
 def write_patient_files(folder: Path, visit: Visit, frame: AnatomicalFrame) -> dict[str, Any]:
-    """Writes the three files, and returns what frame.json says. Raises OSError."""
+    """Writes the three files, and returns the content of frame.json. Raises OSError."""
     write_patient_mesh(folder / HEAD_FILE, visit, frame.patient_from_world, frame.axes)
     write_json(folder / LANDMARK_FILE, patient_landmarks(visit, frame.patient_from_world, frame.axes))
     document = frame_document(visit, frame)
@@ -39,7 +39,7 @@ def write_patient_files(folder: Path, visit: Visit, frame: AnatomicalFrame) -> d
 
 
 def frame_document(visit: Visit, frame: AnatomicalFrame) -> dict[str, Any]:
-    """Returns what frame.json says of a frame."""
+    """Returns the content of frame.json for a frame."""
     return {
         "format": FORMAT,
         "axes": frame.axes,
@@ -54,7 +54,7 @@ def frame_document(visit: Visit, frame: AnatomicalFrame) -> dict[str, Any]:
 
 
 def matrix_document(motion: RigidTransform) -> list[list[float]]:
-    """Returns a motion as the four rows of its matrix, for column vectors of mm."""
+    """Returns a motion as the four rows of its matrix, for column vectors in mm."""
     return [*np.column_stack([motion.rotation, motion.translation]).tolist(), [0.0, 0.0, 0.0, 1.0]]
 
 
@@ -77,7 +77,7 @@ def write_patient_mesh(
     quality: Float[np.ndarray, " v"] | None = None,
     comments: tuple[str, ...] = (),
 ) -> None:
-    """Writes the head in a patient's axes: with the result's colours and deviations, or with others."""
+    """Writes the head in a patient's axes, with the result's colours and standard deviations or with others."""
     mesh = visit.measured.mesh_world
     moved = Mesh(patient_from_world.apply(mesh.vertices), mesh.faces)
     base = np.full(mesh.vertices.shape, GREY, np.uint8) if mesh.colours is None else mesh.colours
@@ -93,8 +93,8 @@ def write_patient_mesh(
 
 
 def marked_points(path: Path | None, visit: Visit, axes: Axes) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns those points of the Frankfurt plane that a point list marks, in the world frame. The list lies over
-    head.ply as an export without a plane has it. Raises InputError."""
+    """Returns those points of the Frankfurt plane that a point list marks, in the world frame. The list's coordinates
+    are those of head.ply in an export without a plane. Raises InputError."""
     if path is None:
         return {}
     world_from_patient = head_axes(visit.measured, axes).patient_from_world.inverse()
@@ -113,7 +113,7 @@ COLOUR_END_MM = 2.0  # distance at which a colour of residual.ply is full
 
 
 def write_registration(folder: Path, found: Registration) -> dict[str, Any]:
-    """Writes head.ply, residual.ply, landmarks.mrk.json and registration.json; returns the last. Raises OSError."""
+    """Writes head.ply, residual.ply, landmarks.mrk.json and registration.json; returns that report. Raises OSError."""
     motion, axes = found.fit.motion, found.surface.axes
     write_patient_mesh(folder / HEAD_FILE, found.visit, motion, axes)
     write_patient_mesh(
@@ -132,7 +132,7 @@ def write_registration(folder: Path, found: Registration) -> dict[str, Any]:
 
 
 def registration_document(found: Registration) -> dict[str, Any]:
-    """Returns what registration.json says."""
+    """Returns the content of registration.json."""
     motion, surface = found.fit.motion, found.surface
     deviations = np.sqrt(np.diag(found.fit.covariance))
     return {

@@ -1,16 +1,16 @@
-"""Lays a head on the surface of the same person's CT or CBCT, given as a mesh in mm in LPS or RAS,
-with or without skull and airways in it.
+"""Registers a head to the surface of the same person's CT or CBCT, a mesh in mm in LPS or RAS, with or without skull
+and airways in it.
 
-The motion is rigid: photographs and CT both measure millimetres, and what a scale would take up is an error that should
-be seen. It starts from landmarks where the surface has some, else from the head in the Frankfurt plane, for a patient
-stands or lies in a scanner upright within some tens of degrees: turned by up to ``TURNS_DEG``, its face at many places
-of the surface. The best starts are completed by a trimmed, robust fit of the face, and the one in
-which most of the face lies on the surface wins: soft tissue of another day, a chin rest, a field of view that ends at
-the forehead, and the surfaces of skull and airways contradict the rest.
+The motion is rigid: photographs and CT both measure millimetres, and a scale would hide errors that should be visible.
+It starts from landmarks if the surface has some. Otherwise it starts from the head in the Frankfurt plane, because
+patients are upright in a scanner within some tens of degrees: rotated by up to ``TURNS_DEG``, with the face at many
+places of the surface. The best starts are completed by a trimmed, robust fit of the face. The winner is the one with
+most of the face on the surface, because the rest may disagree: soft tissue of another day, a chin rest, a field of view
+that ends at the forehead, surfaces of skull and airways.
 
-Of the points with a counterpart the nearest ``share`` counts (trimmed ICP, Chetverikov et al. 2002), and among these
-Tukey's biweight takes off what stands out of their scatter. A surface that faces the other way, as those of airways and
-skull below the skin do, is no counterpart.
+Of the points with a counterpart the nearest ``share`` counts (trimmed ICP, Chetverikov et al. 2002), and Tukey's
+biweight removes outliers among these. A surface that faces the other way, like those of airways and skull below the
+skin, is no counterpart.
 """
 
 import hashlib
@@ -73,7 +73,7 @@ HEADER_BYTES = 4096  # in which SPACE stands: a comment of a PLY or OBJ, the 80 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patch:
-    """Holds points (mm) of a head with their unit normals and the areas (mm2) that they stand for."""
+    """Holds points (mm) of a head with their unit normals and the areas (mm2) that they represent."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -85,8 +85,8 @@ class TrimmedFit:
     """Holds the motion onto a surface.
 
     ``residual_mm`` is each point's signed distance along the surface's normal, NaN without a counterpart; ``weights``
-    are 0 where a point was taken off. ``covariance`` (6 x 6: turn about ``centre`` in rad, shift in mm) is that of the
-    scatter, with as many independent errors as the area has patches of ``CORRELATED_MM``.
+    are 0 for outliers. ``covariance`` (6 x 6: rotation about ``centre`` in rad, shift in mm) follows from the scatter;
+    the number of independent errors is the number of patches of ``CORRELATED_MM`` in the area.
     """
 
     motion: RigidTransform
@@ -98,11 +98,11 @@ class TrimmedFit:
 
     @property
     def kept_share(self) -> float:
-        """Returns the share of the points that count."""
+        """Returns the fraction of the points that count."""
         return float(np.mean(self.weights > 0.0))
 
     def std_along(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> PerPoint:
-        """Returns how far the motion's error moves points on the surface along normals: standard deviations, mm."""
+        """Returns the displacement of surface points along normals by the motion's error: standard deviations, mm."""
         jacobian = motion_columns(points - self.centre, normals)
         return np.sqrt(np.einsum("np,pq,nq->n", jacobian, self.covariance, jacobian))
 
@@ -110,7 +110,7 @@ class TrimmedFit:
 def trimmed_fit(
     patch: Patch, surface: SurfaceIndex, start: RigidTransform, *, share: float, beside: Callable[[Hits], PointFlags]
 ) -> TrimmedFit | None:
-    """Returns the motion that lays a patch on a surface, None if fewer than ``MIN_POINTS`` have a counterpart there.
+    """Returns the motion that fits a patch to a surface; None if fewer than ``MIN_POINTS`` have a counterpart there.
 
     Args:
         patch: of the head, in any frame.
@@ -151,8 +151,8 @@ def trimmed_fit(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Met:
-    """Holds the closest points of a surface, which of them are counterparts, the signed distances from them along the
-    surface's normals (positive where the points lie outside), the weights, and the deviation of those that count."""
+    """Holds the closest points of a surface, which of them are counterparts, their signed distances along the surface's
+    normals (positive if the points lie outside), the weights, and the standard deviation of points that count."""
 
     hits: Hits
     valid: PointFlags
@@ -171,7 +171,7 @@ def _met(
     share: float,
     beside: Callable[[Hits], PointFlags],
 ) -> _Met | None:
-    """Returns what the points meet where the motion brings them, None if fewer than ``MIN_POINTS`` do."""
+    """Returns the counterparts of the moved points; None if fewer than ``MIN_POINTS`` have one."""
     normals = patch.normals @ motion.rotation.T
     hits = surface.closest(there, facing=normals, facing_mm=FACING_MM)
     alike = np.einsum("nx,nx->n", normals, hits.normals) > FACING
@@ -229,7 +229,7 @@ class Registration:
     distance_mm: Float[np.ndarray, " v"]
 
     def figures(self) -> dict[str, float]:
-        """Returns what is left between head and surface (mm), over the face."""
+        """Returns the remaining distances between head and surface (mm), over the face."""
         face = self.visit.measured.regions["face"]
         known = face & np.isfinite(self.distance_mm)
         away, areas = np.abs(self.distance_mm[known]), self.visit.measured.areas
@@ -274,8 +274,8 @@ def register(
 
 
 def _searched(visit: Visit, surface: PatientSurface, patch: Patch, rng: np.random.Generator) -> list[RigidTransform]:
-    """Returns starting motions: the head in the Frankfurt plane, turned a little, its face on the surface's parts that
-    look forward."""
+    """Returns starting motions: the head in the Frankfurt plane, slightly rotated, with its face on parts of the
+    surface that face forward."""
     upright = frankfurt_axes(visit.measured, surface.axes).patient_from_world
     forward = np.array([0.0, -1.0 if surface.axes == "LPS" else 1.0, 0.0])
     angles = [(nod, turn) for nod in TURNS_DEG["x"] for turn in TURNS_DEG["z"]]
@@ -293,7 +293,7 @@ def _searched(visit: Visit, surface: PatientSurface, patch: Patch, rng: np.rando
 
 
 def _best(patch: Patch, surface: PatientSurface, starts: list[RigidTransform]) -> TrimmedFit | None:
-    """Returns the completed fit of the start from which most of the face comes to lie on the surface."""
+    """Returns the completed fit with the largest part of the face on the surface."""
     reference = surface.reference
     few = Patch(patch.points[:FEW], patch.normals[:FEW], patch.areas[:FEW])
     if len(starts) > 1:
@@ -312,7 +312,7 @@ def _best(patch: Patch, surface: PatientSurface, starts: list[RigidTransform]) -
 def _distances(
     visit: Visit, surface: PatientSurface, motion: RigidTransform, normals: Float[np.ndarray, "v 3"]
 ) -> Float[np.ndarray, " v"]:
-    """Returns the signed distance of every vertex to the surface, NaN where that has nothing of the head."""
+    """Returns the signed distance of every vertex to the surface, NaN where the surface has no part of the head."""
     there, facing = motion.apply(visit.measured.mesh_world.vertices), normals @ motion.rotation.T
     hits = surface.reference.index.closest(there, facing=facing)
     alike: Bool[np.ndarray, " v"] = np.einsum("nx,nx->n", facing, hits.normals) > 0.3
@@ -322,8 +322,8 @@ def _distances(
 
 
 def read_surface_landmarks(path: Path, axes: Axes) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns landmarks by this project's names, in the surface's axes. A .mrk.json states its own axes; any other form
-    is in the surface's. Raises InputError, also for fewer than ``MIN_MARKS`` known ones."""
+    """Returns landmarks by this project's names, in the surface's axes. A .mrk.json states its own axes; other forms
+    are in the surface's. Raises InputError, also if fewer than ``MIN_MARKS`` names are known."""
     known = read_landmarks(path, axes)
     if len(known) < MIN_MARKS:
         raise InputError(path.name, [compose("marks-too-few", found=len(known), needed=MIN_MARKS)])

@@ -1,4 +1,4 @@
-"""Animates a binary glTF of one node: its pose, and the weights of its morph targets.
+"""Animates a binary glTF of one node: the node's pose, and the weights of its morph targets.
 
 https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations
 """
@@ -20,7 +20,7 @@ HEADER, CHUNK = 12, 8  # bytes of the file's header and of a chunk's
 def animated(
     glb: bytes, times_s: Float[np.ndarray, " t"], weights: Float[np.ndarray, "t m"], poses: Sequence[RigidTransform]
 ) -> bytes:
-    """Returns the file with an animation of its first node. ``weights`` are of the mesh's morph targets, in their
+    """Returns the file with an animation of its first node. ``weights`` are for the mesh's morph targets in their
     order; ``poses`` are in mm."""
     (length,) = struct.unpack_from("<I", glb, HEADER)
     document = json.loads(glb[HEADER + CHUNK : HEADER + CHUNK + length])

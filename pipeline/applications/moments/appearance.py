@@ -1,9 +1,9 @@
-"""What the skin of a sequence's person looks like: the fine texture at samples of the surface, by camera.
+"""Models the appearance of a person's skin in a sequence: the fine texture at samples of the surface, by camera.
 
-The texture of a picture is the logarithm of its grey values less their local mean, so that neither a camera's gain nor
-shading changes it. The reference of a sample in a camera is its mean over the frames by which the person was found; in
-a camera that saw it in none of them, that over all cameras. A frame is compared with the reference alone, never with
-the frame before, so that nothing drifts.
+The texture of a picture is the logarithm of its grey values minus their local mean, so neither a camera's gain nor
+shading changes it. A sample's reference in a camera is its mean over the frames from which the person was estimated; in
+a camera that saw it in none of them, the mean over all cameras. A frame is compared with the reference alone, never
+with the previous frame, so errors do not accumulate.
 """
 
 from collections.abc import Iterable, Mapping
@@ -38,7 +38,7 @@ EDGE_PX = 5  # nothing is read nearer to the head's outline, half-size pixels
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Holds s samples on the face of a person: their triangles' vertices, their place in them, and the head's
+    """Holds s samples on the face of a person: their triangles' vertices, their barycentric coordinates, and the head's
     expressions there (mm at weight 1)."""
 
     corners: Int[np.ndarray, "s 3"]
@@ -52,7 +52,7 @@ class Samples:
 
 
 def spread(person: SequencePerson) -> Samples:
-    """Spreads samples over the person's face, without its lids: what they close over is no skin."""
+    """Spreads samples over the person's face except the lids, which may cover the eyeball instead of skin."""
     level, lids = person.model.levels["full"], lid_motion_mm(person) > LID_MM
     skin = level.face_region & ~lids
     corners, shares = spread_samples(person.neutral, level.faces[skin[level.faces].all(axis=1)], SAMPLE_MM)
@@ -62,20 +62,20 @@ def spread(person: SequencePerson) -> Samples:
 
 
 def lid_motion_mm(person: SequencePerson) -> Float[np.ndarray, " v"]:
-    """Returns how far a blink moves each vertex."""
+    """Returns the displacement of each vertex by a blink."""
     blinks = [k for k, name in enumerate(person.names) if plain_name(name) in BLINKS]
     return np.linalg.norm(person.shapes[blinks], axis=2).max(axis=0, initial=0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texture:
-    """Holds the fine texture of a picture, and its slopes along x and y by the pixel, at a ``reduced`` size."""
+    """Holds the fine texture of a picture and its slopes along x and y per pixel, at a ``reduced`` size."""
 
     image: Float32[np.ndarray, "h w 3"]
     reduced: int
 
     def read(self, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-        """Returns texture and slopes at pixels of the whole picture, and which of them lie inside it."""
+        """Returns texture and slopes at pixels of the full-size picture, and which of them lie inside it."""
         height, width = self.image.shape[:2]
         scaled = (pixels + 0.5) / self.reduced - 0.5
         inside = np.all((scaled >= 0.0) & (scaled < (width - 1.001, height - 1.001)), axis=1)  # False for NaN
@@ -90,7 +90,7 @@ class Texture:
 
 
 def texture_of(grey: Float32[np.ndarray, "h w"], reduced: int) -> Texture:
-    """Returns the fine texture of a grey picture that is reduced by a whole factor."""
+    """Returns the fine texture of a grey picture after reduction by an integer factor."""
     height, width = grey.shape
     if reduced > 1:
         grey = cv2.resize(grey, (width // reduced, height // reduced), interpolation=cv2.INTER_AREA)
@@ -104,7 +104,7 @@ def texture_of(grey: Float32[np.ndarray, "h w"], reduced: int) -> Texture:
 
 
 def textures(pictures: Pictures, rig: Rig, reduced: int) -> list[Texture | None]:
-    """Returns the textures of a frame in the order of the cameras; None where one has no picture."""
+    """Returns the textures of a frame in the order of the cameras; None for a camera without a picture."""
 
     def one(k: int) -> Texture | None:
         image = pictures.get(rig.names[k])
@@ -150,8 +150,8 @@ def _seen(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Appearance:
-    """Holds the reference texture of every sample in every camera (NaN where no frame showed it in any), and the
-    deviation of a frame's texture from it."""
+    """Holds the reference texture of every sample in every camera (NaN where no frame showed it in any camera), and the
+    standard deviation of a frame's texture from it."""
 
     reference: Float32[np.ndarray, "k s"]
     deviation: float
@@ -160,7 +160,7 @@ class Appearance:
 def observe(
     person: SequencePerson, samples: Samples, shown: Iterable[tuple[Pictures, Motion]], reduced: int
 ) -> Appearance:
-    """Returns the appearance of a person in some frames, whose motions are known."""
+    """Returns the appearance of a person in some frames with known motions."""
     shape = (len(person.rig), len(samples.neutral))
     total, count, squares = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for pictures, motion in shown:

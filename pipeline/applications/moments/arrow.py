@@ -1,9 +1,9 @@
-"""Equations of an arrow: unknowns that all blocks share, and unknowns of one block each. No own unknown of a block
-meets one of another block, so each block's are eliminated by themselves,
+"""Solves equations whose matrix has the form of an arrow: some unknowns are shared by all blocks, the others belong to
+one block each. No equation connects the unknowns of two blocks, so each block's unknowns are eliminated separately,
 
     S = M_ss - sum_k M_sk M_kk^-1 M_ks        (Schur complement of what is left)
 
-and follow once the others are known. Bounded unknowns are not eliminated: they are left beside the shared ones.
+and follow once the shared ones are known. Unknowns with bounds are not eliminated but solved with the shared ones.
 """
 
 from collections.abc import Callable, Iterator
@@ -26,8 +26,8 @@ Left = Float[np.ndarray, "r r"]  # of the unknowns that are left
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eliminated:
-    """Holds a block that was eliminated: its rows, the lower Cholesky factor of its own matrix, and its columns towards
-    the r unknowns that are left."""
+    """Holds an eliminated block: its rows, the lower Cholesky factor of its matrix, and its columns for the r remaining
+    unknowns."""
 
     rows: Rows
     root: Float[np.ndarray, "b b"]
@@ -39,14 +39,14 @@ class Eliminated:
 
     @property
     def taken(self) -> Left:
-        """Returns what its elimination takes from the matrix of the unknowns that are left."""
+        """Returns what the elimination subtracts from the matrix of the remaining unknowns."""
         half = scipy.linalg.solve_triangular(self.root, self.across, lower=True, check_finite=False)
         return half.T @ half
 
 
 @dataclass(frozen=True, eq=False)
 class Arrow:
-    """Holds which of ``size`` unknowns are eliminated: those of each of ``blocks``, whose rows ascend."""
+    """Holds which of ``size`` unknowns are eliminated: those in ``blocks``, whose rows are ascending."""
 
     size: int
     blocks: tuple[Rows, ...]
@@ -61,13 +61,13 @@ class Arrow:
         return self._whole(matrix, right, cholesky_solve)
 
     def least(self, matrix: Matrix, gradient: Vector, lower: Vector, upper: Vector) -> Vector:
-        """Returns what ``least_within`` does. Unknowns that are eliminated must have no bound."""
+        """Minimises a quadratic form within bounds, as ``least_within``. Eliminated unknowns must have no bound."""
         bounds = lower[self.left], upper[self.left]
         return self._whole(matrix, -gradient, lambda rest, right: least_within(rest, -right, *bounds))
 
     def variances(self, matrix: Matrix) -> Vector:
-        """Returns the diagonal of the inverse of ``matrix`` for the unknowns that are left, and infinity for all
-        others. Raises LinAlgError."""
+        """Returns the diagonal of the inverse of ``matrix`` for the remaining unknowns, and infinity for all others.
+        Raises LinAlgError."""
         found = np.full(self.size, np.inf)
         found[self.left] = inverse_diagonal(self._rest(matrix, self._eliminated(matrix)))
         return found

@@ -1,7 +1,7 @@
-"""What the face networks say of a frame: landmarks and the openings of the lids, in the cameras that see the face best.
+"""Runs the face networks on a frame: landmarks and the openings of the lids, in the cameras that see the face best.
 
-The networks look where the last frames say that the face is. A landmark's bias in a camera is measured in the frames by
-which the person was found, and so is how wide the eyes are when they are open.
+The networks search where the previous frames predict the face. The frames from which the person was estimated also give
+the bias of each landmark in each camera, and the opening of open eyes.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -38,7 +38,7 @@ MIN_SIGMA_PX = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """Holds what the networks found in a frame: pixels of the landmarks by camera, and each eye's opening."""
+    """Holds the networks' results in a frame: pixels of the landmarks by camera, and each eye's opening."""
 
     pixels: Mapping[str, Float[np.ndarray, "468 2"]]
     openings: Mapping[str, float]
@@ -46,7 +46,7 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceReference:
-    """Holds where the landmarks lie on the person, and what the networks say of its first frames."""
+    """Holds the landmarks' positions on the person, and the networks' results in its first frames."""
 
     which: Int[np.ndarray, " n"]  # of the 468
     neutral: Float[np.ndarray, "n 3"]
@@ -71,8 +71,8 @@ def sight(
     eyes: int | None = None,
     points: Float[np.ndarray, "468 3"] | None = None,
 ) -> Sighting:
-    """Looks for the face where ``motion`` says that it is, in the ``views`` cameras that see it best, and for the lids
-    in the first ``eyes`` of them (None: in all). ``points``: the landmarks there, if they are known (world, mm)."""
+    """Searches the face where ``motion`` predicts it, in the ``views`` cameras that see it best, and the lids in the
+    first ``eyes`` of them (None: in all). ``points``: the predicted landmarks, if known (world, mm)."""
     placed = Similarity.from_rigid(motion.world_from_head)
     facing = {
         name: float(direction_from_face(placed, person.rig[name])[2]) for name in person.rig.names if name in pictures
@@ -111,7 +111,7 @@ def landmarks_of(person: SequencePerson, weights: Float[np.ndarray, " e"]) -> Fl
 
 
 def refer(person: SequencePerson, networks: FaceNetworks, shown: Iterable[tuple[Pictures, Motion]]) -> FaceReference:
-    """Measures what the networks say of frames whose motions are known."""
+    """Collects the networks' results in frames with known motions."""
     places = landmark_map(person.model)
     which = spread_points(places)
     still = places.points(np.repeat(lid_motion_mm(person)[:, None], 3, axis=1))[which, 0] < LID_MM
@@ -135,7 +135,7 @@ def refer(person: SequencePerson, networks: FaceNetworks, shown: Iterable[tuple[
 
 
 def closing_of(person: SequencePerson) -> dict[str, Float[np.ndarray, " e"]]:
-    """Returns, for each eye, by how much every expression closes it, a blink by 1. An eye without a blink is left
+    """Returns, for each eye, how much every expression closes it; a blink counts 1. An eye without a blink is left
     out."""
     places, right = landmark_map(person.model), np.array(RIGHT_EYE_OUTLINE)
     outline = {"right": right, "left": point_table().mirror_images[right]}
@@ -151,7 +151,7 @@ def closing_of(person: SequencePerson) -> dict[str, Float[np.ndarray, " e"]]:
 
 
 def terms_of(reference: FaceReference, rig: Rig, found: Sighting) -> Sequence[Term[Motion]]:
-    """Returns the terms of what was found in a frame."""
+    """Returns the cost terms of the networks' results in a frame."""
     terms: list[Term[Motion]] = []
     seen = {name: pixels[reference.which] for name, pixels in found.pixels.items()}
     if seen:
@@ -169,14 +169,14 @@ def terms_of(reference: FaceReference, rig: Rig, found: Sighting) -> Sequence[Te
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkTerm:
-    """Computes the cost of the landmarks' pixels without their bias."""
+    """Computes the cost of the landmarks' pixels after their bias is subtracted."""
 
     reference: FaceReference
     rig: Rig
     pixels: Mapping[str, Float[np.ndarray, "n 2"]]
 
     def at(self, motion: Motion) -> Residuals:
-        """Returns the differences of projected and found landmarks, in deviations."""
+        """Returns the differences between projected and detected landmarks, in standard deviations."""
         pose, reference = motion.world_from_head, self.reference
         world = pose.apply(reference.points(motion.weights))
         none, sigma = np.zeros((len(world), 2)), reference.sigma_px * np.sqrt(ALIKE)
@@ -198,12 +198,12 @@ class LandmarkTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidTerm:
-    """Computes the cost of how far the eyes are closed, a linear function of the weights."""
+    """Computes the cost of the eyes' closures, which are a linear function of the weights."""
 
     columns: Float[np.ndarray, "s e"]
     observed: Float[np.ndarray, " s"]
 
     def at(self, motion: Motion) -> Residuals:
-        """Returns the differences of modelled and observed closures, in deviations."""
+        """Returns the differences between modelled and observed closures, in standard deviations."""
         whole = np.concatenate([np.zeros((len(self.observed), POSE)), self.columns], axis=1)
         return Linear(whole, self.observed).at(np.concatenate([np.zeros(POSE), motion.weights]))

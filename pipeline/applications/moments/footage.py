@@ -1,8 +1,8 @@
 """Reads a sequence: cameras.json, and either ``images/<camera>/<frame>.<ext>`` or ``videos/<camera>.<ext>``.
 
-Beside them may lie clean plates (``background/``, as in a capture), masks (``masks/<camera>/<frame>.<ext>``),
-``times.csv`` with the columns frame and time_s, and ``clock.json`` of `eigenhead clock`. Frames are read small, one
-after another, for tracking; single ones also as a capture, at the size of a single job.
+The same folder may hold clean plates (``background/``, as in a capture), masks (``masks/<camera>/<frame>.<ext>``),
+``times.csv`` with the columns frame and time_s, and ``clock.json`` of `eigenhead clock`. For tracking, frames are read
+one after another at reduced size. A single frame can also be read as a capture, at the size of a single job.
 """
 
 import csv
@@ -37,7 +37,7 @@ Pictures = Mapping[str, ImageRgb]  # by camera; one that lacks the frame is left
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footage:
-    """Holds where the pictures of a sequence lie. ``rig`` are the cameras of the files, ``work`` those of the small
+    """Holds the location of a sequence's pictures. ``rig`` are the cameras of the files, ``work`` those of the reduced
     pictures. A camera has either ``files`` by frame, or a video of its own."""
 
     folder: Path
@@ -50,7 +50,7 @@ class Footage:
     spread_s: float = 0.0  # between the first and the last camera's exposure of a frame; 0 without clock.json
 
     def read(self, first: int = 0, cameras: Sequence[str] = ()) -> Iterator[Pictures]:
-        """Yields the small pictures of every frame from ``first`` on, of all ``cameras`` if none is named. A picture
+        """Yields the reduced pictures of every frame from ``first`` on, of all ``cameras`` if none is named. A picture
         that is missing or damaged is left out."""
         names = cameras or self.rig.names
         with ExitStack() as stack:
@@ -73,7 +73,7 @@ class Footage:
 
     @contextmanager
     def capture(self, number: int) -> Iterator[tuple[Capture, Rig]]:
-        """Yields a frame as a capture with its plates and masks, and its cameras. Raises InputError."""
+        """Yields a frame as a capture with its plates and masks, together with its cameras. Raises InputError."""
         with tempfile.TemporaryDirectory() as scratch:
             folder, frame = Path(scratch), self.frames[number]
             rig_file = find_rig_file(self.folder)
@@ -148,7 +148,7 @@ def open_footage(folder: Path) -> Footage:
 
 
 def _spread(path: Path, rig: Rig) -> float:
-    """Returns how much later (s) the last of the cameras exposes than the first. Raises InputError."""
+    """Returns how much later (s) the last camera exposes than the first. Raises InputError."""
     if not path.is_file():
         return 0.0
     try:
@@ -160,7 +160,7 @@ def _spread(path: Path, rig: Rig) -> float:
 
 
 def _times(path: Path, frames: tuple[str, ...], rate: float) -> Float[np.ndarray, " n"]:
-    """Returns when each frame was taken (s). Raises InputError if times.csv names some frames alone, or goes back."""
+    """Returns when each frame was taken (s). Raises InputError if times.csv lacks some frames, or if times decrease."""
     if not path.is_file():
         return np.arange(len(frames)) / rate
     try:

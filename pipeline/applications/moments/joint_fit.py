@@ -1,15 +1,15 @@
-"""Solves for the one identity of several moments, with pose, expression and cameras of each moment.
+"""Solves for the one identity of several moments, together with pose, expression and cameras of each moment.
 
-Enters: the contour solver's solution of every moment, outlines or photographs. Leaves: the same solutions at one
-identity. Its unknowns are those of all moments; the identity's coefficients and the log of scale are one for all of
-them, which makes an arrow of the equations (``arrow``). The cost is the sum of the moments' costs.
+In: the contour solver's solution of every moment, fitted to outlines or photographs. Out: the same solutions with one
+identity. The identity's coefficients and the log of scale are shared; all other unknowns belong to one moment. The
+equations therefore form an arrow (``arrow``). The cost is the sum of the moments' costs.
 
-The prior of what K moments share stands in each of these costs. If their errors were independent, it would count once.
-But cameras, light, hair and the misfit of the model are the same in all: with the share ``COMMON`` of its variance in
-common, the evidence of K moments is worth K / (1 + COMMON (K - 1)), and so the prior counts 1 + COMMON (K - 1) times.
-Counted once, it left the head of eight moments before three cameras no better than the mean of their own heads.
+Each of these costs contains the prior of the shared unknowns. With independent errors it would count once. But cameras,
+light, hair and the misfit of the model are the same in all moments. If the fraction ``COMMON`` of the error variance is
+common, K moments are worth K / (1 + COMMON (K - 1)) independent ones; so the prior counts 1 + COMMON (K - 1) times.
+Counted once, it left the joint head of eight moments from three cameras no better than the mean of their own heads.
 
-A moment whose photographs show too little has no fine modes: it speaks for the modes that it has.
+A moment whose photographs show too little has no fine modes; it contributes only to the modes that it has.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -37,7 +37,7 @@ Rows = Int[np.ndarray, "_"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Holds where each moment's unknowns stand among those of all moments: those of the identity first, then the log of
+    """Holds the position of each moment's unknowns among all unknowns: those of the identity first, then the log of
     scale, then each moment's own."""
 
     identity: int  # coefficients
@@ -48,12 +48,12 @@ class Layout:
 
     @property
     def arrow(self) -> Arrow:
-        """Returns the arrow whose shaft is what moments share, and their expression weights."""
+        """Returns the arrow: its shaft is the shared unknowns and the expression weights."""
         return Arrow(self.size, self.free)
 
 
 def identity_of(solved: ContourSolution, state: State) -> Float[np.ndarray, " i"]:
-    """Returns the coefficients of a moment's head that are no expression weights."""
+    """Returns the coefficients of a moment's head without expression weights."""
     return np.delete(state.coefficients, np.asarray(solved.problem.model.posed, int))
 
 
@@ -76,8 +76,8 @@ def lay_out(solutions: Sequence[ContourSolution], problems: Sequence[Problem[Sta
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointTerm:
-    """Computes the cost of all moments, each by its own problem. The prior of what K of them share counts ``1 + common
-    (K - 1)`` times."""
+    """Computes the cost of all moments, each by its own problem. The prior of the shared unknowns counts ``1 + common
+    (K - 1)`` times for K moments."""
 
     problems: tuple[Problem[State], ...]
     solutions: tuple[ContourSolution, ...]
@@ -85,7 +85,7 @@ class JointTerm:
     common: float
 
     def at(self, states: States) -> "LinearisedJointTerm":
-        """Returns the term linearised at one state a moment."""
+        """Returns the linearised term; ``states`` has one state for each moment."""
         parts = tuple(problem.at(state) for problem, state in zip(self.problems, states, strict=True))
         counts = np.zeros(self.layout.identity + 1)  # priors too many
         values = np.zeros(self.layout.identity + 1)
@@ -100,8 +100,8 @@ class JointTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedJointTerm:
-    """Holds the moments' costs linearised, and what is taken off: the information of priors that are ``repeated``, at
-    the ``values`` of what is shared."""
+    """Holds the moments' linearised costs, and what is subtracted: the information of the ``repeated`` priors, at the
+    shared ``values``."""
 
     term: JointTerm
     parts: tuple[Linearised, ...]
@@ -147,8 +147,8 @@ def joint_problem(solutions: Sequence[ContourSolution], common: float = COMMON) 
 
 
 def start_at_mean(solutions: Sequence[ContourSolution]) -> States:
-    """Returns each moment's state with the mean identity and scale of all. Of a mode that some moments do not have, the
-    others' mean counts."""
+    """Returns each moment's state with the mean identity and scale of all. For a mode that some moments lack, it is the
+    mean of the others."""
     identities = [identity_of(each, each.state) for each in solutions]
     stacked = np.full((len(solutions), max(map(len, identities))), np.nan)
     for row, identity in zip(stacked, identities, strict=True):
@@ -159,7 +159,7 @@ def start_at_mean(solutions: Sequence[ContourSolution]) -> States:
 
 
 def with_identity(solved: ContourSolution, state: State, identity: Float[np.ndarray, " i"], scale: float) -> State:
-    """Returns a moment's state with another identity (its first coefficients that the moment has) and scale."""
+    """Returns a moment's state with another identity (truncated to the moment's modes) and scale."""
     coefficients, posed = state.coefficients.copy(), np.asarray(solved.problem.model.posed, int)
     rows = np.setdiff1d(np.arange(len(coefficients)), posed)
     coefficients[rows] = identity[: len(rows)]
@@ -200,8 +200,8 @@ def _with_evidence(
     here: Linearised,
     eigenheads: int,
 ) -> States:
-    """Solves once more for shape and expressions, as ``expression_evidence`` does for one moment: with a prior variance
-    for each group of modes that is estimated from what all moments determine."""
+    """Solves once more for shape and expressions, as ``expression_evidence`` does for one moment; the prior variance of
+    each group of modes is estimated from all moments."""
     longest = max(range(len(states)), key=lambda k: len(states[k].coefficients))
     posed = solutions[longest].problem.model.posed
     identity = identity_of(solutions[longest], states[longest])
@@ -236,8 +236,8 @@ def _with_evidence(
 
 def joint_covariances(solutions: Sequence[ContourSolution]) -> Iterator[Float[np.ndarray, "p p"]]:
     """Yields the covariance of each moment's coefficients, rotation, translation and log scale, given the evidence of
-    all moments. What is independent in them follows from the joint normal matrix, with the prior once; the share
-    ``COMMON`` stays as it is for the moment alone. Weights at bounds are held as ``finish`` does."""
+    all moments. The independent part follows from the joint normal matrix, with the prior once; the fraction ``COMMON``
+    keeps the covariance of the single moment. Weights at bounds are treated as in ``finish``."""
     problem, layout = joint_problem(solutions, common=0.0)
     here = problem.at(tuple(each.state for each in solutions))
     assert isinstance(here, Sum)

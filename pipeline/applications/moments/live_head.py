@@ -1,12 +1,12 @@
-"""Follows the head of whoever sits before the cameras, by the face's landmarks in small pictures: quick, not fine.
+"""Tracks the head of the person in front of the cameras, by the face's landmarks in small pictures: fast, not precise.
 
-Enters: the pictures that all cameras show now, and the head of the look before. Leaves: the head with its pose, its
-expression and the landmarks that each camera shows.
+In: the current pictures of all cameras, and the previous head. Out: the head with its pose, its expression and its
+landmarks in each camera.
 
-At first the face is searched in all views, and the model's shape is fitted to its triangulated landmarks: the person
-of a sequence (``sequence_person``), without outlines and texture. From then on the network looks where the head was,
-and pose and weights are fitted by the sequence's own terms (``face_evidence``), starting at those of the last look. A
-head that has moved far is looked at again from where it was found.
+At first the face is searched in all views, and the model's shape is fitted to its triangulated landmarks. The result is
+the person of a sequence (``sequence_person``), without outlines and texture. From then on the network searches at the
+previous position, and the sequence's own terms (``face_evidence``) fit pose and weights, starting from the previous
+ones. If the head moved far, the network searches again at the new position.
 """
 
 from collections.abc import Mapping
@@ -52,8 +52,8 @@ MESH = "p99"  # the level that is shown
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LivePerson:
-    """Holds what stays the same from look to look: the person, its ``scale`` by the model's size, what the networks
-    say of it, and the vertices of the small mesh, then the 468 landmarks, with their expressions (head frame, mm)."""
+    """Holds everything constant over time: the person, its ``scale`` relative to the model, the networks' reference
+    values, the vertices of the small mesh and then the 468 landmarks, with their expressions (head frame, mm)."""
 
     person: SequencePerson
     scale: float
@@ -101,7 +101,7 @@ def mesh_faces(model: HeadModel) -> Int[np.ndarray, "f 3"]:
 def meet(
     model: HeadModel, face: MatchedFaces, pictures: Mapping[str, ImageRgb], rig: Rig, networks: FaceNetworks
 ) -> LiveHead | None:
-    """Makes the person whose face was found in the pictures. Returns None where the pictures do not bear it out."""
+    """Builds the person whose face was found in the pictures. Returns None if the pictures do not confirm the face."""
     alignment = align_to_face(model, face, landmark_map(model))
     state = _shaped(alignment.landmarks, alignment.world_from_head, min(MODES, len(model.modes)))
     scale, names = state.world_from_head.scale, tracked_names(model)
@@ -134,18 +134,18 @@ def _shaped(observed: LandmarkObservations, start: Similarity, modes: int) -> St
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapePrior:
-    """Computes the prior of coefficients and scale, as ``contour_fit.prior_term`` does of a whole problem."""
+    """Computes the prior of coefficients and scale, as ``contour_fit.prior_term`` for a whole problem."""
 
     rows: Float[np.ndarray, "n p"]  # by coefficients and pose, in deviations
 
     def at(self, state: State) -> Residuals:
-        """Returns the coefficients, and the log of scale by its deviation."""
+        """Returns the coefficients, and the log of scale divided by its standard deviation."""
         residual = np.append(state.coefficients, np.log(state.world_from_head.scale) / SCALE_SPREAD)
         return Residuals(residual[:, None], lambda: self.rows[:, None])
 
 
 def follow(head: LiveHead, pictures: Mapping[str, ImageRgb], networks: FaceNetworks) -> LiveHead | None:
-    """Returns the same person's head in the next pictures. Returns None where it is lost."""
+    """Returns the same person's head in the next pictures. Returns None if the head is lost."""
     who, person = head.who, head.who.person
     motion, points, found, strangers = head.motion, head.points_world, head.sighting, tuple[str, ...]()
     for _ in range(LOOKS):
@@ -179,7 +179,7 @@ def _fitted(who: LivePerson, found: Sighting, start: Motion) -> Motion:
 
 
 def _misfits(who: LivePerson, found: Sighting, motion: Motion) -> dict[str, float]:
-    """Returns the RMS distance of each camera's landmarks from the head's, by the face's size there."""
+    """Returns the RMS distance of each camera's landmarks from the head's, relative to the face's size there."""
     reference, misfits = who.reference, {}
     world = motion.world_from_head.apply(reference.points(motion.weights))
     for name, pixels in found.pixels.items():

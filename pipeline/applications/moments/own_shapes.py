@@ -1,13 +1,13 @@
-"""The neutral head and the person's own shapes, from the heads of a take.
+"""Estimates the neutral head and the person's own shapes from the heads of a take.
 
-At each vertex, the head of moment k is what the model says of it plus what the model does not know,
+At each vertex, the head of moment k is the model's prediction plus what the model does not explain,
 
     y_k = u + sum_e w_ke d_e + noise,    u ~ N(0, r^2),    d_e ~ N(0, (OWN |S_e|)^2)
 
-with u the relief that all moments have, d_e how far the person's shape e differs from the model's S_e, and w_ke the
-weights. The noise is each head's deviation; the share ``COMMON`` of its variance is the same in all moments (cameras,
-hair, light), and more moments do not remove it. Vertices are independent of each other: neighbours agree since the
-heads are smooth. All is Gaussian, so the K x K covariance of the y_k at each vertex suffices.
+with u the relief common to all moments, d_e the difference of the person's shape e from the model's S_e, and w_ke the
+weights. The noise is each head's standard deviation. A fraction ``COMMON`` of its variance is the same in all moments
+(cameras, hair, light); more moments do not reduce it. Vertices are independent of each other: neighbours agree because
+the heads are smooth. Everything is Gaussian, so the K x K covariance of the y_k at each vertex is enough.
 """
 
 from dataclasses import dataclass
@@ -26,8 +26,8 @@ COMMON = 0.5  # share of the variance that a take's heads have in common
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OwnShapes:
-    """Holds a person's neutral head (head frame, mm) with Apple's 52 shapes as that person makes them. ``shown`` are
-    the names that the take shows: all others are the model's own."""
+    """Holds a person's neutral head (head frame, mm) with Apple's 52 shapes in that person's form. ``shown`` are the
+    names that occur in the take; all other shapes are the model's own."""
 
     neutral: Float[np.ndarray, "v 3"]
     deviation_mm: Float[np.ndarray, " v"]

@@ -19,8 +19,8 @@ from rig.mesh import Mesh, vertex_normals
 def write_point_cache(
     path: Path, frames: Sequence[Float[np.ndarray, "v 3"]], faces: Int32[np.ndarray, "f 3"], times_s: np.ndarray
 ) -> None:
-    """Writes the vertices (mm) of ``frames`` to ``path`` (.usdc), y up, in metres. They are shown at ``times_s``; the
-    unit of time codes is the median time between two of them. Raises NoUsd and OSError."""
+    """Writes the vertices (mm) of ``frames`` to ``path`` (.usdc), y up, in metres. Their times are ``times_s``; the
+    unit of time codes is the median interval. Raises NoUsd and OSError."""
     check_usd()
     Usd, UsdGeom = map(openusd_module, ("Usd", "UsdGeom"))
     codes = (times_s - times_s[0]) / np.median(np.diff(times_s))

@@ -1,8 +1,8 @@
-"""Measures how far apart free cameras expose, by a clock on a screen that all of them see.
+"""Measures the time offsets between unsynchronised cameras, by a clock on a screen that all of them see.
 
-The screen shows a row of ``SLOTS`` ArUco markers. At its refresh n the marker n % SLOTS changes, and no other. So every
-picture shows most markers whole; those that changed while it was exposed are blended and are not read. From what is
-read follows the middle of the exposure, to a refresh of the screen; the mean of many shots is surer than one.
+The screen shows a row of ``SLOTS`` ArUco markers. At refresh n only the marker n % SLOTS changes. So every picture
+shows most markers sharply; the ones that changed during the exposure are blended and not read. The markers read give
+the middle of the exposure, to one refresh of the screen; the mean of many shots is more precise.
 """
 
 import json
@@ -59,7 +59,7 @@ requestAnimationFrame(next);
 
 @dataclass(frozen=True, slots=True)
 class Skew:
-    """Holds how much later a camera exposes than the mean of all, ms; its scatter from shot to shot, and the standard
+    """Holds how much later a camera exposes than the mean of all (ms), the scatter from shot to shot, and the standard
     deviation of the mean."""
 
     shots: int
@@ -69,7 +69,7 @@ class Skew:
 
 
 def clock_page() -> str:
-    """Returns a page without any other file that shows the clock in a browser, and the screen's rate."""
+    """Returns a self-contained page that shows the clock in a browser, and the screen's rate."""
     bits = [_bits(code) for code in range(PERIOD)]
     page = PAGE.replace("CODES", json.dumps(["".join(map(str, of.ravel().tolist())) for of in bits]))
     for name, value in (("SLOTS", SLOTS), ("TURNS", TURNS), ("CELLS", CELLS), ("GAP", GAP)):
@@ -78,7 +78,7 @@ def clock_page() -> str:
 
 
 def draw_row(refresh: int) -> UInt8[np.ndarray, "h w"]:
-    """Draws what the screen shows after its refresh ``refresh``, a pixel for each cell."""
+    """Draws the screen's row after its refresh ``refresh``, one pixel for each cell."""
     row = np.full((CELLS + GAP, SLOTS * (CELLS + GAP)), 255, np.uint8)
     for slot in range(SLOTS):
         changed = refresh - (refresh - slot) % SLOTS
@@ -116,7 +116,7 @@ def measure_skews(refreshes: Mapping[str, Float[np.ndarray, " n"]], rate_hz: flo
         refreshes: by camera, of each shot what ``read_refresh`` says; NaN where it is unknown.
         rate_hz: refreshes of the screen in a second.
 
-    Returns those of the cameras that share shots with others.
+    Returns only cameras that share shots with others.
     """
     rows = np.array([*refreshes.values()])
     apart = (rows[:, None] - rows[None] + PERIOD / 2.0) % PERIOD - PERIOD / 2.0  # of each from each, in every shot

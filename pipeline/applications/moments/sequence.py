@@ -1,11 +1,11 @@
 """Tracks a head through a sequence: one identity, and the pose and expression of every frame.
 
-The identity follows from the sharpest frames of the first second (``sequence_person``). Then each frame is fitted from
-the last one's state, moved on as the head moved before (``track_frame``). A head that is lost is searched anew; where
-that fails, too, the frame has failed and is interpolated. At last all courses are smoothed (``smoothing``).
+The identity is estimated from the sharpest frames of the first second (``sequence_person``). Then each frame is fitted
+from the previous frame's state, extrapolated by the motion (``track_frame``). A lost head is searched anew; if that
+fails too, the frame has failed and is interpolated. At the end all is smoothed over time (``smoothing``).
 
-What is found is kept in chunks, each written under a temporary name first. A run that was killed goes on after the last
-whole chunk, from its very numbers, and so finds the same.
+Results are stored in chunks, each written under a temporary name first. A killed run continues after the last complete
+chunk, from its stored numbers, and gives the same result.
 """
 
 import hashlib
@@ -45,8 +45,8 @@ SHARE = 0.1  # of the work, that finds the person
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """Holds what was found frame by frame: weights of the model's expressions, pose (world_from_head), deviations of
-    rotation (rad), translation (mm) and weights, the correlation of the texture, and which frames have failed."""
+    """Holds the result frame by frame: weights of the model's expressions, pose (world_from_head), standard deviations
+    of rotation (rad), translation (mm) and weights, the correlation of the texture, and which frames have failed."""
 
     weights: Float[np.ndarray, "t e"]
     rotations: Float[np.ndarray, "t 3 3"]
@@ -59,13 +59,13 @@ class Course:
         return len(self.failed)
 
     def motion(self, frame: int) -> Motion:
-        """Returns what the head does at a frame."""
+        """Returns the head's motion at a frame."""
         return Motion(RigidTransform(self.rotations[frame], self.translations[frame]), self.weights[frame])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracker:
-    """Holds everything that stays the same from frame to frame."""
+    """Holds everything that is constant over the frames."""
 
     person: SequencePerson
     samples: Samples
@@ -74,7 +74,7 @@ class Tracker:
     networks: FaceNetworks
 
     def track(self, pictures: Pictures, start: Motion) -> Tracked | None:
-        """Fits one frame. Returns None where the head is not found."""
+        """Fits one frame. Returns None if the head is not found."""
         if len(pictures) < MIN_VIEWS:
             return None
         found = self.fit(pictures, start)
@@ -85,7 +85,7 @@ class Tracker:
         return found if found is not None and found.alike >= MIN_ALIKE else None
 
     def fit(self, pictures: Pictures, start: Motion) -> Tracked:
-        """Fits one frame from a motion that is near."""
+        """Fits one frame from a nearby motion."""
         found = sight(self.person, self.networks, pictures, start)
         terms = terms_of(self.reference, self.person.rig, found)
         return fit_frame(self.person, self.samples, self.levels, pictures, start, terms)
@@ -99,7 +99,7 @@ class Tracker:
 
 
 def make_tracker(footage: Footage, person: SequencePerson) -> Tracker:
-    """Learns what the person looks like in the frames by which it was found."""
+    """Learns the person's appearance from the frames from which the person was estimated."""
     networks, samples = load_networks(), spread(person)
     shown = [(next(footage.read(key)), motion) for key, motion in zip(person.keys, person.motions, strict=True)]
     tracker = _learn(person, samples, networks, shown)
@@ -119,8 +119,8 @@ def _learn(
 def track_sequence(
     footage: Footage, model: HeadModel, settings: Settings, kept: Path, *, renderer: Renderer, report: Progress
 ) -> tuple[SequencePerson, Course]:
-    """Tracks a head through all frames. ``kept`` is the folder of what an earlier run has found. Returns the person and
-    the courses as measured. Raises what ``find_person`` raises."""
+    """Tracks a head through all frames. ``kept`` is the folder with an earlier run's results. Returns the person and
+    the courses as measured. Raises like ``find_person``."""
     inputs = json.dumps(inputs_of(footage, model, settings)).encode()
     if not (kept / INPUTS).is_file() or (kept / INPUTS).read_bytes() != inputs:
         for path in kept.glob("*.npz"):
@@ -143,7 +143,7 @@ def track_sequence(
 
 
 def _track_chunk(tracker: Tracker, footage: Footage, frames: range, before: Course | None, report: Progress) -> Course:
-    """Tracks the frames of a chunk, from the last two motions of the one before."""
+    """Tracks the frames of a chunk, from the last two motions of the previous one."""
     person, count = tracker.person, len(footage.frames)
     last = [before.motion(k) for k in np.flatnonzero(~before.failed)[-2:].tolist()] if before is not None else []
     last = last or [person.motions[0]]
@@ -167,7 +167,7 @@ def _track_chunk(tracker: Tracker, footage: Footage, frames: range, before: Cour
 
 
 def moved_on(last: list[Motion]) -> Motion:
-    """Returns the motion after the last two, if the head keeps a ``KEPT`` share of its speed."""
+    """Extrapolates the last two motions; the head keeps the fraction ``KEPT`` of its speed."""
     if len(last) < 2:
         return last[-1]
     before, now = (each.world_from_head for each in last)
@@ -177,7 +177,7 @@ def moved_on(last: list[Motion]) -> Motion:
 
 
 def smoothed(course: Course) -> Course:
-    """Returns the courses smoothed, with a pose and deviations for failed frames, too."""
+    """Returns the courses smoothed, with a pose and standard deviations for failed frames as well."""
     if course.failed.all():
         return course
     middle = course.rotations[np.flatnonzero(~course.failed)[0]]
@@ -195,7 +195,7 @@ def smoothed(course: Course) -> Course:
 
 
 def inputs_of(footage: Footage, model: HeadModel, settings: Settings) -> dict[str, Any]:
-    """Returns what a sequence's result follows from: its files by name, size and time, the model, and the settings."""
+    """Returns all that a sequence's result depends on: its files by name, size and time, the model, the settings."""
     digest, paths = hashlib.sha256(), sorted(path for path in footage.folder.rglob("*") if path.is_file())
     for path in paths:
         status = path.stat()

@@ -1,4 +1,4 @@
-"""Makes a sequence from its folder, and writes it.
+"""Tracks a sequence from its folder, and writes the result.
 
 sequence.npz    frames (t), times_s, expressions (e), weights and weight_deviations (t e), rotations (t 3 3),
                 translations (t 3, mm; world_from_head), pose_deviations (t 6: rad, mm), alike (t: correlation of the
@@ -56,9 +56,9 @@ CLAY, LIGHT = np.array([198.0, 176.0, 158.0]), np.array([-0.35, 0.45, 0.82])  # 
 def make_sequence(
     folder: Path, out: Path, *, model: str, settings: Settings, report: Progress, usd: bool = False
 ) -> dict[str, Any]:
-    """Tracks the head of a sequence and writes the ``FILES`` into ``out``, with ``usd`` sequence.usdc, too. Returns the
-    content of report.json. Raises InputError for a wrong folder, what the identity's single jobs raise, UnknownModel or
-    BadModel, NoUsd, and OSError."""
+    """Tracks the head of a sequence and writes the ``FILES`` into ``out``; with ``usd`` also sequence.usdc. Returns the
+    content of report.json. Raises InputError for a wrong folder, the errors of the identity's single jobs, UnknownModel
+    or BadModel, NoUsd, and OSError."""
     if usd:
         check_usd()
     footage, head_model = open_footage(folder), load_model(model)
@@ -97,7 +97,7 @@ def make_sequence(
 
 
 def skew_mm(person: SequencePerson, footage: Footage, course: Course) -> Float[np.ndarray, " t"]:
-    """Returns how far landmarks move in the mean, in each frame, between the first and the last camera's exposure."""
+    """Returns the mean displacement of landmarks, in each frame, between the first and the last camera's exposure."""
     rows = list(person.model.landmarks.values())
     moved = person.neutral[rows] + np.einsum("te,emx->tmx", course.weights, person.shapes[:, rows])
     places = np.einsum("txy,tmy->tmx", course.rotations, moved) + course.translations[:, None]
@@ -168,14 +168,14 @@ def write_preview(path: Path, person: SequencePerson, footage: Footage, course: 
 
 
 def draw_clay(person: SequencePerson, camera: Camera, motion: Motion) -> UInt8[np.ndarray, "h w 3"]:
-    """Draws the head of a frame in clay, as a camera sees it."""
+    """Draws the head of a frame in clay, in the view of a camera."""
     faces = person.model.levels["full"].faces
     head = motion.world_from_head.apply(person.head(motion.weights))
     return picture(camera, head, faces, clay_colours(vertex_normals(head, faces), camera), (255, 255, 255))
 
 
 def clay_colours(normals: Float[np.ndarray, "v 3"], camera: Camera) -> UInt8[np.ndarray, "v 3"]:
-    """Returns the colours of clay under a lamp beside the camera, by unit normals in the world frame."""
+    """Returns the colours of clay under a lamp at the camera, by unit normals in the world frame."""
     towards = camera.camera_from_world.rotation.T @ (LIGHT * (1.0, -1.0, -1.0))
     shade = 0.25 + 0.75 * np.clip(normals @ towards / np.linalg.norm(LIGHT), 0.0, 1.0)
     return np.clip(CLAY * shade[:, None] * 1.2, 0, 255).astype(np.uint8)

@@ -1,7 +1,7 @@
-"""Finds the person of a sequence: the one head of its first second, solved as a take.
+"""Finds the person of a sequence: one head for its first second, solved as a take.
 
-Enters: the footage. Leaves: the neutral head with the model's expressions at its vertices, the cameras with the
-corrections that all of these frames agree on, and the pose and weights of each of them.
+Enters: the footage. Out: the neutral head with the model's expressions at its vertices, the cameras with the mean
+correction of these frames, and the pose and weights of each frame.
 """
 
 from collections.abc import Callable
@@ -30,8 +30,8 @@ FIRST_S, KEYS = 1.0, 5  # the identity's frames: the sharpest of each fifth of t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Holds what changes from frame to frame: the pose of the head (its scale is in its vertices), and the weights of
-    the model's expressions."""
+    """Holds the values that change from frame to frame: the pose of the head (its scale is in its vertices), and the
+    weights of the model's expressions."""
 
     world_from_head: RigidTransform
     weights: Float[np.ndarray, " e"]
@@ -40,7 +40,7 @@ class Motion:
 @dataclass(frozen=True, slots=True, eq=False)
 class SequencePerson:
     """Holds the head of a sequence. Vertices and shapes are those of the full level, head frame, mm; ``rig`` are the
-    cameras of the small pictures, corrected."""
+    corrected cameras of the reduced pictures."""
 
     model: HeadModel
     names: tuple[str, ...]  # of the expressions that are tracked: the model's for Apple's names
@@ -58,8 +58,8 @@ class SequencePerson:
 def find_person(
     footage: Footage, model: HeadModel, settings: Settings, renderer: Renderer, report: Callable[[float], None]
 ) -> SequencePerson:
-    """Solves the best frames of the first second as a take. Raises what ``reconstruct`` raises, with the frame's name,
-    and InputError for the method simplex."""
+    """Solves the best frames of the first second as a take. Raises like ``reconstruct``, with the frame's name; also
+    InputError for the method simplex."""
     keys, solved = best_frames(footage), list[ContourSolution]()
     for done, key in enumerate(keys):
         report(done / (len(keys) + 1))
@@ -86,7 +86,7 @@ def best_frames(footage: Footage) -> tuple[int, ...]:
 def person_of(
     footage: Footage, model: HeadModel, keys: tuple[int, ...], joint: tuple[ContourSolution, ...]
 ) -> SequencePerson:
-    """Returns the head that the solutions of the frames ``keys`` share."""
+    """Returns the head that the solutions of the frames ``keys`` have in common."""
     longest = max(joint, key=lambda each: len(each.state.coefficients))
     fitted, scale = longest.problem.model, longest.state.world_from_head.scale
     coefficients = longest.state.coefficients.copy()
@@ -105,8 +105,8 @@ def person_of(
 
 
 def tracked_names(model: HeadModel) -> tuple[str, ...]:
-    """Returns the model's expressions that belong to Apple's 52 names: its other ones say much the same once more, and
-    together they can imitate a shift of the whole head."""
+    """Returns the model's expressions that belong to Apple's 52 names. The other expressions largely repeat these, and
+    all together could imitate a shift of the whole head."""
     parts = arkit_parts(model.expressions.names)
     return tuple(model.expressions.names[row] for row in sorted({row for of in parts.values() for row in of}))
 
@@ -114,7 +114,7 @@ def tracked_names(model: HeadModel) -> tuple[str, ...]:
 def weights_alone(
     shapes: Float32[np.ndarray, "n v 3"], weights: Float[np.ndarray, " n"], rows: list[int]
 ) -> Float[np.ndarray, " e"]:
-    """Returns the weights of the shapes ``rows`` alone that move the head most nearly as ``weights`` of all do."""
+    """Returns weights of the shapes ``rows`` alone that move the head as nearly as possible as all ``weights`` do."""
     flat = shapes.reshape(len(shapes), -1)
     alone = flat[rows]
     matrix = (alone @ alone.T).astype(float)
@@ -124,7 +124,7 @@ def weights_alone(
 
 
 def _corrected(rig: Rig, joint: tuple[ContourSolution, ...]) -> Rig:
-    """Returns the cameras with the mean of the frames' corrections: they stand still."""
+    """Returns the cameras with the mean of the frames' corrections, since they do not move."""
     shifts: dict[str, list[np.ndarray]] = {name: [] for name in rig.names}
     for each in joint:
         for name, shift in zip(each.problem.views.names, each.state.camera_shift, strict=True):

@@ -1,13 +1,13 @@
-"""Smooths the course of a sequence's unknowns forward and backward, as strongly as their noise asks for.
+"""Smooths each unknown of a sequence over time, forward and backward, as strongly as its noise requires.
 
-Of every unknown x, measured as y with deviation s at each of T frames, the smooth course minimises
+For every unknown x, measured as y with standard deviation s at each of T frames, the smooth course minimises
 
     sum_t (x_t - y_t)^2 / s_t^2 + sum_t log(q^2 + a_t^2) ,    a_t = x_t+1 - 2 x_t + x_t-1
 
-where q is a share of its noise. The logarithm holds back accelerations that noise explains, and lets larger ones be: a
-blink stays as it is. Unknowns of one group (a rotation's three) accelerate together. It is solved by repeated weighted
-least squares, a Cholesky factor of five diagonals for all unknowns at once; the same factor gives the deviations. A
-frame without a measurement follows from its neighbours, as far as accelerations of the whole sequence allow.
+where q is a multiple of its noise. The logarithm suppresses accelerations that noise explains, and tolerates larger
+ones: a blink stays as it is. The unknowns of a group (a rotation's three) accelerate together. It is solved by repeated
+weighted least squares, with a Cholesky factor of five diagonals for all unknowns at once; the same factor gives the
+standard deviations. A frame without a measurement is interpolated, with accelerations typical of the sequence.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ Courses = Float[np.ndarray, "t p"]
 def smooth(
     measured: Courses, deviation: Courses, failed: Bool[np.ndarray, " t"], groups: Sequence[Int[np.ndarray, " g"]]
 ) -> tuple[Courses, Courses]:
-    """Returns the smooth courses and their deviations.
+    """Returns the smooth courses and their standard deviations.
 
     Args:
         measured: the courses; what stands at failed frames does not matter.
@@ -64,7 +64,7 @@ def _together(squares: Courses, groups: Sequence[Int[np.ndarray, " g"]]) -> Cour
 
 
 def _factor(information: Courses, held: Float[np.ndarray, "t-2 p"]) -> tuple[Courses, Courses, Courses]:
-    """Returns the factor L D L^T of the five-diagonal matrices: D, and the two diagonals of L below its unit one."""
+    """Returns the factor L D L^T of the five-diagonal matrices: D, and the two diagonals below L's unit diagonal."""
     count = len(information)
     main, first, second = information.copy(), np.zeros_like(information), np.zeros_like(information)
     main[:-2] += held
@@ -100,8 +100,8 @@ def _solve(factor: tuple[Courses, Courses, Courses], right: Courses) -> Courses:
 
 
 def _inverse_diagonal(factor: tuple[Courses, Courses, Courses]) -> Courses:
-    """Returns the diagonal of the inverse: of the inverse Z = L^-T D^-1 + (1 - L^T) Z only the five diagonals are
-    needed (Takahashi, Fagan and Chen 1973)."""
+    """Returns the diagonal of the inverse Z = L^-T D^-1 + (1 - L^T) Z, of which only five diagonals are needed
+    (Takahashi, Fagan and Chen 1973)."""
     main, first, second = factor
     count = len(main)
     same, beside, beyond = 1.0 / main, np.zeros_like(main), np.zeros_like(main)  # Z at (t, t), (t, t+1), (t, t+2)

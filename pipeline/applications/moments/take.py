@@ -1,8 +1,8 @@
 """Reconstructs a take: several captures of one person, solved as one.
 
-Each moment runs the stages of a single job up to the fit to its photographs. Then one fit of all moments finds the
-identity that they share (``joint_fit``), and each goes on from there to its fine surface, colours and evidence. The
-heads of all moments have the same vertices; from them follow the neutral head and the person's own shapes
+Each moment runs the stages of a single job up to the fit to its photographs. Then one fit of all moments estimates
+their common identity (``joint_fit``); from there each moment continues to its fine surface, colours and evidence. The
+heads of all moments have the same vertices; the neutral head and the person's own shapes follow from them
 (``own_shapes``).
 """
 
@@ -42,7 +42,7 @@ SHARES = (0.45, 0.55)  # of a take's time, at which the joint fit begins and end
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """Holds what a take found of one moment. Arrays are over the model's expressions and the full level's vertices."""
+    """Holds a take's results of a moment. Arrays are by the model's expressions and the full level's vertices."""
 
     name: str
     detail: str  # the level that was reached
@@ -66,7 +66,7 @@ class Take:
 
 
 def check_count(count: int) -> None:
-    """Raises InputError for fewer captures than make a take."""
+    """Raises InputError if there are fewer captures than a take needs."""
     if count < MIN_MOMENTS:
         raise InputError("take", [compose("take-too-small", count=count)])
 
@@ -84,8 +84,8 @@ def reconstruct_take(
         deliver: receives each moment's finished result, which is not kept.
         report: receives the progress of the whole; raises Cancelled to stop. The contexts' own hooks are not called.
 
-    Raises InputError for fewer than two moments or the method ``simplex``, and what ``reconstruct`` raises, with the
-    name of the moment.
+    Raises InputError for fewer than two moments or the method ``simplex``, and the errors of ``reconstruct`` with the
+    moment's name.
     """
     check_count(len(contexts))
     progress, fitted = _Advance(report, len(contexts)), dict[str, tuple[Generator[Any, HeadFit, None], HeadFit]]()
@@ -114,7 +114,7 @@ def reconstruct_take(
 
 
 def joined(head: HeadFit, solved: ContourSolution, covariance: Float[np.ndarray, "p p"], eigenheads: int) -> HeadFit:
-    """Returns a moment's fitted head as the solution of all moments has it, with that solution's uncertainty."""
+    """Returns a moment's fitted head according to the joint solution, with that solution's uncertainty."""
     state, level = solved.state, head.detail.level
     fit = replace(
         head.fit,
@@ -132,15 +132,15 @@ def joined(head: HeadFit, solved: ContourSolution, covariance: Float[np.ndarray,
 
 
 def differ_by(alone: Fit, joint: ContourSolution, eigenheads: int) -> float:
-    """Returns how far a moment's own identity is from that of all moments: the RMS of its eigenheads' differences, in
-    standard deviations of its own posterior."""
+    """Returns the difference between a moment's own identity and the joint one: the RMS over the eigenheads, in
+    standard deviations of the moment's own posterior."""
     assert alone.covariance is not None
     apart = (alone.coefficients - joint.state.coefficients[: len(alone.coefficients)])[:eigenheads]
     return float(np.sqrt(apart @ np.linalg.solve(alone.covariance[:eigenheads, :eigenheads], apart) / eigenheads))
 
 
 def solution_of(head: HeadFit) -> ContourSolution:
-    """Returns what a moment's fit was made of. Raises InputError for a fit by the simplex method."""
+    """Returns the contour solution behind a moment's fit. Raises InputError for a fit by the simplex method."""
     if head.solution is None:
         raise InputError("take", [compose("take-needs-contour")])
     return head.solution
@@ -148,7 +148,7 @@ def solution_of(head: HeadFit) -> ContourSolution:
 
 @contextmanager
 def named(name: str) -> Iterator[None]:
-    """Puts the moment's name before what the block refuses."""
+    """Puts the moment's name in front of refusals in the block."""
     try:
         yield
     except Cancelled:
@@ -191,13 +191,13 @@ def _own_shapes(model: HeadModel, joint: Sequence[ContourSolution], moments: Seq
 
 
 class _Advance:
-    """Turns progress of the moments' stages into that of the take, which never falls."""
+    """Converts progress of the moments' stages to that of the take, which never decreases."""
 
     def __init__(self, report: Progress, count: int) -> None:
         self._report, self._count, self._most = report, count, 0.0
 
     def of(self, name: str, number: int) -> Progress:
-        """Returns what the moment ``number`` (0 for the first) reports to."""
+        """Returns the progress function for the moment ``number`` (0 for the first)."""
 
         def tell(stage: str, fraction: float) -> None:
             for stages, (first, last) in ((OBSERVED, (0.0, SHARES[0])), (DELIVERED, (SHARES[1], 1.0))):

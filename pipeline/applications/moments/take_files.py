@@ -1,4 +1,4 @@
-"""Makes a take from its captures, and writes it.
+"""Reconstructs a take from its captures, and writes the result.
 
 neutral.ply           the person's head without expression: head frame, mm; quality is its standard deviation
 neutral.glb           the same in metres, with the person's own shapes as morph targets under Apple's 52 names
@@ -44,7 +44,7 @@ TOLD = 0.02  # a smaller weight is left out of report.json
 
 
 class Shot(NamedTuple):
-    """Holds a capture of a take, and what computes its silhouettes."""
+    """Holds a capture of a take, and the function that computes its silhouettes."""
 
     capture: Capture
     rig: Rig
@@ -55,7 +55,7 @@ def make_take(
     folder: Path, shots: Mapping[str, Shot], *, model: str, settings: Settings, report: Progress
 ) -> dict[str, Any]:
     """Reconstructs a take from its captures, by the moments' names, and writes it into ``folder``. Returns the content
-    of report.json. Raises what ``reconstruct_take`` does, UnknownModel or BadModel, and OSError."""
+    of report.json. Raises like ``reconstruct_take``, also UnknownModel or BadModel, and OSError."""
     head_model, colours = load_model(model), Colours()
 
     def deliver(name: str, result: Reconstruction) -> None:
@@ -81,15 +81,15 @@ def warning_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 class Colours:
-    """Gathers the colours of the neutral head from the moments: at each vertex those of the moment that most images
-    coloured."""
+    """Collects the colours of the neutral head: each vertex gets them from the moment in which most images coloured
+    it."""
 
     def __init__(self) -> None:
         self.colours: UInt8[np.ndarray, "v 3"] | None = None
         self.views: UInt8[np.ndarray, " v"] | None = None
 
     def take_over(self, result: Reconstruction) -> None:
-        """Takes over the colours of a moment where it saw more."""
+        """Takes the colours of a moment at vertices that more of its images coloured."""
         found = result.texturing.vertices
         if self.colours is None or self.views is None:
             self.colours, self.views = found.colours.copy(), found.views.copy()
@@ -99,8 +99,8 @@ class Colours:
 
 
 def write_take(folder: Path, take: Take, colours: Colours, digests: Mapping[str, str]) -> dict[str, Any]:
-    """Writes the files of a take beside its moments' folders, each under a temporary name first, report.json last.
-    Returns what that says. ``digests``: SHA-256 of each moment's inputs. Raises OSError."""
+    """Writes the files of a take next to its moments' folders, each under a temporary name first, report.json last.
+    Returns the content of report.json. ``digests``: SHA-256 of each moment's inputs. Raises OSError."""
     person, model = take.person, take.model
     assert colours.colours is not None
     assert colours.views is not None

@@ -1,7 +1,7 @@
-"""Fits one frame of a sequence: the pose of a known head and the weights of its expressions, from where it was before.
+"""Fits one frame of a sequence: the pose of a known head and the weights of its expressions, from the previous ones.
 
-Three kinds of evidence enter one least-squares problem: the face network's landmarks in the cameras that the face looks
-at, which find a head that has moved far; the openings of its lids; and the texture of the skin against its reference
+One least-squares problem combines three kinds of evidence: the face network's landmarks in the cameras in front of the
+face, which find a head that moved far; the openings of its lids; and the texture of the skin against its reference
 (``appearance``), which is precise. The prior of the weights is that of a single job (``contour_fit.prior_term``).
 
     r_texture = (T_k(pi_k(R x_s(w) + t)) - reference_ks) / sigma
@@ -44,7 +44,7 @@ class TextureTerm:
     scale: float
 
     def at(self, motion: Motion) -> Residuals:
-        """Returns the differences from the reference, in deviations."""
+        """Returns the differences from the reference, in standard deviations."""
         pose, head = motion.world_from_head, self.samples.points(motion.weights)
         world, rows, parts = pose.apply(head), [], []
         sigma = np.float32(self.appearance.deviation * np.sqrt(ALIKE))
@@ -93,7 +93,7 @@ def derivatives(
     pose: RigidTransform,
     shapes: Float32[np.ndarray, "n 3 e"],
 ) -> Float32[np.ndarray, "n p"]:
-    """Returns derivatives by pose and weights of values whose derivatives by their world points are known."""
+    """Returns derivatives by pose and weights, from the derivatives of the same values by their world points."""
     out = np.empty((len(world), POSE + shapes.shape[2]), np.float32)
     out[:, :3], out[:, 3:POSE] = np.cross(world - pose.translation, by_world), by_world
     turned = (by_world @ pose.rotation).astype(np.float32)
@@ -144,8 +144,8 @@ def room(motion: Motion) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
-    """Holds a fitted frame: its motion, the deviations of its unknowns (rad, mm, weights), and the correlation of its
-    texture with the reference."""
+    """Holds a fitted frame: its motion, the standard deviations of its unknowns (rad, mm, weights), and the correlation
+    of its texture with the reference."""
 
     motion: Motion
     deviation: Float[np.ndarray, " p"]

@@ -1,2 +1,2 @@
-"""Writes results in the vertex order of another mesh, a template. It is registered once to a head model, and from then
-on deformed with every fitted head."""
+"""Writes results in the vertex order of another mesh, the template. A template is registered to a head model once, and
+then deforms with every fitted head."""

@@ -1,19 +1,19 @@
-"""A head that can be animated, in a registered mesh or in the model's own: Apple's 52 shapes, its pivots, and
-eyeballs, teeth and a tongue where its eyes are open and its lips part and it has none. A registered mesh has the
-visemes, too, and shapes without crossing.
+"""Builds a head for animation, in a registered mesh or in the model's own: Apple's 52 shapes, pivots, and, if the mesh
+lacks them, eyeballs behind open eyes and teeth and a tongue behind lips that part. A registered mesh also gets visemes,
+and shapes without crossing triangles.
 
-The lips of a fitted head may lie some tenths of a millimetre apart, through which teeth would shine: what photographs
-show of shut lips is a dark line, and the surface there is the model's. They are shut; a wider gap is an open mouth, and
-stays. The inner edge at which an open mouth ends is smoothed.
+The lips of a fitted head may be some tenths of a millimetre apart, and teeth would show through: photographs of shut
+lips show a dark line, and the surface there comes from the model. Such lips are shut; a wider gap is an open mouth, and
+stays. The inner edge of an open mouth is smoothed.
 
-Of a model's expressions on a registered mesh: the skin moves as its attachment says (``carrying``). What lies deeper is
-attached, too, where the mesh leads to it over vertices that move alike: an expression parts lips that touch, so that
-the smooth map in space that carries a person's shape would tear the inside of one lip along with the other. Vertices
-that cannot be attached move with their neighbours on the mesh. Parts of their own, not joined to the skin, are
+A model's expressions move a registered mesh as follows: the skin moves as it is attached (``carrying``). Deeper
+vertices are attached as well, if the mesh connects them to the skin over vertices that move alike. (An expression parts
+lips that touch; a smooth map in space would tear the inside of one lip along with the other.) Vertices that cannot be
+attached move with their neighbours on the mesh. Separate parts, not connected to the skin, are
 
-- round and closed: eyeballs, which no shape moves (turn them about their pivots);
-- at the skin: lashes and brows, which stand on the triangle of the skin at their roots and turn with it;
-- inside: teeth and tongue, which stay with the skull, or, below the line of the lips, move with the jaw.
+- round and closed: eyeballs, which no shape moves (rotate them about their pivots);
+- at the skin: lashes and brows, which stand on the skin's triangle at their roots and rotate with it;
+- inside: teeth and tongue, which move with the jaw below the line of the lips, and else stay with the skull.
 """
 
 from collections.abc import Mapping
@@ -56,7 +56,7 @@ Shapes = Mapping[str, Float[np.ndarray, "v 3"]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neutral:
-    """Holds a head without expression: the model's full level (mm) and its triangles, and where the mesh lies on it."""
+    """Holds a head without expression: the model's full level (mm), its triangles, and the mesh's position on it."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -72,8 +72,8 @@ def carried_shapes(
 ) -> dict[str, Places]:
     """Returns the displacement of each vertex of a mesh (mm, weight 1), by shape; everything in the head frame.
 
-    ``surface_binding``: how the model carries the mesh. ``triangles``: of the mesh. ``neutral``: the head that the
-    shapes start from. ``shapes``: displacements of the model's full level. ``landmarks``: of that head.
+    ``surface_binding``: binding of the mesh to the model. ``triangles``: triangles of the mesh. ``neutral``: head
+    without expression. ``shapes``: displacements of the model's full level. ``landmarks``: landmarks of that head.
     """
     names = list(shapes)
     mesh, count = neutral.mesh, len(neutral.mesh)
@@ -100,7 +100,7 @@ def carried_shapes(
 def loose_parts(
     surface_binding: SurfaceBinding, triangles: Int[np.ndarray, "g 3"], count: int
 ) -> Int[np.ndarray, " t"]:
-    """Returns the number of the part of its own that each vertex of a mesh belongs to, -1 of what is joined to the
+    """Returns the index of the separate part that each vertex of a mesh belongs to, -1 for vertices connected to the
     skin."""
     edges = _edges(triangles)
     parts = connected_components(_matrix(edges, np.ones(len(edges)), count), directed=False)[1]
@@ -120,7 +120,7 @@ def _matrix(edges: Int[np.ndarray, "e 2"], values: np.ndarray, count: int) -> sp
 
 
 def _with_skin(attachment: Attachment, surface_binding: SurfaceBinding) -> Attachment:
-    """Returns the attachment of all vertices in which those of the skin are attached as they were registered."""
+    """Returns the attachment of all vertices, with the skin attached as registered."""
     skin, registered = surface_binding.skin, surface_binding.attachment
     for whole, part in (
         (attachment.triangles, registered.triangles),
@@ -143,8 +143,8 @@ def _led(
     skin: Int[np.ndarray, " n"],
     near: Bool[np.ndarray, " t"],
 ) -> Bool[np.ndarray, " t"]:
-    """Tells which vertices the surface carries: the skin, and what edges lead to from it over vertices that are near
-    the surface and move alike in every shape."""
+    """Tells which vertices the surface carries: the skin, and vertices connected to it by edges over vertices near the
+    surface that move alike in every shape."""
     a, b = edges.T
     parting = np.linalg.norm(moves[a] - moves[b], axis=2).max(axis=1, initial=0.0)
     alike = parting < ALIKE * np.linalg.norm(mesh[a] - mesh[b], axis=1) + ALIKE_MM
@@ -162,8 +162,8 @@ def _follow(
     leading: Bool[np.ndarray, " t"],
     following: Bool[np.ndarray, " t"],
 ) -> None:
-    """Sets the moves of vertices to the mean of their neighbours', nearer ones weighing more, while leading vertices
-    keep theirs."""
+    """Sets the displacements of ``following`` vertices to the mean of their neighbours', weighted by nearness;
+    ``leading`` vertices keep theirs."""
     rows, fixed = np.flatnonzero(following), np.flatnonzero(leading)
     if not len(rows):
         return
@@ -176,7 +176,7 @@ def _follow(
 
 
 def _jaw_moves(landmarks: Points, neutral: Neutral, shapes: Shapes, mesh: Places) -> Float[np.ndarray, "t s 3"]:
-    """Returns how each vertex would move if it were fixed to the lower jaw."""
+    """Returns the displacement of each vertex as if it were fixed to the lower jaw."""
     motions = jaw_motions(landmarks, neutral.vertices, shapes)
     still = np.zeros_like(mesh)
     return np.stack([motions[name].apply(mesh) - mesh if name in motions else still for name in shapes], axis=1)
@@ -189,7 +189,7 @@ def _standing_at_roots(
     skin: Int[np.ndarray, "g 3"],
     moves: Float[np.ndarray, "t s 3"],
 ) -> Float[np.ndarray, "r s 3"] | None:
-    """Returns the moves of a part that stands on the skin; None if it comes near no skin."""
+    """Returns the displacements of a part that stands on the skin; None if it is not near the skin."""
     hits = SurfaceIndex(mesh, skin).closest(mesh[rows])
     roots = hits.distances < ROOT_MM
     if not roots.any():
@@ -200,7 +200,7 @@ def _standing_at_roots(
 def _nearest_root(
     mesh: Places, edges: Int[np.ndarray, "e 2"], rows: Int[np.ndarray, " r"], roots: Bool[np.ndarray, " r"]
 ) -> Int[np.ndarray, " r"]:
-    """Returns for each vertex of a part which of its roots is the nearest along its edges."""
+    """Returns, for each vertex of a part, its nearest root along the part's edges."""
     number = np.full(len(mesh), -1)
     number[rows] = np.arange(len(rows))
     inside = edges[(number[edges] >= 0).all(axis=1)]
@@ -213,7 +213,7 @@ def _nearest_root(
 def _standing(
     mesh: Places, rows: Int[np.ndarray, " r"], corners: Int[np.ndarray, "r 3"], moves: Float[np.ndarray, "t s 3"]
 ) -> Float[np.ndarray, "r s 3"]:
-    """Returns the moves of vertices that stand on triangles of the mesh's own skin and turn with them."""
+    """Returns the displacements of vertices that stand on triangles of the mesh's own skin and rotate with them."""
     used, local = np.unique(corners, return_inverse=True)
     faces, rest = local.reshape(-1, 3), mesh[used]
     thirds = np.full((len(rows), 3), 1.0 / 3.0)
@@ -250,10 +250,10 @@ def animated_mesh(
 ) -> AnimatedMesh:
     """Carries shapes to a mesh and keeps its lips and lids apart; adds the visemes, pivots, eyeballs, teeth and tongue.
 
-    ``surface_binding``: how the model carries the mesh. ``triangles``: of the mesh. ``vertices``: the model's full
-    level without expression, head frame, mm. ``faces``: its triangles. ``shapes``: displacements of that level, by
-    Apple's names or the model's. ``landmark_rows``: the model's landmarks, rows of that level. ``gazes``: where eyes
-    look (unit vectors, head frame), by pivot; straight ahead where there is none.
+    ``surface_binding``: binding of the mesh to the model. ``triangles``: triangles of the mesh. ``vertices``: the
+    model's full level without expression, head frame, mm. ``faces``: its triangles. ``shapes``: displacements of that
+    level, by Apple's names or the model's. ``landmark_rows``: the model's landmarks, as rows of that level. ``gazes``:
+    directions of the eyes (unit vectors, head frame), by pivot; straight ahead for missing ones.
     """
     mesh = surface_binding.on(vertices, faces)
     landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
@@ -284,7 +284,7 @@ def animated_head(
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> AnimatedMesh:
     """Shuts the lips of a model's full level (head frame, mm), and adds pivots, eyeballs, teeth and a tongue. The
-    triangles ``opened`` leave out what closes eyes and mouth. Lips and lids move as the model's shapes have them."""
+    triangles ``opened`` lack those that close eyes and mouth. Lips and lids move according to the model's shapes."""
     landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
     vertices = shut_lips(vertices, opened, landmarks)
     bare = AnimatedMesh(vertices, shapes, pivots(landmarks, vertices, shapes, []), {}, gazes=gazes)
@@ -299,7 +299,7 @@ def _with_parts(
     jaw: Mapping[str, RigidTransform],
     loose: Int[np.ndarray, " t"],
 ) -> AnimatedMesh:
-    """Returns the mesh with the eyeballs, teeth and tongue that it lacks, and lids and lips that keep off them."""
+    """Returns the mesh with missing eyeballs, teeth and tongue added, and lids and lips that do not touch these."""
     mesh, shapes = bare.neutral, bare.shapes
     lacking = {name: at for name, at in bare.pivots.items() if name.startswith("eye_") and name not in bare.eyeballs}
     added = placed_eyeballs(mesh, triangles, landmarks, lacking, bare.gazes)
@@ -314,10 +314,10 @@ def _with_parts(
 def parted_shapes(
     rest: RestSurface, shapes: Mapping[str, Float[np.ndarray, "t 3"]]
 ) -> dict[str, Float[np.ndarray, "t 3"]]:
-    """Returns shapes without crossing, and the visemes mixed of them without crossing.
+    """Returns shapes without crossing triangles, and the visemes mixed from them, also without crossing.
 
-    ``mouthClose`` closes a mouth that ``jawOpen`` has opened, and is kept apart together with that shape: without it
-    lips cross, as Apple's definition has it."""
+    ``mouthClose`` closes a mouth that ``jawOpen`` has opened, and is corrected together with it: by Apple's definition,
+    lips cross if it is used alone."""
     out = {
         name: kept_apart(rest, shape, closing=name.startswith(LIDS))
         for name, shape in shapes.items()
@@ -333,8 +333,8 @@ def parted_shapes(
 def shut_lips(
     vertices: Float[np.ndarray, "v 3"], opened: Int[np.ndarray, "f 3"], landmarks: Points
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns the vertices (head frame, mm) with the lips shut where they are nearly so. ``opened``: the triangles
-    without those that close the mouth."""
+    """Returns the vertices (head frame, mm) with nearly shut lips shut. ``opened``: triangles without those that close
+    the mouth."""
     rim = min(
         boundary_loops(opened), key=lambda loop: np.linalg.norm(vertices[loop].mean(axis=0) - landmarks["stomion"])
     )

@@ -1,9 +1,8 @@
 """Deforms a template together with a head.
 
-A vertex on the skin keeps its triangle of the model, its barycentric coordinates there, and its offset in the
-triangle's own frame. Vertices that lie deeper (mouth, sockets, lashes) follow the skin around them by the smooth map of
-``landmark_warp``. Closed parts (eyeballs, teeth) move as wholes and change only their size, so that a ball stays a
-ball.
+A skin vertex stores its triangle of the model, its barycentric coordinates there, and its offset in the triangle's own
+frame. Deeper vertices (mouth, sockets, lashes) follow the skin around them by the smooth map of ``landmark_warp``.
+Closed parts (eyeballs, teeth) move rigidly and change only their size, so that a ball stays a ball.
 """
 
 from dataclasses import dataclass
@@ -80,7 +79,7 @@ class SurfaceBinding:
         return self.with_skin(self.attachment.on(vertices, faces))
 
     def with_skin(self, skin: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "t 3"]:
-        """Returns the template's vertices where its skin lies at ``skin``; all others follow it."""
+        """Returns the template's vertices if its skin lies at ``skin``; all others follow it."""
         out = np.empty_like(self.rest)
         out[self.skin] = skin
         deep = self.wholes < 0
@@ -96,8 +95,8 @@ class SurfaceBinding:
 def surface_binding(
     rest: Float[np.ndarray, "t 3"], skin: Int[np.ndarray, " n"], attachment: Attachment, wholes: Int[np.ndarray, " t"]
 ) -> SurfaceBinding:
-    """Builds a binding, and chooses the skin vertices that deeper ones follow: those nearest to them, and some spread
-    over all of the skin."""
+    """Builds a binding, and chooses the skin vertices that deeper ones follow: the nearest ones, and some spread over
+    all of the skin."""
     tree = KDTree(rest[skin])
     deep = wholes < 0
     deep[skin] = False

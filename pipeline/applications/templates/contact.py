@@ -1,12 +1,12 @@
-"""Shapes that let lips and lids meet but not pass through each other, at every weight from 0 to 1.
+"""Changes shapes so that lips and lids meet but do not pass through each other, at every weight from 0 to 1.
 
-A blendshape is linear, and knows nothing of what it meets. Where triangles of a posed mesh cross that did not at rest:
+A blendshape is linear and ignores collisions. If triangles of a posed mesh cross that do not cross at rest:
 
-- lids, which are apart at rest and meet late, stop where they first meet: their displacement is scaled there;
-- lips, which touch at rest, move together: their displacement is blended with its mean over the space about them (a
-  smooth field in space carries both lips alike, and what moves less in a millimetre than a millimetre cannot cross).
+- lids, which are apart at rest, stop where they first meet: their displacement is scaled there;
+- lips, which touch at rest, move together: their displacement is blended with its mean over the surrounding space. (A
+  smooth field in space carries both lips alike; if it changes by less than 1 mm per mm, nothing can cross.)
 
-Both are done no more than needed, ever wider until nothing crosses; all other vertices keep their displacement.
+Both changes are as small as possible and widen until nothing crosses; all other vertices keep their displacement.
 """
 
 from dataclasses import dataclass
@@ -37,8 +37,8 @@ Rows = Int[np.ndarray, " r"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RestSurface:
-    """Holds a mesh at rest for contact: ``beside`` has 1 for every two vertices joined by an edge. Triangles that cross
-    others at rest, and those next to them, are ``excluded``: no shape can part them."""
+    """Holds a mesh at rest for contact: ``beside`` is 1 for every two vertices joined by an edge. Triangles that cross
+    others at rest, and their neighbours, are ``excluded``, because no shape can separate them."""
 
     vertices: Vertices
     faces: Int[np.ndarray, "f 3"]
@@ -59,15 +59,15 @@ def rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurfa
 
 
 def crossings(rest: RestSurface, displacement: Vertices, weights: tuple[float, ...] = WEIGHTS) -> Int[np.ndarray, " w"]:
-    """Returns how many triangles cross others at each weight of a shape that do not at rest."""
+    """Returns, at each weight of a shape, the number of triangles that cross others but do not at rest."""
     moved = _moved(rest, displacement)
     return np.array([np.count_nonzero(_crossing(rest, displacement, w, moved)) for w in weights])
 
 
 def kept_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> Vertices:
-    """Returns the displacement (mm, weight 1) changed so little that no triangles cross at ``WEIGHTS`` that do not at
-    rest; where that cannot be, so that the fewest do. ``closing``: lids, which stop where they meet; everything else
-    moves together."""
+    """Returns the displacement (mm, weight 1) with the smallest change so that no triangles cross at ``WEIGHTS`` that
+    do not at rest; if that is impossible, as few as possible cross. ``closing``: lids, which stop where they meet; all
+    other vertices move together."""
     spot = _spot(rest, displacement, WEIGHTS[1::2])
     best, fewest, zone = displacement, np.count_nonzero(spot), np.zeros(len(rest.vertices), bool)
     for _ in range(MAX_ZONES):
@@ -84,7 +84,7 @@ def kept_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> V
 
 
 def _moved(rest: RestSurface, displacement: Vertices) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles a shape moves. Triangles that stay cross none that stay."""
+    """Tells which triangles a shape moves. Unmoved triangles cannot begin to cross each other."""
     return (np.abs(displacement).max(axis=1) > STILL_MM)[rest.faces].any(axis=1)
 
 
@@ -105,7 +105,7 @@ def _stopped(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
 
 
 def _together(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
-    """Returns the displacement blended with its mean over space, ever wider, until no triangles of a zone cross."""
+    """Returns the displacement blended with its mean over growing radii, until no triangles of a zone cross."""
     out, rounds = displacement, 0
     best, fewest = displacement, np.inf
     for radius_mm in RADII_MM:
@@ -129,7 +129,7 @@ def _together(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices
 
 
 def _relaxed(rest: RestSurface, wanted: Vertices, clean: Vertices, zone: Rows) -> Vertices:
-    """Returns the displacement nearest to ``wanted``, on the way from ``clean``, that does not cross either."""
+    """Returns the displacement between ``clean`` and ``wanted`` that is nearest to ``wanted`` and does not cross."""
     if (wanted == clean).all() or _spot(rest, clean, WEIGHTS, zone).any():
         return clean
     low, high = 0.0, 1.0
@@ -141,7 +141,7 @@ def _relaxed(rest: RestSurface, wanted: Vertices, clean: Vertices, zone: Rows) -
 
 
 def _mean_in_space(vertices: Vertices, rows: Rows, radius_mm: float) -> sparse.csr_array:
-    """Returns the matrix of Gaussian means about some vertices over all vertices near them."""
+    """Returns the matrix of Gaussian means around some vertices, over all vertices near them."""
     near = KDTree(vertices).query_ball_point(vertices[rows], 2.0 * radius_mm)
     counts = np.array([len(each) for each in near])
     column, row = np.concatenate(near).astype(int), np.repeat(np.arange(len(rows)), counts)
@@ -154,7 +154,7 @@ def _mean_in_space(vertices: Vertices, rows: Rows, radius_mm: float) -> sparse.c
 def _crossing(
     rest: RestSurface, displacement: Vertices, weight: float, active: Bool[np.ndarray, " f"]
 ) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles cross at a weight; only pairs with an active one are looked at."""
+    """Tells which triangles cross at a weight; only pairs with an active one are tested."""
     if not active.any():
         return active
     few = active if active.mean() < FEW else None
@@ -162,7 +162,7 @@ def _crossing(
 
 
 def _crossing_within(rest: RestSurface, displacement: Vertices, weight: float, rows: Rows) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles of some rows cross each other at a weight: a tenth of the time of looking at all."""
+    """Tells which triangles of ``rows`` cross each other at a weight; it takes a tenth of the time of testing all."""
     out = np.zeros(len(rest.faces), bool)
     out[rows] = crossing_faces(rest.vertices + weight * displacement, rest.faces[rows])
     return out & ~rest.excluded
@@ -171,7 +171,7 @@ def _crossing_within(rest: RestSurface, displacement: Vertices, weight: float, r
 def _spot(
     rest: RestSurface, displacement: Vertices, weights: tuple[float, ...], zone: Rows | None = None
 ) -> Bool[np.ndarray, " t"]:
-    """Tells which vertices are corners of triangles that cross at some weight; of a zone's triangles alone, if any."""
+    """Tells which vertices are corners of triangles that cross at some weight; with a ``zone``, only its triangles."""
     out, moved = np.zeros(len(rest.vertices), bool), _moved(rest, displacement)
     for weight in weights:
         crossing = (
@@ -190,7 +190,7 @@ def _grown(rest: RestSurface, chosen: Bool[np.ndarray, " t"], rings: int) -> Boo
 
 
 def _faded(rest: RestSurface, retained: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
-    """Returns shares that fade to 1 over the rings about the smaller ones."""
+    """Returns factors that rise to 1 over the rings around vertices with smaller factors."""
     count = np.maximum(np.asarray(rest.beside.sum(axis=1)).ravel(), 1.0)
     out = retained
     for _ in range(SOFT_RINGS):

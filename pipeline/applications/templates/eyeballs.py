@@ -1,8 +1,8 @@
-"""Eyeballs for a mesh that has none: a ball with a cornea behind the lids, and lids that close over it.
+"""Adds eyeballs to a mesh without any: a ball with a cornea behind the lids, and lids that close over it.
 
 Sizes are an adult's: a ball of 12 mm, a cornea of 7.8 mm that meets it at a limbus of 5.9 mm (after Gullstrand's
-schematic eye). The ball lies as far in front as open lids let it; where it lies sideways, ``pivots`` says. A blendshape
-moves a lid along a straight line, which cuts through the ball: the lid is lifted as much as half and full weight need.
+schematic eye). The ball lies as far in front as open lids allow; ``pivots`` gives its sideways position. A blendshape
+moves a lid along a straight line, which cuts through the ball; so the lid is lifted as half and full weight require.
 """
 
 from collections.abc import Mapping
@@ -32,15 +32,15 @@ WHITE, IRIS, PUPIL = (225, 220, 214), (96, 72, 52), (12, 12, 12)  # sRGB; no pho
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eyeball:
-    """Holds an eyeball in the head frame, mm. ``gaze`` is the unit vector along which it looks."""
+    """Holds an eyeball in the head frame, mm. ``gaze`` is the unit vector of its direction."""
 
     centre: Float[np.ndarray, " 3"]
     gaze: Float[np.ndarray, " 3"]
     radius_mm: float = EYE_RADIUS_MM
 
     def reach(self, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Returns how far the surface lies from the centre in each direction (unit vectors), mm: the ball's or, within
-        the limbus, the cornea's."""
+        """Returns the distance of the surface from the centre in each direction (unit vectors), mm: the ball's or,
+        within the limbus, the cornea's."""
         cosine = directions @ self.gaze
         cornea = float(np.sqrt(self.radius_mm**2 - LIMBUS_MM**2) - np.sqrt(CORNEA_MM**2 - LIMBUS_MM**2))
         inside = np.maximum(CORNEA_MM**2 - cornea**2 * (1.0 - cosine**2), 0.0)
@@ -48,7 +48,7 @@ class Eyeball:
         return np.where(cosine > _limbus_cosine(self.radius_mm), bulge, self.radius_mm)
 
     def mesh(self) -> Mesh:
-        """Returns the surface as rings about the gaze, coloured as white, iris and pupil."""
+        """Returns the surface as rings around the gaze, coloured as white, iris and pupil."""
         limbus, pupil = np.arccos(_limbus_cosine(self.radius_mm)), np.arcsin(PUPIL_MM / self.radius_mm)
         marks = np.unique(np.concatenate([np.linspace(0.0, np.pi, RINGS), [pupil, limbus]]))[1:-1]
         around = np.arange(SECTORS) * 2.0 * np.pi / SECTORS
@@ -88,7 +88,7 @@ def _ring_faces(count: int) -> Int[np.ndarray, "f 3"]:
 def _outward(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], centre: Float[np.ndarray, " 3"]
 ) -> Int[np.ndarray, "f 3"]:
-    """Returns the triangles wound so that their normals leave the ball."""
+    """Returns the triangles oriented so that their normals point out of the ball."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     inward = np.einsum("fx,fx->f", np.cross(b - a, c - a), a - centre) < 0.0
     return np.where(inward[:, None], faces[:, ::-1], faces)
@@ -102,8 +102,8 @@ def _colours(angles: Float[np.ndarray, " n"], pupil: float, limbus: float) -> UI
 
 
 def turn_to(gaze: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
-    """Returns the rotation that turns an eye from straight ahead to ``gaze`` (unit, head frame), without roll about
-    either (Listing)."""
+    """Returns the rotation of an eye from straight ahead to ``gaze`` (unit, head frame), without roll about the line of
+    sight (Listing's law)."""
     axis = np.cross(AHEAD, gaze)
     sine = float(np.linalg.norm(axis))
     return rotation_from_vector(axis * (np.arctan2(sine, gaze @ AHEAD) / sine if sine > 0.0 else 1.0))
@@ -138,7 +138,7 @@ def placed_eyeballs(
 
 
 def _is_open(mesh: Places, triangles: Int[np.ndarray, "g 3"], landmarks: Points, side: str) -> bool:
-    """Tells whether the mesh has a border near the middle of an eye, as lids about an open eye have."""
+    """Tells whether the mesh has a border near the middle of an eye, as around an open eye."""
     outer, inner = landmarks[f"exocanthion_{side}"], landmarks[f"endocanthion_{side}"]
     border = mesh[np.unique(boundary_edges(triangles))]
     away = np.linalg.norm(border - 0.5 * (outer + inner), axis=1)
@@ -146,7 +146,7 @@ def _is_open(mesh: Places, triangles: Int[np.ndarray, "g 3"], landmarks: Points,
 
 
 def _near(mesh: Places, triangles: Int[np.ndarray, "g 3"], centre: Float[np.ndarray, " 3"]) -> Bool[np.ndarray, " g"]:
-    """Tells which triangles lie about an eye and before its centre."""
+    """Tells which triangles lie around an eye and in front of its centre."""
     near = (np.linalg.norm(mesh - centre, axis=1) < REACH_MM) & (mesh[:, 2] > centre[2] - BACK_MM)
     return near[triangles].all(axis=1)
 
@@ -159,7 +159,7 @@ def sample_triangles(mesh: Places, triangles: Int[np.ndarray, "g 3"]) -> Float[n
 
 
 def _depths(eyeball: Eyeball, points: Float[np.ndarray, "g 7 3"]) -> Float[np.ndarray, " g"]:
-    """Returns how far each triangle reaches into an eyeball and the gap before it, mm; 0 where it does not."""
+    """Returns how deep (mm) each triangle lies within an eyeball and its required gap; 0 for triangles outside."""
     away = points - eyeball.centre
     distance = np.linalg.norm(away, axis=2)
     reach = eyeball.reach((away / np.maximum(distance, 1e-9)[:, :, None]).reshape(-1, 3)).reshape(distance.shape)
@@ -169,7 +169,7 @@ def _depths(eyeball: Eyeball, points: Float[np.ndarray, "g 7 3"]) -> Float[np.nd
 def lifted(
     mesh: Places, triangles: Int[np.ndarray, "g 3"], displacement: Places, eyeballs: Mapping[str, Eyeball]
 ) -> Places:
-    """Returns a shape's displacement (mm) with lids lifted off the eyeballs at ``WEIGHTS``; all else is kept."""
+    """Returns a shape's displacement (mm) with lids lifted off the eyeballs at ``WEIGHTS``; all else is unchanged."""
     out = displacement
     for eyeball in eyeballs.values():
         about = triangles[_near(mesh, triangles, eyeball.centre)]

@@ -1,12 +1,12 @@
-"""The surface of a FLAME head model: linear shape and expression, pose correctives, and skinning over five joints.
+"""Computes the surface of a FLAME head model: linear shape and expression, pose correctives, skinning over five joints.
 
 T. Li, T. Bolkart, M. J. Black, H. Li and J. Romero, *Learning a model of facial shape and expression from 4D scans*,
 ACM Transactions on Graphics 36(6), 2017, sections 3 and 4. Lengths are metres, as in the model's files; y is up, z out
 of the face. The joints are, in this order, the root, the neck, the jaw and the two eyes.
 
 Its parameters are fitted to a mesh in its vertex order by Levenberg-Marquardt on the distances of the vertices, with
-Gaussian priors. The distances' own deviation is estimated, too, in rounds: if the model can equal the mesh, the priors
-fade; if not, they decide what the mesh leaves open.
+Gaussian priors. The standard deviation of the distances is estimated in rounds too. If the model can reproduce the
+mesh, the priors fade; if not, they decide what the mesh leaves undetermined.
 """
 
 from dataclasses import dataclass, replace
@@ -29,8 +29,8 @@ POSE = 3 * JOINTS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlameParameters:
-    """Holds what makes one face of a FLAME model. ``shape`` and ``expression`` count standard deviations, ``pose`` has
-    a rotation vector for each joint (radians), relative to the joint above it; ``translation`` is in metres."""
+    """Holds the parameters of one face of a FLAME model. ``shape`` and ``expression`` count standard deviations.
+    ``pose`` has a rotation vector (radians) for each joint, relative to its parent; ``translation`` is in metres."""
 
     shape: Float[np.ndarray, " s"]
     expression: Float[np.ndarray, " e"]
@@ -69,18 +69,18 @@ class FlameModel:
         return FlameParameters(np.zeros(shapes), np.zeros(expressions), np.zeros((JOINTS, 3)), np.zeros(3))
 
     def shaped(self, parameters: FlameParameters) -> Float[np.ndarray, "v 3"]:
-        """Returns the vertices with shape and expression, before any joint turns, m."""
+        """Returns the vertices with shape and expression, before any joint rotates, m."""
         return self.template + self.shape_modes @ parameters.shape + self.expression_modes @ parameters.expression
 
     def surface(
         self, parameters: FlameParameters, offsets: Float[np.ndarray, "v 3"] | None = None
     ) -> Float[np.ndarray, "v 3"]:
-        """Returns the vertices of a face, m. ``offsets`` are added before any joint turns (``static_offset``)."""
+        """Returns the vertices of a face, m. ``offsets`` are added before any joint rotates (``static_offset``)."""
         shaped = self.shaped(parameters)
         return self.posed(shaped if offsets is None else shaped + offsets, parameters.pose) + parameters.translation
 
     def posed(self, shaped: Float[np.ndarray, "v 3"], pose: Float[np.ndarray, "5 3"]) -> Float[np.ndarray, "v 3"]:
-        """Returns shaped vertices with the joints turned."""
+        """Returns shaped vertices with the joints rotated."""
         local = rotation_from_vector(pose)
         turns = chained(local, self.parents)
         shifts = joint_shifts(turns, (self.joint_regressor @ shaped)[:, :, None], self.parents)[:, :, 0]
@@ -88,12 +88,12 @@ class FlameModel:
         return np.einsum("vxy,vy->vx", self.blended(turns), corrected) + self.weights @ shifts
 
     def blended(self, turns: Float[np.ndarray, "5 3 3"]) -> Float[np.ndarray, "v 3 3"]:
-        """Returns the matrix by which each vertex turns: the mean over the joints, by its weights."""
+        """Returns the matrix by which each vertex rotates: the mean over the joints, with the vertex's weights."""
         return np.tensordot(self.weights, turns, axes=1)
 
 
 def chained(local: Float[np.ndarray, "5 3 3"], parents: Int[np.ndarray, " 5"]) -> Float[np.ndarray, "5 3 3"]:
-    """Returns the rotation of each joint in space from those relative to the joints above."""
+    """Returns the rotation of each joint in space, from rotations relative to the parent joints."""
     out = local.copy()
     for joint in range(1, JOINTS):
         out[joint] = out[parents[joint]] @ local[joint]
@@ -103,8 +103,8 @@ def chained(local: Float[np.ndarray, "5 3 3"], parents: Int[np.ndarray, " 5"]) -
 def joint_shifts(
     turns: Float[np.ndarray, "5 3 3"], joints: Float[np.ndarray, "5 3 k"], parents: Int[np.ndarray, " 5"]
 ) -> Float[np.ndarray, "5 3 k"]:
-    """Returns what is added to a vertex that has turned with each joint, so that the joint stays in place. It is linear
-    in the joints; the last axis has several sets of them."""
+    """Returns what is added to a vertex after it rotates with each joint, so that the joint stays in position. It is
+    linear in the joints' positions; the last axis holds several sets of them."""
     placed = joints.copy()
     for joint in range(1, JOINTS):
         above = parents[joint]
@@ -114,7 +114,7 @@ def joint_shifts(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlameFit:
-    """Holds fitted parameters, what they leave of the mesh, and offsets that take that up, m."""
+    """Holds fitted parameters, their remaining distances from the mesh, and offsets that remove these, m."""
 
     parameters: FlameParameters
     distances: Float[np.ndarray, " v"]  # from the mesh to the surface that the parameters make, m
@@ -145,7 +145,7 @@ def fit_flame(
 
 
 def _start(model: FlameModel, target: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, " v"]) -> FlameParameters:
-    """Returns the mean head where the mesh is. The root turns about its joint."""
+    """Returns the mean head at the mesh's position. The root rotates about its joint."""
     placed = rigid_fit(model.template, target, weights)
     mean, root = model.neutral(), model.joint_regressor[0] @ model.template
     pose = np.zeros((JOINTS, 3))
@@ -158,7 +158,7 @@ def _distances(model: FlameModel, value: FlameParameters, target: Float[np.ndarr
 
 
 def _deviation(distances: Float[np.ndarray, " v"], weights: Float[np.ndarray, " v"]) -> float:
-    """Returns the standard deviation of a coordinate of the distances, m; not less than ``FLOOR_M``."""
+    """Returns the standard deviation of a coordinate of the distances, m, at least ``FLOOR_M``."""
     return max(FLOOR_M, float(np.sqrt(weights @ distances**2 / (3.0 * weights.sum()))))
 
 
@@ -207,8 +207,8 @@ class _Vertices:
 
 
 def surface_jacobian(model: FlameModel, value: FlameParameters) -> Float[np.ndarray, "v 3 p"]:
-    """Returns the derivatives of a face's vertices by shape, expression, pose and translation, in this order. In the
-    coefficients the surface is linear; angles have differences."""
+    """Returns the derivatives of a face's vertices by shape, expression, pose and translation, in this order. The
+    surface is linear in the coefficients; the derivatives by angles are finite differences."""
     turns = chained(rotation_from_vector(value.pose), model.parents)
     blended, shaped = model.blended(turns), model.shaped(value)
     columns = []
@@ -228,8 +228,8 @@ def surface_jacobian(model: FlameModel, value: FlameParameters) -> Float[np.ndar
 
 
 def _offsets(model: FlameModel, value: FlameParameters, target: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
-    """Returns what must be added to the shaped vertices so that the face is the mesh. Offsets move the joints, too,
-    which all vertices turn about: what the 15 coordinates of the joints do then is solved for."""
+    """Returns the offsets of the shaped vertices with which the face equals the mesh. Offsets also move the joints,
+    about which all vertices rotate; the 15 coordinates of the joints are therefore solved for as well."""
     turns = chained(rotation_from_vector(value.pose), model.parents)
     back = np.linalg.inv(model.blended(turns))
     missing = np.einsum("vxy,vy->vx", back, target - model.surface(value))

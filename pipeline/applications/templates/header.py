@@ -1,6 +1,6 @@
 """Lists the registered templates and their files (in the folder ``templates`` of the data folder, each with its
-picture), reads the header of a template's file, without its arrays, and checks whether a job may use the template.
-Loads no model: the command line, the service and the console call it before any work begins."""
+picture). Reads the header of a template's file without its arrays, and checks whether a job may use the template. It
+loads no model, because the command line, the service and the console call it before any work begins."""
 
 import json
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ WORDS = ("name", "source", "source_sha256", "model_name", "model_sha256")
 
 
 class UnknownTemplate(EigenheadError):
-    """Reports a name that no registered template has."""
+    """Reports a name without a registered template."""
 
     def __init__(self, name: str) -> None:
         known = [*list_templates()] or ["none"]
@@ -41,7 +41,7 @@ def is_name(name: str) -> bool:
 
 
 def templates_folder() -> Path:
-    """Returns the folder of registered templates. It need not exist."""
+    """Returns the folder of registered templates. The folder may not exist yet."""
     return data_folder() / "templates"
 
 
@@ -76,7 +76,7 @@ def remove_template(name: str) -> Path:
 
 
 class BadTemplate(EigenheadError):
-    """Reports a file that should hold a registered template but is of another kind, or damaged."""
+    """Reports a damaged file, or one of another kind, in place of a registered template."""
 
     def __init__(self, path: Path, why: Message | str) -> None:
         super().__init__(compose("template-unusable", path=str(path), why=why, name=path.stem))
@@ -84,7 +84,7 @@ class BadTemplate(EigenheadError):
 
 
 class OtherModel(EigenheadError):
-    """Reports a template that was registered to another model than the one in use."""
+    """Reports a template that was registered to a model other than the one in use."""
 
     def __init__(self, template: "TemplateHeader", model_name: str) -> None:
         same = template.model_name == model_name
@@ -103,7 +103,7 @@ class OtherModel(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class TemplateHeader:
-    """Holds which mesh was registered to which model, and the figures that say how well."""
+    """Holds which mesh was registered to which model, and figures of the quality."""
 
     name: str
     source: str  # the OBJ file's name

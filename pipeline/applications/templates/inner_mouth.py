@@ -1,9 +1,9 @@
-"""Teeth and a tongue for a mesh that has none: behind its lips, moved with its jaw, and lips that keep off them.
+"""Adds teeth and a tongue behind the lips of a mesh without any, and moves them with its jaw. Lips must not touch them.
 
-The shipped parts (``load_inner_mouth``) are brought to the person by the similarity of the mouth's landmarks, then
-moved back until no lip meets them, shut or open. Upper teeth stay with the skull; lower teeth and tongue move with the
-jaw as parts of a mesh do (``pivots.jaw_motions``). A shape that presses lips through the teeth is lifted there, with
-what moves about it, as lids are off eyeballs (``eyeballs.lifted``).
+The similarity of the mouth's landmarks brings the shipped parts (``load_inner_mouth``) to the person. The parts then
+move back until no lip touches them, shut or open. Upper teeth stay with the skull; lower teeth and tongue move with the
+jaw as parts of a mesh do (``pivots.jaw_motions``). A shape that presses lips through the teeth is lifted there together
+with its surroundings, like lids off eyeballs (``eyeballs.lifted``).
 """
 
 from collections.abc import Mapping
@@ -36,7 +36,7 @@ ANCHORS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InnerPart:
-    """Holds a part with its colours, and how it moves when the tongue is put out (mm; empty if it does not)."""
+    """Holds a part with its colours, and its displacement when the tongue is out (mm; empty if it does not move)."""
 
     mesh: Mesh
     tongue_out: Float[np.ndarray, "n 3"]
@@ -44,7 +44,7 @@ class InnerPart:
 
 @lru_cache(maxsize=1)
 def load_inner_mouth() -> tuple[dict[str, InnerPart], Mapping[str, Float[np.ndarray, " 3"]]]:
-    """Returns the parts by name and the landmarks of the head that they lie in."""
+    """Returns the parts by name, and the landmarks of the head that contains them."""
     with np.load(PACK) as file:
         parts = {}
         for name in PARTS:
@@ -79,14 +79,14 @@ Shapes = Mapping[str, Places]
 @dataclass(frozen=True, slots=True, eq=False)
 class InnerMouth:
     """Holds the parts by name without expression (head frame, mm), and the displacements of each by shape; shapes that
-    do not move a part are left out. ``absence``: why there are no parts."""
+    do not move a part are missing. ``absence``: reason why there are no parts."""
 
     parts: Mapping[str, Mesh] = field(default_factory=dict)
     moves: Mapping[str, Mapping[str, Float[np.ndarray, "n 3"]]] = field(default_factory=dict)
     absence: Absence | None = None
 
     def posed(self, shape: str, weight: float) -> dict[str, Float[np.ndarray, "n 3"]]:
-        """Returns the vertices of each part at a shape's weight. Shapes that are meant for an open jaw have it open."""
+        """Returns the vertices of each part at a shape's weight. Shapes for an open jaw are combined with one."""
         with_jaw, out = jaw_weight(shape, weight), {}
         for name, part in self.parts.items():
             moves = self.moves[name]
@@ -95,7 +95,7 @@ class InnerMouth:
 
 
 def jaw_weight(shape: str, weight: float) -> float:
-    """Returns the weight of ``jawOpen`` with which a shape at a weight is meant."""
+    """Returns the weight of ``jawOpen`` that belongs to a shape at a weight."""
     return 0.0 if shape not in OPENED else 1.0 if shape == TONGUE_OUT else weight
 
 
@@ -107,11 +107,11 @@ def placed_inner_mouth(
     jaw: Mapping[str, RigidTransform],
     loose: Int[np.ndarray, " t"],
 ) -> InnerMouth:
-    """Returns teeth and tongue of a mesh without expression, or why there are none.
+    """Returns teeth and tongue for a mesh without expression, or why there are none.
 
-    ``mesh``: vertices, head frame, mm. ``triangles``: of the mesh. ``shapes``: the mesh's displacements by Apple's
-    names, mm. ``landmarks``: of the head. ``jaw``: how the lower jaw moves with the shapes that move it. ``loose``:
-    number of the part of its own that a vertex belongs to, -1 of the skin and of eyeballs.
+    ``mesh``: vertices of the mesh, head frame, mm. ``triangles``: triangles of the mesh. ``shapes``: the mesh's
+    displacements by Apple's names, mm. ``landmarks``: landmarks of the head. ``jaw``: motion of the lower jaw for each
+    shape that moves it. ``loose``: index of the separate part that a vertex belongs to, -1 for the skin and eyeballs.
     """
     shipped, anchors = load_inner_mouth()
     place = procrustes(np.stack([anchors[name] for name in ANCHORS]), np.stack([landmarks[name] for name in ANCHORS]))
@@ -143,7 +143,7 @@ def _shaded(part: Mesh) -> UInt8[np.ndarray, "n 3"]:
 
 
 def _has_own(mesh: Places, loose: Int[np.ndarray, " t"], parts: Mapping[str, Mesh]) -> bool:
-    """Tells whether a part of the mesh's own lies where teeth would."""
+    """Tells whether a separate part of the mesh lies at the teeth's position."""
     inside = np.concatenate([part.vertices for part in parts.values()])
     low, high = inside.min(axis=0), inside.max(axis=0)
     middles = [mesh[loose == number].mean(axis=0) for number in range(loose.max(initial=-1) + 1)]
@@ -207,7 +207,7 @@ def _meets(mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inne
 
 
 def _is_covered(mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth) -> bool:
-    """Tells whether the mesh hides the gap between the front teeth although the jaw is open: its lips do not part."""
+    """Tells whether the mesh hides the gap between the front teeth although the jaw is open: the lips do not part."""
     if "jawOpen" not in shapes:
         return True
     posed = inner.posed("jawOpen", 1.0)
@@ -225,7 +225,7 @@ def _is_covered(mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes,
 def kept_off_teeth(
     mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth
 ) -> dict[str, Places]:
-    """Returns shapes (mm) whose lips are lifted off the teeth at ``WEIGHTS``; all else is kept."""
+    """Returns shapes (mm) with lips lifted off the teeth at ``WEIGHTS``; all other vertices are unchanged."""
     if not inner.parts:
         return dict(shapes)
     about = triangles[_about(mesh, triangles, inner)]
@@ -251,7 +251,7 @@ def _lift(
     name: str,
     inner: InnerMouth,
 ) -> Float[np.ndarray, "m 3"] | None:
-    """Returns what is added to a displacement so that no triangle meets the teeth; None where none does."""
+    """Returns a change of a displacement after which no triangle touches the teeth; None if none does anyway."""
     lift, fronts = np.zeros_like(rest), {}
     for _ in range(ROUNDS):
         need = np.zeros(len(rest))
@@ -272,7 +272,7 @@ def _lift(
 def _spread(
     rest: Float[np.ndarray, "m 3"], motion: Float[np.ndarray, " m"], need: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, " m"]:
-    """Returns what vertices need, and those about them ever less, nothing where the shape moves nothing."""
+    """Spreads each vertex's needed shift to its neighbours, with decreasing weight, but only to moving vertices."""
     pressed = np.flatnonzero(need)
     near = KDTree(rest[pressed]).sparse_distance_matrix(KDTree(rest), 2.5 * SPREAD_MM, output_type="coo_matrix")
     source, row = pressed[near.row], near.col
@@ -283,13 +283,13 @@ def _spread(
 
 
 def _axis(inner: InnerMouth) -> Float[np.ndarray, " 2"]:
-    """Returns the x and z of the upright line about which the arch of the teeth bends."""
+    """Returns the x and z of the vertical line around which the arch of the teeth bends."""
     rest = inner.parts["teeth_upper"].vertices
     return np.array([0.5 * (rest[:, 0].min() + rest[:, 0].max()), rest[:, 2].min()])
 
 
 def _outward(inner: InnerMouth, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Returns the level directions away from that line."""
+    """Returns the horizontal directions away from that line."""
     axis = _axis(inner)
     away = (points - (axis[0], 0.0, axis[1])) * (1.0, 0.0, 1.0)
     return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
@@ -297,8 +297,8 @@ def _outward(inner: InnerMouth, points: Float[np.ndarray, "n 3"]) -> Float[np.nd
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Front:
-    """Holds how far the teeth's outer faces lie from the arch's upright axis, by direction and height; 0 where there is
-    none."""
+    """Holds the distance of the teeth's outer faces from the arch's vertical axis, by direction and height; 0 where
+    there is none."""
 
     axis: Float[np.ndarray, " 2"]  # x and z
     lowest: float
@@ -322,7 +322,7 @@ class _Front:
     def cells(
         self, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Returns the cell of each point, and how far it lies from the axis."""
+        """Returns the cell of each point, and its distance from the axis."""
         x, z = (points[:, [0, 2]] - self.axis).T
         turn = (np.degrees(np.arctan2(x, z)) // TURN_DEG).astype(int) % self.reach.shape[0]
         height = np.floor((points[:, 1] - self.lowest) / RISE_MM).astype(int)

@@ -1,9 +1,9 @@
 """Fits a head model to another mesh, shape and pose together.
 
-Gauss-Newton minimises the distances from the model's vertices to the planes of the mesh that they meet (Chen and
-Medioni 1992), under the prior z ~ N(0, I), with eigenheads and the smooth deformations of ``gaussian_process``. It is
-the search of section 3.2 with a scale and without landmarks. Distances go from model to mesh, so that other parts of
-the mesh, such as shoulders, have no effect.
+Gauss-Newton minimises the distances from the model's vertices to the tangent planes at their closest points on the mesh
+(Chen and Medioni 1992), under the prior z ~ N(0, I), with eigenheads and the smooth deformations of
+``gaussian_process``. It is the search of section 3.2 with a scale and without landmarks. Distances go from model to
+mesh, so other parts of the mesh, such as shoulders, have no effect.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,7 +52,7 @@ ROWS = 6000  # vertices of the model that look for the mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceMarks:
-    """Holds points of a model's surface, each a mean of three vertices (full level), and where a mesh has them, mm."""
+    """Holds points of a model's surface, each a mean of three vertices (full level), and their positions on a mesh."""
 
     rows: Int[np.ndarray, "p 3"]
     weights: Float[np.ndarray, "p 3"]
@@ -61,7 +61,7 @@ class SurfaceMarks:
 
     @classmethod
     def of_landmarks(cls, model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]]) -> "SurfaceMarks":
-        """Returns marks for landmarks that people marked; names that the model lacks are ignored."""
+        """Returns marks for a person's landmarks; names that the model lacks are ignored."""
         known = {model.landmarks[name]: point for name, point in landmarks.items() if name in model.landmarks}
         rows = np.repeat(np.array(list(known), int)[:, None], 3, axis=1)
         return cls(
@@ -90,8 +90,8 @@ class Likeness:
 def fit_model_to_mesh(
     model: HeadModel, mesh: Surface, marks: SurfaceMarks | None = None, stages: Sequence[Stage] = STAGES
 ) -> Likeness:
-    """Fits shape and pose of the model to a mesh and to marks of that mesh. The mesh must already lie approximately
-    where the mean head lies."""
+    """Fits shape and pose of the model to a mesh and to marks of that mesh. The mesh must already lie approximately at
+    the mean head's position."""
     wide = with_kernel(model, len(model.modes))
     full, count = model.levels["full"], len(model.modes)
     marks = marks or SurfaceMarks.of_landmarks(model, {})
@@ -140,7 +140,7 @@ def _modes_on(model: HeadModel, marks: SurfaceMarks) -> Float[np.ndarray, "p 3 m
 
 
 class MetSurface:
-    """Holds the mesh that the model is fitted to, with search trees of its surface and of its oriented points."""
+    """Holds the mesh to which the model is fitted, with search trees of its surface and of its oriented points."""
 
     def __init__(self, mesh: Surface) -> None:
         self._mesh, self._surface = mesh, SurfaceIndex(mesh.vertices, mesh.faces)
@@ -150,8 +150,8 @@ class MetSurface:
     def meet(
         self, points: Float[np.ndarray, "s 3"], normals: Float[np.ndarray, "s 3"], stage: Stage
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Returns, for each point, its closest place on the mesh, the normal there, the distance, and a weight: 0 where
-        the mesh faces another way, is too far, or ends (there the closest place lies sideways)."""
+        """Returns, for each point, its closest point on the mesh, the normal there, the distance, and a weight: 0 where
+        the mesh faces another way, is too far, or ends (there the closest point lies sideways)."""
         places, planes = self._nearest(points, normals, stage.normal_mm)
         apart = places - points
         off = np.linalg.norm(apart, axis=1)

@@ -1,4 +1,4 @@
-"""Makes a template for ``eigenhead template add``. Jobs, which only ``load`` one, do not wait for what this imports."""
+"""Makes a template for ``eigenhead template add``. Jobs only ``load`` a template, without these imports."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -128,9 +128,9 @@ AZIMUTHS_DEG = (0.0, 55.0)
 
 
 def template_picture(template: Template, found: Registration, model: HeadModel) -> ImageRgb:
-    """Draws a template from the front and the side, in five panels: the mesh as it came; the model fitted to it; the
-    mesh registered to the model (blue: vertices that follow the skin; green: closed parts that move as a whole); the
-    mesh on the model's mean head; and that mean head."""
+    """Draws a template from the front and the side, in five panels: the original mesh; the model fitted to it; the mesh
+    registered to the model (blue: vertices that follow the skin; green: closed parts that move as a whole); the mesh on
+    the model's mean head; and that mean head."""
     faces, triangles = model.levels["full"].faces, template.mesh.triangles()
     mean = model.vertices(np.zeros(0))
     kinds = np.tile(np.array(DEEP), (len(found.surface_binding.rest), 1))

@@ -1,4 +1,5 @@
-"""Where the parts of a head turn: lower jaw, eyes, neck (head frame: x to the subject's left, y up, z out of the face).
+"""Computes the pivots of a head's parts: lower jaw, eyes, neck (head frame: x to the subject's left, y up, z out of the
+face).
 
 - ``jaw``: the middle of the hinge axis, which lies 13 mm from each tragion towards the outer corner of the eye (Beyron
   1942, the arbitrary hinge axis of dental articulators).
@@ -58,8 +59,7 @@ def hinge(landmarks: Points) -> Float[np.ndarray, " 3"]:
 
 
 def _lid_centre(vertices: Vertices, blink: Vertices) -> Float[np.ndarray, " 3"]:
-    """Returns the centre of the eyeball under a lid: the ball through the lid's edge, open and closed, has its front in
-    common with it."""
+    """Returns the centre of the eyeball under a lid: the ball that the lid's edge touches both open and closed."""
     moved = np.linalg.norm(blink, axis=1)
     rows = moved > SLIDING * moved.max()
     points = np.concatenate([vertices[rows], vertices[rows] + blink[rows]])
@@ -71,8 +71,8 @@ def _lid_centre(vertices: Vertices, blink: Vertices) -> Float[np.ndarray, " 3"]:
 
 
 def jaw_motions(landmarks: Points, vertices: Vertices, shapes: Mapping[str, Vertices]) -> dict[str, RigidTransform]:
-    """Returns how the lower jaw moves with the shapes that move it, by the skin over the chin: ``jawOpen`` turns about
-    the hinge axis, the others shift."""
+    """Returns the motion of the lower jaw for each shape that moves it, from the skin over the chin: ``jawOpen``
+    rotates about the hinge axis, the others shift."""
     chin = np.linalg.norm(vertices - landmarks["gnathion"], axis=1) < CHIN_MM
     before, out = vertices[chin].mean(axis=0), {}
     for name in ("jawForward", "jawLeft", "jawRight"):
@@ -88,7 +88,7 @@ def jaw_motions(landmarks: Points, vertices: Vertices, shapes: Mapping[str, Vert
 
 
 def in_mouth(landmarks: Points, points: Float[np.ndarray, "n 3"]) -> bool:
-    """Tells whether a part of a mesh lies in the lower half of the mouth: teeth and tongue that move with the jaw."""
+    """Tells whether a part of a mesh lies in the lower half of the mouth, like teeth and tongue on the jaw."""
     centre, wide = points.mean(axis=0), landmarks["cheilion_left"][0] - landmarks["cheilion_right"][0]
     low, high, middle = landmarks["gnathion"][1], landmarks["stomion"][1], landmarks["stomion"][0]
     inside = low < centre[1] < high and abs(centre[0] - middle) < wide

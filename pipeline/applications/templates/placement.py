@@ -1,8 +1,8 @@
-"""Finds where a foreign mesh lies: head_from_template, a similarity, from landmarks or by a search.
+"""Finds the placement of a foreign mesh: head_from_template, a similarity, from landmarks or by a search.
 
 The search tries millimetres, centimetres, decimetres and metres, every convention of axes, and three starts for each.
 It then iterates closest points (Besl and McKay 1992; with Umeyama's scale) from the model's surface to the mesh, so
-that other parts of the mesh (teeth, eyeballs, shoulders) have no effect.
+other parts of the mesh (teeth, eyeballs, shoulders) have no effect.
 """
 
 from collections.abc import Mapping
@@ -52,7 +52,7 @@ class Surface:
 
 
 def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> Surface:
-    """Returns the mesh with its normals; if its faces look inwards, all of them are turned over."""
+    """Returns the mesh with its normals; if its faces point inwards, all of them are flipped."""
     corners = vertices[faces] - vertices[np.unique(faces)].mean(axis=0)
     if np.einsum("fx,fx->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
         faces = faces[:, ::-1]
@@ -104,8 +104,8 @@ def find_place(model: HeadModel, mesh: Surface, name: str) -> Similarity:
 
 
 def _model_points(model: HeadModel, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns points of the model without its neck, their normals, and their weights: points of the face weigh most,
-    since the mesh may be only a mask."""
+    """Returns points of the model without its neck, their normals, and their weights. Points of the face weigh most,
+    because the mesh may be only a mask."""
     vertices, regions = model.vertices(np.zeros(0)), head_regions(model)
     rows = np.flatnonzero(~regions["neck"])
     rows = rows[:: max(1, len(rows) // count)]

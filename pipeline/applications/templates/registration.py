@@ -1,8 +1,8 @@
-"""Registers a foreign mesh to a head model, once (section 3.2, the other way round).
+"""Registers a foreign mesh to a head model once (section 3.2 in the opposite direction).
 
-The model is fitted to the mesh as closely as it can (``fit_model_to_mesh``). Then the mesh's skin is deformed onto that
-head by ``geometry.registration.nonrigid``, so that a difference between the two does not appear in results.
-Every vertex of the skin now has its point on the model's surface, and deeper ones follow (``carrying``).
+The model is fitted to the mesh as closely as possible (``fit_model_to_mesh``). Then ``geometry.registration.nonrigid``
+deforms the mesh's skin onto that head, so that their difference does not appear in results. Every skin vertex now has
+its point on the model's surface, and deeper ones follow (``carrying``).
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,7 +48,7 @@ LIKE_MM = 2.0  # median distance of the fitted face from the mesh
 
 
 class NotRegistered(InputError):
-    """Reports a mesh that cannot be registered, with the reasons and what to do."""
+    """Reports a mesh that cannot be registered, with reasons and remedies."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,8 +86,8 @@ def register(
 ) -> Registration:
     """Registers a mesh to a model: places it, fits the model to it, deforms the mesh onto that head, and binds it.
 
-    ``mesh``: in any unit and with any axes. ``model``: the head model. ``name``: of the mesh, for messages.
-    ``landmarks``: in the mesh's frame; None searches for the placement. ``report``: progress.
+    ``mesh``: in any unit and with any axes. ``model``: the head model. ``name``: name of the mesh, for messages.
+    ``landmarks``: landmarks in the mesh's frame; None searches for the placement. ``report``: progress.
 
     Raises InputError if the mesh is no head, and NotRegistered if the model cannot follow it.
     """
@@ -124,8 +124,8 @@ def register(
 
 
 def _check(like: Likeness, name: str, *, marked: bool) -> float:
-    """Returns the share of the face region's area that the mesh shows. Raises NotRegistered if it shows too little or
-    differs too much; with landmarks an unusual shape is allowed."""
+    """Returns the fraction of the face region's area that the mesh covers. Raises NotRegistered if it covers too little
+    or differs too much; with landmarks an unusual shape is allowed."""
     met, area = np.isfinite(like.distances), np.where(like.in_face, like.areas, 0.0)
     covered = float(area[met].sum() / area.sum())
     faults = []
@@ -142,10 +142,10 @@ def _check(like: Likeness, name: str, *, marked: bool) -> float:
 
 
 def weld(mesh: Surface) -> tuple[Surface, Int[np.ndarray, " t"]]:
-    """Joins vertices at the same position along open borders, since files cut surfaces along texture seams. Returns the
-    mesh and the new index of each old vertex.
+    """Joins vertices at the same position along open borders, because files cut surfaces along texture seams. Returns
+    the mesh and the new index of each old vertex.
 
-    Lashes stay separate parts, since the lid has no border where they begin.
+    Lashes stay separate parts, because the lid has no border at their roots.
     """
     ends = np.zeros(len(mesh.vertices), bool)
     ends[boundary_edges(mesh.faces)] = True
@@ -170,8 +170,8 @@ def _graph(faces: Int[np.ndarray, "f 3"], count: int) -> sparse.csr_array:
 
 
 def skin_parts(mesh: Surface, parts: Int[np.ndarray, " t"], head: Surface) -> Bool[np.ndarray, " p"]:
-    """Tells which connected parts of the mesh are skin: those that lie nearest to the head, facing the same way, over a
-    large enough share of its area."""
+    """Tells which connected parts of the mesh are skin: those near the head, facing the same way, over a large enough
+    fraction of its area."""
     rows = slice(None, None, max(1, len(head.vertices) // 6000))
     hits = SurfaceIndex(mesh.vertices, mesh.faces).closest(head.vertices[rows], CANDIDATES, facing=head.normals[rows])
     part = parts[mesh.faces[hits.triangles, 0]]
@@ -181,8 +181,8 @@ def skin_parts(mesh: Surface, parts: Int[np.ndarray, " t"], head: Surface) -> Bo
 
 
 def balls(mesh: Surface, parts: Int[np.ndarray, " t"], among: Bool[np.ndarray, " p"]) -> Int[np.ndarray, " t"]:
-    """Returns, for each vertex, the number of the closed, round part that it belongs to, considering only the parts
-    ``among``; -1 for all other vertices."""
+    """Returns, for each vertex, the index of the closed, round part that it belongs to, among the parts ``among``; -1
+    for all other vertices."""
     closed = among.copy()
     closed[parts[boundary_edges(mesh.faces).ravel()]] = False
     closed[parts[~_used(mesh)]] = False
@@ -202,8 +202,8 @@ def _used(mesh: Surface) -> Flags:
 def parting(
     attachment: Attachment, rest: Vertices, skin: Flags, faces: Int[np.ndarray, "f 3"], model: HeadModel
 ) -> Flags:
-    """Tells which vertices move away from their neighbours on some random head. Such vertices were attached to another
-    layer of the surface, such as the inside of a lid or the eyeball."""
+    """Tells which vertices move away from their neighbours on at least one random head. Such vertices were attached to
+    another layer of the surface, such as the inside of a lid or the eyeball."""
     graph = _graph(faces[skin[faces].all(axis=1)], len(rest))
     graph = sparse.csr_array(((graph + graph.T) > 0).astype(float))
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)[:, None]
@@ -216,8 +216,8 @@ def parting(
 
 
 def without_edge(skin: Flags, faces: Int[np.ndarray, "f 3"]) -> Flags:
-    """Returns the skin without its vertices next to deeper parts. Where a lid turns inwards it is chance which of them
-    still meet the model's lid; without all of them the deeper parts follow evenly."""
+    """Returns the skin without its vertices next to deeper parts. Where a lid turns inwards, it is chance which of
+    these vertices still match the model's lid; without all of them the deeper parts follow evenly."""
     out = skin.copy()
     for _ in range(EDGE_RINGS):
         out[faces[~out[faces].all(axis=1)]] = False
@@ -233,7 +233,7 @@ def without_specks(mask: Flags, faces: Int[np.ndarray, "f 3"]) -> Flags:
 
 
 def _drawn(mesh: Surface, skin: Flags, head: Surface, marks: Sequence[tuple[np.ndarray, np.ndarray]]) -> Vertices:
-    """Returns the mesh's vertices with the skin drawn onto the head, and its landmarks onto the head's; other parts
+    """Returns the mesh's vertices with the skin deformed onto the head, and its landmarks onto the head's; other parts
     stay."""
     rows = np.flatnonzero(skin)
     place = np.full(len(skin), -1)

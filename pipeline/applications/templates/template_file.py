@@ -1,4 +1,4 @@
-"""Reads and writes templates as files (npz with a JSON ``meta``): a mesh, and how it follows a head model."""
+"""Reads and writes templates as files (npz with a JSON ``meta``): a mesh, and its binding to a head model."""
 
 import io
 import json
@@ -124,7 +124,7 @@ def _template(meta: dict, arrays: Mapping[str, np.ndarray], flame: FlameModel | 
 
 
 def _check(path: Path, template: Template) -> None:
-    """Raises BadTemplate if rows or numbers of the file are invalid, which would fail a job only at its end."""
+    """Raises BadTemplate if rows or numbers of the file are invalid; otherwise a job would fail only at its end."""
     mesh, surface_binding = template.mesh, template.surface_binding
     count = len(surface_binding.rest)
     rows = (mesh.corners, surface_binding.skin, surface_binding.anchors, surface_binding.whole_anchors)

@@ -1,2 +1,2 @@
-"""Judges whether a result is right, and whether it repeats. Meshes and landmarks enter, judgements leave, whatever
-program made the heads."""
+"""Judges whether a result is correct, and whether it is repeatable. In: meshes and landmarks, from any program. Out:
+judgements."""

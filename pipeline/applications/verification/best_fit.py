@@ -1,10 +1,10 @@
-"""Lays a measured head on its reference by a rigid motion: least squares of the distances to the surface.
+"""Aligns a measured head to its reference by a rigid motion: least squares of the distances to the surface.
 
-The reference has its own frame. The motion starts from landmarks where both have them, else from a search: rotations
-spread over all directions, with the head's middle at the middles of parts of the scan. The start with the best fit of
-the face wins. Steps on distances along the reference's normals over the face, weighted by area, complete the motion
-(``pipeline.geometry.registration``). It is a standard's best fit, in which size has no part. The size error is found
-afterwards by the same steps with a scale, and reported.
+The reference has a frame of its own. The motion starts from landmarks if both have them. Otherwise it starts from a
+search: rotations spread over all directions, with the head's middle at the middles of parts of the scan. The start with
+the best fit of the face wins. Steps on distances along the reference's normals over the face, weighted by area,
+complete the motion (``pipeline.geometry.registration``). This is the standard's best fit, in which size is not
+corrected. The size error is then found by the same steps with a scale, and reported.
 """
 
 from dataclasses import dataclass
@@ -43,11 +43,11 @@ NOT_THIS_MM = 5.0  # RMS over the face after the best fit: beyond any fault of a
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BestFit:
-    """Holds the rigid motion that lays a head on its reference.
+    """Holds the rigid motion that aligns a head to its reference.
 
     ``start`` is "landmarks" or "search". ``rms_mm`` is the RMS distance after the rigid motion, over the ``points``
-    that have a counterpart on the reference. ``scale`` is the size of the measured head relative to the reference, 1 =
-    right.
+    that have a counterpart on the reference. ``scale`` is the size of the measured head relative to the reference, 1 if
+    correct.
     """
 
     reference_from_world: RigidTransform
@@ -58,8 +58,8 @@ class BestFit:
 
 
 def best_fit(measured: Measured, reference: Reference) -> BestFit:
-    """Finds the rigid motion that lays the face of a measured head on the reference. Raises InputError if the reference
-    is no scan of this head."""
+    """Finds the rigid motion that aligns the face of a measured head to the reference. Raises InputError if the
+    reference is no scan of this head."""
     face = measured.regions["face"]
     rng = np.random.default_rng(0)
     count = min(POINTS, int(face.sum()))
@@ -97,9 +97,9 @@ def _refined(
     free_scale: bool,
 ) -> tuple[Similarity, float, int]:
     """Refines a motion by Gauss-Newton. Returns the motion, the RMS distance (mm) and the number of points with a
-    counterpart. Far points weigh less at first (Geman and McClure), and the same as others in the end.
+    counterpart. Far points weigh less at first (Geman and McClure), and equally in the end.
 
-    The RMS counts a point that is far from the scan as ``FAR_MM`` off, so that a fit to a corner of it is no good one.
+    A point far from the scan counts in the RMS as ``FAR_MM`` off, so a fit to a small part of the scan does not win.
     """
 
     def meet(_: Similarity, there: Float[np.ndarray, "n 3"], reach: float) -> Counterparts | None:
@@ -123,8 +123,8 @@ def _refined(
 
 
 def _searched(measured: Measured, reference: Reference, rng: np.random.Generator) -> list[Similarity]:
-    """Returns the best starting motions among all rotations: many are tried briefly with few points, fewer of them
-    longer with more."""
+    """Returns the best starting motions among all rotations: many are tried briefly with few points, then the better
+    ones longer with more."""
     head = np.flatnonzero(~measured.regions["neck"])
     chosen = head[draw_rows(measured.areas[head], ROUNDS[-1].points, rng)]
     surface, facing = draw_surface_points(reference.index, rng)

@@ -1,15 +1,15 @@
-"""Reads the heads of many results of one model, and builds a model from them, with their stated deviations.
+"""Reads the heads of many results of one model, and builds a new model from them and their stated standard deviations.
 
-The heads lie in their model's topology already, so nothing has to be corresponded. The model that made them is the
-known population, and what it cannot make comes from them. Topology, landmarks and expressions stay, so that the new
+The heads already have their model's topology, so no correspondence is needed. The model that made them is the prior
+population; shapes outside its span come from the heads. Topology, landmarks and expressions stay the same, so the new
 model is used like the old one.
 
-The population is updated by the observed heads, each vertex as far as it is known. Mean and covariance have the normal-
-inverse-Wishart prior that the known population gives (K. Murphy, *Conjugate Bayesian analysis of the Gaussian
-distribution*, 2007, section 8): it counts as so many heads. Observed heads lie in it only as far as their deviations
-let them: each is replaced by what it is expected to be in the population, and by the covariance of that, a step of
-expectation maximisation for a Gaussian with known noise. Without it, what a rig could not see would count as what
-people look like.
+The observed heads update the population, each vertex according to its accuracy. Mean and covariance have a
+normal-inverse-Wishart prior from the known population (K. Murphy, *Conjugate Bayesian analysis of the Gaussian
+distribution*, 2007, section 8), which counts as a stated number of heads. Heads have errors. So each head is replaced
+by its expected shape in the population, given its standard deviations, together with the covariance of that
+expectation: a step of expectation maximisation for a Gaussian with known noise. Without this step, errors where a rig
+sees nothing would count as variation of people.
 """
 
 from dataclasses import dataclass, replace
@@ -106,10 +106,10 @@ def updated(
     *,
     report: Progress = discard_progress,
 ) -> Components:
-    """Returns the population that is known after N heads were observed, which are aligned to its mean.
+    """Returns the population updated by N observed heads, which are aligned to its mean.
 
-    ``deviation_mm`` is how far each of their vertices may be off along an axis, above zero. The scores are the heads'
-    average, in the new modes."""
+    ``deviation_mm`` is the standard deviation of each vertex along an axis, above zero. ``scores`` are those of the
+    heads' average in the new modes."""
     expected, spread = heads, np.zeros((0, *known.mean.shape))
     now = pooled(known, expected, spread)
     for k in range(ROUNDS):
@@ -125,8 +125,8 @@ def updated(
 def pooled(
     known: Population, heads: Float[np.ndarray, "N V 3"], spread: Float[np.ndarray, "S V 3"] | None = None
 ) -> Population:
-    """Returns the posterior mean of the population. The rows of ``spread`` are the square root of the covariance that
-    the heads have besides, summed over all heads."""
+    """Returns the posterior mean of the population. The rows of ``spread`` are the square root of the additional
+    covariance of the heads, summed over all heads."""
     count, average = len(heads), heads.mean(axis=0)
     mean = (count * average + MEAN_HEADS * known.mean) / (count + MEAN_HEADS)
     between = np.sqrt(count * MEAN_HEADS / (count + MEAN_HEADS)) * (average - known.mean)
@@ -138,8 +138,8 @@ def pooled(
 def _expected(
     population: Population, heads: Float[np.ndarray, "N V 3"], deviation_mm: Float[np.ndarray, "N V"]
 ) -> tuple[Float[np.ndarray, "N V 3"], Float[np.ndarray, "M V 3"]]:
-    """Returns each head as the population and its deviations let it be, and the square root of the covariances of all
-    of them together."""
+    """Returns the expected shape of each head, given the population and its standard deviations, and the square root of
+    the summed covariance."""
     count, vertices = population.modes.shape[:2]
     weight = np.sqrt(min(1.0, PATCHES / vertices)) / deviation_mm
     coefficients, covariance = np.zeros((len(heads), count)), np.zeros((count, count))
@@ -181,7 +181,7 @@ def find_results(folder: Path) -> tuple[Path, ...]:
 def read_delivered(
     folder: Path, folders: tuple[Path, ...], model: HeadModel, *, report: Progress = discard_progress
 ) -> tuple[Delivered, dict[str, Message]]:
-    """Reads results that ``model`` made. Returns the heads, and why results were left out, by their place below
+    """Reads results that ``model`` made. Returns the heads, and the reasons for left-out results, by their path below
     ``folder``. Raises InputError naming every damaged result."""
     names, points, deviations, skipped, faults = [], [], [], {}, []
     for k, place in enumerate(folders):

@@ -1,24 +1,24 @@
-"""The figures of a verification, in the spirit of VDI/VDE 2634 part 3, with a mannequin in place of its spheres.
+"""Computes the figures of a verification after VDI/VDE 2634 part 3, with a mannequin in place of its spheres.
 
-Deviations are signed distances (mm, positive outside) of a measured head's vertices to the reference after the best
-fit, weighted by the area that each vertex stands for. Vertices whose closest point lies at the rim of the scan, or
-farther than 10 mm, are not judged, and the share that is left is told.
+Deviations are signed distances (mm, positive outside) from the reference to a measured head's vertices after the best
+fit, weighted by the area of each vertex. Vertices whose closest point lies at the rim of the scan, or farther than 10
+mm, are not judged; the remaining fraction is reported.
 
 - probing error, form: the range of the deviations of 99.7 % of the face's area;
-- probing error, size: the scale of the best fit with a scale, by 1, in percent;
-- distance error: distances between landmarks, measured less those of the reference. They need no alignment;
-- repeatability: scatter of the heads over the captures (``repeatability``); the limit is for that along the normal,
-  the surface's own, since which vertex lies where on it is no one's concern here;
-- error by region: mean, RMS, median and 95th percentile, and what all captures have in common (``repeated``).
+- probing error, size: the best-fit scale minus 1, in percent;
+- distance error: distances between landmarks, measured minus reference. No alignment is needed for it;
+- repeatability: scatter of the heads over the captures (``repeatability``). The limit applies to the scatter along the
+  normal, because a vertex's position along the surface does not matter here;
+- error by region: mean, RMS, median and 95th percentile, and the part common to all captures (``repeated``).
 
-Repeatability is how far heads of one subject, shot several times, are from each other. All heads have the model's own
-vertices, so that each vertex is compared with itself. Rigid motions, without scale, remove where the subject sat: each
-head is laid on the mean of all over the given vertices, and the mean is computed anew (generalised Procrustes analysis
+Repeatability is the scatter of heads of one subject that was shot several times. All heads have the model's own
+vertices, so each vertex is compared with itself. Rigid motions, without scale, remove the subject's position: each head
+is aligned to the mean of all over the given vertices, and the mean is computed anew (generalised Procrustes analysis
 without scale; Gower 1975, https://doi.org/10.1007/BF02291478).
 
-The default limits are about one and a half times what the simulated studio reaches with a bare mannequin of another
-population than the model's (tests/laboratory/notes/verification.md), so that a sound rig passes and one with a lasting
-fault does not.
+The default limits are about one and a half times the values of the simulated studio with a bare mannequin from outside
+the model's population (tests/laboratory/notes/verification.md). A sound rig passes, and a rig with a lasting fault does
+not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -64,8 +64,8 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Holds a figure beside its limit. ``value`` and ``passed`` are None if the captures or the reference do not
-    provide the figure."""
+    """Holds a figure and its limit. ``value`` and ``passed`` are None if the captures or the reference do not provide
+    the figure."""
 
     name: str
     value: float | None
@@ -90,10 +90,10 @@ def checks(limits: Limits, values: Mapping[str, float | None]) -> tuple[Check, .
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scatter:
-    """Holds how each vertex scatters over several shots of one subject: standard deviations (mm) about the mean head.
+    """Holds the scatter of each vertex over several shots of one subject: standard deviations (mm) about the mean head.
 
-    ``position_mm`` is over all three directions together, ``normal_mm`` along the mean head's normal. The mean head
-    lies where the first head does.
+    ``position_mm`` is over all three directions together, ``normal_mm`` along the mean head's normal. The mean head has
+    the pose of the first head.
     """
 
     mean: Float[np.ndarray, "v 3"]
@@ -103,11 +103,11 @@ class Scatter:
     def figures(
         self, stated_mm: Float[np.ndarray, " v"], weights: Float[np.ndarray, " v"], kept: Bool[np.ndarray, " v"]
     ) -> dict[str, float]:
-        """Returns figures over the ``kept`` vertices, weighted by ``weights``: the RMS scatter and, beside it, the
-        stated deviation (mm, along the normal).
+        """Returns figures over the ``kept`` vertices, weighted by ``weights``: the RMS scatter and the stated standard
+        deviation (mm, along the normal).
 
-        ``scatter_over_stated`` is their ratio: 1 if the stated deviation is all scatter, less if part of it is an error
-        that each shot repeats. ``rank_correlation`` says whether vertices with a larger stated deviation scatter more.
+        ``scatter_over_stated`` is their ratio: 1 if the stated deviation is all scatter, less if a part of it repeats
+        in each shot. ``rank_correlation`` tells whether vertices with a larger stated deviation scatter more.
         """
         share = weights[kept] / weights[kept].sum()
         position, normal, stated = self.position_mm[kept], self.normal_mm[kept], stated_mm[kept]
@@ -128,8 +128,8 @@ class Scatter:
 
 @dataclass(frozen=True, slots=True)
 class RegionError:
-    """Holds the deviations (mm) of a region of the head, weighted by area. ``covered`` is the share of the region's
-    area that the reference shows."""
+    """Holds the deviations (mm) of a region of the head, weighted by area. ``covered`` is the fraction of the region's
+    area that the reference contains."""
 
     covered: float
     mean_mm: float
@@ -153,7 +153,7 @@ class Judged:
 
     @property
     def size_error_percent(self) -> float:
-        """Returns by how many percent the head is too large; negative if it is too small."""
+        """Returns by how many percent the head is too large; negative if too small."""
         return 100.0 * (self.fit.scale - 1.0)
 
     @property
@@ -179,13 +179,13 @@ class Judgement:
 
     @property
     def passed(self) -> bool:
-        """Tells whether all limits are kept. A figure that could not be judged (no landmarks, a single capture) does
-        not fail."""
+        """Tells whether all figures are within their limits. A figure that could not be judged (no landmarks, a single
+        capture) does not fail."""
         return all(check.passed is not False for check in self.checks)
 
 
 def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) -> Judgement:
-    """Judges heads of one model and subject against the reference. Raises InputError if it is not of this head."""
+    """Judges heads of one model and subject against the reference. Raises InputError if it shows another head."""
     captures = tuple(judge_one(one, reference) for one in measured)
     first = measured[0]
     deviations = np.stack([one.deviation_mm for one in captures])
@@ -204,8 +204,8 @@ def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) ->
 
 
 def judge_one(measured: Measured, reference: Reference) -> Judged:
-    """Judges one head against the reference. Raises InputError if the reference is not of this head, or its faces look
-    inwards."""
+    """Judges one head against the reference. Raises InputError if the reference shows another head, or if its faces
+    point inwards."""
     fit = best_fit(measured, reference)
     there = fit.reference_from_world.apply(measured.mesh_world.vertices)
     hits = reference.index.closest(there)
@@ -222,7 +222,7 @@ def judge_one(measured: Measured, reference: Reference) -> Judged:
 
 
 def region_errors(deviation_mm: Float[np.ndarray, " v"], measured: Measured) -> dict[str, RegionError]:
-    """Returns the errors of every region of which the reference covers at least ``MIN_COVERED``."""
+    """Returns the errors of every region with at least ``MIN_COVERED`` of its area in the reference."""
     found = {}
     known = np.isfinite(deviation_mm)
     for name in REGIONS:
@@ -245,8 +245,8 @@ def _region_error(deviation_mm: Float[np.ndarray, " n"], areas: Float[np.ndarray
 
 
 def weighted_range(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], share: float) -> float:
-    """Returns the range of the values that holds the given share of the weight; half of the rest is cut off on each
-    side."""
+    """Returns the width of the central range that holds this ``share`` of the weight; half of the remainder is cut off
+    on each side."""
     low, high = weighted_quantiles(values, weights, (0.5 - share / 2, 0.5 + share / 2))
     return high - low
 
@@ -254,7 +254,7 @@ def weighted_range(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, "
 def weighted_quantiles(
     values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], shares: Sequence[float]
 ) -> list[float]:
-    """Returns the value below which each of the given shares (0 to 1) of the total weight lies, interpolated."""
+    """Returns, for each of ``shares`` (0 to 1), the value below which that part of the weight lies, interpolated."""
     order = np.argsort(values)
     reached = (np.cumsum(weights[order]) - 0.5 * weights[order]) / weights.sum()
     return np.interp(shares, reached, values[order]).tolist()
@@ -274,7 +274,7 @@ def distance_pairs(measured: Measured, reference: Reference) -> dict[str, tuple[
 
 
 def _values(captures: Sequence[Judged], repeatability: Mapping[str, Mapping[str, float]]) -> dict[str, float | None]:
-    """Returns the figures of the worst capture, by the names of the limits."""
+    """Returns the figures of the worst capture, by the limits' names."""
     faces = [one.regions.get("face") for one in captures]
     features = [one.regions[name].rms_mm for one in captures for name in FEATURES if name in one.regions]
     distances = [rms for one in captures if (rms := one.distance_rms_mm) is not None]
@@ -293,7 +293,7 @@ def scatter(
     heads: Float[np.ndarray, "n v 3"], faces: Int[np.ndarray, "f 3"], laid_on: Bool[np.ndarray, " v"]
 ) -> Scatter:
     """Computes the scatter of two or more heads (mm, each in its own frame) with the same vertices. The heads are first
-    laid on each other over the vertices ``laid_on``."""
+    aligned to each other over the vertices ``laid_on``."""
     if len(heads) < 2:
         raise ValueError(f"{len(heads)} heads have no scatter; two are needed")
     mean = heads[0]

@@ -24,8 +24,8 @@ DOUBTFUL = ("face-elsewhere", "no-face", "pose-doubtful", "scale-assumed", "scal
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """Holds one reconstructed head. ``stated_mm`` is the standard deviation along the normal that its result states for
-    each vertex."""
+    """Holds one reconstructed head. ``stated_mm`` is the result's standard deviation of each vertex along the
+    normal."""
 
     name: str
     mesh_world: Mesh
@@ -52,7 +52,7 @@ def is_result(folder: Path) -> bool:
 
 
 def identity_of(folder: Path) -> ResultIdentity:
-    """Returns which model made a result. Raises InputError if report.json is missing, damaged or does not say it."""
+    """Returns which model made a result. Raises InputError if report.json is missing, damaged or lacks the model."""
     try:
         model = read_report(folder)["model"]
         return ResultIdentity(str(model["name"]), str(model["sha256"]))
@@ -61,8 +61,7 @@ def identity_of(folder: Path) -> ResultIdentity:
 
 
 def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
-    """Reads a result folder that was made with ``model``. Raises InputError that names each file or field that does not
-    fit."""
+    """Reads a result folder made with ``model``. Raises InputError that names each file or field that is wrong."""
     report = read_report(folder)
     mesh, stated_mm = read_head_ply(folder / "head.ply")
     full = model.levels["full"]
@@ -91,7 +90,7 @@ def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
 
 
 def read_report(folder: Path) -> ReportDocument:
-    """Returns the decoded report.json of a result; its contents are not checked. Raises InputError."""
+    """Returns the decoded report.json of a result without checking its contents. Raises InputError."""
     try:
         return json.loads((folder / "report.json").read_text(encoding="utf-8"))
     except FileNotFoundError as error:

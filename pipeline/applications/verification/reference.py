@@ -1,8 +1,8 @@
-"""The reference: a scan of the mannequin that was shot, in mm and in a frame of its own, with its landmarks.
+"""Holds the reference: a scan of the mannequin, in mm and in a frame of its own, with its landmarks.
 
-What is wrong with a file is named before anything is judged by it: a scan in metres or centimetres, too few triangles
-(half a file), faces that look different ways, landmarks that are not on the surface. Holes are no fault by themselves;
-``judgement`` says how much of each region the scan covers.
+Faults of a file are named before it is used: a scan in metres or centimetres, too few triangles (half a file), faces
+with inconsistent orientation, landmarks off the surface. Holes alone are no fault; ``judgement`` reports how much of
+each region the scan covers.
 """
 
 from collections.abc import Mapping

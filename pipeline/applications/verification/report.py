@@ -1,4 +1,4 @@
-"""``report.json`` of a verification (format ``eigenhead-verification/1``)."""
+"""Builds ``report.json`` of a verification (format ``eigenhead-verification/1``)."""
 
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -19,7 +19,7 @@ VerificationReport = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Occasion:
-    """Holds what a report says besides the judgement: the day of the test (ISO 8601), the model, and the limits."""
+    """Holds the report's content besides the judgement: the day of the test (ISO 8601), the model, and the limits."""
 
     date: str
     model: ResultIdentity

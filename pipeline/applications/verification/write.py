@@ -1,4 +1,4 @@
-"""The folder of a verification: report.json, certificate.pdf, and the certificate's pictures in one."""
+"""Writes the folder of a verification: report.json, certificate.pdf, and one file with the certificate's pictures."""
 
 import json
 from dataclasses import dataclass
@@ -64,7 +64,7 @@ class Pictures:
 
 
 def draw(first: Measured, reference: Reference, judgement: Judgement) -> Pictures:
-    """Draws all pictures. ``first`` is the head of the first capture in ``judgement``. The error drawn on it is the
+    """Draws all pictures. ``first`` is the head of the first capture in ``judgement``. The head is coloured with the
     mean error over all captures."""
     head = first.head_from_world.apply(first.mesh_world.vertices)
     fitted = Mesh(head, first.mesh_world.faces)
@@ -107,7 +107,7 @@ def legend(width: int = 600, height: int = 24) -> Resized:
 def write_verification(
     folder: Path, first: Measured, reference: Reference, judgement: Judgement, occasion: Occasion
 ) -> VerificationReport:
-    """Writes a verification's files, report.json last, and returns that. ``first`` is the first capture's head."""
+    """Writes a verification's files, report.json last, and returns its content. ``first``: the first capture's head."""
     document, pictures = report_document(judgement, reference, occasion), draw(first, reference, judgement)
     rows = [np.hstack(row) for row in (pictures.reference, pictures.result, pictures.error)]
     write_image(folder / "error.png", np.vstack(rows))

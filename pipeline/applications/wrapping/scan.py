@@ -1,4 +1,4 @@
-"""The scan: a triangle mesh in its own unit and axes, whose vertices are joined along seams, and its colours."""
+"""Reads the scan: a triangle mesh in its own unit and axes, with vertices joined along seams, and its colours."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,15 +34,15 @@ class RawScan:
         return self.painted.image is not None or self.painted.mesh.colours is not None
 
     def turned_over(self) -> "RawScan":
-        """Returns the scan with all triangles turned over."""
+        """Returns the scan with all triangles flipped."""
         painted = replace(self.painted, mesh=_reversed(self.painted.mesh))
         return RawScan(self.name, _reversed(self.mesh), painted)
 
     def colours_at(
         self, triangles: Int[np.ndarray, " n"], weights: Float[np.ndarray, "n 3"]
     ) -> UInt8[np.ndarray, "n 3"]:
-        """Returns the sRGB colours of points on the surface, given by triangle and barycentric weights; grey where the
-        file holds none."""
+        """Returns the sRGB colours of points on the surface, given by triangle and barycentric weights; grey if the
+        file has none."""
         rows = self.painted.mesh.faces[triangles]
         if self.painted.image is not None and self.painted.uv is not None:
             return _texels(self.painted.image, np.einsum("nk,nkx->nx", weights, self.painted.uv[rows]))
@@ -52,8 +52,8 @@ class RawScan:
         return np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
 
     def drawable(self) -> Mesh:
-        """Returns the scan with colours at its vertices, its triangles divided until a texture is not blurred by
-        that."""
+        """Returns the scan with colours at its vertices; its triangles are divided until vertex colours do not blur the
+        texture."""
         mesh = self.painted.mesh
         if self.painted.image is None or self.painted.uv is None:
             return mesh
@@ -64,7 +64,7 @@ class RawScan:
 
 
 def read_raw_scan(path: Path) -> RawScan:
-    """Reads a scan with its colours. Raises InputError that says what is wrong with the file."""
+    """Reads a scan with its colours. Raises InputError with the fault of the file."""
     painted = read_textured_mesh(path)
     count = len(painted.mesh.faces)
     if count < MIN_TRIANGLES:
@@ -87,7 +87,7 @@ def _reversed(mesh: Mesh) -> Mesh:
 
 
 def _texels(image: ImageRgb, uv: Float[np.ndarray, "n 2"]) -> UInt8[np.ndarray, "n 3"]:
-    """Reads a texture at coordinates (v upwards) that repeat beyond the unit square, bilinearly."""
+    """Reads a texture bilinearly at coordinates (v upwards), which repeat outside the unit square."""
     size = np.array(image.shape[1::-1])
     shares = np.where((uv >= 0.0) & (uv <= 1.0), uv, uv % 1.0)
     at = np.clip(np.stack([shares[:, 0], 1.0 - shares[:, 1]], axis=1) * size - 0.5, 0.0, size - 1.0)

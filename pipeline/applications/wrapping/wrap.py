@@ -1,13 +1,13 @@
-"""Composes the wrapping of a scan: placed by its face, fitted, drawn, measured.
+"""Wraps a scan in four steps: it is placed by its face, the model is fitted, the template is deformed, and distances
+are measured.
 
-The face is found on renders, whatever the scan's unit and axes. The scan is drawn from all sides until one picture
-shows a face (the finder takes it in any roll). Its points are lifted onto the scan; their size tells the unit, their
-order in space the axes. Then the scan is drawn from seven directions in front of that face, as photographs of a rig,
-and the face is found in these as in any capture.
+The face is found on rendered pictures, whatever the scan's unit and axes. The scan is rendered from all sides until one
+picture shows a face (the finder accepts any roll). The points of the face are projected onto the scan; their size gives
+the unit, and their arrangement the axes. Then the scan is rendered from seven directions in front of that face, like
+photographs of a rig, and the face is found in these as in any capture.
 
-Then the model is fitted, as for a template's registration (``templates``), with the scan in the template's place. At
-last the template's own vertices are drawn, as ``geometry.registration.nonrigid`` does, with exact closest points of the
-scan's triangles.
+Then the model is fitted to the scan, as to a mesh in a template's registration (``templates``). Last, the template's
+own vertices are deformed as in ``geometry.registration.nonrigid``, with exact closest points on the scan's triangles.
 """
 
 from collections.abc import Iterator, Mapping
@@ -87,7 +87,7 @@ NEAR_MM = 8.0  # of a mean adult: a lifted point that differs by this weighs a q
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Glance:
-    """Holds a face in one picture, lifted onto the scan (its own unit)."""
+    """Holds a face in one picture, projected onto the scan (in the scan's unit)."""
 
     detection: FaceDetection
     scan_from_face: Similarity  # of a mean adult's points, mm
@@ -95,8 +95,8 @@ class _Glance:
 
 
 def unit_of(scale: float) -> tuple[str | None, float]:
-    """Returns the unit and its millimetres in which a face has a head's size, from its size in the scan's unit by a
-    mean adult's in mm. Returns None, and what makes it a mean adult, if no unit does."""
+    """Returns the unit, and its length in mm, in which a face has a human's size; ``scale`` is its size in the scan's
+    unit relative to a mean adult in mm. Returns None, and the factor to a mean adult's size, if no unit fits."""
     for unit, factor in UNITS_MM.items():
         if SIZE_RANGE[0] < scale * factor < SIZE_RANGE[1]:
             return unit, factor
@@ -104,7 +104,7 @@ def unit_of(scale: float) -> tuple[str | None, float]:
 
 
 def front_rig(world_from_face: Similarity) -> Rig:
-    """Returns cameras before a face (mm), which look at its middle."""
+    """Returns cameras in front of a face (mm), directed at its middle."""
     turn, middle = world_from_face.rotation, world_from_face.translation
     lens = _lens(FRONT_PX, FRONT_PX * FRONT_MM / FRONT_SHOWN_MM)
     cameras = []
@@ -120,8 +120,8 @@ def _lens(size: int, focal_px: float) -> Intrinsics:
 
 
 def _search(mesh: Mesh, light: Light, networks: FaceNetworks, renderer: Renderer) -> _Glance | None:
-    """Returns the best face of the pictures from all sides: first those along the axes, then, unless one of these is
-    beyond doubt, those between."""
+    """Returns the best face in the pictures from all sides: first along the axes, then, unless one is beyond doubt,
+    from directions between."""
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     low, high = np.percentile(centres, [OUTLYING, 100.0 - OUTLYING], axis=0)
     middle, factor = (low + high) / 2, SEARCH_RADIUS / max(float(np.linalg.norm(high - low)) / 2, 1e-12)
@@ -141,7 +141,7 @@ def _search(mesh: Mesh, light: Light, networks: FaceNetworks, renderer: Renderer
 
 
 def _round_rigs() -> Iterator[Rig]:
-    """Returns cameras that look at the origin along the axes, then along the diagonals."""
+    """Returns cameras directed at the origin along the axes, then along the diagonals."""
     focal = 0.5 * SEARCH_PX * 6.0 * SEARCH_RADIUS / (1.02 * SEARCH_RADIUS)
     directions = [np.array(d, float) for d in product((-1, 0, 1), repeat=3) if any(d)]
     for diagonal in (False, True):
@@ -169,7 +169,7 @@ def _before_grey(image: np.ndarray) -> ImageRgb:
 def _lifted(
     face: FaceDetection, camera: Camera, depth: Float[np.ndarray, "h w"], small_from_scan: Similarity
 ) -> _Glance | None:
-    """Lifts the points of a face onto the scan. Returns None if too few of them lie on it."""
+    """Projects the points of a face onto the scan. Returns None if too few of them lie on it."""
     columns, rows = np.clip(np.rint(face.landmarks_px).astype(int), 0, SEARCH_PX - 1).T
     away = depth[rows, columns].astype(float)
     hit = np.isfinite(away)
@@ -189,7 +189,7 @@ def _lifted(
 
 
 def _looks_inwards(mesh: Mesh, scan_from_face: Similarity) -> bool:
-    """Tells whether the triangles in front of the face look into the head."""
+    """Tells whether the triangles in front of the face point into the head."""
     face_from_scan = scan_from_face.inverse()
     middles = face_from_scan.apply(mesh.vertices[mesh.faces].mean(axis=1))
     shape = point_table().shape_mm
@@ -205,7 +205,7 @@ def nearest_axis(direction: Float[np.ndarray, " 3"]) -> str:
 
 
 def _lids(face: MatchedFaces, rig: Rig) -> Float[np.ndarray, "32 3"] | None:
-    """Triangulates the edges of the lids as the eyes' network sees them, also those of closed eyes."""
+    """Triangulates the edges of the lids from the eye network's points, also for closed eyes."""
     seen = {name: found.lids_px for name, found in face.detections.items() if found.lids_px is not None}
     if len(seen) < 2:
         return None
@@ -219,11 +219,11 @@ def _lids(face: MatchedFaces, rig: Rig) -> Float[np.ndarray, "32 3"] | None:
 def drawn_onto(
     carried: Float[np.ndarray, "t 3"], template: Template, model: HeadModel, scan: Surface
 ) -> tuple[Float[np.ndarray, "t 3"], Bool[np.ndarray, " t"]]:
-    """Draws a template onto a scan near it. Returns all vertices, and which of them lie on the scan.
+    """Deforms a template onto a nearby scan. Returns all vertices, and which of them lie on the scan.
 
-    The parts that have skin are drawn as one surface, from the shape in which the template was registered, so that lips
-    and lids stay as smooth as they are there; what lies deeper in them follows by its stiffness. All other parts follow
-    the skin (``SurfaceBinding.with_skin``)."""
+    The parts with skin are deformed as one surface, starting from the template's registered shape, so that lips and
+    lids stay as smooth as there; deeper vertices in them follow by stiffness. All other parts follow the skin
+    (``SurfaceBinding.with_skin``)."""
     binding, target = template.surface_binding, MetSurface(scan)
     welded, joined = weld(Surface.of(binding.rest, template.mesh.triangles()))
     first = np.unique(joined, return_index=True)[1]  # a row of the file for every joined vertex
@@ -261,15 +261,15 @@ def drawn_onto(
 
 
 def _near_face(points: Float[np.ndarray, "n 3"], model: HeadModel) -> Bool[np.ndarray, " n"]:
-    """Tells which points of a registered template lie near the face of the mean head: points there that are no skin lie
-    in the mouth, the nose or the sockets."""
+    """Tells which points of a registered template lie near the face of the mean head. Points there that are no skin
+    belong to the mouth, the nose or the sockets."""
     mean = model.vertices(np.zeros(0))
     return KDTree(mean[model.levels["full"].face_region]).query(points)[0] < FACE_MM
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedScan:
-    """Holds a scan with its unit and axes, and how the mean head lies on it."""
+    """Holds a scan with its unit and axes, and the pose of the mean head on it."""
 
     scan: RawScan  # turned over where its triangles looked inwards
     turned_over: bool
@@ -281,12 +281,12 @@ class PlacedScan:
 
     @property
     def up(self) -> str:
-        """Returns the axis of the scan nearest to the head's up, as "+y"."""
+        """Returns the scan's axis nearest to the head's upward direction, as "+y"."""
         return nearest_axis(self.head_from_scan.rotation[1])
 
     @property
     def front(self) -> str:
-        """Returns the axis of the scan nearest to where the face looks."""
+        """Returns the scan's axis nearest to the face's direction."""
         return nearest_axis(self.head_from_scan.rotation[2])
 
     def surface(self) -> Surface:
@@ -297,8 +297,8 @@ class PlacedScan:
 def place_scan(
     scan: RawScan, model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None
 ) -> PlacedScan:
-    """Places a scan by the face that is found on it, or by landmarks in the scan's own frame. Raises InputError if no
-    face is found, or too few landmarks are named."""
+    """Places a scan by its detected face, or by landmarks in the scan's own frame. Raises InputError if no face is
+    found, or too few landmarks are named."""
     if not landmarks:
         with Renderer.create() as renderer:
             return _place_on_face(scan, model, load_networks(), renderer)
@@ -383,7 +383,7 @@ class Wrapped:
     index: SurfaceIndex  # of the scan, own frame
 
     def hits(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Hits:
-        """Returns the closest places of the scan that face the same way."""
+        """Returns the closest points of the scan that face the same way."""
         return _closest(self.index, points, normals, self.placed.mm_per_unit)
 
     def figures(self) -> dict[str, float]:
@@ -445,7 +445,7 @@ def wrap(
 
 
 def residual_colours(distance_mm: Float[np.ndarray, " t"], covered: Bool[np.ndarray, " t"]) -> UInt8[np.ndarray, "t 3"]:
-    """Returns colours of distances: white at 0, yellow at 0.5 mm, red from 1 mm on; grey where the scan has nothing."""
+    """Returns colours of distances: white at 0, yellow at 0.5 mm, red from 1 mm on; grey where there is no scan."""
     share = np.clip(distance_mm, 0.0, 1.0)
     colours = np.stack(
         [np.ones_like(share), np.clip(2.0 - 2.0 * share, 0, 1), np.clip(1.0 - 2.0 * share, 0, 1)], axis=1
@@ -467,7 +467,7 @@ def _scan_distances(
     triangles: Int[np.ndarray, "f 3"],
     covered: Bool[np.ndarray, " t"],
 ) -> Float[np.ndarray, " n"]:
-    """Returns the distances (mm) of points of the scan from the template, for those whose closest place lies in a
+    """Returns the distances (mm) of the scan's points from the template, for points whose closest point lies in a
     covered triangle."""
     mesh = placed.scan.mesh
     rows = np.arange(0, len(mesh.vertices), max(1, len(mesh.vertices) // SCAN_POINTS))

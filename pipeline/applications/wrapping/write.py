@@ -1,4 +1,4 @@
-"""Writes a wrapped scan: the template's OBJ with its texture, the residual map, a report, and a picture to look at."""
+"""Writes a wrapped scan: the template's OBJ with its texture, the residual map, a report, and a picture."""
 
 import io
 import json
@@ -47,7 +47,7 @@ def write_wrapped(folder: Path, wrapped: Wrapped) -> dict[str, Any]:
 
 
 def document_of(wrapped: Wrapped) -> dict[str, Any]:
-    """Returns what wrap.json says."""
+    """Returns the content of wrap.json."""
     placed, template = wrapped.placed, wrapped.template
     place = placed.head_from_scan
     return {
@@ -109,7 +109,7 @@ def _write_residuals(folder: Path, wrapped: Wrapped) -> None:
 
 
 def wrap_picture(wrapped: Wrapped) -> ImageRgb:
-    """Draws, from front and side, the scan in clay, the template on it, and the residuals; below, the face."""
+    """Draws, from front and side, the scan in clay, the template on it, and the residuals, with the face below."""
     scan, template = surface_in_head(wrapped)
     colours = residual_colours(wrapped.distance_mm, wrapped.covered)
     box = (template.vertices.min(axis=0), template.vertices.max(axis=0))

@@ -1,5 +1,5 @@
-"""Draws a mesh onto another surface smoothly, by non-rigid closest points (Amberg, Romdhani and Vetter 2007): each
-step is linear in the displacements; and warps by landmarks (section 3.2, step 3: scattered-data interpolation).
+"""Deforms a mesh smoothly onto another surface, by non-rigid closest points (Amberg, Romdhani and Vetter 2007): each
+step is linear in the displacements. Also warps by landmarks (section 3.2, step 3: scattered-data interpolation).
 
 The kernel of a warp is the distance itself, which minimises bending in three dimensions (F. Bookstein's thin plate in
 3-D; Carr et al. 2001, *Reconstruction and Representation of 3D Objects with Radial Basis Functions*, section 3), with a
@@ -22,7 +22,7 @@ from rig.mesh import edges_of, vertex_normals
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Holds the limits of one stage in which points of a head are searched on a scan. Lengths in mm."""
+    """Holds the limits of one stage of the search for a head's points on a scan. Lengths in mm."""
 
     steps: int
     reach_mm: float  # a match farther than this is another part of the head
@@ -54,7 +54,7 @@ def draw_to_target(
     marks: Mapping[int, Float[np.ndarray, " 3"]] = MappingProxyType({}),
     mark_weight: float = 0.0,
 ) -> Float[np.ndarray, "V 3"]:
-    """Draws a mesh onto a target by non-rigid closest points (``draw_to_matches``). Matches are nearest by
+    """Deforms a mesh onto a target by non-rigid closest points (``draw_to_matches``). Matches are the nearest points by
     position and normal together. ``marks`` are target positions of vertices (mm)."""
     tree, fixed = oriented_tree(target, search), np.array(list(marks), int)
 
@@ -75,12 +75,12 @@ def draw_to_matches(
     match: Callable[[Float[np.ndarray, "V 3"]], tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, " V"]]],
     stiffnesses: Sequence[float],
 ) -> Float[np.ndarray, "V 3"]:
-    """Moves a mesh smoothly to where its vertices match: non-rigid closest points, a step for each stiffness.
+    """Moves a mesh smoothly to its vertices' matches: non-rigid closest points, one step for each stiffness.
 
-    Each step solves (W + k L^T L) u = W d for the displacements u from ``start``. L is the graph Laplacian, so that
-    nearly affine motions cost little; all three axes share the matrix. ``match`` returns the wanted position and the
-    weight of every vertex of a shape (mm). It should move a vertex along the normal of its match and leave it in place
-    in the tangent plane."""
+    Each step solves (W + k L^T L) u = W d for the displacements u from ``start``. L is the graph Laplacian, so nearly
+    affine motions cost little; all three axes share the matrix. ``match`` returns the target position (mm) and the
+    weight of every vertex. The target should lie along the normal of the match, so that the vertex does not move in the
+    tangent plane."""
     bending, shape = _bending(faces, start), start
     for stiffness in stiffnesses:
         wanted, weight = match(shape)
@@ -127,8 +127,8 @@ def landmark_warp(
     smoothing: float = 0.0,
 ) -> Float[np.ndarray, "N 3"]:
     """Moves points by the smooth map that takes each source landmark to its target. If ``smoothing`` (mm) is above 0,
-    landmarks may miss their targets in exchange for less bending. At least 4 landmarks that are not on a plane are
-    needed; else numpy.linalg.LinAlgError is raised."""
+    landmarks may miss their targets in exchange for less bending. Raises numpy.linalg.LinAlgError unless at least 4
+    landmarks span all three dimensions."""
     count = len(source)
     affine = np.concatenate([np.ones((count, 1)), source], 1)
     system = np.zeros((count + 4, count + 4))

@@ -1,8 +1,7 @@
-"""Takes Gauss-Newton steps on the distances of points from a surface along its normals (Chen and Medioni 1992), over a
-motion and, if wanted, over the coefficients of a shape; and searches a motion from many starts, by trimmed
-iterations of points closest in position and direction (Besl and McKay 1992, https://doi.org/10.1109/34.121791):
-briefly from all of them, longer from the best. Procrustes analysis (section 4.2, eq. 3) has a form with a
-covariance."""
+"""Fits motions of points to a surface. Gauss-Newton steps minimise the distances along the normals (Chen and Medioni
+1992), over a motion and optionally shape coefficients. A search from many starts uses trimmed iterations of points
+closest in position and direction (Besl and McKay 1992, https://doi.org/10.1109/34.121791): brief from all starts,
+longer from the best. Procrustes analysis (section 4.2, eq. 3) also has a form with a covariance."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,8 +22,9 @@ Points = Float[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Counterparts:
-    """Holds what n points meet: the unit normals there, how far the surface lies ahead along them (mm), and weights, 0
-    for a point without a counterpart. ``reach_mm`` is how far counterparts may be at the next step."""
+    """Holds the counterparts of n points: the unit normals there, the distances to the surface along them (mm), and
+    weights, 0 for a point without a counterpart. ``reach_mm`` is the largest distance of a counterpart at the next
+    step."""
 
     normals: Points
     ahead_mm: Float[np.ndarray, " n"]
@@ -38,9 +38,9 @@ Meet = Callable[[Similarity, Points, float], Counterparts | None]
 def fit_motion(
     points: Points, meet: Meet, start: Similarity, *, reach_mm: float, steps: int, still_mm: float, scale: bool = False
 ) -> Similarity | None:
-    """Lays points on a surface by a rigid motion or, with ``scale``, a similarity. ``meet`` finds the counterparts of
-    the points where a motion brings them, within a reach that is ``reach_mm`` at first; once it returns None, for too
-    few, so does this. A step that moves every point by less than ``still_mm`` is the last, unless the reach shrinks."""
+    """Fits points to a surface by a rigid motion or, with ``scale``, a similarity. ``meet`` finds the counterparts of
+    the moved points within a reach, at first ``reach_mm``. It returns None if there are too few; so does this function.
+    A step that moves every point by less than ``still_mm`` is the last, unless the reach shrinks."""
     motion = start
     for _ in range(steps):
         there = motion.apply(points)
@@ -60,8 +60,8 @@ def fit_motion(
 
 
 def motion_columns(arms: Points, normals: Points, *, scale: bool = False) -> Float[np.ndarray, "n p"]:
-    """Returns how far points move along normals by a turn (rad) about the origin of ``arms``, by a shift (mm) and, with
-    ``scale``, by the logarithm of the scale."""
+    """Returns the displacement of points along normals by a rotation (rad) about the origin of ``arms``, by a shift
+    (mm) and, with ``scale``, by the logarithm of the scale."""
     columns = [np.cross(arms, normals), normals]
     if scale:
         columns.append((arms * normals).sum(axis=1, keepdims=True))
@@ -69,7 +69,7 @@ def motion_columns(arms: Points, normals: Points, *, scale: bool = False) -> Flo
 
 
 def motion_about(centre: Float[np.ndarray, " 3"], step: Float[np.ndarray, " p"]) -> Similarity:
-    """Returns the motion of a step in the unknowns of ``motion_columns``, about ``centre``."""
+    """Converts a step in the unknowns of ``motion_columns`` to a motion about ``centre``."""
     turn, scale = rotation_from_vector(step[:3]), float(np.exp(step[6])) if len(step) > 6 else 1.0
     return Similarity(scale, turn, centre + step[3:6] - scale * turn @ centre)
 
@@ -84,11 +84,11 @@ def solve_with_prior(
     precision: type = np.float64,
     ridge: float = 0.0,
 ) -> Float[np.ndarray, " p"]:
-    """Returns the step of the unknowns from ``state`` that explains the distances ``ahead`` best, under independent
+    """Returns the step of the unknowns from ``state`` that best explains the distances ``ahead``, under independent
     priors about 0 of information ``prior``.
 
-    Single ``precision`` halves the time where the prior is firm. ``ridge`` keeps unknowns without a prior from running
-    away: it is added to their information, by the mean information of all.
+    Single ``precision`` halves the time; use it where the prior is strong. ``ridge`` keeps unknowns without a prior
+    bounded: it is added to their information, as a multiple of the mean information.
     """
     root = np.sqrt(information)
     weighted = (columns * root[:, None]).astype(precision)
@@ -101,8 +101,7 @@ def solve_with_prior(
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Holds one round of the search: how many points and iterations of closest points it uses, and how many of the best
-    starts it keeps."""
+    """Holds one round of the search: the number of points, of iterations, and of best starts that continue."""
 
     points: int
     iterations: int
@@ -122,9 +121,9 @@ def search_motions(
     turns: Float[np.ndarray, "t 3 3"],
     places: Float[np.ndarray, "p 3"],
 ) -> list[Similarity]:
-    """Returns the best starting motions of points in random order: every turn with the points' middle at every place is
-    tried briefly with few of them, fewer motions longer with more. ``normals`` and ``facing`` are unit normals of the
-    points and of ``surface``, points of the other surface."""
+    """Returns the best starting motions of points in random order. Every rotation, with the points' middle at every
+    place, is tried briefly with few points; the best motions continue with more. ``normals`` and ``facing`` are unit
+    normals of the points and of ``surface``, points of the other surface."""
     middle = points.mean(axis=0)
     points = points - middle
     tree = KDTree(np.concatenate([surface, TURN_MM * facing], axis=1))
@@ -185,8 +184,8 @@ def procrustes(
 
 
 def rigid_procrustes(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> RigidTransform:
-    """Computes the rigid motion that minimises eq. (3), as ``procrustes``: of the same turn, but without a scale, which
-    fits few points too well."""
+    """Computes the rigid motion that minimises eq. (3), with the rotation of ``procrustes`` but no scale: a scale would
+    overfit few points."""
     rotation = procrustes(source, target).rotation
     return RigidTransform(rotation, target.mean(axis=0) - rotation @ source.mean(axis=0))
 
@@ -200,8 +199,8 @@ def generalised_procrustes(
     start: Similarity,
     scale_spread: float = SCALE_SPREAD,
 ) -> Similarity:
-    """Computes the most likely similarity T for ``target = T(source + e) + f``, where the errors e (head frame) and f
-    (world frame) are correlated between points.
+    """Computes the most likely similarity T for ``target = T(source + e) + f``; the errors e (head frame) and f (world
+    frame) are correlated between points.
 
     Iterated generalised least squares from ``start``: the residual's covariance is ``s^2 R C R^T + F``, taken at the
     last estimate. log s has the prior N(0, ``scale_spread``^2).

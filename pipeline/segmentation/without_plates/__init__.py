@@ -1,5 +1,5 @@
-"""Finds the subject of a capture that has neither clean plates nor masks: what all cameras are directed at, from the
-photographs.
+"""Finds the subject in the photographs of a capture without clean plates and masks. The subject is the object at which
+all cameras are directed.
 
-``decide`` combines: volume, colours, occupancy, and a plate guessed from the surroundings.
+``decide`` combines volume, colours, occupancy, and a plate guessed from the surroundings.
 """

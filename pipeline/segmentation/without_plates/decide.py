@@ -1,11 +1,11 @@
-"""Decides on every view of a capture that has neither plates nor masks: what the subject is, and how its edge is found.
+"""Decides, in every view of a capture without plates and masks, which pixels show the subject, and how the subject's
+edge is found.
 
 Matting must know the background behind the subject's border. In front of a studio's backdrop it is guessed well from
-what is beside the subject. In front of clutter, or if the subject stands on something of its own colour, it is not, and
-the view is cut along its edges instead, since a coarse mask may be a hand's breadth too wide where the surroundings
-look similar: windows along the outline are cut one by one (Rother et al., *GrabCut*, SIGGRAPH 2004, in OpenCV), so that
-colours are local, and overlapping windows are averaged (Bai et al., *Video SnapCut*, 2009). Then the views are compared
-again: what is left of the surroundings in one is rejected by another view's edge.
+what is beside the subject. In front of a plain backdrop the pixels beside the subject are a good guess of it. In front
+of clutter, or where subject and ground have one colour, the guess is bad, and a coarse mask may be a hand's breadth too
+wide. Such a view is cut along image edges: windows along the outline are cut one by one (Rother et al., *GrabCut*,
+SIGGRAPH 2004, in OpenCV) with local colours, and overlapping windows are averaged (Bai et al., *Video SnapCut*, 2009).
 """
 
 from collections.abc import Callable, Mapping
@@ -52,8 +52,8 @@ MIN_PIECE = 100  # px of outline
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WithoutPlates:
-    """Holds the views in two groups, by how their outline is found: ``decisions`` go to the matting; ``shares`` are the
-    subject's share of each pixel (full size), for views that were cut along edges."""
+    """Holds the views in two groups: ``decisions`` go to the matting; ``shares`` are the subject's fraction of each
+    pixel (full size) in views that were cut along edges."""
 
     decisions: Mapping[str, Decision]
     shares: Mapping[str, Float32[np.ndarray, "_ _"]]
@@ -103,8 +103,8 @@ def decide_without_plates(
 def background_seen(
     points: ScenePoints, name: str, width: int, size: tuple[int, int], volume: ViewingVolume, plane: Plane | None
 ) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of a reduced image (``size``: height, width) around scene points that are background: far from
-    the subject, or on the plane that it stands on."""
+    """Returns the pixels of a reduced image (``size``: height, width) around those scene points that are background:
+    far from the subject, or on the plane under it."""
     seen_points = points.points[points.rows[name]]
     behind = np.linalg.norm(seen_points - volume.centre_world, axis=1) > volume.radius_mm
     if plane is not None:
@@ -116,8 +116,8 @@ def background_seen(
 
 
 def solid_around(core: Bool[np.ndarray, "h w"], share: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Returns the share of a person's cut, of which the head's ``core`` is part and that has no holes: a cut takes a
-    highlight on a forehead for the wall."""
+    """Returns the subject's fraction of each pixel in a cut of a person, with the head's ``core`` added and holes
+    filled. (A cut may take a highlight on a forehead for the wall.)"""
     subject = np.pad(((share > 0.5) | core).view(np.uint8), 1)
     cv2.floodFill(subject, None, (0, 0), 2)
     return np.where(core | ((subject[1:-1, 1:-1] == 0) & (share <= 0.5)), np.float32(1.0), share)
@@ -147,7 +147,7 @@ def decision_without_plate(
     image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], found: CoarseMask, *, solid: bool = False
 ) -> Decision:
     """Returns a decision for the matting, with a background estimated from the pixels around the mask. If ``solid``,
-    the subject is a head, and holes in the mask are filled as skin or hair of the wall's colour."""
+    the subject is a head, and holes in the mask are filled: they are skin or hair of the wall's colour."""
     mask, others = whole_subject(found.mask, found.odds < -1)
     odds = found.odds
     if solid:
@@ -188,8 +188,8 @@ def estimated_background(
 
 
 def _pixel_noise(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, " 3"]:
-    """Returns the noise of one pixel (levels) in each channel, from differences of neighbours, most of which lie on no
-    edge."""
+    """Returns the noise (levels) of one pixel in each channel, from differences of neighbouring pixels, most of which
+    lie on no edge."""
     steps = image[::4, 1:].astype(np.float32) - image[::4, :-1]
     return (1.4826 * np.median(np.abs(steps), axis=(0, 1)) / np.sqrt(2)).astype(np.float32)
 
@@ -211,8 +211,8 @@ MIN_OFF_CENTRE = 0.08  # of the radius: the place that all cameras look at is no
 
 
 def standing_plane(points_world: Float[np.ndarray, "n 3"], centre_world: Vector, radius_mm: float) -> Plane | None:
-    """Finds a plane that many scene points lie on and hardly any lie beyond. ``plane . (x, 1)`` is the distance (mm),
-    positive on the subject's side; None if there is no such plane."""
+    """Finds a plane that contains many scene points and has hardly any behind it. ``plane . (x, 1)`` is the distance
+    (mm), positive on the subject's side; None if there is no such plane."""
     near = points_world[np.linalg.norm(points_world - centre_world, axis=1) < 2 * radius_mm]
     if len(near) < MIN_POINTS:
         return None
@@ -236,8 +236,8 @@ def standing_plane(points_world: Float[np.ndarray, "n 3"], centre_world: Vector,
 def ball_above(
     plane_world: Plane, points_world: Float[np.ndarray, "n 3"], centre_world: Vector, radius_mm: float
 ) -> tuple[Vector, float]:
-    """Returns the centre (world) and radius (mm) of a ball around the scene points above the plane, with some margin
-    for parts without points."""
+    """Returns the centre (world) and radius (mm) of a ball around the scene points above the plane; a margin covers
+    parts without points."""
     height = points_world @ plane_world[:3] + plane_world[3]
     inside = np.linalg.norm(points_world - centre_world, axis=1) < radius_mm
     standing = points_world[inside & (height > 2 * NEAR * radius_mm)]
@@ -282,7 +282,7 @@ def _refined(plane: Plane, points: Float[np.ndarray, "n 3"], centre: Vector, rad
 
 @dataclass(frozen=True, slots=True)
 class Bands:
-    """Holds how far inside and outside the given outline the edge is searched, in pixels of the images that are cut."""
+    """Holds how far (pixels of the cut images) inside and outside an outline its edge is searched."""
 
     inside: int
     outside: int
@@ -293,8 +293,8 @@ BANDS = (Bands(14, 8), Bands(8, 6))
 
 
 def cut_along(image: UInt8[np.ndarray, "h w 3"], mask: Mask, bands: Bands) -> Float32[np.ndarray, "h w"]:
-    """Cuts the image in windows along the mask's outline. Returns, for each pixel, the share of the windows over it
-    that assign it to the subject, weighted towards their middles."""
+    """Cuts the image in windows along the mask's outline. Returns, for each pixel, the fraction of its windows that
+    assign it to the subject; a window counts more near its middle."""
     height, width = mask.shape
     inner, outer = eroded(mask, bands.inside), ~dilated(mask, bands.outside)
     side = min(WINDOW, height, width)
@@ -318,7 +318,7 @@ def cut_along(image: UInt8[np.ndarray, "h w 3"], mask: Mask, bands: Bands) -> Fl
 
 
 def _cut(image: UInt8[np.ndarray, "h w 3"], mask: Mask, inner: Mask, outer: Mask) -> Mask | None:
-    """Cuts one window into subject and background; None if too few of its pixels are sure on either side."""
+    """Cuts one window into subject and background; None if too few of its pixels are certain on either side."""
     if min(np.count_nonzero(inner), np.count_nonzero(outer)) < MIN_SAMPLES:
         return None
     kinds = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -337,8 +337,8 @@ def cut_views(
     *,
     report: Callable[[float], None],
 ) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """Returns the subject's share of each pixel in every view, at the size of ``images``. ``volume`` belongs to the
-    size of ``masks``."""
+    """Returns the subject's fraction of each pixel in every view, at the size of ``images``. ``volume`` is built for
+    the size of ``masks``."""
     wide = {name: _resized(mask, images[name].shape[:2]) for name, mask in masks.items()}
     shares: dict[str, Float32[np.ndarray, "_ _"]] = {}
     for step, bands in enumerate(BANDS):
@@ -357,7 +357,7 @@ def _carved(
     masks: Mapping[str, Bool[np.ndarray, "_ _"]],
     volume: ViewingVolume,
 ) -> dict[str, Bool[np.ndarray, "_ _"]]:
-    """Returns the cut masks without the pixels that the cuts of the other views rule out."""
+    """Returns the cut masks without the pixels that the other views' cuts exclude."""
     odds = {
         name: (MAX_ODDS * (2 * cv2.resize(share, masks[name].shape[::-1], interpolation=cv2.INTER_AREA) - 1))
         for name, share in shares.items()

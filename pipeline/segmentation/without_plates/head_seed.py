@@ -1,4 +1,4 @@
-"""Finds where the head is by its face: the start of the search for masks, if somebody looks into the cameras."""
+"""Locates the head by its face, if the subject faces some of the cameras. The search for masks starts there."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ UPRIGHT = 0.7  # sine of the angle between view and up
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadSeed:
     """Holds the head's centre, upward direction and size in the world (mm), and the face's landmarks (px) in the views
-    that show it."""
+    that show the face."""
 
     centre_world: Float[np.ndarray, " 3"]
     up_world: Float[np.ndarray, " 3"]
@@ -62,7 +62,7 @@ def head_core(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[np.
 
 def beside_head(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """Returns the pixels of a reduced image (``size``: height, width) that certainly do not show the subject: above the
-    chin, and farther to the side than hair reaches. None is marked if the camera sees the head from above or below."""
+    chin, and farther to the side than hair reaches. No pixel is marked if the camera is above or below the head."""
     centre_camera = camera.camera_from_world.apply(seed.centre_world)
     up = (camera.camera_from_world.rotation @ seed.up_world)[:2]
     if centre_camera[2] <= seed.skull_mm or np.linalg.norm(up) < UPRIGHT:

@@ -1,15 +1,15 @@
-"""Finds coarse masks of all views together: colours say what looks like the subject, the views what exists in all of
-them.
+"""Finds coarse masks of all views together: colours tell which pixels look like the subject, other views tell what
+really stands there.
 
-The start is what geometry alone tells: a disc around the point that all cameras are directed at is the subject, and the
-border of the image is not, except where the body leaves it at the bottom. From there colours and space are used in
-turn. A view first learns its background from that border alone, then from what its mask leaves and the other views
-reject: a coat that it has not found yet must not become background.
+Geometry gives the start: a disc around the point that all cameras are directed at is the subject. The image border is
+background, except at the bottom, where the body leaves the image. From there colours and space take turns. A view first
+learns its background from that border alone. Later it learns from pixels outside its mask that other views reject too:
+a coat that it has not found yet must not become background.
 
-Each view has its own background. The subject is the same in all views, but the light may change its colours, so that
-its density is half that of all views together and half the view's own. Where both overlap (a grey coat before a grey
-wall), the colours nearby are more telling than those of the whole image: a Gaussian of the mean and scatter in a window
-is combined with each histogram (Bai et al., *Video SnapCut*, SIGGRAPH 2009, use such local models).
+Each view has its own background. The subject is the same in all views, but the light may change its colours: half of
+its colour density comes from all views together, half from the view itself. Where the densities of both overlap (a grey
+coat before a grey wall), nearby colours distinguish better than those of the whole image. So each histogram is combined
+with a Gaussian of the mean and scatter in a window (Bai et al., *Video SnapCut*, SIGGRAPH 2009, use such local models).
 """
 
 from collections.abc import Callable, Mapping
@@ -68,8 +68,8 @@ class Samples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
-    """Holds what geometry alone tells of a view: pixels that certainly show the subject, that certainly show
-    background, and that can show the subject at all."""
+    """Holds the pixels of a view that geometry alone decides: certain subject, certain background, and those that can
+    show the subject at all."""
 
     core: Mask
     border: Mask
@@ -79,8 +79,8 @@ class Seeds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarseMask:
-    """Holds the log odds of the subject after colours, neighbours and other views are combined, and the one connected
-    ``mask`` that follows."""
+    """Holds the log odds of the subject from colours, neighbours and other views, and the one connected ``mask`` that
+    follows."""
 
     odds: Float32[np.ndarray, "h w"]
     mask: Mask
@@ -120,8 +120,8 @@ def search_masks(
     head: HeadSeed | None = None,
     report: Callable[[float], None],
 ) -> dict[str, CoarseMask]:
-    """Finds the subject's mask in every reduced image. ``background``: pixels known not to show it. ``bounded``: the
-    volume holds all of the subject, so that pixels beyond it serve as background from an earlier round on."""
+    """Finds the subject's mask in every reduced image. ``background``: pixels that certainly do not show the subject.
+    ``bounded``: the volume holds all of the subject, so pixels beyond it become background from an early round on."""
     up = guessed_up(rig) if head is None else head.up_world
     sizes = {name: image.shape[:2] for name, image in images.items()}
     seeds = {camera.name: find_seeds(camera, volume, up, sizes[camera.name], head) for camera in rig}
@@ -217,8 +217,8 @@ def colour_odds(
 ) -> Float32[np.ndarray, "h w"]:
     """Returns the log odds of subject against background for every pixel, from its colour.
 
-    ``image``: reduced. ``samples``: pixels that are certain. ``common``: counts of the subject's colours in all views.
-    ``noise``: grey levels. ``nearby``: whether colours near the pixel count too; they need nearly complete samples.
+    ``image``: reduced. ``samples``: certain pixels. ``common``: the subject's colour counts in all views. ``noise``:
+    grey levels. ``nearby``: whether colours near the pixel count; it needs nearly complete samples.
     """
     subject = _log_density(image, (common, histogram(image[samples.subject])))
     background = _log_density(image, (histogram(image[samples.background]),))

@@ -1,7 +1,7 @@
-"""Divides the space that the cameras see into voxels, and combines what the other views say of a pixel's ray.
+"""Divides the space in view into voxels, and combines the evidence of the other views along a pixel's ray.
 
-Enters: a rig and the sizes of its reduced images. Leaves: for every voxel its pixel in every view. A voxel belongs to
-the subject only if no view that sees it rejects it, as in the visual hull (figure 1). Views vote by log odds instead of
+In: a rig and the sizes of its reduced images. Out: for every voxel its pixel in every view. A voxel belongs to the
+subject only if no view that sees it rejects it, as in the visual hull (figure 1). Views vote by log odds instead of
 masks (Franco & Boyer, *Fusion of multi-view silhouette cues using a space occupancy grid*, ICCV 2005), so that a view
 in doubt has no effect.
 """
@@ -36,9 +36,9 @@ class ViewingVolume:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OtherViews:
-    """Holds, for each pixel of one view, what all other views say of its ray: ``support``, the largest sum of their log
-    odds at a voxel on it (negative if they exclude the subject), and ``solid``, whether it meets a voxel that none of
-    them doubts."""
+    """Holds, for each pixel of one view, what all other views contribute on its ray: ``support``, the largest sum of
+    their log odds at a voxel (negative if they exclude the subject), and ``solid``, whether the ray meets a voxel that
+    none of them doubts."""
 
     support: Float32[np.ndarray, "h w"]
     solid: Bool[np.ndarray, "h w"]
@@ -48,7 +48,7 @@ def viewing_ball(
     rig: Rig, centre_world: Float[np.ndarray, " 3"] | None = None
 ) -> tuple[Float[np.ndarray, " 3"], float]:
     """Returns centre (world) and radius (mm) of a ball that reaches to the corners of the median image.
-    ``centre_world`` is a better centre than the point that the cameras are directed at; None takes that point."""
+    ``centre_world`` replaces the centre; None takes the point that the cameras are directed at."""
     centre = rig.centre_world() if centre_world is None else centre_world
     radius = float(
         np.median(
@@ -70,8 +70,8 @@ def viewing_volume(
     plane_world: Float[np.ndarray, " 4"] | None = None,
 ) -> ViewingVolume:
     """Builds the volume from a ``ball``, centre and radius (mm), for reduced images of ``sizes`` (height, width).
-    ``plane_world`` is the plane that the subject stands on: only the side on which ``plane . (x, 1)`` is positive is
-    kept."""
+    ``plane_world`` is the plane on which the subject stands: only the side where ``plane . (x, 1)`` is positive is
+    retained."""
     centre, radius = ball
     line = ((np.arange(CELLS) + 0.5) / CELLS * 2 - 1) * radius
     offsets = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -100,8 +100,8 @@ def reachable(volume: ViewingVolume, name: str, size: tuple[int, int]) -> Bool[n
 
 
 def ask_other_views(volume: ViewingVolume, odds: Mapping[str, Float32[np.ndarray, "_ _"]]) -> dict[str, OtherViews]:
-    """Combines, for each view, the log odds of all other views along the rays of its pixels. ``odds``: of subject
-    against background, for every view."""
+    """Combines, for each view, the log odds of all other views along the rays of its pixels. ``odds``: log odds of
+    subject against background, by view."""
     count = len(next(iter(volume.places.values())))
     total, seen, against = np.zeros(count, np.float32), np.zeros(count, np.int32), np.zeros(count, np.int32)
     grants = min(MAX_GRANTS, GRANTS_SUM / max(1, len(odds) - 1))

@@ -1,2 +1,2 @@
-"""Lays a mesh flat for its texture: where each triangle lies, on the full and on a reduced mesh, and the normals that
-reduction loses."""
+"""Lays a mesh flat for its texture: the position of each triangle, on the full and on a reduced mesh, and the normals
+lost by the reduction."""

@@ -1,12 +1,12 @@
 """Computes the normal map of a reduced mesh: an image that turns its normals to those of the full mesh.
 
-Enters: the head, its layout, the layout reduced. Leaves: the reduced mesh with normals and tangents, and its normal map
-as glTF defines it: x along the tangent, +Y up in the image, z along the normal. Tangents are those of MikkTSpace
+In: the head, its layout, the reduced layout. Out: the reduced mesh with normals and tangents, and its normal map as
+glTF defines it: x along the tangent, +Y up in the image, z along the normal. Tangents are those of MikkTSpace
 (Mikkelsen, *Simulation of Wrinkled Surfaces Revisited*, 2008), which glTF prescribes and viewers interpolate: the mean
 over a vertex's corners of the direction in which u grows, in the vertex's tangent plane, weighted by the corner's
 angle. https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes-overview
 
-A texel shows the same point of the head in the normal map and in the texture, so that shape and colour agree.
+A texel shows the same point of the head in the normal map and in the texture, so shape and colour agree.
 """
 
 from dataclasses import dataclass
@@ -143,15 +143,15 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _image(uv: Pixels, faces: Faces, values: Float[np.ndarray, "n k"], size: int) -> Float32[np.ndarray, "s s k"]:
-    """Values of the vertices over the layout; NaN beside it."""
+    """Returns the vertices' values interpolated over the layout; NaN outside it."""
     texels, ones = size * uv - 0.5, np.ones(len(uv))
     _, shown = rasterise(texels, ones, faces, size, size)
     return interpolate(shown, texels, ones, faces, values.astype(np.float32))
 
 
 def _in_frame(wanted: Picture, tangent: Picture, normal: Picture, sign: np.float32) -> Picture:
-    """Returns the wanted unit vectors as shares of tangent, bitangent and normal, which are no longer at right angles
-    once interpolated."""
+    """Returns the wanted unit vectors as multiples of tangent, bitangent and normal; these are not orthogonal once
+    interpolated."""
     lean = np.einsum("yxc,yxc->yx", tangent, normal)
     bitangent = _unit(sign * np.cross(normal, tangent))
     x, z = (np.einsum("yxc,yxc->yx", wanted, axis) for axis in (tangent, normal))

@@ -1,16 +1,16 @@
 """Lays a head flat, for a texture with more detail than one colour for each vertex.
 
-The surface is cut from the nape over the back of the head to the crown, and spread on a square, whose sides bulge a
-little, with the neck at the bottom. Every inner vertex is a mean of its neighbours with mean-value weights (Floater,
-*Mean value coordinates*, CAGD 2003), so that by Tutte's theorem no two triangles overlap. What becomes too small, the
-nose and the ears, is enlarged by rounds of reweighting (Yoshizawa, Belyaev and Seidel, *A fast and simple
-stretch-minimizing mesh parameterization*, SMI 2004), which keep the weights positive.
+The surface is cut from the nape over the back of the head to the crown. It is then spread on a square with slightly
+bulging sides, the neck at the bottom. Every inner vertex is a mean of its neighbours with mean-value weights (Floater,
+*Mean value coordinates*, CAGD 2003), so no two triangles overlap (Tutte's theorem). Parts that become too small (nose,
+ears) are enlarged by rounds of reweighting that keep the weights positive (Yoshizawa, Belyaev and Seidel, *A fast and
+simple stretch-minimizing mesh parameterization*, SMI 2004).
 
 The layout is made from a model's mean head, so that texels of any two subjects correspond.
 
-The bust's surface is laid flat in charts instead. Each triangle goes to the one of six directions (along the head's
-axes) that its surroundings face, and is drawn as it is seen from there. Where one sheet lies behind another (an ear
-before the head), the hidden one goes to a chart of its own. Charts are packed on shelves.
+The bust's surface is laid flat in several charts instead. Each triangle goes to one of six directions (along the head's
+axes), the one that its surroundings face, and is drawn as seen from there. If one sheet lies behind another (the head
+behind an ear), the hidden sheet gets a chart of its own. Charts are packed in rows of equal height.
 """
 
 from dataclasses import dataclass
@@ -55,8 +55,8 @@ class NoLayout(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Holds a mesh cut open and laid flat. ``source`` is the mesh's vertex that each vertex of the layout comes from;
-    ``uv`` is its position in the unit square, v downwards as in glTF."""
+    """Holds a mesh cut open and laid flat. ``source`` is the mesh vertex of each layout vertex; ``uv`` is its position
+    in the unit square, v downwards as in glTF."""
 
     uv: Float[np.ndarray, "n 2"]
     faces: Faces
@@ -115,7 +115,7 @@ def _border(faces: Faces) -> Int[np.ndarray, " b"]:
 
 
 def _path(vertices: Float[np.ndarray, "v 3"], faces: Faces, start: int, end: int) -> Int[np.ndarray, " p"]:
-    """Returns the shortest path on edges that prefers the symmetry plane and meets the border at its start only."""
+    """Returns the shortest path on edges that prefers the symmetry plane and touches the border only at its start."""
     edges = _edges(faces)
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     length *= 1 + np.abs(vertices[edges].mean(axis=1)[:, 0])
@@ -129,7 +129,7 @@ def _path(vertices: Float[np.ndarray, "v 3"], faces: Faces, start: int, end: int
 
 
 def _cut_open(faces: Faces, count: int, path: Int[np.ndarray, " p"]) -> tuple[Faces, Int[np.ndarray, " n"]]:
-    """Returns faces with the path's vertices doubled except its end, and the original of each vertex."""
+    """Returns the faces with the path's vertices doubled (except its end), and the original of each vertex."""
     edges = _edges(faces)
     beside = np.flatnonzero(np.isin(edges, path).any(axis=1))
     face_of = dict(zip(map(tuple, edges[beside].tolist()), (beside % len(faces)).tolist(), strict=True))
@@ -200,7 +200,7 @@ def _settled(
 
 
 def _stretch(points: Float[np.ndarray, "n 3"], uv: Float[np.ndarray, "n 2"], faces: Faces) -> Float[np.ndarray, " n"]:
-    """Returns how much longer (RMS) the surface around each vertex is than its picture, relative to the whole."""
+    """Returns how many times longer (RMS) the surface around each vertex is than its image, relative to the whole."""
     a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
     (s, t), (p, q) = (uv[faces[:, 1]] - uv[faces[:, 0]]).T, (uv[faces[:, 2]] - uv[faces[:, 0]]).T
     determinant = s * q - t * p
@@ -267,7 +267,7 @@ def model_layout(model: HeadModel) -> ModelLayout:
 
 @traced
 def lay_out_charts(mesh: Mesh, towards: Float[np.ndarray, "v 3"]) -> Layout:
-    """Returns the layout of a closed mesh (mm, the head's axes); ``towards``: normals of vertices' surroundings."""
+    """Returns the layout of a closed mesh (mm, the head's axes); ``towards``: normals of each vertex's surroundings."""
     count, rows = len(mesh.vertices), np.arange(len(mesh.faces))
     seen = [_seen_from(mesh.vertices, direction) for direction in range(6)]
     flat = np.stack([each[0] for each in seen])
@@ -298,14 +298,14 @@ def lay_out_charts(mesh: Mesh, towards: Float[np.ndarray, "v 3"]) -> Layout:
 
 
 def _six(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6"]:
-    """Returns the components of normals towards +x, -x, +y, -y, +z and -z."""
+    """Returns the components of normals along +x, -x, +y, -y, +z and -z."""
     return np.stack([normals, -normals], axis=2).reshape(-1, 6)
 
 
 def _seen_from(
     vertices: Float[np.ndarray, "n 3"], direction: int
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Returns the vertices (mm; x to the right, y down) as they are seen from a direction, and their depth."""
+    """Returns the vertices (mm; x to the right, y down) and their depths as seen from a direction."""
     axis, sign = direction // 2, 1.0 - 2.0 * (direction % 2)
     right, up = ((2, 1), (0, 2), (0, 1))[axis]
     turn = sign if axis == 2 else -sign
@@ -318,14 +318,14 @@ def _hidden(
     depth: Float[np.ndarray, " v"],
     size: Int[np.ndarray, " 2"],
 ) -> Int[np.ndarray, " h"]:
-    """Returns the rows of the triangles that lie behind others in a picture of that ``size``."""
+    """Returns the rows of the triangles that lie behind others in a picture of this ``size``."""
     first, last = (rasterise(pixels, FAR_MM + sign * depth, faces, size[1], size[0])[1] for sign in (1.0, -1.0))
     hidden = np.unique(last[first != last])
     return hidden if len(hidden) < len(faces) else np.zeros(0, int)
 
 
 def _packed(flat: Float[np.ndarray, "n 2"], piece: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-    """Places the charts, each a ``piece`` of the layout, in the unit square, all at one scale."""
+    """Places the charts in the unit square, all at one scale; ``piece`` is the chart of each vertex."""
     chart = np.unique(piece, return_inverse=True)[1]
     order = np.argsort(chart, kind="stable")
     starts = np.searchsorted(chart[order], np.arange(chart.max() + 1))

@@ -1,16 +1,16 @@
 """Estimates the skin's relief and its fine colours from two disjoint sets of full-size pictures.
 
-A furrow turns the skin towards the light or away from it: with a relief h, the logarithm of the diffuse light changes
-by ``-g . grad h``, where g is the tangential gradient of the light by the normal, over the light (Pentland, *Linear
-shape from shading*, IJCV 1990). In each patch of skin, a few millimetres wide, this is a multiplication of waves and is
-inverted there. Waves along whose direction the light does not change stay unknown, and are drawn to zero.
+A furrow turns the skin towards or away from the light. A relief h changes the logarithm of the diffuse light by ``-g .
+grad h``; g is the light's tangential gradient by the normal, divided by the light (Pentland, *Linear shape from
+shading*, IJCV 1990). In a patch of skin, a few millimetres wide, this multiplies each wave by a factor, so it can be
+inverted. Waves along whose direction the light does not change stay unknown, and tend to zero.
 
-Pictures have noise and highlights, and geometry and cameras are off by a pixel. Per patch and octave of wavelength only
-that share of the power is kept that repeats between two sets of views without a common view, after the shift between
-the two is taken out. Repeating colour cannot be distinguished from relief in this way; it counts as ``COLOUR`` of a
-slope's shading.
+Pictures have noise and highlights, and the geometry and the cameras are off by a pixel. So the views are split into two
+disjoint sets, and the shift between the two is removed. For each patch and octave of wavelength, only the fraction of
+the power that both sets show is retained. This test does not separate colour from relief; ``COLOUR`` sets how strongly
+colour counts as shading.
 
-The texture gains in the same way what repeats of the difference between full size and work size.
+The texture gets, in the same way, the repeated part of the difference between full size and working size.
 """
 
 from dataclasses import dataclass
@@ -54,7 +54,7 @@ class TexelFrames:
         return float(np.median(np.maximum(area2, 0.0)) ** 0.25) if len(area2) else 1.0
 
     def at(self, image: Float32[np.ndarray, "s s *c"], x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Reads an image at points of the unit square."""
+        """Reads an image at points (x, y) of the unit square."""
         column, row = ((COARSE * at - 0.5).astype(np.float32) for at in (x, y))
         return cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
@@ -69,9 +69,9 @@ def texel_frames(
 ) -> TexelFrames:
     """Computes the images of a head.
 
-    ``layout``: of its vertices. ``mesh_world``: the head, mm. ``normals``: unit, of the vertices. ``light``: harmonics
-    of the light (``pipeline.texturing.light``). ``shading``: of the vertices in that light, shadows included. ``skin``:
-    share of the relief that is wanted at each vertex, 0 to 1.
+    ``layout``: the layout of its vertices. ``mesh_world``: the head (mm). ``normals``: unit normals of the vertices.
+    ``light``: coefficients of the light (``pipeline.texturing.light``). ``shading``: brightness of the vertices in that
+    light, shadows included. ``skin``: factor of the relief at each vertex, 0 to 1.
     """
     along_u, along_v = _steps(layout, mesh_world)
     pull = light_slopes(normals, light) / np.maximum(shading, 1e-3)[:, None]
@@ -86,7 +86,7 @@ def texel_frames(
 
 
 def light_slopes(normals: Float[np.ndarray, "v 3"], light: Float[np.ndarray, "9"]) -> Float[np.ndarray, "v 3"]:
-    """Returns the gradient of the light by the normal, in the surface."""
+    """Returns the gradient of the light by the normal, projected into the surface."""
     by_axis = []
     for axis in np.eye(3):
         either = [harmonics(_unit(normals + sign * STEP * axis)) * BAND_FACTORS @ light for sign in (1.0, -1.0)]
@@ -99,7 +99,7 @@ def _unit(vectors: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
 
 
 def _steps(layout: Layout, mesh: Mesh) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Steps on the surface (mm) for one whole image along u and along v: means over the triangles of each corner."""
+    """Returns the steps on the surface (mm) for a whole image along u and v: means over each corner's triangles."""
     corners, flat = mesh.vertices[layout.source][layout.faces], layout.uv[layout.faces]
     edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     (s, t), (p, q) = (flat[:, 1] - flat[:, 0]).T, (flat[:, 2] - flat[:, 0]).T
@@ -118,7 +118,7 @@ def _sums(faces: Int[np.ndarray, "f 3"], values: Float[np.ndarray, "f 3"], count
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strips:
-    """Holds a layout's triangles in an image ``size`` texels wide and high, sorted out by rows."""
+    """Holds a layout's triangles in an image ``size`` texels wide and high, sorted by rows."""
 
     layout: Layout
     size: int
@@ -137,7 +137,7 @@ class Strips:
         return cls(layout, size, texels, low, high)
 
     def paint(self, first: int, rows: int, pictures: Pictures, choice: Choice) -> UInt8[np.ndarray, "r s 3"]:
-        """Paints ``rows`` rows from row ``first`` on (which may be negative): codes, blue first."""
+        """Paints ``rows`` rows (BGR codes) from row ``first`` on, which may be negative."""
         strip = np.full((rows, self.size, 3), EMPTY, np.uint8)
         which = np.flatnonzero((self.high >= first) & (self.low <= first + rows - 1))
         moved = self.texels - (0.0, float(first))
@@ -162,7 +162,7 @@ Spectra = Complex[np.ndarray, "n p q"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkinDetail:
-    """Holds what full-size pictures show of the skin, over a layout.
+    """Holds the skin's relief and fine brightness from full-size pictures, over a layout.
 
     Attributes:
         heights_mm: the relief, along the normals.
@@ -177,7 +177,7 @@ class SkinDetail:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HalfPictures:
-    """Holds two disjoint sets of views as the painter takes them, at full size and at work size."""
+    """Holds two disjoint sets of views in the painter's form, at full size and at working size."""
 
     full: Pictures
     work: Pictures
@@ -211,13 +211,13 @@ def estimate_detail(strips: Strips, halves: HalfPictures, frames: TexelFrames) -
 
 
 def patch_side(size: int, frames: TexelFrames) -> int:
-    """Returns the texels of a patch's side, a power of two, for skin where the layout is of ordinary scale."""
+    """Returns the side of a patch in texels, a power of two, for skin at the layout's usual scale."""
     return int(np.clip(2 ** round(np.log2(PATCH_MM * size / frames.image_mm())), 16, 256))
 
 
 def _painted(strips: Strips, halves: HalfPictures) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Returns the logarithm of the light in both sets of full-size pictures, and by how much it differs from that in
-    the pictures of work size (float16: of the size of noise in the pictures' codes)."""
+    """Returns the logarithm of the light in both sets of full-size pictures, and its difference from the pictures of
+    working size (float16, whose steps are as small as the noise of the pictures' codes)."""
     size = strips.size
     full, added = (list(np.zeros((2, size, size), np.float16)) for _ in range(2))
 
@@ -234,15 +234,15 @@ def _painted(strips: Strips, halves: HalfPictures) -> tuple[list[np.ndarray], li
 
 
 def log_light(codes: np.ndarray) -> Float32[np.ndarray, "r s"]:
-    """Returns the logarithm of the light in a painted strip, by that of middle grey."""
+    """Returns the logarithm of the light in a painted strip, relative to middle grey."""
     return np.log(np.maximum(LINEAR[codes] @ LUMINANCE, MIN_LIGHT) / LINEAR[EMPTY])
 
 
 def without_slow(light: Float32[np.ndarray, "r s"], side: int) -> Float32[np.ndarray, "r s"]:
-    """Returns a strip without what is wider than a third of a patch, whose edges would leak into all waves.
+    """Returns a strip without structures wider than a third of a patch, whose edges would leak into all waves.
 
-    So wide a Gaussian is computed on fewer texels: in a texture of 8192 that takes a fiftieth of the time, and strips
-    of noise differ by 0.3 % of their spread at most."""
+    The wide Gaussian is computed on fewer texels: in a texture of 8192 that takes a fiftieth of the time, and strips of
+    noise differ by at most 0.3 % of their spread."""
     height, width = light.shape
     step = max(side // BLURRED_SIDE, 1)
     coarse = cv2.resize(light, (width // step, height // step), interpolation=cv2.INTER_AREA)
@@ -258,8 +258,8 @@ def _row_of_patches(
     frames: TexelFrames,
     figures: Float[np.ndarray, "o 2"],
 ) -> tuple[Float32[np.ndarray, "r s"], Float32[np.ndarray, "r s"]] | None:
-    """Returns heights and brightness of one row of patches, windowed so that rows add up; None without skin. Powers are
-    added to ``figures``."""
+    """Returns heights and brightness of one row of patches, windowed so that rows add up; None without skin. Adds the
+    powers to ``figures``."""
     side = len(full[0])
     hop = side // 2
     columns = np.arange(-hop, size, hop)
@@ -299,8 +299,8 @@ def _row_of_patches(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Holds the waves of patches of one side: cycles a mm, how much shading a wave of 1 mm makes, and the octave of
-    each wave (-1: not kept)."""
+    """Holds the waves of square patches of one size: frequency (cycles per mm), shading of a wave of 1 mm height, and
+    the octave of each wave (-1: discarded)."""
 
     side: int
     per_mm: Float32[np.ndarray, "n p q"]
@@ -327,8 +327,8 @@ class Patches:
         return cls(side, per_mm, shading, octave)
 
     def shift_between(self, first: Spectra, second: Spectra) -> Spectra:
-        """Returns the turn of each wave that moves the first half-way to the second; its conjugate moves the second
-        half-way back. Shifts by more than ``MAX_SHIFT_MM`` are not looked for."""
+        """Returns the phase shift of each wave that moves the first set half-way to the second; its conjugate moves the
+        second set half-way back. Shifts above ``MAX_SHIFT_MM`` are not searched."""
         cross = np.where(self.octave >= 0, np.conj(first) * second, np.complex64(0.0))
         peaks = np.fft.fftshift(fields_of(cross, self.side), axes=(1, 2))
         fu, fv = waves_by_texel(self.side)
@@ -344,8 +344,8 @@ class Patches:
         return np.exp(np.complex64(-1j * np.pi) * (fu * shifts[:, :1, None] + fv * shifts[:, 1:, None]))
 
     def repeating(self, first: Spectra, second: Spectra) -> tuple[Float32[np.ndarray, "n p q"], np.ndarray]:
-        """Returns Wiener's weight of each wave in the mean of two sets of views, and the power that repeats and all
-        power, by octave."""
+        """Returns each wave's Wiener weight in the mean of two sets of views, and for each octave the repeated power
+        and the whole power."""
         common = np.real(first * np.conj(second))
         either = np.abs(first) ** 2 + np.abs(second) ** 2
         weight, powers = np.zeros(self.per_mm.shape, np.float32), np.zeros((OCTAVES, 2))
@@ -363,8 +363,8 @@ class Patches:
         return 0.5 * self.repeating(first, second)[0] * (first + second)
 
     def relief(self, first: Spectra, second: Spectra) -> tuple[Spectra, Float[np.ndarray, "o 2"]]:
-        """Returns the waves of the relief from those of the shading in two sets of views, and ``repeating``'s
-        powers."""
+        """Returns the waves of the relief from those of the shading in two sets of views, and the powers from
+        ``repeating``."""
         weight, powers = self.repeating(first, second)
         noise2 = np.maximum((2 * np.pi * COLOUR * self.per_mm) ** 2, 1e-12)
         gain = weight * np.conj(self.shading) / (np.abs(self.shading) ** 2 + noise2)
@@ -372,22 +372,22 @@ class Patches:
 
 
 def spectra_of(fields: Float32[np.ndarray, "n s s"]) -> Complex[np.ndarray, "n s h"]:
-    """Returns the waves of square fields. SciPy's transform takes a quarter of the time of NumPy's."""
+    """Returns the Fourier transforms of square fields. SciPy takes a quarter of NumPy's time."""
     return np.asarray(scipy.fft.rfft2(fields))
 
 
 def fields_of(waves: Complex[np.ndarray, "n s h"], side: int) -> Float32[np.ndarray, "n s s"]:
-    """Returns the fields of waves, ``side`` texels wide and high."""
+    """Returns the fields of Fourier transforms, ``side`` texels wide and high."""
     return np.asarray(scipy.fft.irfft2(waves, (side, side)))
 
 
 def waves_by_texel(side: int) -> tuple[Float32[np.ndarray, "p q"], Float32[np.ndarray, "p q"]]:
-    """Returns cycles by texel across and down of the waves of ``spectra_of``."""
+    """Returns the frequencies (cycles per texel, across and down) of the waves of ``spectra_of``."""
     down, across = np.meshgrid(np.fft.fftfreq(side), np.fft.rfftfreq(side), indexing="ij")
     return across.astype(np.float32), down.astype(np.float32)
 
 
 def _vertex(three: Float32[np.ndarray, " 3"]) -> float:
-    """Returns the peak's distance from the middle one of three neighbouring values, on their parabola."""
+    """Returns the offset of a peak from the middle one of three neighbouring values, by the parabola through them."""
     bend = float(three[0] - 2 * three[1] + three[2])
     return 0.0 if bend >= 0 else float(np.clip(0.5 * (three[0] - three[2]) / bend, -0.5, 0.5))

@@ -1,6 +1,6 @@
 """Makes the maps of a head's skin: displacement and normals in the texture's layout.
 
-Displacement is along the normals of head.ply, interpolated; a code is ``MM_PER_CODE``, and ``MID_CODE`` is no
+Displacement is along the interpolated normals of head.ply; one code is ``MM_PER_CODE``, and ``MID_CODE`` means no
 displacement. Normals are in the frame of glTF: x along the tangent (where u grows), y up in the image, z along the
 normal.
 """
@@ -56,8 +56,8 @@ class CloseViews:
     decision: Decision
 
     def for_texels(self) -> Rig:
-        """Returns cameras as fine as the texels need to be: a quarter coarser than the pictures, or most pictures of
-        0.1 mm a pixel would need four times as many texels."""
+        """Returns cameras with as many pixels as the texels need, a quarter coarser than the pictures: at 0.1 mm a
+        pixel, most pictures would otherwise need four times as many texels."""
         return self.views.scaled(COARSER)
 
 
@@ -70,11 +70,11 @@ def read_close_views(
     sources: Mapping[str, str],
     chart: ChartColours | None = None,
 ) -> CloseViews:
-    """Reads the pictures of the views that see most of the face, one after the other, and keeps what shows the head.
+    """Reads, one after the other, the pictures of the views that see most of the face, and keeps the head's part.
 
-    ``read``: a picture at the size of its file. ``mesh_world``: the head. ``coloured``: with the gains and offsets of
-    the cameras, and a decision. ``face``: vertices of the face. ``sources``: the name under which a camera's picture is
-    filed, where that is another's. ``chart``: by which the colours of the pictures of work size were corrected.
+    ``read``: returns a picture at the size of its file. ``mesh_world``: the head. ``coloured``: holds the cameras'
+    gains and offsets, and a decision. ``face``: vertices of the face. ``sources``: for exchanged pictures, the camera
+    name under which a camera's picture is filed. ``chart``: corrections that the pictures of working size got.
     """
     decision = coloured.decision
     assert decision is not None, "the head has a texture"
@@ -97,7 +97,7 @@ def read_close_views(
 
 
 def _head_of(camera: Camera, image: ImageRgb, mesh: Mesh) -> tuple[Camera, UInt8[np.ndarray, "_ _ 3"]]:
-    """Returns the camera of the rectangle around the head and a copy of that, so that the rest can be freed."""
+    """Returns the camera of a rectangle around the head and a copy of its pixels, so that the rest can be freed."""
     k = camera.intrinsics.at_size(image.shape[1], image.shape[0])
     pixels = project_points(replace(camera, intrinsics=k), mesh.vertices)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
@@ -112,7 +112,7 @@ def _head_of(camera: Camera, image: ImageRgb, mesh: Mesh) -> tuple[Camera, UInt8
 def plain_choice(
     views: Int32[np.ndarray, "v s"], shares: Float32[np.ndarray, "v s"], weights: Float32[np.ndarray, "k v"]
 ) -> Choice:
-    """Returns the choice of these views without any correction of their colours."""
+    """Returns the choice of these views without colour corrections."""
     nothing = np.zeros((*views.shape, 4), np.float32)
     grey = np.full((len(views), 4), GREY, np.float32)
     return Choice(views, shares, nothing, grey, np.ascontiguousarray(weights))
@@ -121,7 +121,7 @@ def plain_choice(
 def mean_of(
     members: Bool[np.ndarray, " k"], weights: Float[np.ndarray, "k v"], most: int
 ) -> tuple[Int32[np.ndarray, "v s"], Float32[np.ndarray, "v s"]]:
-    """Returns the ``most`` best of some views for each vertex (-1: none) and their shares in its mean."""
+    """Returns the ``most`` best of the views ``members`` for each vertex (-1: none) and their weights in its mean."""
     allowed = np.where(members[:, None], weights, 0.0)
     order = np.argsort(-allowed, axis=0, kind="stable")[:most]
     chosen = np.take_along_axis(allowed, order, axis=0)
@@ -131,7 +131,7 @@ def mean_of(
 
 
 def halves_of(close: CloseViews, world_from_head: Similarity) -> HalfPictures:
-    """Returns two disjoint sets of views: every second one around the head, and the others."""
+    """Returns two disjoint sets of views: every second view around the head, and the others."""
     towards = np.array([camera.centre_world for camera in close.views]) - world_from_head.translation
     in_head = towards @ world_from_head.rotation
     around = np.argsort(np.arctan2(in_head[:, 0], in_head[:, 2]), kind="stable")
@@ -187,10 +187,10 @@ def skin_maps(
 ) -> tuple[SkinMaps, Atlas]:
     """Estimates the skin's relief from the full-size pictures. Returns the maps, and the texture with their detail.
 
-    ``layout``: of the head. ``atlas``: its texture, which sets the size of the maps. ``mesh_world``: the head, mm.
-    ``normals``: unit, of its vertices. ``coloured``: its colours. ``close``: the full-size pictures. ``face``: vertices
-    from whose shading the light is estimated. ``skin``: probability that a vertex shows skin. ``world_from_head``:
-    pose, which says how the views stand around the head.
+    ``layout``: layout of the head. ``atlas``: texture of the head, which sets the size of the maps. ``mesh_world``: the
+    head (mm). ``normals``: unit normals of its vertices. ``coloured``: its colours. ``close``: the full-size pictures.
+    ``face``: vertices from whose shading the light is estimated. ``skin``: probability that a vertex shows skin.
+    ``world_from_head``: pose, which orders the views around the head.
     """
     white = transfer(mesh_world, normals, layout.around)
     light = fit_light(white, linear_from_srgb(coloured.colours / 255.0), (coloured.views > 0) & face)

@@ -1,6 +1,6 @@
-"""Colours a head by further photographs from the same cameras.
+"""Colours a head with further photographs from the same cameras.
 
-Enters: the head with the decision which photographs colour it, and the texture sets of the capture. Leaves: a texture
-for each set, in the layout of the head's; and of sets in polarised light what the skin scatters (diffuse) and what its
-surface mirrors (specular).
+In: the head with its decision about views, and the capture's texture sets. Out: a texture for each set, in the head's
+layout. Sets in polarised light also give the light that the skin scatters (diffuse) and the light that its surface
+mirrors (specular).
 """

@@ -1,13 +1,13 @@
-"""Separates what skin mirrors from what it scatters, by two sets in polarised light.
+"""Separates mirrored from scattered light by two sets in polarised light.
 
-Lamps behind a filter send polarised light. Light that the surface mirrors stays polarised; light that leaves the skin
-from within does not. A filter before the lens that is crossed with the lamps' passes scattered light alone, a parallel
-one both in equal exposure (Ma et al., *Rapid Acquisition of Specular and Diffuse Normal Maps*, EGSR 2007). So, in
-linear light, ``cross`` is the diffuse part and ``parallel / exposure - cross`` the specular one.
+Lamps behind a filter send polarised light. Mirrored light stays polarised; light scattered inside the skin does not. A
+lens filter crossed with the lamps' passes half of the scattered light only. A parallel one passes mirrored light and
+half of the scattered (Ma et al., *Rapid Acquisition of Specular and Diffuse Normal Maps*, EGSR 2007). So, in linear
+light, ``cross`` is the diffuse part and ``parallel / exposure - cross`` the specular one.
 
-The exposure of the parallel picture by that of the crossed one is measured for each camera from colour alone: mirrored
-light has the lamps' colour, near grey in a balanced picture, so that differences between channels come from scattered
-light, and their ratio is the exposure's. The median over the head leaves out where that does not hold.
+Exposures may differ, so their ratio is measured for each camera, from colour alone. Mirrored light has the lamps'
+colour, near grey in a balanced picture; differences between channels come from scattered light, and their ratio is that
+of the exposures. The median over the head removes pixels where this does not hold.
 """
 
 from collections.abc import Mapping, Sequence
@@ -67,8 +67,8 @@ def exposure_ratios(
     silhouettes: Mapping[str, Silhouette],
     names: Sequence[str],
 ) -> dict[str, float]:
-    """Measures how much longer each camera exposed its parallel picture than its crossed one. A camera that sees no
-    colour gets the median of the others; 1 if none sees any."""
+    """Measures the ratio of each camera's exposures, parallel picture to crossed picture. A camera that sees no colour
+    gets the median of the others; 1 if none sees any."""
     found = map_in_threads(
         lambda k: _exposure(cross[names[k]], parallel[names[k]], silhouettes[names[k]].mask), len(names)
     )
@@ -109,9 +109,9 @@ def specular_light(
 ) -> Specular:
     """Computes the mirrored light of every texel.
 
-    ``cross``: pictures without mirrored light, by camera. ``parallel``: pictures with it. ``gains``: of the cameras and
-    channels, as the crossed set's texture has them. ``decision``: how well the cameras see each vertex.
-    ``silhouettes``: by camera. ``layout``: of the head. ``size``: of the map, texels.
+    ``cross``: pictures without mirrored light, by camera. ``parallel``: pictures with mirrored light, by camera.
+    ``gains``: by camera and channel, from the texture of the crossed set. ``decision``: weights with which the cameras
+    see each vertex. ``silhouettes``: by camera. ``layout``: layout of the head. ``size``: width of the map in texels.
     """
     views = decision.views
     exposure = exposure_ratios(cross, parallel, silhouettes, views.names)
@@ -154,7 +154,7 @@ def specular_light(
 
 
 def _lamp_colour(light: Float32[np.ndarray, "s s 3"]) -> Float32[np.ndarray, "s s 3"]:
-    """Returns the colour of mirrored light around each texel, with mean 1: it is that of the lamps, so differences
+    """Returns the colour of mirrored light around each texel, with mean 1. The lamps have one colour, so differences
     between texels are noise."""
     size = len(light)
     coarse = cv2.resize(light, (COLOUR_SIDE, COLOUR_SIDE), interpolation=cv2.INTER_AREA)

@@ -1,7 +1,7 @@
 """Colours a head by the texture sets of its capture.
 
-Weights and chosen views are those of the head's texture, so that a texel of any set shows the same pixel of the same
-camera. Only what depends on the set's own light is estimated anew: the cameras' gains, the agreed colours and the
+Weights and chosen views are those of the head's texture, so a texel shows the same pixel of the same camera in all
+sets. Only values that depend on the set's own light are estimated anew: the cameras' gains, the agreed colours and the
 corrections at seams.
 """
 
@@ -36,15 +36,15 @@ CROSS, PARALLEL = "cross", "parallel"  # names of the sets in polarised light
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetTextures:
-    """Holds the texture of each set, in the layout of the head's. ``specular`` is None unless there are both sets of
-    polarised light."""
+    """Holds the texture of each set, in the layout of the head's texture. ``specular`` is None unless both sets of
+    polarised light exist."""
 
     atlases: Mapping[str, Atlas]
     specular: Specular | None
 
     @property
     def diffuse(self) -> Atlas | None:
-        """Returns the texture of what the skin scatters, None without crossed pictures."""
+        """Returns the texture of the scattered light; None without crossed pictures."""
         return self.atlases.get(CROSS)
 
 
@@ -58,7 +58,7 @@ def colour_by_sets(
     atlas: Atlas | None,
     settings: TextureSettings,
 ) -> tuple[SetTextures | None, list[ReportWarning]]:
-    """Paints a texture of each set, and separates diffuse and specular light of those in polarised light.
+    """Paints a texture of each set, and separates diffuse from specular light if there are sets in polarised light.
 
     Args:
         sets: pictures by set and camera.
@@ -102,8 +102,8 @@ def set_texture(
 ) -> tuple[Atlas, Float[np.ndarray, "k 3"]]:
     """Paints the texture of one set. Also returns the gain of each camera and channel (k, 3).
 
-    ``images`` of the set and ``silhouettes`` are by camera. ``decision``: which views colour each vertex.
-    ``mesh_world``: the head, mm. ``size``: of the texture, texels.
+    ``images`` (of the set) and ``silhouettes`` are by camera. ``decision``: the views that colour each vertex.
+    ``mesh_world``: the head (mm). ``size``: width of the texture in texels.
     """
     views, weights = decision.views, decision.weights
 

@@ -1,4 +1,4 @@
-"""Reads and writes files of cameras: ``cameras.json``, other programs' files, and the length that gives them a scale.
+"""Reads and writes files of cameras: ``cameras.json``, other programs' files, and ``scale.json`` with a known length.
 
-Enters: a file, or a folder that holds one. Leaves: a checked ``Rig``, or all faults of the file at once.
-``cameras_file`` picks the reader by the file's name; ``foreign_keys`` says what becomes of every key."""
+In: a file, or a folder that contains one. Out: a checked ``Rig``, or all faults of the file at once. ``cameras_file``
+chooses the reader by the file's name; ``foreign_keys`` defines the treatment of every key."""

@@ -1,9 +1,9 @@
 """Writes a script that puts a rig's cameras into a Blender scene: ``blender --python cameras.py``, or its text editor.
 
 Blender's camera (https://docs.blender.org/api/current/bpy.types.Camera.html): with ``sensor_fit`` HORIZONTAL the focal
-length in pixels is ``lens width / sensor_width``; ``shift_x`` and ``shift_y`` move the frame to the right and up by
-shares of the width; there is no distortion. Axes: x right, y up, z backwards; lengths in metres. Photographs fit as
-backgrounds only if they are undistorted; each camera's note says how far its lens moves the picture's corners."""
+length in pixels is ``lens width / sensor_width``; ``shift_x`` and ``shift_y`` move the frame to the right and up, as
+fractions of the width; there is no distortion. Axes: x right, y up, z backwards; lengths in metres. Photographs fit as
+backgrounds only if undistorted; each camera has a note with the displacement of the picture's corners by its lens."""
 
 import json
 from pathlib import Path

@@ -1,17 +1,17 @@
 """Reads and writes rigs in other programs' files.
 
-Read and written are COLMAP (text and binary), caliscope's ``camera_array.toml``, aniposelib's TOML, Metashape's XML,
-RealityCapture's XMP and CSV, nerfstudio's ``transforms.json`` and OpenCV's YAML; Blender's script is only written.
-Every reader turns its file into the ``eigenhead-cameras/1`` document and passes it to ``rig_from_document``, so that
-all formats meet the same checks. Each format's module says where its layout is described.
+It reads and writes COLMAP (text and binary), caliscope's ``camera_array.toml``, aniposelib's TOML, Metashape's XML,
+RealityCapture's XMP and CSV, nerfstudio's ``transforms.json`` and OpenCV's YAML; it only writes Blender's script. Every
+reader converts its file to an ``eigenhead-cameras/1`` document and passes it to ``rig_from_document``, so that all
+formats get the same checks. Each format's module names the description of its layout.
 
 Pixels: in this project and OpenCV the centre of the top-left pixel is (0, 0); in COLMAP, Metashape, RealityCapture and
 nerfstudio it is (0.5, 0.5). Lengths become millimetres: caliscope, Metashape and RealityCapture are in metres; COLMAP's
-scale is free and taken as millimetres; the unit of aniposelib, nerfstudio and OpenCV follows from the size of the
-rig. Gaussian splatting's ``cameras.json`` and NeRSemble's ``camera_params.json`` are read, too.
+scale is free and taken as millimetres; the unit of aniposelib, nerfstudio and OpenCV follows from the size of the rig.
+Gaussian splatting's ``cameras.json`` and NeRSemble's ``camera_params.json`` are also read.
 
-Keys of ``cameras.json`` that are not read, such as a misspelt ``covarianse`` or a ``k4`` that the lens model lacks, are
-no faults, because files may carry other programs' keys, but a warning tells the author that they have no effect.
+Unread keys of ``cameras.json``, such as a misspelt ``covarianse`` or a ``k4`` that the lens model lacks, are no faults,
+because files may carry other programs' keys. A warning tells the author that they have no effect.
 """
 
 import re
@@ -91,8 +91,8 @@ def _are_of_splatting(entries: list[Any]) -> bool:
 
 
 def no_rig_fault(folder: Path) -> Message:
-    """Returns the fault of a folder without a rig's file; if it contains captures, an archive, or cameras of a program
-    that is not read instead, the fault names them."""
+    """Returns the fault of a folder without a file of cameras. If the folder contains captures, an archive, or cameras
+    of an unsupported program instead, the fault names them."""
     if unread := unread_programs(folder):
         return unread[0]
     archives = [path.name for path in sorted(folder.iterdir()) if path.name.lower().endswith(ARCHIVE_ENDINGS)]
@@ -109,8 +109,7 @@ def find_rig_file(folder: Path) -> Path | None:
 
 
 def rig_files(folder: Path) -> Iterator[Path]:
-    """Yields the files in ``folder`` that may hold the rig, at most one for each program. The first is the one that is
-    read.
+    """Yields the files in ``folder`` that may hold the rig, at most one for each program. The first is the one to read.
 
     In this order: ``cameras.json``; a COLMAP model in ``sparse/0``, ``sparse`` or at the top (``cameras.bin`` or
     ``.txt``); ``camera_array.toml``; any other TOML file with aniposelib's keys; ``transforms.json``; ``intri.yml``;
@@ -174,7 +173,7 @@ def read_cameras(path: Path) -> CamerasRead:
 
 
 def _read_json(path: Path) -> CamerasRead:
-    """Reads the cameras of a JSON file, whose program is told by its content."""
+    """Reads the cameras of a JSON file; its content tells which program wrote it."""
     document = read_document(path)
     reader = next((read for is_of, read in JSON_READERS if is_of(document)), None)
     if reader is not None:
@@ -196,7 +195,7 @@ def _read_json(path: Path) -> CamerasRead:
 
 
 def _thinned(read: CamerasRead, file: str) -> CamerasRead:
-    """Leaves out cameras of more than ``CAMERAS_MOST``, so that those that take part stand well apart."""
+    """Reduces more than ``CAMERAS_MOST`` cameras to that number; the remaining ones stand well apart."""
     if len(read.rig) <= CAMERAS_MOST:
         return read
     kept = set(spread_views(read.rig, CAMERAS_MOST))
@@ -230,8 +229,8 @@ def write_rig_file(rig: Rig, path: Path, kind: str) -> None:
 
 
 def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[Message, ...]:
-    """Returns messages for the keys of a decoded ``cameras.json`` that are not read; keys that many cameras share are
-    reported once, with their number."""
+    """Returns messages for the unread keys of a decoded ``cameras.json``; keys that many cameras share are reported
+    once, with their number."""
     counts = Counter(_unread(document))
     faults = []
     for (place, key), times in list(counts.items())[:TOLD_MOST]:
@@ -243,7 +242,7 @@ def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[Messag
 
 
 def _unread(document: Any) -> Iterator[tuple[str, str]]:
-    """Yields the place and name of each key that is not read."""
+    """Yields the place and name of each unread key."""
     if not isinstance(document, Mapping) or document.get("format") != FORMAT:
         return
     cameras, tables = document.get("cameras"), list[tuple[str, Any]]([("", document)])

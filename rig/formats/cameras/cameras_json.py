@@ -118,7 +118,7 @@ def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
 
 
 def _unit_fault(unit: Any) -> Message:
-    """Returns the fault of a unit that is not millimetres, with the factor to millimetres where it is known."""
+    """Returns the fault of a unit other than millimetres, with the factor to millimetres if it is known."""
     written = f"{unit!r:.80}"
     factor = UNITS_MM.get(unit.lower()) if isinstance(unit, str) else None
     if factor is None:
@@ -127,7 +127,7 @@ def _unit_fault(unit: Any) -> Message:
 
 
 def _repeated(names: list[str]) -> list[Message]:
-    """Returns one fault for all names that several cameras have: a list written twice repeats every one of them."""
+    """Returns one fault for all names that several cameras have (in a list written twice, all are repeated)."""
     repeated = [name for name in sorted(set(names)) if names.count(name) > 1]
     if not repeated:
         return []
@@ -184,8 +184,8 @@ def _lens_document(camera: Camera) -> dict[str, str | float]:
 
 
 def _read_lens(lens: Any, where: str, faults: list[Message]) -> tuple[Distortion, RecordedLens | None]:
-    """Returns the camera's own distortion, or no distortion and the recorded lens that its pictures are undistorted
-    from."""
+    """Returns the camera's own distortion; or no distortion, and the recorded lens whose distortion is removed from its
+    pictures."""
     model = lens.get("model", "brown-conrady") if isinstance(lens, dict) else "brown-conrady"
     known: LensModel | None = next((name for name in COEFFICIENTS if name == model), None)
     if known is None and model != "brown-conrady":
@@ -252,7 +252,7 @@ def _is_covariance(matrix: np.ndarray) -> bool:
 
 
 def is_number(value: Any) -> bool:
-    """Tells whether a decoded value is a finite number of a size that occurs, and no truth value."""
+    """Tells whether a decoded value is a finite number of plausible size, and not a truth value."""
     return isinstance(value, int | float) and not isinstance(value, bool) and bool(abs(value) < 1e12)  # NaN fails too
 
 

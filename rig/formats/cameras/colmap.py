@@ -107,8 +107,8 @@ class _Records:
         return values
 
     def count(self, least_bytes: int) -> int:
-        """Reads a number of records of at least ``least_bytes`` each. Raises Malformed if so many cannot fit in the
-        rest of the file, before memory is spent on them."""
+        """Reads a number of records, each of at least ``least_bytes`` bytes. Raises Malformed if so many do not fit in
+        the rest of the file, before any memory is allocated for them."""
         (count,) = self.take("Q")
         if count * least_bytes > len(self.data) - self.at:
             raise Malformed(compose("records-promised", records=str(count)))
@@ -190,7 +190,7 @@ def _text_cameras(data: bytes) -> dict[int, ColmapCamera]:
 
 
 def _text_images(data: bytes) -> list[ColmapImage]:
-    """Reads images: one line each, followed by a line with its points, which files written by hand often lack."""
+    """Reads images: one line each, followed by a line with its points, which hand-written files often lack."""
     images: list[ColmapImage] = []
     after_image = False
     for line in _text_lines(data):
@@ -210,10 +210,10 @@ def _text_images(data: bytes) -> list[ColmapImage]:
 
 
 def _is_of_points(line: str) -> bool:
-    """Tells whether a line lists points, as X, Y and a whole number each, or is empty; it may as well be the next
-    image's.
+    """Tells whether a line is empty or can be a list of points (X, Y and a whole number each); such a line may still be
+    the next image's.
 
-    An image's line has ten words or more and among them a name; ten numbers cannot be points, since 3 does not divide
+    An image's line has ten or more words, one of them a name; ten numbers cannot be points, since 3 does not divide
     10."""
     words = line.split()
     try:

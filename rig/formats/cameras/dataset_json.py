@@ -1,9 +1,9 @@
-"""Data sets of views for programs that learn a scene: what nerfstudio and GaussianAvatars read beside the pictures.
+"""Writes the JSON files that nerfstudio and GaussianAvatars read together with the pictures of a data set of views.
 
-Both take ``transforms.json`` (``rig.formats.cameras.transforms_json``) and agree on its axes and its half pixel.
-GaussianAvatars reads a division a file, the field of view alone (``camera_angle_x``: square pixels, the principal point
-in the middle), and numbers of cameras and moments (https://github.com/ShenhanQian/GaussianAvatars,
-its dataset_readers; https://github.com/ShenhanQian/VHAP, whose data sets it takes). Lengths are metres, in the
+Both read ``transforms.json`` (``rig.formats.cameras.transforms_json``) with the same axes and half pixel.
+GaussianAvatars reads one file for each division of the data, only the field of view (``camera_angle_x``: square pixels,
+the principal point in the middle), and numbers of cameras and moments (https://github.com/ShenhanQian/GaussianAvatars,
+its dataset_readers; https://github.com/ShenhanQian/VHAP, whose data sets it reads). Lengths are metres, in the
 capture's world frame.
 """
 
@@ -54,8 +54,8 @@ def picture_names(rig: Rig, form: DatasetFormat) -> dict[str, str]:
 def dataset_documents(
     rig: Rig, form: DatasetFormat, *, with_points: bool, with_flame: bool = False
 ) -> dict[str, bytes]:
-    """Returns the JSON files of a data set by name. ``rig``: the pinholes of its pictures. ``with_points``: there is a
-    point cloud beside them; ``with_flame``: so are FLAME parameters."""
+    """Returns the JSON files of a data set by name. ``rig``: pinhole cameras of its pictures. ``with_points``: the data
+    set has a point cloud; ``with_flame``: it has FLAME parameters."""
     layout, names = LAYOUTS[form], picture_names(rig, form)
     head: dict[str, object] = {"camera_model": "OPENCV", "unit": "metre"}
     if with_points:
@@ -77,8 +77,8 @@ def dataset_documents(
 
 
 def held_out_camera(rig: Rig) -> str:
-    """Returns the camera that is left out of training, to test the result: the one whose two nearest neighbours are
-    nearest, and which is therefore missed least."""
+    """Returns the camera that is held out of training to test the result: the one whose two nearest neighbours are
+    nearest, since training can best do without it."""
     centres = np.stack([camera.centre_world for camera in rig])
     distances = np.sort(np.linalg.norm(centres[:, None] - centres[None], axis=2), axis=1)
     return rig.names[int(np.argmin(distances[:, 1:3].sum(axis=1)))]

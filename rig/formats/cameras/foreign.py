@@ -1,8 +1,7 @@
-"""Holds what all readers of other programs' files share: errors for damaged files, cameras' names, conversion of
-lenses, and what a reader finds (faults, unused keys, cameras that take no part); and recognises, by names and
-beginnings, files of cameras that programs write and nothing here reads. A capture without cameras of a known format
-is one of photographs alone, whose cameras are found anew; whoever put other cameras beside them learns that they
-were not read."""
+"""Holds the common parts of all readers of other programs' files: errors for damaged files, cameras' names, conversion
+of lenses, and a reader's findings (faults, unused keys, excluded cameras). Also recognises, by names and first bytes,
+files of cameras that no reader supports. A capture without cameras in a known format is treated as photographs alone,
+and its cameras are estimated. A message then tells the user that other files of cameras in it were not read."""
 
 import csv
 import re
@@ -77,7 +76,7 @@ BYTES_MOST = 1 << 29  # far above the few megabytes of a rig's sparse model, who
 
 @dataclass(frozen=True, slots=True)
 class CamerasRead:
-    """Holds a rig, warnings of its reader, and the cameras of the file that take no part, each with the reason."""
+    """Holds a rig, warnings of its reader, and the excluded cameras of the file, each with the reason."""
 
     rig: Rig
     remarks: tuple[Message, ...] = ()
@@ -95,7 +94,7 @@ class Reading:
     _unknown: dict[str, None] = field(default_factory=dict)
 
     def judge(self, table: Table, values: Mapping[str, object], whose: str, *, place: str = "") -> None:
-        """Notes the keys of ``values`` that the table refuses, wants reported or does not contain.
+        """Records the keys of ``values`` that the table refuses, wants reported or does not contain.
 
         ``whose`` is the camera's name, empty for keys of the whole file; ``place`` is the prefix of the keys in the
         table."""
@@ -107,7 +106,7 @@ class Reading:
                 self._meant.setdefault((place + key, rule), []).append((whose, value))
 
     def leave_out(self, name: str, why: Message) -> None:
-        """Notes that a camera takes no part, and why."""
+        """Records that a camera is excluded, and why."""
         self.left_out[name] = why
 
     def finish(self, entries: Sequence[Mapping[str, object]]) -> CamerasRead:
@@ -191,8 +190,8 @@ def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
 
 
 def camera_names(files: list[str]) -> list[str]:
-    """Returns camera names: the pictures' names without their endings or, where those repeat (``cam00/shot.png``), the
-    names of the innermost folders that tell them all apart."""
+    """Returns camera names: the pictures' names without their endings. If those repeat (``cam00/shot.png``), it is the
+    names of the innermost folders that distinguish all of them."""
     paths = [tuple(part for part in file.replace("\\", "/").split("/") if part not in ("", ".")) for file in files]
     stems = [picture_stem(path[-1]) if path else "" for path in paths]
     if len(set(stems)) == len(stems):
@@ -242,7 +241,7 @@ def lens_entry(
     """Returns the ``distortion`` entry of ``eigenhead-cameras/1`` for coefficients under OpenCV's names; missing ones
     are 0. ``skew`` is entry (0, 1) of the camera matrix in focal lengths fx.
 
-    All foreign lenses get their model here. A coefficient other than 0 that the model does not have is a fault."""
+    All lenses from other programs get their model here. A nonzero coefficient that the model lacks is a fault."""
     model: LensModel | None = "kannala-brandt" if fisheye else None
     if model is None and any(parameters.get(key, 0.0) for key in ("k4", "k5", "k6")):
         model = "rational"
@@ -293,7 +292,7 @@ def matrix_skew(matrix: Float[np.ndarray, "3 3"]) -> float:
 
 
 def millimetres_of(centres: Sequence[Float[np.ndarray, " 3"]]) -> float:
-    """Returns how many millimetres the unit of the cameras' places has: of metres 1000, else 1."""
+    """Returns the unit of the cameras' positions in millimetres: 1000 for metres, otherwise 1."""
     known = [centre for centre in centres if np.isfinite(centre).all()]
     return 1000.0 if known and np.ptp(known, axis=0).max() < METRES_MOST else 1.0
 
@@ -313,7 +312,7 @@ def sized(folder: Path, name: str, faults: list[Message]) -> tuple[int, int]:
     """Returns width and height of the picture of camera ``name`` in ``folder`` or its ``images``, for formats without
     sizes.
 
-    If there is no picture, a fault is appended that says where to put it, and a placeholder size is returned."""
+    If there is no picture, a fault that says where to put it is appended, and a placeholder size is returned."""
     from rig.formats.pictures.images import picture_size  # decoders, which most formats do without
 
     for place in (folder, entry(folder, "images"), entry(folder.parent, "images")):
@@ -334,8 +333,8 @@ def brown_conrady(
     radial: Sequence[float], radius: float, focal: float, where: str, faults: list[Message]
 ) -> list[float]:
     """Fits k1 k2 k3 to the ``radial`` polynomial k1 k2 k3 k4 ... up to the ``radius`` (of ``X / Z``) of the picture's
-    corner; copies them if k4 and higher are zero. With the focal length (px) the fit may be wrong by ``LENS_LOSS_PX``
-    at most, otherwise a fault is appended."""
+    corner; copies them if k4 and higher are zero. With the focal length (px), a fault is appended if the fit is wrong
+    by more than ``LENS_LOSS_PX``."""
     if not any(radial[3:]) or not np.isfinite([*radial, radius, focal]).all():
         return list(radial[:3])
     r2 = np.linspace(0.0, max(radius, 1e-3) ** 2, 400)
@@ -364,7 +363,7 @@ def unread_programs(folder: Path) -> list[Message]:
 
 
 def program_of(path: Path) -> str | None:
-    """Returns the program that wrote a file of cameras which is not read, and a remedy; None for another file."""
+    """Returns the program that wrote an unsupported file of cameras, and a remedy; None for another file."""
     named = (program for pattern, program in PATTERNS if fnmatch(path.name.lower(), pattern))
     held = (
         program
@@ -375,7 +374,7 @@ def program_of(path: Path) -> str | None:
 
 
 def head_of(path: Path) -> str:
-    """Returns the beginning of a text, by which its format is recognised; nothing if it cannot be read."""
+    """Returns the beginning of a text, which identifies its format; empty if it cannot be read."""
     try:
         with path.open("rb") as file:
             return as_utf8(file.read(HEAD_BYTES)).decode("utf-8", "replace")

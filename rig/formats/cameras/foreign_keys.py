@@ -1,8 +1,8 @@
-"""Declares what becomes of each key of another program's file of cameras; readers obey this table.
+"""Declares how each key of another program's file of cameras is treated; readers obey this table.
 
 A key is ``read``: the reader uses it. ``refused``: it changes a camera in a way that this project cannot represent; the
 file is refused if the key has a value that matters. ``told``: its value is not used, and a warning (``unknown-key``)
-names it. ``nothing``: it has no influence on poses and lenses. A key that is missing from the table is warned of too.
+names it. ``nothing``: it has no influence on poses and lenses. A key missing from the table also gives a warning.
 ``docs/foreign-cameras.md`` is generated from this table; a test plants each key, and another compares the page."""
 
 from collections.abc import Iterator, Mapping
@@ -16,8 +16,8 @@ Treatment = Literal["read", "refused", "told", "nothing"]
 class ForeignKey(NamedTuple):
     """Holds the rule for one key.
 
-    ``why`` says as what the key is read, or why it is not read (a message if a reader reports it). ``silent`` lists
-    values at which a refused or reported key has no effect, as if it were missing; of a list, all elements must be
+    ``why`` says what the key is read as, or why it is not read (a message if a reader reports it). ``silent`` lists
+    values at which a refused or reported key has no effect, as if it were missing; for a list, all its elements must be
     among them.
     """
 
@@ -48,7 +48,7 @@ def _parts(value: object) -> Iterator[object]:
 
 
 def _plain(value: object) -> str | float:
-    """Returns numbers and truth values in a comparable form, however a file writes them."""
+    """Converts numbers and truth values to a comparable form, however a file writes them."""
     text = str(value).strip().casefold()
     try:
         return {"true": 1.0, "false": 0.0}[text] if text in ("true", "false") else float(text)

@@ -1,8 +1,8 @@
 """Reads and writes Agisoft Metashape's XML of cameras (File > Export > Export Cameras, format Agisoft XML).
 
-Each camera has a transform to the chunk (4 x 4, axes as OpenCV's); the transform of its component or of the chunk leads
-on to the world, in metres. The lens (user manual, appendix "Camera models") is ``u = w / 2 + cx + x' f + x' b1 + y'
-b2`` with the corner of the picture at 0, so that half a pixel is subtracted. p1 and p2 have OpenCV's meanings
+Each camera has a transform to the chunk (4 x 4, axes as OpenCV's); the transform of its component or of the chunk then
+maps to the world, in metres. The lens (user manual, appendix "Camera models") is ``u = w / 2 + cx + x' f + x' b1 + y'
+b2``, where the corner of the picture is 0, so half a pixel is subtracted. Compared with OpenCV, p1 and p2 are
 exchanged. Type ``fisheye`` is equidistant; with k1 to k4 it is Kannala and Brandt's lens."""
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,8 +40,8 @@ Similarity = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], float]  # 
 
 
 def read_metashape(path: Path) -> CamerasRead:
-    """Returns the cameras of a Metashape export that are aligned and enabled. Their names are their labels or, where
-    labels repeat, those of their groups. Raises InputError naming every fault."""
+    """Returns the aligned and enabled cameras of a Metashape export. Their names are their labels or, if labels repeat,
+    their groups' labels. Raises InputError naming every fault."""
     root = parsed(path, xml_root)
     reading = Reading(path.name)
     chunk = _chunk(root, reading)
@@ -144,7 +144,7 @@ def _read_camera(
 
 
 def write_metashape(rig: Rig, path: Path) -> None:
-    """Writes the export that ``read_metashape`` reads. Raises InputError for a lens that Metashape does not have."""
+    """Writes the export that ``read_metashape`` reads. Raises InputError for a lens that Metashape lacks."""
     rational = [camera.name for camera in rig if camera.recorded is not None and camera.recorded.model == "rational"]
     if rational:
         raise InputError("metashape", [compose("metashape-without-rational", cameras=rational)])
@@ -249,7 +249,7 @@ def _numbers(node: ElementTree.Element | None, count: int, where: str, faults: l
 
 
 def _size(node: ElementTree.Element | None) -> tuple[int | None, int | None]:
-    """Returns width and height; None where they are no numbers of pixels."""
+    """Returns width and height; None if they are no valid numbers of pixels."""
     texts = ["" if node is None else node.get(key, "") for key in ("width", "height")]
     whole = [int(text) if text.isdecimal() and len(text) < 7 else None for text in texts]
     return whole[0], whole[1]

@@ -54,8 +54,8 @@ POSE_KEY = re.compile(r"(R|Rot|T)_")
 
 
 def read_yaml(path: Path) -> CamerasRead:
-    """Returns the rig in ``intri.yml`` and the ``extri.yml`` beside it, or in ``path`` alone. Raises InputError naming
-    every fault."""
+    """Returns the rig in ``intri.yml`` and the ``extri.yml`` in the same folder, or in ``path`` alone. Raises
+    InputError naming every fault."""
     parts = [entry(path.parent, name) for name in FILES] if path.name.lower() in FILES else [path, path]
     lenses, poses = (parsed(part, _matrices) for part in parts)
     held = [key.removeprefix("K_") for key in lenses if key.startswith("K_")]
@@ -237,7 +237,7 @@ def read_toml(path: Path) -> CamerasRead:
 
 
 def write_caliscope(rig: Rig, path: Path) -> None:
-    """Writes ``camera_array.toml``: metres, cameras numbered in the rig's order, names kept beside the numbers."""
+    """Writes ``camera_array.toml``: metres, cameras numbered in the rig's order, with their names."""
     blocks = []
     for number, camera in enumerate(rig):
         keys: dict[str, object] = {
@@ -255,7 +255,7 @@ def write_caliscope(rig: Rig, path: Path) -> None:
 
 
 def write_aniposelib(rig: Rig, path: Path) -> None:
-    """Writes an aniposelib calibration, in millimetres (which ``metadata`` says)."""
+    """Writes an aniposelib calibration, in millimetres (as ``metadata`` states)."""
     blocks = []
     for number, camera in enumerate(rig):
         keys: dict[str, object] = {"name": camera.name, **_toml_intrinsics(camera)}
@@ -295,10 +295,10 @@ def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults:
 
 
 def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]], reading: Reading) -> float:
-    """Returns how many millimetres the unit of an aniposelib file has.
+    """Returns the unit of an aniposelib file in millimetres.
 
-    ``metadata.unit`` states it. Without it the size of the rig decides, since aniposelib takes over the unit of the
-    board: cameras within 30 units of each other are in metres."""
+    ``metadata.unit`` states it. Without it the size of the rig decides, because aniposelib uses the unit of the board:
+    cameras within 30 units of each other are in metres."""
     metadata = document.get("metadata")
     unit = metadata.get("unit") if isinstance(metadata, dict) else None
     if isinstance(metadata, dict):
@@ -311,7 +311,7 @@ def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]
 
 
 def _centre(table: Mapping[str, Any]) -> Float[np.ndarray, " 3"]:
-    """Returns the place of a camera; NaN where its pose is none."""
+    """Returns the position of a camera; NaN if its pose is invalid."""
     translation = number_array(table.get("translation"), (3,), "", [])
     rotation = pose_rotation(number_array(table.get("rotation"), None, "", []))
     return -rotation.T @ translation if rotation.shape == (3, 3) else np.full(3, np.nan)

@@ -2,11 +2,11 @@
 "Internal/External camera parameters".
 
 XMP (https://support.capturingreality.com/hc/en-us/articles/360017783459): ``Rotation`` is camera_from_world with
-OpenCV's axes; ``Position`` is the camera's centre in metres; the focal length is that of a film whose longer side is 36
-mm; the principal point is relative to the middle, in longer sides. CSV: the same focal length, the principal point in
-millimetres of that film, and heading, pitch and roll (degrees) of a camera that at 0 0 0 looks down, its top to the
-north. Neither contains the picture's size, which is read from the pictures beside it. Distortion, of ``X / Z``: k1 to
-k4; t1 and t2 are OpenCV's p1 and p2."""
+OpenCV's axes; ``Position`` is the camera's centre in metres; the focal length is for a film whose longer side is 36 mm;
+the principal point is relative to the middle, in multiples of the longer side. CSV: the same focal length, the
+principal point in millimetres of that film, and heading, pitch and roll (degrees). At 0 0 0 a camera points down, with
+its top to the north. Neither contains the picture's size, which comes from the picture files. Distortion, of ``X / Z``:
+k1 to k4; t1 and t2 are OpenCV's p1 and p2."""
 
 import csv
 import io
@@ -63,8 +63,8 @@ _XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
 
 
 def read_xmp(file: Path) -> CamerasRead:
-    """Returns the rig in an XMP file and those beside it, one camera each. Cameras that are not aligned or not used for
-    meshing take no part. Raises InputError naming every fault."""
+    """Returns the rig in an XMP file and the others in its folder, one camera each. Cameras that are not aligned or not
+    used for meshing are excluded. Raises InputError naming every fault."""
     folder = file.parent
     reading = Reading(f"{folder.name}/*.xmp")
     entries = []
@@ -128,12 +128,12 @@ def read_csv(path: Path) -> CamerasRead:
 
 
 def looks_like_csv(head: str) -> bool:
-    """Tells whether a file that begins so is the CSV, as RealityCapture wrote it or as a spreadsheet saved it."""
+    """Tells whether a file with this beginning is the CSV, as RealityCapture wrote it or as a spreadsheet saved it."""
     return _with_commas(head).startswith(",".join(COLUMNS[:8]))
 
 
 def _with_commas(text: str) -> str:
-    """Returns the table with commas between values, where a spreadsheet put semicolons and decimal commas."""
+    """Returns the table with commas between values, after a spreadsheet used semicolons and decimal commas."""
     return text.replace(",", ".").replace(";", ",") if text.startswith(COLUMNS[0] + ";") else text
 
 

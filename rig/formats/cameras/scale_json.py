@@ -24,7 +24,7 @@ KINDS = ("points", "tag", "cameras")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointDistance:
-    """Holds the pixels of two points of the scene by camera, and how far apart they are."""
+    """Holds the pixels of two points of the scene by camera, and the distance between the points."""
 
     first: Mapping[str, Float[np.ndarray, " 2"]]
     second: Mapping[str, Float[np.ndarray, " 2"]]
@@ -41,7 +41,7 @@ class TagSize:
 
 @dataclass(frozen=True, slots=True)
 class CameraDistance:
-    """Holds how far apart the centres of two cameras are."""
+    """Holds the distance between the centres of two cameras."""
 
     cameras: tuple[str, str]
     distance_mm: float

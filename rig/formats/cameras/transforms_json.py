@@ -2,9 +2,9 @@
 
 ``transform_matrix`` is world_from_camera with OpenGL's axes (x right, y up, z backwards;
 https://docs.nerf.studio/quickstart/data_conventions.html). The centre of the top-left pixel is (0.5, 0.5), as in
-COLMAP, from which nerfstudio takes its intrinsics. Intrinsics are at the top or in a frame; Blender's files give
-``camera_angle_x``, and the size follows from the pictures. Lengths are metres if all cameras lie within 30 units of
-each other, otherwise millimetres; ``applied_scale`` is undone. Of several moments (``timestep_index``) one is read."""
+COLMAP, from which nerfstudio takes its intrinsics. Intrinsics are at the top level or in a frame. Blender's files give
+``camera_angle_x``; the size comes from the pictures. Lengths are metres if all cameras lie within 30 units of each
+other, otherwise millimetres; ``applied_scale`` is undone. Of several moments (``timestep_index``), one is read."""
 
 import json
 import math
@@ -74,9 +74,9 @@ def read_transforms(document: Any, path: Path) -> CamerasRead:
 def _frames_of_one_moment(
     document: dict[str, Any], names: list[str], frames: list[dict[str, Any]], reading: Reading
 ) -> tuple[list[str], list[dict[str, Any]]]:
-    """Returns the cameras and frames of one moment, and leaves the others out: of the first one that the file lists as
-    ``timestep_indices``, or the first one there is. Frames without a number belong to every moment, and a frame
-    without a pose to none."""
+    """Returns the cameras and frames of one moment and leaves the others out. It is the first moment listed in the
+    file's ``timestep_indices``, otherwise the first one present. Frames without a number belong to every moment, and a
+    frame without a pose to none."""
     posed = [k for k, frame in enumerate(frames) if frame.get("transform_matrix") is not None]
     for name in (name for k, name in enumerate(names) if k not in posed):
         reading.leave_out(name, compose("left-without-pose"))
@@ -112,7 +112,7 @@ def read_splatting(document: Any, path: Path) -> CamerasRead:
 
 def read_nersemble(document: Any, path: Path) -> CamerasRead:
     """Returns the rig in NeRSemble's ``camera_params.json``: camera_from_world in metres, OpenCV's axes, one camera
-    matrix of all. The size is read from the pictures. Raises InputError naming every fault."""
+    matrix for all cameras. The size is read from the pictures. Raises InputError naming every fault."""
     reading = Reading(path.name)
     faults, poses = reading.faults, document["world_2_cam"]
     if not isinstance(poses, dict):
@@ -133,7 +133,7 @@ def write_transforms(rig: Rig, path: Path) -> None:
 
 
 def frame_document(camera: Camera, file_path: str) -> dict[str, object]:
-    """Returns the frame of one camera, in metres. Raises InputError for a lens that the format does not hold."""
+    """Returns the frame of one camera, in metres. Raises InputError for a lens that the format cannot state."""
     return {"file_path": file_path, **_lens(camera), "transform_matrix": opengl_pose(camera)}
 
 
@@ -197,7 +197,7 @@ def _check_applied(value: object, faults: list[Message]) -> None:
     """Appends a fault if the applied transform scales or mirrors, which would change lengths or exchange left and
     right.
 
-    A rotation is accepted and not undone, since the world frame is free."""
+    A rotation is accepted and not undone, because the world frame is arbitrary."""
     if value is None:
         return
     try:

@@ -1,4 +1,3 @@
 """Reads and writes captures: folders and archives of one synchronised shot, with masks, feature points and outlines.
 
-Enters: a folder or an archive that anybody may have made. Leaves: a ``Capture`` with its ``Rig``, or all faults at
-once."""
+In: a folder or an archive from any source. Out: a ``Capture`` with its ``Rig``, or all faults at once."""

@@ -1,12 +1,12 @@
 """Extracts an uploaded .zip, .tar or .tar.gz safely.
 
-An archive comes from a stranger, so none of its statements is trusted: members are checked by name and kind before the
-first byte is written, bytes are counted as they are unpacked, and a refused archive leaves the folder empty. Every
-fault names the member that has it.
+An archive comes from a stranger, so none of its statements is trusted. Members are checked by name and kind before the
+first byte is written, bytes are counted while unpacking, and a refused archive leaves the folder empty. Every fault
+names the member that has it.
 
 A member's name is read as UTF-8 if its bytes are valid UTF-8, whatever the archive states, because macOS writes UTF-8
-without setting the flag for it; otherwise as code page 437, the zip format's own. Names that are not kept, those of
-folders around the capture and of files that file managers add, need only be writable.
+without setting the flag for it; otherwise as code page 437, the zip format's own. Some names are not written: folders
+around the capture, and files that file managers add. These must only be valid for output.
 
 Sources of the attacks: https://www.bamsoftware.com/hacks/zipbomb (overlapping members), CVE-2007-4559 (traversal and
 links in tar), https://www.unicode.org/reports/tr39 (confusable names)."""
@@ -58,7 +58,7 @@ WINDOWS_NAMES = re.compile(r"(?i)^(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)")
 
 @dataclass(frozen=True, slots=True)
 class ArchiveLimits:
-    """Limits what one archive may hold. 64 cameras with 32 clean plates each are about 2,200 files."""
+    """Limits the content of one archive. 64 cameras with 32 clean plates each are about 2,200 files."""
 
     members: int = 5000
     total_bytes: int = 16 << 30
@@ -81,7 +81,7 @@ class _Member:
 
     @property
     def shown(self) -> str:
-        """Returns the name for messages; a name that may be garbled is replaced."""
+        """Returns the name for messages; a possibly garbled name is replaced."""
         text = re.sub(r"[^\x00-\x7f]", "?", self.name) if self.guessed else self.name
         return f"{text!r:.120}"
 
@@ -114,8 +114,8 @@ def is_archive(path: Path) -> bool:
 def extract_archive(path: Path, folder: Path, limits: ArchiveLimits = ArchiveLimits()) -> tuple[str, ...]:
     """Unpacks ``path`` into the empty or absent ``folder`` and returns the relative names of the files written.
 
-    Raises InputError naming every fault, and OSError (a full disk, for example). In both cases ``folder`` is left
-    empty."""
+    Raises InputError naming every fault, and OSError (a full disk, for example). In both cases ``folder`` is empty
+    afterwards."""
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise InputError(folder.name, [compose("archive-folder-not-empty")])
@@ -145,7 +145,7 @@ def _format(path: Path) -> str | None:
 
 
 def _is_old_header(head: bytes) -> bool:
-    """Tells whether a tar from before POSIX begins so; only the checksum of its first header identifies it."""
+    """Tells whether a tar from before POSIX begins like this; only its first header's checksum identifies it."""
     if len(head) < tarfile.BLOCKSIZE or not head[0]:
         return False
     try:
@@ -162,7 +162,7 @@ def _foreign_kind(path: Path) -> str | None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Iterable[_Member]]:
-    """Yields the members of an archive. Every failure that damage can cause is raised as InputError."""
+    """Yields the members of an archive. Every failure due to damage is raised as InputError."""
     kind = _format(path)
     if kind is None:
         foreign = _foreign_kind(path)
@@ -195,8 +195,8 @@ def _opened(path: Path) -> Iterator[Iterable[_Member]]:
 
 
 class _TarInfo(tarfile.TarInfo):
-    """Limits the size of extra headers, such as a long name: tarfile reads them whole into memory, whatever size they
-    claim."""
+    """Limits the size of extra headers, such as a long name: tarfile reads them whole into memory, whatever their
+    stated size."""
 
     def _proc_member(self, archive: tarfile.TarFile) -> tarfile.TarInfo:
         if self.type not in (*tarfile.SUPPORTED_TYPES, tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE):
@@ -291,7 +291,7 @@ def _buffered(stream: object) -> BufferedIOBase:
 
 def _extract(members: Iterable[_Member], folder: Path, limits: ArchiveLimits, packed_bytes: int) -> tuple[str, ...]:
     """Writes the files until the first fault; the members after it are only checked. A fault in the name of a folder
-    counts only if the folder is kept, which is known at the end: a folder around all files is not."""
+    counts only if the folder is written. A folder around all files is not, which is known only at the end."""
     faults = _Faults()
     seen: dict[str, tuple[str, str]] = {}
     odd: dict[tuple[str, ...], list[Message]] = {}
@@ -360,8 +360,8 @@ def _judge(
     faults: _Faults,
     limits: ArchiveLimits,
 ) -> str | None:
-    """Returns the relative name to write a member to; None if there is nothing to write. Adds its faults to ``faults``,
-    and those of a part of its name, which count only if that part is kept, to ``odd`` under the part's path."""
+    """Returns the relative name to write a member to; None if there is nothing to write. Adds its faults to ``faults``.
+    ``odd``: faults of folder names, by path, which count only if the folder is written."""
     if member.kind not in ("file", "folder"):
         faults.add(compose("member-no-file", member=member.shown, kind=_NO_FILES[member.kind]))
         return None
@@ -409,8 +409,8 @@ def decoded_name(raw: bytes) -> tuple[str, bool]:
 
 
 def unicode_path(extra: bytes, raw: bytes) -> bytes | None:
-    """Returns the name in UTF-8 from Info-ZIP's extra field, or None. The field counts only if its checksum is that of
-    the name ``raw``."""
+    """Returns the name in UTF-8 from Info-ZIP's extra field, or None. The field counts only if its checksum matches the
+    name ``raw``."""
     at = 0
     while at + 4 <= len(extra):
         kind, size = struct.unpack_from("<HH", extra, at)
@@ -427,13 +427,13 @@ def unicode_path(extra: bytes, raw: bytes) -> bytes | None:
 
 
 def is_dropped(part: str) -> bool:
-    """Tells whether a file or folder of this name is never written: file managers add it."""
+    """Tells whether a file or folder of this name is never written, because file managers add it."""
     return part.startswith("._") or part.casefold() in DROPPED
 
 
 def name_clash(parts: list[str], shown: str, kind: str, seen: dict[str, tuple[str, str]]) -> Message | None:
-    """Returns a fault if a name repeats another member's, or if some file system or reader would take both for the
-    same. Adds the name to ``seen``."""
+    """Returns a fault if a name repeats another member's, or if some file system or reader would not distinguish them.
+    Adds the name to ``seen``."""
     name = "/".join(parts)
     key = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
     other = seen.get(key)
@@ -448,7 +448,7 @@ def name_clash(parts: list[str], shown: str, kind: str, seen: dict[str, tuple[st
 
 
 def path_faults(name: str, shown: str, *, depth: int, name_length: int) -> list[Message]:
-    """Returns faults of a member's path that no member may have, kept or not. Messages call the member ``shown``."""
+    """Returns faults of a member's path that no member may have, written or not. Messages call the member ``shown``."""
     if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
         return [compose("member-name-invisible", member=shown)]
     if "\\" in name or re.match(r"^[A-Za-z]:", name):
@@ -467,7 +467,7 @@ def path_faults(name: str, shown: str, *, depth: int, name_length: int) -> list[
 
 
 def name_faults(part: str, shown: str, *, name_length: int) -> list[Message]:
-    """Returns faults of one part of a path that a kept file or folder must not have."""
+    """Returns faults that one part of a written file's or folder's path must not have."""
     faults = []
     if any(unicodedata.category(c) in ("Cf", "Co", "Cn", "Zl", "Zp") for c in part):
         faults.append(compose("member-name-invisible", member=shown))

@@ -7,10 +7,10 @@ features.json                      optional
 masks/<camera>.png                 optional; then background/ may be absent
 texture_sets/<set>/<camera>.<ext>  optional: further photographs by the same cameras, for the texture
 
-Without background/ and masks/ the subject is the opaque part if every picture was cut out; otherwise it is segmented
-from the photographs. Without images/ the pictures lie beside cameras.json. ``shot_files`` decides which file
-belongs to which camera where names differ. Pictures are reduced (``rig.formats.pictures.work_size``); pores need all
-pixels, so pictures can be read once more, one at a time, at the size of their files.
+Without background/ and masks/, the subject is the opaque part of the pictures if every picture was cut out; otherwise
+it is segmented from the photographs. Without images/ the pictures lie in the same folder as cameras.json.
+``shot_files`` assigns files to cameras if names differ. Pictures are reduced (``rig.formats.pictures.work_size``).
+Pores need all pixels, so pictures can also be read one at a time at full size.
 """
 
 import hashlib
@@ -62,7 +62,7 @@ SETS_ALIKE = 0.9  # to texture_sets: "texture_set" 0.96, "texture-sets" 0.92; "t
 
 
 def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Capture, Rig]:
-    """Reads a capture folder and returns its capture and cameras, without those whose pictures cannot be used.
+    """Reads a capture folder and returns its capture and cameras, without cameras whose pictures cannot be used.
 
     Pictures and feature points of a ``recorded`` lens are undistorted. Pictures of more than ``pixels_most`` pixels are
     reduced, and their cameras with them (``rig.formats.pictures.work_size``). Raises InputError naming every fault of
@@ -88,8 +88,8 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
 
 
 def judge_lost(lost: Mapping[str, Sequence[Message]], rig: Rig, faults: list[Message]) -> list[Message]:
-    """Returns a warning for each camera that takes no part because its pictures cannot be used; ``lost`` says why.
-    Where the other cameras do not suffice, all that is wrong is appended to ``faults``."""
+    """Returns a warning for each camera that is excluded because its pictures cannot be used; ``lost`` holds the
+    reasons. If too few cameras remain, all faults are appended to ``faults``."""
     left, needed = len(rig) - len(lost), max(CAMERAS_LEAST, ceil(REST_LEAST * len(rig)))
     if left < needed:
         faults += [fault for of_camera in lost.values() for fault in of_camera]
@@ -100,8 +100,8 @@ def judge_lost(lost: Mapping[str, Sequence[Message]], rig: Rig, faults: list[Mes
 
 
 def open_capture(folder: Path) -> tuple[list[Path], CamerasRead, ShotFiles, list[Message]]:
-    """Returns the files of cameras in a capture's folder, of which the first is read, its cameras, the files of the
-    shot, and what is wrong with all of them. Raises InputError where no cameras can be read."""
+    """Returns a capture folder's files of cameras (the first is read), its cameras, the files of the shot, and the
+    faults of all of them. Raises InputError if no cameras can be read."""
     rigs = [*rig_files(folder)]
     if not rigs:
         raise InputError("capture", [no_rig_fault(folder)])
@@ -142,8 +142,9 @@ def unread_folders(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
 
 
 def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
-    """Returns remarks on files of cameras in the folder that are not read: those of other programs, and further rigs,
-    since only the first of ``rigs`` is read; beside photographs without a rig, all files but pictures and notes."""
+    """Returns remarks on unread files of cameras in the folder: those of other programs, and further rigs, since only
+    the first of ``rigs`` is read. Next to photographs without a rig, all files except pictures and notes are
+    reported."""
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and path not in rigs]
     if rigs:
         read, *others = (path.relative_to(folder).as_posix() for path in rigs)
@@ -164,8 +165,7 @@ def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
 
 
 def _other_models(folder: Path, rig_file: Path) -> list[str]:
-    """Returns further COLMAP models: the same one in the other encoding, and those of images that were registered
-    separately."""
+    """Returns further COLMAP models: the same one in the other encoding, and models of images registered separately."""
     if rig_file.suffix not in (".bin", ".txt"):
         return []
     twin = entry(rig_file.parent, "cameras.txt" if rig_file.suffix == ".bin" else "cameras.bin")
@@ -176,14 +176,14 @@ def _other_models(folder: Path, rig_file: Path) -> list[str]:
 
 
 def has_known_length(folder: Path) -> bool:
-    """Tells whether scale.json fixes the unit of the cameras. It does not where it was used already when the cameras
-    were calibrated from the photographs."""
+    """Tells whether scale.json fixes the unit of the cameras. It does not if it was already used when the cameras were
+    calibrated from the photographs."""
     return entry(folder, SCALE).is_file() and not (folder / "calibration.json").is_file()
 
 
 def capture_root(folder: Path) -> Path:
-    """Returns the capture's own folder: ``folder``, or the single folder in it, and so on, as archives have enclosing
-    folders.
+    """Returns the capture's own folder: ``folder``, or the single folder inside, and so on, because archives have
+    enclosing folders.
 
     Raises InputError if ``folder`` is no folder."""
     if not folder.is_dir():
@@ -199,9 +199,9 @@ def capture_root(folder: Path) -> Path:
 
 
 def check_folders(folder: Path, rig: Rig) -> None:
-    """Raises InputError for folders whose names nearly are one of a capture's own, such as "backgrounds".
+    """Raises InputError for folders whose names resemble a capture's own folders, such as "backgrounds".
 
-    They would not be read, and the subject would be segmented without its clean plates, or every picture be missing."""
+    Unread, they would leave the subject without clean plates, or every picture missing."""
     kinds = ("images", *BESIDE_PICTURES)
     folders = [path.name for path in sorted(folder.iterdir()) if path.is_dir()]
     others = {name.casefold(): name for name in folders if not {name, name.lower()} & {*kinds, *rig.names}}
@@ -230,8 +230,8 @@ def read_shot(
 ) -> Capture:
     """Returns the images of a folder for a known rig, at the size and undistorted as ``work_rig`` describes them.
 
-    Every fault is appended to ``faults``, except those of ``files``, which its finder has reported already. With
-    ``lost``, pictures, masks and plates that cannot be used are noted there by camera, which then has none at all."""
+    Every fault is appended to ``faults``, except those in ``files``, which were reported already. With ``lost``,
+    unusable pictures, masks and plates are recorded there by camera, and that camera gets no pictures at all."""
     if files is None:
         files = find_files(folder, rig)
         faults += files.faults
@@ -289,7 +289,7 @@ def _decoded(
     pixels_most: int | None,
     bits: Mapping[str, int],
 ) -> tuple[dict[str, list[tuple[str, str, np.ndarray]]], dict[str, str]]:
-    """Returns camera, file and pixels of every picture that can be read, by kind, and the SHA-256 of the files."""
+    """Returns camera, file and pixels of every readable picture, by kind, and the SHA-256 of the files."""
 
     def decode(job: tuple[str, str, Path]) -> tuple[np.ndarray | None, str, Message | None]:
         return decode_picture(folder, *job, rig=rig, pixels_most=pixels_most, bits=bits[job[0]])
@@ -333,8 +333,8 @@ def _cut_outs(
 def _sample_bits(
     jobs: Sequence[tuple[str, str, Path]], faults: list[Message]
 ) -> tuple[Mapping[str, int], list[Message]]:
-    """Returns, for each kind of files, how many of 16 bits are used, and a remark where they are fewer. Sensor mosaics
-    that were not developed are appended to ``faults``."""
+    """Returns, for each kind of files, how many of 16 bits are used, and a remark if they are fewer. Raw sensor mosaics
+    are appended to ``faults``."""
     kinds = [*dict.fromkeys(("images", "background", *(kind for kind, _, _ in jobs if kind != "masks")))]
     samples = {kind: measure_samples([path for of, _, path in jobs if of == kind]) for kind in kinds}
     mosaics = [f"{kind}/" for kind in kinds if samples[kind].mosaic]
@@ -349,7 +349,7 @@ def _sample_bits(
 
 
 def _page_remarks(folder: Path, jobs: Sequence[tuple[str, str, Path]]) -> list[Message]:
-    """Returns a remark that names the files of several pictures, of which the first is read."""
+    """Returns a remark on files that contain several pictures, of which only the first is read."""
     paged = [path.relative_to(folder).as_posix() for _, _, path in jobs if page_count(path) > 1]
     if not paged:
         return []
@@ -357,7 +357,7 @@ def _page_remarks(folder: Path, jobs: Sequence[tuple[str, str, Path]]) -> list[M
 
 
 def _grey_remarks(images: Mapping[str, np.ndarray]) -> list[Message]:
-    """Returns a remark that names the grey pictures among some in colour."""
+    """Returns a remark on grey pictures among coloured ones."""
     grey = [name for name, image in images.items() if is_grey(image)]
     return [compose("pictures-grey", cameras=some_of(grey))] if 0 < len(grey) < len(images) else []
 
@@ -386,8 +386,7 @@ def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
 
 
 def _in_read_pictures(features: Features, rig: Rig) -> Features:
-    """Moves feature points from the pictures in the files to the pictures as they are read, where these are
-    undistorted."""
+    """Converts feature points from the pictures in the files to the undistorted pictures in memory."""
 
     def moved(name: str, pixel: np.ndarray) -> np.ndarray:
         lens = rig[name].recorded
@@ -399,8 +398,8 @@ def _in_read_pictures(features: Features, rig: Rig) -> Features:
 def decode_picture(
     folder: Path, kind: str, name: str, path: Path, *, rig: Rig, pixels_most: int | None, bits: int
 ) -> tuple[np.ndarray | None, str, Message | None]:
-    """Decodes a file of a camera, reduced and undistorted. Returns its pixels, the sha256 of the file, and a fault
-    (then there are no pixels). ``kind`` is images, background, masks or a texture set's folder."""
+    """Decodes a file of a camera, reduced and undistorted. Returns its pixels and the sha256 of the file; or a fault in
+    place of pixels. ``kind`` is images, background, masks or a texture set's folder."""
     camera = rig[name]
     wanted, share = (camera.intrinsics.width, camera.intrinsics.height), work_share(camera.intrinsics, pixels_most)
     where, whole = path.relative_to(folder).as_posix(), kind == "masks"
@@ -426,7 +425,7 @@ def decode_picture(
 
 
 def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> Message:
-    """Describes a picture whose size (width, height) is not that of its camera."""
+    """Describes a picture whose size (width, height) differs from its camera's."""
     of_picture, of_camera = f"{size[0]} x {size[1]}", f"{k.width} x {k.height}"
     fault = compose("picture-size-differs", picture=where, size=of_picture, wanted=of_camera)
     if size == (k.height, k.width):
@@ -441,8 +440,8 @@ def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> Message:
 
 
 def full_size_reader(folder: Path, rig: Rig, left_out: Sequence[str] = ()) -> ReadImage:
-    """Returns a function that reads the picture of a camera of ``rig`` from a capture's own folder, undistorted as
-    ``read_capture`` does it. ``left_out`` are cameras of its file that are not in the rig."""
+    """Returns a function that reads the picture of a camera of ``rig`` from a capture's own folder, undistorted as in
+    ``read_capture``. ``left_out`` are cameras in its file but not in the rig."""
     files = find_files(folder, rig, left_out)
     paths = {name: path for name in rig.names for kind, path in files.of_camera(name) if kind == "images"}
     bits = measure_samples([*paths.values()]).bits or WHOLE_BITS

@@ -73,8 +73,8 @@ def features_from_document(document: Any, rig: Rig, faults: list[Message]) -> Fe
 
 
 def _fault_of_all(points: dict[str, Any], rig: Rig) -> Message | None:
-    """Returns the fault that all points share: cameras outside and landmarks inside, shares of the picture in place of
-    pixels, or pixels of other pictures. None if there is none."""
+    """Returns the fault that all points share: cameras and landmarks nested in the wrong order, fractions of the
+    picture in place of pixels, or pixels of other pictures. None if there is none."""
     inner = {name for views in points.values() if isinstance(views, dict) for name in views}
     if points and inner and all(name in rig for name in points) and not any(name in rig for name in inner):
         return compose("features-by-camera")

@@ -1,10 +1,10 @@
 """Assigns the files of a capture folder to cameras: each camera's picture, mask and clean plates.
 
-A file belongs to the camera whose name it has. If a camera has no file of exactly its name, similar names are
-matched where only one camera can be meant (``rig.formats.pictures.picture_names``), then the body's serial number
-(EXIF's BodySerialNumber (CIPA DC-008, tag 0xA431) of JPEG, TIFF, PNG, WebP and HEIC, of RAW files built like TIFF,
-and of Canon's CR3 (its box CMT2), and DNG's CameraSerialNumber (0xC62F)). A camera's file may also lie in a folder
-of the camera's name, and all files together in one more folder."""
+A file named like a camera belongs to that camera. If a camera has no file of exactly its name, a similar name is
+accepted if it fits only one camera (``rig.formats.pictures.picture_names``). Otherwise the body's serial number decides
+(EXIF's BodySerialNumber (CIPA DC-008, tag 0xA431) of JPEG, TIFF, PNG, WebP and HEIC, of RAW files built like TIFF, and
+of Canon's CR3 (its box CMT2), and DNG's CameraSerialNumber (0xC62F)). A camera's file may also lie in a folder with the
+camera's name, and all files together in one more folder."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -73,8 +73,8 @@ def _exif(data: bytes) -> Image.Exif:
 
 
 def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
-    """Returns the rig with each camera's ``serial`` read from its picture. Serials that two pictures share are left
-    out, since then one body took both."""
+    """Returns the rig with each camera's ``serial`` read from its picture. Serials shared by two pictures are left out,
+    since one body took both."""
     serials = {name: camera_serial(path) for name, path in pictures.items()}
     recorded = [serial for serial in serials.values() if serial is not None]
     unique = {name: serial for name, serial in serials.items() if serial is not None and recorded.count(serial) == 1}
@@ -82,10 +82,10 @@ def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
 
 
 def pictures_by_serial(folder: Path, rig: Rig, faults: list[Message]) -> dict[str, Path]:
-    """Returns pictures of ``folder`` by camera, matched by serial number, for pictures whose names are no camera's.
+    """Returns pictures of ``folder`` by camera, matched by serial number, if their names fit no camera.
 
-    Nothing is read if every camera has a picture of its name. Appends a fault for each picture that cannot be matched,
-    and for two pictures of one body."""
+    Nothing is read if every camera has a picture with its name. Appends a fault for each unmatched picture, and for two
+    pictures of one body."""
     here = sorted(path for path in folder.iterdir() if is_picture(path))
     inside = {path.name for path in folder.iterdir() if path.is_dir()}
     lacking = [camera for camera in rig if camera.name not in {path.stem for path in here} | inside]
@@ -115,9 +115,9 @@ def pictures_by_serial(folder: Path, rig: Rig, faults: list[Message]) -> dict[st
 
 @dataclass(frozen=True, slots=True)
 class ShotFiles:
-    """Holds the files of a shot by camera. ``strays`` are pictures of no camera, relative to the capture's folder;
-    ``faults`` are messages on files that are missing or ambiguous; ``texture_sets`` are files by set and camera;
-    ``absent`` says, by camera, which of its files is missing while those of others are there."""
+    """Holds the files of a shot by camera. ``strays`` are pictures without a camera, relative to the capture's folder;
+    ``faults`` are messages on missing or ambiguous files; ``texture_sets`` are files by set and camera; ``absent``
+    names, by camera, a file that it lacks but others have."""
 
     images: Mapping[str, Path]
     masks: Mapping[str, Path]
@@ -136,8 +136,7 @@ class ShotFiles:
 
 
 def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFiles:
-    """Finds the files of one shot. Files of the cameras in ``left_out``, which take no part, are neither used nor
-    strays."""
+    """Finds the files of one shot. Files of the excluded cameras ``left_out`` are neither used nor strays."""
     names, faults = [*rig.names, *left_out], list[Message]()
     places = {"images": picture_folder(folder), **{kind: entry(folder, kind) for kind in BESIDE_PICTURES}}
     owned = {kind: _owned(place, names, kind, rig, faults) for kind, place in places.items()}
@@ -162,7 +161,7 @@ def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFile
 
 
 def _texture_sets(folder: Path, rig: Rig, names: Sequence[str], faults: list[Message]) -> dict[str, dict[str, Path]]:
-    """Returns the pictures of each texture set by camera. Its name becomes that of a file, so it has small letters."""
+    """Returns the pictures of each texture set by camera. A set's name becomes a file's name, so it is lower case."""
     place = entry(folder, TEXTURE_SETS)
     if not place.is_dir():
         return {}
@@ -211,7 +210,7 @@ def listed_pictures(folder: Path) -> list[Path]:
 
 
 def stray_sentence(strays: Sequence[str], rig: Rig) -> Message:
-    """Returns a message that names the pictures which belong to no camera."""
+    """Returns a message that names the pictures without a camera."""
     return compose("pictures-strange", count=len(strays), pictures=some_of(strays), cameras=rig.names)
 
 
@@ -270,7 +269,7 @@ def _flat(paths: Sequence[Path]) -> list[Path]:
 
 
 def _strays(place: Path, used: set[Path], names: Sequence[str], kind: str) -> list[Path]:
-    """Returns pictures in a folder of the capture that belong to no camera, those of unreadable formats included."""
+    """Returns pictures in a folder of the capture that fit no camera, including those of unreadable formats."""
     if not place.is_dir():
         return []
     is_root = kind == "images" and place.name.lower() != "images"
@@ -280,7 +279,7 @@ def _strays(place: Path, used: set[Path], names: Sequence[str], kind: str) -> li
 
 
 def shows_something(path: Path) -> bool:
-    """Tells whether a path is a picture, of a kind that is read or not, and no copy of a RAW file."""
+    """Tells whether a path is a picture, readable or not, and no copy of a RAW file."""
     if has_raw_beside(path):
         return False
     return is_picture(path) or (path.suffix.lower() in UNREAD_PICTURES and not is_junk(path.name) and path.is_file())
@@ -296,9 +295,9 @@ def _missing(
     places: Mapping[str, Path],
     strays: Mapping[str, Sequence[Path]],
 ) -> tuple[list[Message], dict[str, Message], bool]:
-    """Returns faults of files, by camera what it alone lacks, and whether they name the strays already.
+    """Returns faults of files, the missing file of single cameras, and whether the faults already name the strays.
 
-    If no camera has a file of its name and other files are there, that is reported as one cause."""
+    If no camera has a file with its name and other files exist, one message reports the common cause."""
     inside = "" if places["images"] == folder else "images/"
     faults, alone, named = list[Message](), not any(entry(folder, kind).is_dir() for kind in BESIDE_PICTURES), False
     absent: dict[str, Message] = {}
@@ -333,7 +332,7 @@ def _missing(
 
 
 def _of_other_kind(name: str, folder: Path, strays: Sequence[Path]) -> Message | None:
-    """Returns the fault of a camera's file of a kind that is not read, or None."""
+    """Returns the fault of a camera's file in an unreadable format, or None."""
     for path in strays:
         kind = UNREAD_PICTURES.get(path.suffix.lower())
         if kind is not None and picture_stem(path.name) == name:
@@ -342,7 +341,7 @@ def _of_other_kind(name: str, folder: Path, strays: Sequence[Path]) -> Message |
 
 
 def _broken_link(place: Path, name: str) -> Path | None:
-    """Returns a symbolic link of the camera's name whose target is missing, or None."""
+    """Returns a symbolic link with the camera's name whose target is missing, or None."""
     links = (path for path in sorted(place.iterdir()) if path.is_symlink() and not path.exists())
     return next((path for path in links if picture_stem(path.name) == name), None)
 
@@ -350,7 +349,7 @@ def _broken_link(place: Path, name: str) -> Path | None:
 def _cause(
     rig: Rig, lacking: Sequence[str], strays: Sequence[Path], place: str | Message, what: Message
 ) -> Message | None:
-    """Returns one message if all cameras lack a file and at least as many other files are there; otherwise None."""
+    """Returns one message if all cameras lack a file and there are at least as many other files; otherwise None."""
     strangers = [path for path in strays if is_picture(path)]
     if not len(lacking) == len(rig) > 1 or len(strangers) < max(len(lacking), 2):
         return None
@@ -364,7 +363,7 @@ def _cause(
 
 
 def _doubt(strangers: Sequence[Path], rig: Rig) -> Message | None:
-    """Returns why names that contain those of cameras cannot be assigned: there are several for each camera."""
+    """Returns why file names that contain cameras' names cannot be assigned: there are several for each camera."""
     several = match_names([path.name for path in strangers], rig.names, several=True)
     if len(several) < len(rig) or all(len(pictures) == 1 for pictures in several.values()):
         return None

@@ -1,8 +1,8 @@
-"""Parameters of a FLAME head in a file: flame_param.npz, as VHAP writes and GaussianAvatars reads it.
+"""Reads and writes the parameters of a FLAME head: flame_param.npz, which VHAP writes and GaussianAvatars reads.
 
 A NumPy archive of float32 (https://github.com/ShenhanQian/VHAP, https://github.com/ShenhanQian/GaussianAvatars):
 lengths in metres, rotation vectors in radians, and moments along the first axis, of which there is one here.
-``static_offset`` is added to each vertex before any joint turns.
+``static_offset`` is added to each vertex before any joint rotates.
 """
 
 import io
@@ -30,7 +30,7 @@ def flame_param(
     translation: Float[np.ndarray, " 3"],
     offsets: Float[np.ndarray, "v 3"],
 ) -> FlameParam:
-    """Returns the arrays of the file for one moment. ``pose``: of root, neck, jaw and both eyes."""
+    """Returns the arrays of the file for one moment. ``pose``: rotations of root, neck, jaw and both eyes."""
     parts = np.split(pose.ravel(), np.cumsum([*POSES.values()])[:-1])
     arrays = {"shape": shape, "expr": expression[None]}
     arrays |= {name: part[None] for name, part in zip(POSES, parts, strict=True)}
@@ -39,7 +39,7 @@ def flame_param(
 
 
 def canonical(parameters: FlameParam) -> FlameParam:
-    """Returns the head of the same person at the origin, looking along z, without expression, mouth open."""
+    """Returns the head of the same person at the origin, facing along z, without expression, mouth open."""
     out = {name: array if name in ("shape", "static_offset") else 0.0 * array for name, array in parameters.items()}
     return out | {"jaw_pose": np.array([[CANONICAL_JAW_RAD, 0.0, 0.0]], np.float32)}
 

@@ -1,10 +1,10 @@
-"""Writes binary glTF: meshes with vertex colours or textures, morph targets, and nodes at the points that parts turn
-about. It does not use trimesh, whose bytes differ between versions.
+"""Writes binary glTF: meshes with vertex colours or textures, morph targets, and nodes at the pivots of parts. It does
+not use trimesh, whose bytes differ between versions.
 
-The nodes, where there are pivots: ``neck`` over all others, at the joint of skull and spine; under it the parts that
-turn with it and a node at every other pivot (``jaw``, ``eye_right``, ``eye_left``). A part that has a pivot's name is
-the mesh of that node; others are nodes below it. Morph targets are sparse, since an expression moves only a part of the
-face; their names are in ``extras.targetNames``, where three.js, Blender and others look for them.
+If there are pivots, the top node is ``neck``, at the joint of skull and spine. Under it are the parts that turn with
+it, and a node for every other pivot (``jaw``, ``eye_right``, ``eye_left``). A part with a pivot's name is the mesh of
+that node; others are nodes below it. Morph targets are sparse, because an expression moves only a part of the face;
+their names are in ``extras.targetNames``, where three.js, Blender and others read them.
 """
 
 import json
@@ -52,7 +52,7 @@ def scene_glb_bytes(scene: Scene, extras: Mapping[str, Any] | None = None) -> by
 
 
 def _append_pivots(nodes: list[dict[str, Any]], scene: Scene, below: dict[str, list[int]]) -> None:
-    """Appends the nodes of pivots, ``neck`` last and over all others."""
+    """Appends the nodes of pivots; ``neck`` is last and the parent of all others."""
     neck = scene.pivots_mm[NECK] / 1000.0
     for number in below[NECK]:
         nodes[number]["translation"] = (-neck).tolist()
@@ -92,8 +92,8 @@ class _Writer:
     def append_mesh(self, part: Part, vertices: Float[np.ndarray, "v 3"]) -> int:
         """Appends a part whose vertices (mm) are relative to its node, and returns the number of its mesh.
 
-        glTF's ``COLOR_0`` is linear and ours is sRGB. It is converted, to 16 bits so that dark tones are kept.
-        https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes
+        glTF's ``COLOR_0`` is linear, while colours here are sRGB. They are converted to 16 bits, so that dark tones
+        stay distinct. https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes
         """
         skin, colours = part.skin, part.mesh.colours
         rows = np.arange(len(vertices)) if skin is None or skin.source is None else skin.source
@@ -152,7 +152,7 @@ class _Writer:
         return len(materials) - 1
 
     def _texture(self, image: bytes, mime: str) -> int:
-        """Returns the number of an encoded image's texture; images that are alike are written once."""
+        """Returns the number of an encoded image's texture; identical images are written once."""
         if image in self._textures:
             return self._textures[image]
         self.document.setdefault("samplers", [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}])

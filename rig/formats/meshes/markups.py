@@ -1,7 +1,7 @@
 """Reads and writes point lists of 3D Slicer: ``.mrk.json``, markups schema 1.0.3.
 
 A file states its axes: LPS (x to the patient's left, y to the back, z up) or RAS (x to the right, y to the front, z
-up). Both are right-handed, and a half turn about z leads from one to the other. Lengths are mm.
+up). Both are right-handed; a half turn about z converts one to the other. Lengths are mm.
 """
 
 import json
@@ -27,14 +27,14 @@ SCHEMA = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkupPoint:
-    """Holds a point (mm) of a list and what is said of it."""
+    """Holds a point (mm) of a list with its label and description."""
 
     position: Float[np.ndarray, " 3"]
     description: str = ""
 
 
 def axes_turn(wanted: Axes, held: Axes) -> Float[np.ndarray, "3 3"]:
-    """Returns the rotation that takes coordinates in axes ``held`` to ``wanted``."""
+    """Returns the rotation that converts coordinates in axes ``held`` to ``wanted``."""
     return np.eye(3) if wanted == held else RAS_FROM_LPS
 
 
@@ -61,8 +61,8 @@ def markups_document(points: Mapping[str, MarkupPoint], axes: Axes, name: str = 
 
 
 def read_markups(path: Path, axes: Axes) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns the points of all lists of a file by their labels, in ``axes``, whatever the file's own are; points that
-    are not placed are left out. Raises InputError."""
+    """Returns the points of all lists of a file by their labels, converted to ``axes``; points without a position are
+    left out. Raises InputError."""
     found: dict[str, Float[np.ndarray, " 3"]] = {}
     turns: dict[str, Float[np.ndarray, "3 3"]] = {}
     try:

@@ -1,7 +1,7 @@
-"""Reads meshes of other programs: PLY, OBJ, GLB and, where it is asked for, STL, through trimesh.
+"""Reads meshes of other programs through trimesh: PLY, OBJ, GLB and, on request, STL.
 
-trimesh passes over glTF's normalised integers, sparse accessors and compressions without an error. A GLB with one of
-them is refused by its name (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, sections 3.6.2 and 3.12).
+trimesh ignores glTF's normalised integers, sparse accessors and compressions without an error. A GLB that uses one of
+them is refused by the feature's name (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, sections 3.6.2, 3.12).
 """
 
 import json
@@ -41,7 +41,7 @@ class TexturedMesh:
 
 
 def read_mesh(path: Path, endings: tuple[str, ...] = MESH_ENDINGS) -> Mesh:
-    """Reads PLY, OBJ, GLB or what else ``endings`` names, in the file's own units. Raises InputError."""
+    """Reads PLY, OBJ, GLB or other formats in ``endings``, in the file's own units. Raises InputError."""
     return _mesh(_loaded(path, endings), path)
 
 
@@ -84,8 +84,8 @@ def _loaded(path: Path, endings: tuple[str, ...] = MESH_ENDINGS) -> Any:
 
 
 def _plain_obj(path: Path) -> StringIO:
-    """Returns an OBJ without what trimesh misreads: the mark of an encoding, line ends of old systems, tabs, and notes
-    behind numbers. Raises InputError if its faces count from 0, which trimesh takes for the last vertex."""
+    """Returns an OBJ without what trimesh misreads: a byte order mark, line ends of old systems, tabs, and comments
+    after numbers. Raises InputError if its faces count from 0, because trimesh would take 0 for the last vertex."""
     text = as_utf8(path.read_bytes()).decode("utf-8", "replace")
     text = re.sub(r"\r\n?", "\n", text).replace("\t", " ")
     text = re.sub(r"^((?:v|vt|vn|f) [^#\n]*)#.*", r"\1", text, flags=re.MULTILINE)
@@ -95,7 +95,7 @@ def _plain_obj(path: Path) -> StringIO:
 
 
 def _check_glb(path: Path) -> None:
-    """Raises InputError for a damaged GLB, and for what is stored in it in ways that trimesh does not decode."""
+    """Raises InputError for a damaged GLB, and for data in encodings that trimesh does not decode."""
     data = path.read_bytes()
     try:
         (length,) = struct.unpack_from("<I", data, 12)

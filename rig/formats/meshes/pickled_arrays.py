@@ -1,8 +1,8 @@
-"""Reads the arrays of files from elsewhere: of an npz within a bound, of a pickle without running anything it names.
+"""Reads arrays from untrusted files: an npz within size limits, a pickle without running any code in it.
 
-A pickle is a program: the names in it are imported and called. Here no name is. NumPy's arrays and types, SciPy's
-sparse matrices and chumpy's arrays become inert stand-ins of this module, which decode plain numbers by themselves;
-any other name is refused. Pickles of Python 2 are read, too.
+A pickle is a program: loading it imports and calls the names in it. This module imports none of them. NumPy's arrays
+and types, SciPy's sparse matrices and chumpy's arrays become harmless stand-ins, which decode plain numbers by
+themselves; any other name is refused. Pickles of Python 2 are also read.
 """
 
 import io
@@ -41,8 +41,8 @@ DAMAGE = (
 
 @contextmanager
 def open_npz(source: Path | io.BytesIO) -> Iterator[Any]:
-    """Opens an archive of arrays, each of which is read when it is asked for. Raises OSError or one of ``DAMAGE``
-    for another kind of file, and for an archive or an array that is larger than ``MAX_UNPACKED`` or than it says."""
+    """Opens an archive of arrays; each array is read on access. Raises OSError or one of ``DAMAGE`` for another kind of
+    file, and for an archive or an array that exceeds ``MAX_UNPACKED`` or its stated size."""
     with np.load(source, allow_pickle=False) as file:
         if sum(entry.file_size for entry in file.zip.infolist()) > MAX_UNPACKED:
             raise ValueError(f"more than {MAX_UNPACKED >> 20} MB of arrays")
@@ -50,8 +50,8 @@ def open_npz(source: Path | io.BytesIO) -> Iterator[Any]:
 
 
 def read_pickled_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Returns the arrays of a pickled dictionary by name; entries that are no arrays of numbers are left out, sparse
-    matrices are made dense. Raises InputError naming what is wrong, such as a name that is no array's."""
+    """Returns the arrays of a pickled dictionary by name; entries without numbers are left out, and sparse matrices
+    become dense. Raises InputError with the fault, such as a name of no array type."""
     if path.stat().st_size > MAX_BYTES:
         large = compose("mesh-file-large", size_mb=path.stat().st_size >> 20, most_mb=MAX_BYTES >> 20)
         raise InputError(path.name, [large])
@@ -70,22 +70,22 @@ def read_pickled_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 class _Foreign(Exception):
-    """Reports a name in a pickle that belongs to no array."""
+    """Reports a name in a pickle that belongs to no array type."""
 
 
 class _StandIn:
-    """Stands for anything in a pickle. Stand-ins are classes, never functions: a pickle can set attributes of what has
-    no ``__setstate__``."""
+    """Replaces any object in a pickle. Stand-ins are classes, never functions, because a pickle can set attributes of
+    objects without ``__setstate__``."""
 
     def __init__(self, *_: Any) -> None:
-        """Ignores what a pickle hands over before the state."""
+        """Ignores the arguments that a pickle passes before the state."""
 
     def __setstate__(self, state: Any) -> None:
         """Ignores the state."""
 
 
 class _Type(_StandIn):
-    """Stands for numpy.dtype: one of the plain kinds of numbers, and its byte order."""
+    """Replaces numpy.dtype: one of the plain kinds of numbers, and its byte order."""
 
     def __init__(self, kind: Any = "", *_: Any) -> None:
         self.kind, self.order = str(kind), "<"
@@ -100,7 +100,7 @@ class _Type(_StandIn):
 
 
 class _Array(_StandIn):
-    """Stands for numpy.ndarray, of which a pickle holds shape, type, order and bytes."""
+    """Replaces numpy.ndarray: shape, type, order and bytes."""
 
     value: np.ndarray | None = None
 
@@ -119,7 +119,7 @@ def _decoded(raw: Any, kind: Any, shape: Any, order: Any) -> np.ndarray | None:
 
 
 class _Inert(_StandIn):
-    """Stands for an object of SciPy or chumpy: keeps its state."""
+    """Replaces an object of SciPy or chumpy, and stores its state."""
 
     state: Any = None
     kind = ""
@@ -129,14 +129,14 @@ class _Inert(_StandIn):
 
 
 class _Encoded(_StandIn):
-    """Stands for _codecs.encode, by which Python 3 writes bytes for Python 2."""
+    """Replaces _codecs.encode, with which Python 3 writes bytes for Python 2."""
 
     def __new__(cls, text: str = "", *_: Any) -> Any:
         return text.encode("latin1")
 
 
 class _FromBuffer(_StandIn):
-    """Stands for what makes an array of a buffer."""
+    """Replaces the function that makes an array from a buffer."""
 
     def __new__(cls, raw: Any = b"", kind: Any = None, shape: Any = (), order: Any = "C", *_: Any) -> Any:
         array = _Array()
@@ -145,7 +145,7 @@ class _FromBuffer(_StandIn):
 
 
 class _Empty(_StandIn):
-    """Stands for what makes an empty object of a class: only stand-ins are made."""
+    """Replaces the function that makes an empty object of a class; it makes only stand-ins."""
 
     def __new__(cls, kind: Any = None, *_: Any) -> Any:
         return kind() if isinstance(kind, type) and issubclass(kind, _Array | _Inert) else _Inert()
@@ -168,7 +168,7 @@ _INERT = ("scipy", "chumpy")
 
 class _Reader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> type[_StandIn]:
-        """Returns the stand-in of a name, and imports nothing. Raises _Foreign for names of other programs."""
+        """Returns the stand-in for a name, and imports nothing. Raises _Foreign for names of other programs."""
         package = module.partition(".")[0]
         if (name, package) in _BY_NAME:
             return _BY_NAME[name, package]
@@ -190,7 +190,7 @@ def _array(value: Any) -> np.ndarray | None:
 
 
 def _dense(kind: str, state: dict[str, Any]) -> np.ndarray | None:
-    """Returns a sparse matrix of compressed columns or rows as an array."""
+    """Converts a sparse matrix of compressed columns or rows to an array."""
     data, at, ends = (_array(state.get(name)) for name in ("data", "indices", "indptr"))
     shape = state.get("_shape", state.get("shape"))
     if data is None or at is None or ends is None or shape is None:

@@ -1,5 +1,5 @@
-"""Writes PLY as docs/capture-format.md defines it, and reads it back. It does not use trimesh, which lacks the
-additional vertex properties and whose bytes differ between versions."""
+"""Writes PLY according to docs/capture-format.md, and reads it. It does not use trimesh, which lacks the additional
+vertex properties and whose bytes differ between versions."""
 
 import re
 from collections.abc import Sequence
@@ -37,9 +37,9 @@ def ply_bytes(
     comments: Sequence[str] = (),
 ) -> bytes:
     """Encodes a binary little-endian PLY of a surface (mm): unit normals, sRGB colours, ``quality`` (standard deviation
-    of each vertex along its normal, mm), ``views`` (number of images that coloured it), ``part`` (what it shows: skin,
-    hair, clothes) if given, and ``corner_uv`` (of the faces' corners, v downwards; written as MeshLab's ``texcoord``, v
-    upwards). ``comments`` are lines of the header."""
+    of each vertex along its normal, mm), ``views`` (number of images that coloured it), optionally ``part`` (skin, hair
+    or clothes), and ``corner_uv`` (of the faces' corners, v downwards; written as MeshLab's ``texcoord``, v upwards).
+    ``comments`` are lines of the header."""
     kind = PLY_VERTEX if part is None else PLY_PART_VERTEX
     vertices = np.empty(len(mesh.vertices), kind)
     for i, axis in enumerate("xyz"):
@@ -87,13 +87,13 @@ def read_head_ply(path: Path) -> tuple[Mesh, Float[np.ndarray, " v"]]:
 
 
 def read_view_counts(path: Path) -> UInt8[np.ndarray, " v"]:
-    """Reads of a head.ply how many images coloured each vertex; 0 where it was filled. Raises InputError."""
+    """Reads how many images coloured each vertex of a head.ply; 0 if interpolated. Raises InputError."""
     return _head_rows(path)[0]["views"].copy()
 
 
 def read_vertex_numbers(path: Path, name: str) -> Float[np.ndarray, " v"] | None:
-    """Reads a number for each vertex from a file that ``write_ply`` wrote; None if it does not have it. Raises
-    InputError for another program's file."""
+    """Reads a number for each vertex from a file by ``write_ply``; None if the file lacks it. Raises InputError for
+    another program's file."""
     vertices, _ = _head_rows(path)
     return vertices[name].astype(np.float32) if name in (vertices.dtype.names or ()) else None
 

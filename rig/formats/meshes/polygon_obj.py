@@ -1,8 +1,8 @@
-"""Reads and writes Wavefront OBJ with its polygons kept: vertex order, quads, texture coordinates, groups and
+"""Reads and writes Wavefront OBJ without changing its polygons: vertex order, quads, texture coordinates, groups and
 materials.
 
 ``mesh_file`` reads triangles through trimesh, which splits polygons and may reorder vertices; templates need both
-kept."""
+unchanged."""
 
 import io
 import math
@@ -71,7 +71,7 @@ def read_polygons(path: Path) -> PolygonMesh:
 
 
 def _whole_lines(file: Iterable[str]) -> Iterable[tuple[int, str]]:
-    """Yields lines with their numbers; lines that end with a backslash are joined with the next."""
+    """Yields lines with their numbers; a line that ends with a backslash is joined with the next."""
     begun = ""
     for number, raw in enumerate(file, start=1):
         line = raw.rstrip()
@@ -86,7 +86,7 @@ def _whole_lines(file: Iterable[str]) -> Iterable[tuple[int, str]]:
 
 @dataclass(slots=True)
 class _Reading:
-    """Collects what has been read of an OBJ file."""
+    """Collects the contents of an OBJ file while it is read."""
 
     vertices: list[tuple[float, ...]] = field(default_factory=list)
     uv: list[tuple[float, ...]] = field(default_factory=list)
@@ -192,9 +192,9 @@ def polygon_obj_bytes(
     library: str | None = None,
     decimals: int = 4,
 ) -> bytes:
-    """Encodes an OBJ with other vertex positions; order, polygons, texture coordinates, groups and materials are kept.
-    Colours are sRGB, written after the position as MeshLab and Blender read it; ``comments`` are lines at the top,
-    ``library`` is the name of an .mtl file beside it, ``decimals`` are of the positions."""
+    """Encodes an OBJ with other vertex positions; order, polygons, texture coordinates, groups and materials stay the
+    same. Colours are sRGB and follow the position, as MeshLab and Blender read them; ``comments`` are lines at the top,
+    ``library`` is the name of an .mtl file in the same folder, ``decimals`` applies to positions."""
     text = io.StringIO()
     text.writelines(f"# {line}\n" for line in comments)
     position = " ".join([f"%.{decimals}f"] * 3)
@@ -226,10 +226,10 @@ def _write_faces(text: io.StringIO, mesh: PolygonMesh) -> None:
 
 
 def scene_obj_bytes(scene: Scene, library: str | None = None) -> bytes:
-    """Encodes parts as objects of a Wavefront OBJ, in mm, turned as the scene says.
+    """Encodes parts as objects of a Wavefront OBJ, in mm, with the scene's rotations.
 
     Vertices are the meshes' own: only texture coordinates are doubled at seams. A part without a texture has the vertex
-    colours that MeshLab and Blender read after the position. ``library`` is the name of the .mtl file beside it.
+    colours that MeshLab and Blender read after the position. ``library`` is the name of the .mtl file.
     """
     text, first, first_uv, first_normal = io.StringIO(), 1, 1, 1
     if library is not None:
@@ -257,6 +257,6 @@ def scene_obj_bytes(scene: Scene, library: str | None = None) -> bytes:
 
 
 def mtl_bytes(image: str) -> bytes:
-    """Returns the material of a textured part; ``image`` is the texture's file name beside it."""
+    """Returns the material of a textured part; ``image`` is the texture's file name in the same folder."""
     lines = ("newmtl skin", "Ka 1 1 1", "Kd 1 1 1", "Ks 0.04 0.04 0.04", "Ns 20", "illum 2", f"map_Kd {image}", "")
     return "\n".join(lines).encode()

@@ -1,4 +1,4 @@
-"""Writes closed meshes as STL and 3MF, for 3D printing. Both are in millimetres; only 3MF can state so."""
+"""Writes closed meshes as STL and 3MF, for 3D printing. Both are in millimetres, but only 3MF can state that."""
 
 import io
 import zipfile

@@ -1,5 +1,5 @@
-"""What GLB, USDZ and OBJ files of heads are made of: meshes by name with colours, texture and shapes, and the points
-that they turn about."""
+"""Defines the content of GLB, USDZ and OBJ files of heads: named meshes with colours, texture and shapes, and their
+pivots."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,10 +18,9 @@ Shapes = Mapping[str, Float[np.ndarray, "v 3"]]
 class Skin:
     """Holds a texture: coordinates (from the image's upper left corner, v downwards) and the encoded image.
 
-    ``source`` says which vertex of the mesh each coordinate belongs to, and ``faces`` are the triangles of coordinates;
-    without them there is a coordinate a vertex. With a normal map (PNG, linear, +Y up), ``tangents`` are the tangents
-    to which it refers, with the signs of the bitangents. ``specular`` is the strength of mirrored light, the alpha of a
-    PNG.
+    ``source`` is the mesh vertex of each coordinate, and ``faces`` are the triangles of coordinates; without them each
+    vertex has one coordinate. A normal map (PNG, linear, +Y up) refers to ``tangents``, which hold the signs of the
+    bitangents. ``specular`` is the strength of mirrored light, the alpha of a PNG.
     """
 
     uv: Float[np.ndarray, "n 2"]
@@ -36,10 +35,10 @@ class Skin:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """Holds a mesh (mm, head frame, unturned; sRGB colours), its unit normals if they are not those of its triangles,
-    and its displacements by name (mm, at weight 1) with the weights that it is shown with.
+    """Holds a mesh (mm, head frame, not rotated; sRGB colours). It may have unit normals other than its triangles', and
+    displacements by name (mm, at weight 1) with the weights at which it is shown.
 
-    ``pivot`` names the point that the part turns with. ``rows`` says which vertices of a file it has.
+    ``pivot`` names the point with which the part turns. ``rows`` are the vertices of a file that it consists of.
     """
 
     name: str
@@ -58,16 +57,14 @@ class Part:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Holds parts, the points that they turn about (mm, by name; none, or ``neck`` among them), and rotations about
-    some of them."""
+    """Holds parts, their pivots (mm, by name; none, or ``neck`` among them), and rotations about some of them."""
 
     parts: Sequence[Part]
     pivots_mm: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)
     turns: Mapping[str, Float[np.ndarray, "3 3"]] = field(default_factory=dict)
 
     def about(self, part: Part) -> tuple[Float[np.ndarray, "v 3"], RigidTransform]:
-        """Returns the vertices of a part relative to the point that it turns about, and where that point lies and how
-        it is turned (mm)."""
+        """Returns the vertices of a part relative to its pivot, and the pivot's position (mm) and rotation."""
         pivot = np.zeros(3) if part.pivot == NECK else self.pivots_mm[part.pivot]
         return part.mesh.vertices - pivot, RigidTransform(self.turns.get(part.pivot, np.eye(3)), pivot)
 

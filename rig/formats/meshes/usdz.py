@@ -41,7 +41,7 @@ def check_usd() -> None:
 
 def scene_usdz_bytes(scene: Scene) -> bytes:
     """Encodes parts as meshes of one USDZ, y up, in metres, with a UsdPreviewSurface or vertex colours. A part's
-    translation and orientation are operations of its own. The same input is the same bytes. Raises NoUsd."""
+    translation and orientation are separate operations. The same input is the same bytes. Raises NoUsd."""
     check_usd()
     images = {f"{part.name}{SUFFIXES[part.skin.mime]}": part.skin.image for part in scene.parts if part.skin}
     with tempfile.TemporaryDirectory() as scratch:
@@ -56,7 +56,7 @@ def openusd_module(name: str) -> Any:
 
 
 def write_layer(path: Path, scene: Scene) -> None:
-    """Writes the parts to ``path`` (.usdc), where their textures are to lie, too."""
+    """Writes the parts to ``path`` (.usdc); their textures must lie in the same folder."""
     Gf, Usd, UsdGeom = map(openusd_module, ("Gf", "Usd", "UsdGeom"))
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -79,7 +79,7 @@ def write_layer(path: Path, scene: Scene) -> None:
 
 
 def vectors(kind: str, values: np.ndarray) -> Any:
-    """Returns an array of OpenUSD of a kind: Vec3fArray, Vec2fArray or IntArray."""
+    """Returns an OpenUSD array of a given kind: Vec3fArray, Vec2fArray or IntArray."""
     dtype = np.int32 if kind == "IntArray" else np.float32
     return getattr(openusd_module("Vt"), kind).FromNumpy(np.ascontiguousarray(values, dtype))
 
@@ -125,7 +125,7 @@ def _write_skin(stage: Any, shape: Any, part: Part, skin: Skin) -> None:
 
 
 def package(files: dict[str, bytes]) -> bytes:
-    """Returns a zip without compression and times, whose files begin at multiples of 64 bytes; the USD layer comes
+    """Returns a zip without compression or times, in which files begin at multiples of 64 bytes; the USD layer comes
     first."""
     data = BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:

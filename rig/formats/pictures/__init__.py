@@ -1,3 +1,3 @@
-"""Reads and writes pictures and masks, and says what their names and numbers mean.
+"""Reads and writes pictures and masks, and interprets their names and numbers.
 
-Enters: files that anybody may have made. Leaves: arrays of 8 bits and the share of the subject in every pixel."""
+In: files from any source. Out: arrays of 8 bits and the subject's share in every pixel."""

@@ -1,6 +1,6 @@
 """Writes OpenEXR pictures: linear light in half precision, compressed without loss (ZIP, 16 rows a block).
 
-https://openexr.com/en/latest/OpenEXRFileLayout.html. No library that this project has writes the format.
+https://openexr.com/en/latest/OpenEXRFileLayout.html. None of this project's libraries writes the format.
 """
 
 import struct
@@ -56,8 +56,8 @@ def _header(width: int, height: int) -> bytes:
 
 
 def _block(samples: Float[np.ndarray, "r 3 w"]) -> bytes:
-    """Compresses some rows: low bytes before high ones, differences of neighbours, then zlib; or returns the samples as
-    they are if that is not longer."""
+    """Compresses some rows: low bytes before high ones, differences of neighbours, then zlib. If that is not shorter,
+    returns the samples unchanged."""
     raw = np.frombuffer(np.ascontiguousarray(samples).tobytes(), np.uint8)
     parted = np.concatenate([raw[::2], raw[1::2]])
     differences = np.concatenate([parted[:1], parted[1:] - parted[:-1] + np.uint8(128)])

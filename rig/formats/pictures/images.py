@@ -1,8 +1,8 @@
-"""Reads picture files by their content, and writes them so that no reader meets a half-written file.
+"""Reads picture files by their content, and writes them so that a reader never sees a half-written file.
 
 Ordinary pictures (8 or 16 bits) are decoded by OpenCV, RAW and DNG by LibRaw, HEIC by libheif; all become 8-bit sRGB.
 For Netpbm's maps the header states the value of white (4095 for 12 bits), which becomes 255. EXIF's orientation is
-ignored, since calibrations refer to the sensor's own rows and columns."""
+ignored, because calibrations refer to the sensor's own rows and columns."""
 
 import hashlib
 import re
@@ -68,7 +68,7 @@ PNG_OPTIONS = (
 
 
 def is_picture(path: Path) -> bool:
-    """Tells whether a path is a visible file (no folder, pipe or broken link) whose suffix is a picture's."""
+    """Tells whether a path is a visible file (no folder, pipe or broken link) with a picture's suffix."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
@@ -106,7 +106,7 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def page_count(path: Path) -> int:
-    """Returns how many pictures a TIFF or WebP file holds, of which the first is read; 1 for other and damaged ones."""
+    """Returns how many pictures a TIFF or WebP file holds (only the first is read); 1 for other and damaged files."""
     if path.suffix.lower() not in PAGED_SUFFIXES:
         return 1
     try:
@@ -127,10 +127,10 @@ def open_picture(path: Path) -> Image.Image:
 def decode_image_file(
     path: Path, where: str, kind: PictureKind, *, share: float = 1.0, bits: int = 16
 ) -> tuple[np.ndarray | None, str, Message | None]:
-    """Decodes a picture file, called ``where`` in messages. Returns its pixels, the sha256 of the file, and a fault
-    (then there are no pixels). The ``kind`` colour gives RGB, grey one channel, mask the channel of the mask, in
-    the file's own values (``rig.formats.pictures.mask_values``). ``share`` scales width and height, but not of masks;
-    ``bits`` are those that samples of a 16-bit file use (``rig.formats.pictures.picture_samples``)."""
+    """Decodes a picture file, called ``where`` in messages. Returns its pixels and the sha256 of the file; or a fault
+    in place of pixels. The ``kind`` colour gives RGB, grey one channel, mask the mask's channel in the file's own
+    values (``rig.formats.pictures.mask_values``). ``share`` scales width and height, except for masks; ``bits`` are the
+    used bits of samples in a 16-bit file (``rig.formats.pictures.picture_samples``)."""
     suffix, data = path.suffix.lower(), b""
     try:
         with _faults_of(where):
@@ -154,7 +154,7 @@ def decode_image_file(
 def cut_out_alpha(path: Path) -> Plane | None:
     """Returns the alpha channel, in the file's own values, of a picture from which the subject was cut out.
 
-    Returns None if the file has no alpha, is too large or damaged, or if its alpha shows no subject. A subject stands
+    Returns None if the file has no alpha, is too large or damaged, or if its alpha shows no subject. A subject must be
     in the middle, with at least ``CUT_AWAY_LEAST`` of the picture transparent around it; rounded corners and the empty
     rim of an undistorted picture do not count."""
     data, suffix = path.read_bytes(), path.suffix.lower()
@@ -213,7 +213,7 @@ def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
 
 
 def _check_metadata(data: bytes) -> None:
-    """Raises InputError for a JPEG with more metadata before its pixels than a camera writes: Pillow joins EXIF
+    """Raises InputError for a JPEG with more metadata before its pixels than cameras write, because Pillow joins EXIF
     segments in quadratic time. Steps from segment to segment as Pillow does."""
     if not data.startswith(JPEG):
         return
@@ -232,8 +232,8 @@ def _check_metadata(data: bytes) -> None:
 
 
 def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int, bits: int) -> np.ndarray:
-    """Returns the decoded pixels. ``halved``: how often a JPEG is halved while decoding, which is faster than full
-    size; other formats are never halved."""
+    """Returns the decoded pixels. ``halved``: how often a JPEG is halved during decoding, which is faster; other
+    formats are never halved."""
     if suffix in RAW_SUFFIXES:
         with _raw(data) as raw:
             # The camera's white balance, and no automatic brightness: pictures of all cameras must stay comparable.
@@ -269,7 +269,7 @@ def _holds_floats(data: bytes) -> bool:
 
 
 def _of_white(data: bytes, white: int, kind: PictureKind) -> np.ndarray:
-    """Decodes a Netpbm map whose white is neither 255 nor 65535. Raises ValueError."""
+    """Decodes a Netpbm map whose white level is neither 255 nor 65535. Raises ValueError."""
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or not 0 < white < 65536:
         raise ValueError("not decoded")

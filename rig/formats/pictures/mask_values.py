@@ -1,15 +1,15 @@
-"""Interprets the values of mask files as the share of the subject in every pixel.
+"""Interprets the values of mask files as the subject's share in every pixel.
 
 Programs write masks as 0 and 1, 0 and 255, 16 bits, two colours, the alpha of a cut-out, soft greys, and through JPEG,
-whose ringing leaves values of 1 to 40 ten pixels outside an outline. All of these have two levels that fill areas, and
-the outline is half way between them. Levels are measured over all masks of a capture, so that a mask that shows nothing
-is not stretched until noise becomes a subject. Files that hold something else (labels, depth, a photograph, a single
-value) are faults.
+whose ringing leaves values of 1 to 40 ten pixels outside an outline. All these have two levels that fill areas, with
+the outline half way between them. Levels are measured over all masks of a capture, so that the noise of an empty mask
+is not stretched to a subject. Files with other content (labels, depth, a photograph, a single value) are faults.
 
-Which level is the subject: white by our convention, black where programs mark what to ignore. Background covers all
-borders of a picture but one (the subject's shoulders fill the bottom, or another side if the camera hangs on its side),
-and the subject covers the middle. A mask is inverted if both criteria say so. They contradict each other for a close-up
-that fills the frame and for a subject beside the middle; such views follow the majority of the others.
+The subject is white by this project's convention, but black in programs that mark the pixels to ignore. Two criteria
+decide. Background covers all borders of a picture but one (the subject's shoulders fill the bottom, or another side if
+the camera is mounted on its side). The subject covers the middle. A mask is inverted if both criteria agree on that.
+They disagree for a close-up that fills the frame and for a subject off the middle; such views follow the majority of
+the others.
 """
 
 from collections.abc import Mapping
@@ -51,11 +51,11 @@ VALUES_NAMED = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskReading:
-    """Holds a mask as it was read.
+    """Holds a mask and its interpretation.
 
-    ``share`` is the share of the subject in each pixel, 0 to 255. ``soft`` tells that edges are soft, so that grey
-    values place the outline within a pixel. ``fault`` says why the file is no mask (then the share is 0); ``remark`` is
-    a warning."""
+    ``share`` is the subject's share in each pixel, 0 to 255. ``soft`` tells that edges are soft, so that grey values
+    locate the outline within a pixel. ``fault`` is the reason why the file is no mask (then the share is 0); ``remark``
+    is a warning."""
 
     share: Share
     soft: bool = False
@@ -64,10 +64,10 @@ class MaskReading:
 
 
 def mask_plane(pixels: Pixels) -> Plane | Message:
-    """Returns the one channel of decoded pixels (BGR order) that holds the mask, or a fault if there is none.
+    """Returns the channel of decoded pixels (BGR order) that contains the mask, or a fault if there is none.
 
-    It is the alpha of a cut-out, or of a picture of two colours the channel in which they differ most. A picture that
-    was cut out on one colour becomes 1 where it has another colour and 0 elsewhere."""
+    It is the alpha of a cut-out. In a picture of two colours it is the channel in which they differ most. A picture
+    that was cut out on one colour becomes 1 where it has another colour and 0 elsewhere."""
     channels = pixels[:, :, None] if pixels.ndim == 2 else pixels
     if channels.shape[2] in (2, 4):
         alpha = channels[:, :, -1]
@@ -142,7 +142,7 @@ def _constant_fault(value: float, common: tuple[float, float]) -> Message:
 
 
 def _levels(plane: Plane, span: tuple[float, float]) -> list[float]:
-    """Returns the values that fill areas, in rising order. Of values close together it takes the most frequent one."""
+    """Returns the values that fill areas, in rising order. Of values close together it takes the most frequent."""
     low, high = span
     exact = plane.dtype.kind in "ui" and high - low < BINS
     count = int(high - low) + 1 if exact else BINS
@@ -180,7 +180,7 @@ def _share_between(plane: Plane, black: float, white: float) -> Share:
 
 
 def _read_trimap(plane: Plane, levels: list[float]) -> MaskReading:
-    """Reads a trimap: the outline is placed in the middle of its undecided band, which must be narrow and lie between
+    """Reads a trimap: the outline is set to the middle of its undecided band, which must be narrow and lie between
     black and white."""
     named = [f"{level:g}" for level in levels[:VALUES_NAMED]] + ["..."] * (len(levels) > VALUES_NAMED)
     labels = compose("mask-of-labels", count=len(levels), values=named)
@@ -205,7 +205,7 @@ def _distance_to(area: np.ndarray) -> Float32[np.ndarray, "h w"]:
 def subject_convention(
     mask: Bool[np.ndarray, "h w"], middle_px: Float[np.ndarray, " 2"] | None = None
 ) -> Convention | None:
-    """Returns which level is the subject, by this mask alone: white or black; None if the criteria disagree.
+    """Returns the subject's level according to this mask alone: white or black; None if the criteria disagree.
 
     Args:
         mask: True where it is white.

@@ -49,14 +49,14 @@ WORD = re.compile(r"\d+|[^\W\d_]+")
 
 
 def is_junk(name: str) -> bool:
-    """Tells whether a file manager added a file or folder of that name, or it is hidden."""
+    """Tells whether a file or folder with this name is hidden, or was added by a file manager."""
     return name.casefold() in {junk.casefold() for junk in JUNK} or name.startswith(".")
 
 
 def entry(folder: Path, name: str) -> Path:
-    """Returns the file or folder of that name in a folder, in whatever case: programs and file systems write capitals.
+    """Returns the file or folder with that name in a folder, ignoring case, since programs and systems change it.
 
-    Returns the path of exactly that name if there is none. Raises InputError if two differ in case alone."""
+    Without one, it returns the path with exactly that name. Raises InputError if two names differ only in case."""
     found = [path for path in sorted(folder.iterdir()) if path.name.casefold() == name] if folder.is_dir() else []
     if len(found) > 1:
         raise InputError(folder.name, [compose("names-of-other-case", names=[path.name for path in found])])
@@ -64,15 +64,15 @@ def entry(folder: Path, name: str) -> Path:
 
 
 def has_raw_beside(path: Path) -> bool:
-    """Tells whether a camera wrote the picture twice, and its RAW file, which is read, is beside this one."""
+    """Tells whether a camera wrote the picture twice: its RAW file is in the same folder, and is read instead."""
     if path.suffix.lower() not in IMAGE_SUFFIXES or path.suffix.lower() in RAW_SUFFIXES:
         return False
     return any(path.with_suffix(cased).is_file() for end in RAW_SUFFIXES for cased in (end, end.upper()))
 
 
 def safe_name(name: str) -> str:
-    """Returns a camera's name in letters, digits and ``-_.``, as files and addresses have it: blanks and signs become
-    ``_``, accents go, and other letters become their numbers. Names that lead into other folders, or that are hidden,
+    """Returns a camera's name in letters, digits and ``-_.``, for files and addresses: blanks and signs become ``_``,
+    accents are dropped, and other letters become their numbers. Names that lead into other folders, or that are hidden,
     stay as they are."""
     if name.startswith(".") or any(c in "/\\" or unicodedata.category(c) in ("Cc", "Cf", "Cs") for c in name):
         return name
@@ -121,15 +121,15 @@ def _words(name: str) -> Words:
 
 
 def _equal(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Matches files whose words are exactly those of a camera: "CAM_0.png" to cam00."""
+    """Matches files whose words equal those of a camera: "CAM_0.png" to cam00."""
     times = Counter(cameras.values())
     owners = {words: camera for camera, words in cameras.items() if words and times[words] == 1}
     return _by_owner((owners[words], name) for name, words in strays.items() if words in owners)
 
 
 def _alike_about(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Matches files that have the same words before and after the words of each camera. The pair of words that fits
-    most cameras counts."""
+    """Matches files that have the same words before and after each camera's words. The pair of words that fits most
+    cameras counts."""
     fitting: dict[tuple[Words, Words], dict[str, list[str]]] = {}
     for name, words in strays.items():
         for camera, known in cameras.items():
@@ -159,7 +159,7 @@ def _naming_one(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Fo
 
 
 def _numbered(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Matches files that have only the words in which the cameras differ ("00.png" to cam00), if every camera has
+    """Matches files that contain only the words in which the cameras differ ("00.png" to cam00), if every camera has
     one."""
     ways = list(cameras.values())
     head = next((i for i, said in enumerate(zip(*ways, strict=False)) if len(set(said)) > 1), None)
@@ -180,7 +180,7 @@ def _within(known: Words, other: Words) -> bool:
 
 
 def _is_telling(words: Words) -> bool:
-    """Tells whether the words contain more than numbers, which may also be counters or dates."""
+    """Tells whether the words contain more than numbers, since numbers may be counters or dates."""
     return any(not word.isdecimal() for word in words)
 
 

@@ -1,14 +1,14 @@
-"""Finds how the samples of picture files are stored, before anything is measured in the pictures.
+"""Finds how the samples of picture files are stored, before any measurement in the pictures.
 
-Machine vision software writes 10 or 12 bits into files of 16 bits: read as they are, such pictures are nearly black. It
-also writes the sensor's mosaic, a quarter of whose pixels is red and a quarter blue, as a grey picture.
+Machine vision software writes 10 or 12 bits into 16-bit files; read without scaling, such pictures are nearly black.
+Such software also writes the sensor's mosaic as a grey picture: a quarter of its pixels is red and a quarter blue.
 
-Enters: files of one kind (photographs or clean plates) of all cameras. Leaves: how many bits they use, and whether they
+In: files of one kind (photographs or clean plates) of all cameras. Out: the number of bits used, and whether the files
 are mosaics.
 
-Also fills the empty rims of pictures whose clean plates have none, and of plates whose pictures have none. Undistortion
-leaves a rim without light, transparent or black, and sometimes white. Compared with a plate that was not treated so it
-is a subject all around the picture. The scene behind the rim is unknown and taken for backdrop."""
+The module also fills the empty rims of pictures if the clean plates have none, and the reverse. Undistortion leaves an
+empty rim: transparent, black, and sometimes white. Compared with a plate without a rim, the rim would look like a
+subject all around the picture. The scene behind the rim is unknown and taken as backdrop."""
 
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -111,8 +111,8 @@ def _mean_step(values: Float32[np.ndarray, "h w"], apart: int) -> float:
 def fill_rims(
     images: Mapping[str, ImageRgb], plates: Mapping[str, Sequence[ImageRgb]], masked: Collection[str]
 ) -> tuple[dict[str, ImageRgb], dict[str, tuple[ImageRgb, ...]], list[Message]]:
-    """Fills the rim that a picture has and its plates have not with what the first plate shows there, and the reverse.
-    Plates of cameras that are ``masked`` are not asked."""
+    """Fills the rim of a picture whose plates have none with the first plate's pixels, and the reverse. Plates of
+    cameras in ``masked`` are ignored."""
     filled, behind = dict(images), {name: tuple(of) for name, of in plates.items()}
     rimmed = []
     for name, image in images.items():
@@ -127,7 +127,7 @@ def fill_rims(
 
 
 def _without_rim(image: ImageRgb, other: ImageRgb) -> ImageRgb:
-    """Returns the picture with its empty rim as ``other`` shows it, or as it is where it has none or both have it."""
+    """Returns the picture with its empty rim filled from ``other``; unchanged if it has none or both have one."""
     rim = empty_rim(image)
     if rim is None or rim.mean() > MAX_SHARE or (rim & ~_empty(other)).mean() < MIN_SHARE:
         return image
@@ -138,8 +138,8 @@ def _without_rim(image: ImageRgb, other: ImageRgb) -> ImageRgb:
 
 
 def empty_rim(image: ImageRgb) -> Bool[np.ndarray, "h w"] | None:
-    """Returns the pixels of one value, black or white, that are connected with the border; None where they do not touch
-    all four sides of the picture, as dark clothes and burnt-out windows do not."""
+    """Returns the pixels of one value, black or white, that are connected to the border. Returns None if they do not
+    touch all four sides, as with dark clothes and overexposed windows."""
     for dark in (True, False):
         sides = (image[:1], image[-1:], image[:, :1], image[:, -1:])
         if not all(_of_value(side, dark=dark).any() for side in sides):

@@ -1,8 +1,8 @@
 """Computes the reduced size at which large photographs are read, and the cameras for pictures of that size.
 
 A head fills 60 % of a picture's height, so with four megapixels a pixel covers 0.24 mm of it: finer than depth is
-measured (0.4 mm, ``PIXEL_MM`` of pipeline/stereo/estimate.py) and than any mesh's vertices. Limits in pixels were
-chosen on pictures of 0.8 Mpx. At 12 Mpx outlines still pass them; at 24 Mpx they are wrongly reported to contradict
+measured (0.4 mm, ``PIXEL_MM`` of pipeline/stereo/estimate.py) and than any mesh's vertices. Limits in pixels were tuned
+on pictures of 0.8 Mpx. At 12 Mpx correct outlines still satisfy them; at 24 Mpx they are wrongly reported to contradict
 their cameras."""
 
 from dataclasses import replace
@@ -43,7 +43,7 @@ def work_rig(rig: Rig, pixels_most: int | None) -> Rig:
 
 
 def work_features(features: Features, rig: Rig, work: Rig) -> Features:
-    """Moves feature points from the files' pictures to the pictures of reduced size."""
+    """Converts feature points from the files' pictures to the reduced pictures."""
 
     def moved(name: str, pixel: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " 2"]:
         full, scaled = rig[name].intrinsics, work[name].intrinsics
@@ -53,7 +53,7 @@ def work_features(features: Features, rig: Rig, work: Rig) -> Features:
 
 
 def halvings(share: float, size: tuple[int, int]) -> int:
-    """Returns how often a decoder may halve a picture of ``size`` (width, height) that is wanted at scale ``share``.
+    """Returns how often a decoder may halve a picture of ``size`` (width, height) that will be scaled by ``share``.
 
     Only halvings that divide the picture into whole blocks count, so that no pixel averages half a block."""
     count = 0
@@ -65,8 +65,8 @@ def halvings(share: float, size: tuple[int, int]) -> int:
 def at_share(
     pixels: UInt8[np.ndarray, "h w *channels"], size: tuple[int, int], share: float
 ) -> UInt8[np.ndarray, "r c *channels"]:
-    """Returns a picture at scale ``share`` of its file's ``size`` (width, height). The pixels may be reduced by a
-    decoder already."""
+    """Returns a picture at scale ``share`` of its file's ``size`` (width, height). A decoder may have reduced the
+    pixels already."""
     wanted = (round(size[0] * share), round(size[1] * share))
     if wanted == (pixels.shape[1], pixels.shape[0]):
         return pixels

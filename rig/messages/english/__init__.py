@@ -1,1 +1,1 @@
-"""The English templates, a module for each area of the program; a code stands in one of them."""
+"""Holds the English templates, one module for each area of the program; each code is in one module."""

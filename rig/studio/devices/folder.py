@@ -1,5 +1,5 @@
-"""Writes a simulated capture to disk: the folder that docs/capture-format.md describes, and its ground truth beside
-it."""
+"""Writes a simulated capture to disk: the folder described in docs/capture-format.md, and a folder with its ground
+truth."""
 
 import io
 import json
@@ -25,9 +25,9 @@ def simulate_to_folder(
     latter.
 
     The truth holds head.ply (world frame, mm, colours as lit), face_mask.npy and colour_mask.npy (a boolean for each
-    vertex), silhouettes/ (subject with hair and clothes, where coverage is at least a half), head_silhouettes/ (bare
-    head), coverage/ (0 to 255), parts/ (0 background, 1 skin, 2 hair or beard, 3 clothes, cap or glasses), visible.npz
-    (points of head, hair and clothes that two or more cameras see), cameras.json (the true cameras) and meta.json.
+    vertex), silhouettes/ (subject with hair and clothes, at least half covered), head_silhouettes/ (bare head),
+    coverage/ (0 to 255), parts/ (0 background, 1 skin, 2 hair or beard, 3 clothes, cap or glasses), visible.npz (points
+    of head, hair and clothes in two or more views), cameras.json (the true cameras) and meta.json.
     """
     capture = simulated.capture
     if not features:

@@ -1,7 +1,7 @@
 """Serves the simulated studio as a set of real devices: motion-JPEG streams on loopback and a trigger box on a
 pseudo-terminal.
 
-The opencv driver and the serial client run against it unchanged. The caller provides what the cameras see: an
+The opencv driver and the serial client run against it unchanged. The caller provides the cameras' pictures: an
 ``ImageSource`` for the empty studio and one with the subject seated. This module adds lamps, cables, triggers, and
 their faults.
 """
@@ -79,7 +79,7 @@ def device_fault_from_text(text: str) -> DeviceFault:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """Holds everything that a camera's picture depends on."""
+    """Holds everything that determines a camera's picture."""
 
     camera: str
     seated: bool
@@ -92,7 +92,7 @@ class StudioDevices:
     rig.toml and the link to the box's port.
 
     ``takes`` is the number of pictures of the empty studio, each with its own noise, that the live view shows in turn;
-    more clean plates than that would repeat themselves. ``close`` leaves no thread, port or link behind.
+    more clean plates than that would contain repetitions. ``close`` leaves no thread, port or link behind.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class StudioDevices:
         return self.folder.resolve() / "trigger-box"
 
     def seat(self, present: bool) -> None:
-        """Seats the subject, or empties the seat. Returns when every camera shows it."""
+        """Seats the subject, or empties the seat. Returns when every camera shows the change."""
         with self._busy:
             self.present = present
             self._refresh()
@@ -198,7 +198,7 @@ class StudioDevices:
         self.box = SimulatedTriggerBox(self.port_link, BoxLogic(self._on_release, self._on_lights, self.streams.arm))
 
     def _apply(self) -> None:
-        """Sets every device to the faults of the list."""
+        """Applies the listed faults to every device."""
         kinds = {(fault.kind, fault.camera) for fault in self.faults}
         views = {name: name for name in self.names}
         for kind, camera in kinds:
@@ -247,7 +247,7 @@ class StudioDevices:
         return _Look(camera, self.present, light, self._strength("bumped", camera))
 
     def _refresh(self) -> None:
-        """Develops what the cameras see now, with the lamps on and off, before anybody looks."""
+        """Encodes the cameras' current pictures in advance, with the lamps on and off."""
         with ThreadPoolExecutor(2) as pool:
             films = [film for films in pool.map(self._films_of, self.names) for film in films.items()]
         # The empty studio comes back with every subject that leaves: its films are kept, theirs are not.
@@ -256,7 +256,7 @@ class StudioDevices:
             self.streams.show(name, self._films[self._look(name)])
 
     def _films_of(self, camera: str) -> dict[_Look, Film]:
-        """Returns the films of one camera with the lamps off and on."""
+        """Returns the films of one camera, with the lamps off and on."""
         lightings = [self._look(camera, lamps) for lamps in (0, (1 << LIGHTS) - 1)]
         if all(lighting in self._films for lighting in lightings):
             return {lighting: self._films[lighting] for lighting in lightings}
@@ -323,7 +323,7 @@ def serve_scene(
 
 
 def _develop(image: ImageRgb, lighting: _Look, rng: np.random.Generator) -> bytes:
-    """Encodes ``image`` as JPEG, with less light and a bump."""
+    """Encodes ``image`` as JPEG, with reduced light and the camera displaced."""
     if lighting.bump_px:
         image = _bumped(image, lighting.bump_px)
     if lighting.light < 1:
@@ -334,7 +334,7 @@ def _develop(image: ImageRgb, lighting: _Look, rng: np.random.Generator) -> byte
 
 
 def _bumped(image: ImageRgb, amount_px: float) -> ImageRgb:
-    """Shifts a knocked camera's picture along (0.8, 0.6), and turns it by a third of ``amount_px`` at its edge."""
+    """Shifts a knocked camera's picture along (0.8, 0.6), and rotates it by a third of ``amount_px`` at its edge."""
     height, width = image.shape[:2]
     turn_deg = float(np.degrees(2 * amount_px / (3 * width)))
     warp = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn_deg, 1.0)

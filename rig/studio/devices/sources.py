@@ -24,7 +24,7 @@ class ImageSource(Protocol):
     """Describes a function that takes the picture of a simulated camera, sensor noise included."""
 
     def __call__(self, camera: str, time_s: float) -> ImageRgb:
-        """Returns what the named camera sees at ``time_s``, in seconds since the studio began."""
+        """Returns the named camera's picture at ``time_s``, in seconds since the studio began."""
         ...
 
 
@@ -32,8 +32,8 @@ class SceneImages:
     """Takes pictures of a still scene, with the subject seated or without. Every picture has its own noise.
     Thread-safe.
 
-    With the subject seated, the light differs from that of the empty studio by the drift that the scene's preset has
-    between clean plate and shot.
+    With the subject seated, the light differs from the empty studio's by the drift that the scene's preset sets between
+    clean plate and shot.
     """
 
     def __init__(self, scene: Scene, *, seated: bool, seed: int = 0) -> None:
@@ -45,7 +45,7 @@ class SceneImages:
         self._busy = threading.Lock()
 
     def __call__(self, camera: str, time_s: float) -> ImageRgb:
-        """Takes one picture with the named camera. The scene is still, so that ``time_s`` has no effect."""
+        """Takes one picture with the named camera. The scene does not change, so ``time_s`` has no effect."""
         with self._busy:
             rng = np.random.default_rng((self._seed, next(self._takes)))
             light = self._light.get(camera)

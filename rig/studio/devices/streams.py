@@ -1,11 +1,11 @@
 """Serves the cameras of the simulated studio as motion-JPEG streams on one HTTP port (on loopback by default).
 
 A stream behaves like a network camera with a trigger input. It has a live view at ``fps``, which pauses while the box
-is armed. When its input is raised it sends one frame at once, and then continues the live view. What a camera sees is a
-``Film``: pictures that differ in their noise, shown in turn, and others for releases, so that no released frame was
-shown in the live view before.
+is armed. When its input is raised it sends one frame at once, and then continues the live view. A camera's pictures are
+a ``Film``: some pictures, which differ in their noise, are for the live view; others are for releases, so that no
+released frame appeared in the live view before.
 
-The server's event loop owns all state; other threads hand work to it (``call_soon_threadsafe``).
+The server's event loop owns all state; other threads pass work to it (``call_soon_threadsafe``).
 """
 
 import asyncio
@@ -28,7 +28,7 @@ Control = Callable[[str, str, Mapping[str, str]], tuple[int, str]]
 
 @dataclass(frozen=True, slots=True)
 class Film:
-    """Holds JPEG files of one scene as a camera sees it: some for the live view, others for triggered frames."""
+    """Holds JPEG files of one scene from one camera: some for the live view, others for triggered frames."""
 
     live: tuple[bytes, ...]
     released: tuple[bytes, ...]
@@ -100,11 +100,11 @@ class StreamServer:
         self._loop.close()
 
     def show(self, name: str, film: Film) -> None:
-        """Sets what a camera sees from now on."""
+        """Sets a camera's pictures from now on."""
         self._do(lambda: setattr(self._cameras[name], "film", film))
 
     def arm(self, armed: bool) -> None:
-        """Pauses all live views, or lets them continue."""
+        """Pauses or continues all live views."""
 
         def hold() -> None:
             for camera in self._cameras.values():
@@ -126,19 +126,19 @@ class StreamServer:
         self._do(plan)
 
     def freeze(self, name: str, frozen: bool = True) -> None:
-        """Makes a camera repeat its last picture, or ends that."""
+        """Makes a camera repeat its last picture, or stops that."""
         self._do(lambda: setattr(self._cameras[name], "frozen", frozen))
 
     def hang(self, name: str, hung: bool = True) -> None:
-        """Makes a camera keep its connections and send nothing, or ends that."""
+        """Makes a camera keep its connections but send nothing, or stops that."""
         self._do(lambda: setattr(self._cameras[name], "hung", hung))
 
     def drop_next(self, name: str, drop: bool = True) -> None:
-        """Makes a camera lose its next triggered frame, or ends that."""
+        """Makes a camera lose its next triggered frame, or stops that."""
         self._do(lambda: setattr(self._cameras[name], "drop_next", drop))
 
     def connect(self, views: Mapping[str, str]) -> None:
-        """Sets which camera's pictures each address shows, as exchanged cables of a rig would."""
+        """Sets which camera's pictures each address shows, to simulate exchanged cables."""
         self._do(lambda: self._views.update(views))
 
     def _do(self, work: Callable[[], Any]) -> None:
@@ -243,7 +243,7 @@ class StreamServer:
             left.cancel()
 
     async def _wait(self, camera: _Camera, left: asyncio.Future[bytes]) -> None:
-        """Waits until the camera shows a frame, the client leaves or some time is over, as cables may be swapped."""
+        """Waits until the camera has a frame, the client disconnects, or some time passes (cables may be exchanged)."""
         shown = asyncio.ensure_future(camera.shown_event.wait())
         try:
             await asyncio.wait({left, shown}, timeout=self._period_s, return_when=asyncio.FIRST_COMPLETED)

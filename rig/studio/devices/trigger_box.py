@@ -58,8 +58,8 @@ class BoxLogic:
     _last_reply: str = ""
 
     def handle(self, sequence: int, body: str, now_s: float) -> str:
-        """Returns the reply to a request. A request that is repeated under the same sequence number gets the same reply
-        and has no further effect."""
+        """Returns the reply to a request. A request repeated with the same sequence number gets the same reply and has
+        no further effect."""
         if self._last == (sequence, body):
             return self._last_reply
         self.expire(now_s)
@@ -73,7 +73,7 @@ class BoxLogic:
         return reply
 
     def expire(self, now_s: float) -> None:
-        """Disarms the box if the time for which it was armed is over."""
+        """Disarms the box once its armed time has passed."""
         if self.armed_until_s is not None and now_s > self.armed_until_s:
             self._disarm()
 

@@ -1,5 +1,5 @@
-"""Finds the few points of a head from which hair, paint and clothes are laid out, and makes the grids that they lie
-on: vertices numbered row by row."""
+"""Finds the points of a head from which hair, paint and clothes are constructed, and makes their grids: vertices
+numbered row by row."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ PAINTED = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anatomy:
-    """Holds the few points of a head from which hair, paint and clothes are laid out (head frame, mm). ``unit`` is the
-    head's size relative to the one for which the layouts were designed."""
+    """Holds the points of a head from which hair, paint and clothes are constructed (head frame, mm). ``unit`` is the
+    head's size relative to the head for which the constructions were designed."""
 
     ears: Float[np.ndarray, " 3"]  # middle between the ears' openings
     half_breadth: float
@@ -70,8 +70,8 @@ def directions_of(elevation: Float[np.ndarray, "r c"], azimuth: Float[np.ndarray
 
 
 def finer_grid(field: Float[np.ndarray, "r c *_"], times: int) -> Float[np.ndarray, "_ _ *_"]:
-    """Interpolates a field linearly to a grid ``times`` as fine in both directions. The grid is closed: its first
-    column follows its last."""
+    """Interpolates a field linearly to a grid ``times`` as fine in both directions. The grid is closed: its last column
+    is next to its first."""
     if times == 1:
         return field
     rows, columns = field.shape[:2]

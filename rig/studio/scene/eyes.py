@@ -1,8 +1,8 @@
-"""Gives a subject eyeballs that look somewhere: white, limbus, iris, pupil and a cornea that mirrors the lamps.
+"""Gives a subject eyeballs with a gaze: white, limbus, iris, pupil and a cornea that reflects the lamps.
 
 Sizes are an adult's: a ball of 12 mm, a cornea of 7.8 mm that meets it at a limbus of 5.85 mm (visible iris diameter
-11.7 mm; Ruefer et al. 2005). The limbus is a transition some tenths of a millimetre wide, half way at that radius. A
-head whose skin closes its eyes is cut open between the lids.
+11.7 mm; Ruefer et al. 2005). The limbus is a gradual transition some tenths of a millimetre wide, half way at that
+radius. A head with skin across its eyes is cut open between the lids.
 """
 
 from collections.abc import Mapping
@@ -43,7 +43,7 @@ SIDES = ("right", "left")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eye:
-    """Holds an eyeball (mm): where it turns, where it looks (a unit vector), and the albedo of its iris."""
+    """Holds an eyeball (mm): its centre, its gaze (a unit vector), and the albedo of its iris."""
 
     centre: Vector
     gaze: Vector
@@ -55,13 +55,13 @@ class Eye:
         return self.centre + np.sqrt(RADIUS_MM**2 - LIMBUS_MM**2) * self.gaze
 
     def placed(self, world_from_head: Similarity) -> "Eye":
-        """Returns the eye in the world frame (of a pose without scale)."""
+        """Returns the eye in the world frame (for a pose without scale)."""
         return replace(
             self, centre=world_from_head.apply(self.centre[None])[0], gaze=world_from_head.rotation @ self.gaze
         )
 
     def reach(self, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Returns how far the surface lies from the centre in each direction (unit vectors), mm."""
+        """Returns the distance of the surface from the centre in each direction (unit vectors), mm."""
         cosine = directions @ self.gaze
         ahead = np.sqrt(RADIUS_MM**2 - LIMBUS_MM**2) - np.sqrt(CORNEA_MM**2 - LIMBUS_MM**2)
         bulge = ahead * cosine + np.sqrt(np.maximum(CORNEA_MM**2 - ahead**2 * (1.0 - cosine**2), 0.0))
@@ -79,7 +79,7 @@ class EyeSurface:
 
 
 def look_at_point(centres: Mapping[str, Vector], target: Vector, iris: Colour) -> dict[str, Eye]:
-    """Returns eyes, by side, that look at one point."""
+    """Returns eyes, by side, directed at one point."""
     out = {}
     for side, centre in centres.items():
         towards = target - centre
@@ -88,7 +88,7 @@ def look_at_point(centres: Mapping[str, Vector], target: Vector, iris: Colour) -
 
 
 def surface(eye: Eye, rng: np.random.Generator) -> EyeSurface:
-    """Makes the surface of an eyeball, its iris with fibres at random."""
+    """Makes the surface of an eyeball, with random fibres in the iris."""
     limbus = np.arcsin(LIMBUS_MM / RADIUS_MM)
     angles = np.concatenate([np.linspace(0.004, limbus + 0.1, 56), np.linspace(limbus + 0.13, 0.6 * np.pi, 24)])
     around = np.arange(SECTORS) * 2.0 * np.pi / SECTORS
@@ -123,8 +123,8 @@ def _step(x: Float[np.ndarray, "r s"], middle: float, width: float) -> Float[np.
 
 
 def opened(mesh: Mesh, landmarks: Landmarks) -> Mesh:
-    """Returns a head (head frame) with small triangles about its eyes, without skin between the lids, and with the
-    lids' margins. Its vertices begin with those of ``mesh``. Eyes that are open in the mesh keep their border."""
+    """Returns a head (head frame) with small triangles around its eyes, without skin between the lids, and with margins
+    of the lids. Its vertices begin with those of ``mesh``. Eyes that are already open in the mesh keep their border."""
     for side in SIDES:
         mesh, cut = _cut(mesh, landmarks, side)
         mesh = _with_margins(mesh, cut)
@@ -132,7 +132,7 @@ def opened(mesh: Mesh, landmarks: Landmarks) -> Mesh:
 
 
 def _cut(mesh: Mesh, landmarks: Landmarks, side: str) -> tuple[Mesh, Int[np.ndarray, "e 2"]]:
-    """Cuts an eye open; the second result are the edges of the cut, none where the mesh is open there."""
+    """Cuts an eye open; the second result is the edges of the cut, empty if the mesh is already open there."""
     inner, outer = landmarks[f"endocanthion_{side}"], landmarks[f"exocanthion_{side}"]
     middle = 0.5 * (inner + outer)
     border = mesh.vertices[np.unique(boundary_edges(mesh.faces))]
@@ -153,7 +153,7 @@ def _cut(mesh: Mesh, landmarks: Landmarks, side: str) -> tuple[Mesh, Int[np.ndar
 
 
 def _with_margins(mesh: Mesh, edges: Int[np.ndarray, "e 2"]) -> Mesh:
-    """Returns a head whose skin goes on backwards from a cut, as lids have a thickness."""
+    """Returns a head whose skin continues backwards from a cut, because lids have a thickness."""
     rim, number = np.unique(edges, return_inverse=True)
     start, end = number.reshape(-1, 2).T + len(mesh.vertices)
     behind = mesh.vertices[rim] - (0.0, 0.0, MARGIN_MM)
@@ -167,8 +167,8 @@ def _between_lids(vertices: Float[np.ndarray, "v 3"], inner: Vector, outer: Vect
 
 
 def eye_centres(mesh: Mesh, landmarks: Landmarks, gaze: Vector) -> dict[str, Vector]:
-    """Returns where the eyeballs of a head lie by side (head frame), as far in front as the lids leave room for eyes
-    that look along ``gaze``."""
+    """Returns the centres of a head's eyeballs by side (head frame), as far in front as the lids permit for the
+    direction ``gaze``."""
     out = {}
     for side in SIDES:
         inner, outer = landmarks[f"endocanthion_{side}"], landmarks[f"exocanthion_{side}"]

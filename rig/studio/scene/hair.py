@@ -1,8 +1,8 @@
 """Makes hair as geometry: a lumpy shell over the scalp, and strands that roughen its outline.
 
 The shell is a grid of directions from the middle of the skull. Its radius is that of the head plus the thickness of the
-hair, which decreases to below the skin beyond the hairline. Beyond it are a sheet that hangs down around the neck, a
-bun on the crown, a full beard (a copy of the lower face, thicker), and curls: ridges that wind over the surface.
+hair, which decreases to below the skin beyond the hairline. Further shapes are a sheet that hangs down around the neck,
+a bun on the crown, a full beard (a thicker copy of the lower face), and curls: ridges that wind over the surface.
 """
 
 from dataclasses import dataclass
@@ -46,8 +46,8 @@ HAIRLINE_OVER_EARS = np.array([(-200, -55), (-40, -52), (-10, -38), (22, -34), (
 
 @dataclass(frozen=True, slots=True)
 class HairStyle:
-    """Describes a hair style. ``fringe_mm`` is how far the hairline comes down over the forehead. Curls, hanging hair
-    and bun are 0 for none."""
+    """Describes a hair style. ``fringe_mm`` is how far the hairline comes down over the forehead. A value of 0 means no
+    curls, hanging hair or bun."""
 
     thickness_mm: float = 14.0
     over_ears: bool = False
@@ -66,8 +66,8 @@ class HairStyle:
 class Hair:
     """Holds one surface of hair, the shell, and the strands on it (head frame, mm).
 
-    ``shade`` is the tone of each vertex relative to the style's; ``roots`` is, for each vertex of a strand, the vertex
-    of the shell whose light it gets; ``one_sided`` says that the inside of the shell is never seen.
+    ``shade`` is each vertex's tone relative to the style's; ``roots`` is the vertex of the shell whose light a strand's
+    vertex gets; ``one_sided`` tells that the inside of the shell is never visible.
     """
 
     shell: Float[np.ndarray, "v 3"]
@@ -158,9 +158,9 @@ def grow_strands(
     style: HairStyle,
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "s 3"], Int[np.ndarray, "g 3"], Float[np.ndarray, "s 3"], Int[np.ndarray, " s"]]:
-    """Grows strands of hair: ribbons that leave the shell mostly in the directions ``along`` (about 3 mm long).
+    """Grows strands of hair: ribbons that leave the shell roughly in the directions ``along`` (about 3 mm long).
     ``weight`` sets how densely they grow at each vertex. Returns their vertices, triangles, texture coordinates and
-    roots, as ``Hair`` holds them."""
+    roots, in the form of ``Hair``."""
     count = style.strands
     weight = weight.copy()
     weight[np.setdiff1d(np.arange(len(shell)), faces)] = 0.0
@@ -198,8 +198,8 @@ def grow_strands(
 def curled(
     vertices: Vertices, normals: Vertices, curl_mm: float, amount: Float[np.ndarray, " v"], rng: np.random.Generator
 ) -> tuple[Vertices, Float[np.ndarray, " v"]]:
-    """Raises curls on a surface of hair. Returns the new vertices, and a shade for each, relative to the hair's tone. A
-    ridge winds along where a random field is near zero.
+    """Raises curls on a surface of hair. Returns the new vertices, and a shade for each, relative to the hair's tone.
+    Ridges follow the lines where a random field is near zero.
 
     Args:
         vertices: of the smooth surface (mm), a few to each curl.
@@ -238,7 +238,7 @@ def grow_beard(head: Mesh, body: Anatomy, style: HairStyle, rng: np.random.Gener
 
 
 def beard_share(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
-    """Returns how densely beard grows at each vertex, 0 to 1: on jaw, chin and upper lip, up to the ears, not on the
+    """Returns the density of a beard at each vertex, 0 to 1: on jaw, chin and upper lip, up to the ears, not on the
     lips."""
     marks, (x, y, z) = body.landmarks, vertices.T
     mouth, ears = marks["stomion"], body.ears
@@ -304,7 +304,7 @@ def hang(shell: Hair, below: Points, body: Anatomy, style: HairStyle, rng: np.ra
 def _fall(
     shell: Hair, below: Points, axis: Float[np.ndarray, " 3"], style: HairStyle, unit: float, length_mm: float
 ) -> Float[np.ndarray, "r c"]:
-    """Returns the radius (float32) by drop and angle: the shell's, then straight down except over what pushes out."""
+    """Returns the radius (float32) by drop and angle: the shell's, then straight down except over protruding parts."""
     hair = _envelope(shell.shell[np.unique(shell.shell_faces)] - axis, unit, length_mm)
     solid = _envelope(below, unit, length_mm)
     step = length_mm / (SHEET_ROWS - 1)
@@ -320,7 +320,7 @@ def _fall(
 
 
 def _envelope(points: Points, unit: float, length_mm: float) -> Float[np.ndarray, "r c"]:
-    """Returns the outermost radius about the vertical axis by drop and angle (float32), 0 where there is nothing."""
+    """Returns the outermost radius around the vertical axis by height and angle (float32), 0 where there is nothing."""
     limit = np.radians(FRONT_EDGE_DEG)
     angle = np.arctan2(-points[:, 0], -points[:, 2])
     row = np.rint((TOP_MM * unit - points[:, 1]) / length_mm * (SHEET_ROWS - 1)).astype(int)

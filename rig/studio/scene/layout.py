@@ -1,4 +1,4 @@
-"""Places cameras: the default rig, and mountings of other studios.
+"""Places cameras: the default rig, and arrangements of other studios.
 
 Azimuth is counted from the front towards the subject's left, elevation upwards. The world's origin is in the middle of
 the head, y up, z towards the front camera.

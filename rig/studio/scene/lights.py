@@ -97,7 +97,7 @@ def _lamp_camera(
 def _reached(
     camera: Camera, depth: Float[np.ndarray, "h w"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns the bilinear share of the four nearest pixels of the depth map that do not hide the point."""
+    """Returns the bilinear fraction of the four nearest pixels of the depth map that do not hide the point."""
     k = camera.intrinsics
     points_camera = camera.camera_from_world.apply(points)
     x, y = np.clip(lens_image(points_camera, k.values()), 0, (k.width - 1.001, k.height - 1.001)).T

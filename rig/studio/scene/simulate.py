@@ -1,7 +1,7 @@
 """Simulates a capture of the studio, with ground truth.
 
 ``build_scene`` renders and lights everything once; ``shoot`` takes the pictures, with the requested faults. A device
-that takes pictures one by one keeps the scene and calls ``view_light`` and ``sensor.expose``.
+that takes pictures one by one stores the scene and calls ``view_light`` and ``sensor.expose``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,8 +37,8 @@ Plane = Float[np.ndarray, "h w"]
 def matt_light(
     renderer: Renderer, rig: Rig, parts: Sequence[Part], gallery: Gallery, preset: Preset
 ) -> Mapping[str, Float[np.ndarray, "_ _ 4"]]:
-    """Returns what the cameras see of the subject without highlights, as ``Renderer.photograph`` returns it; nothing
-    where the preset does not ask for it."""
+    """Returns the subject without highlights in all cameras, in the form of ``Renderer.photograph``; empty unless the
+    preset requests it."""
     if not preset.polarised:
         return {}
     matt = [replace(part, oil=None, grain=replace(part.grain, gloss=0.0)) for part in parts]
@@ -103,8 +103,8 @@ THREADS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Holds what one camera sees. ``subject`` is linear light times coverage, and coverage; ``backdrop`` the light
-    behind the subject; ``matt`` is the subject without what its surface mirrors, where the preset asks for it."""
+    """Holds the light in one camera's view. ``subject`` is linear light times coverage, and coverage; ``backdrop`` is
+    the light behind the subject; ``matt`` is the subject without reflections, if the preset requests it."""
 
     subject: Float[np.ndarray, "h w 4"]
     backdrop: Float[np.ndarray, "h w 3"]
@@ -113,14 +113,14 @@ class View:
 
     @property
     def mask(self) -> Bool[np.ndarray, "h w"]:
-        """Returns the true silhouette: where the subject covers at least half of a pixel."""
+        """Returns the true silhouette: the pixels that the subject covers at least half."""
         return self.subject[:, :, 3] >= 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Holds a lit studio with a subject in it. ``rig`` are the cameras as calibrated, ``true_rig`` the cameras as they
-    stand."""
+    """Holds a lit studio with a subject in it. ``rig`` are the cameras as calibrated, ``true_rig`` the cameras at their
+    true poses."""
 
     rig: Rig
     true_rig: Rig
@@ -165,7 +165,7 @@ def simulate(
     world_from_head: Similarity | None = None,
     faults: Sequence[Fault] = (),
 ) -> SimulatedCapture:
-    """Takes one capture of ``subject`` with ``rig``. Look and pose are drawn at random if they are None."""
+    """Takes one capture of ``subject`` with ``rig``. Look and pose are random if they are None."""
     scene_rng, shot_rng = rng.spawn(2)
     faults = tuple(_settled(fault, rig, shot_rng) for fault in faults)
     scene = build_scene(
@@ -187,7 +187,7 @@ def build_scene(
     lamps: Sequence[Lamp] = LAMPS,
 ) -> Scene:
     """Dresses, lights and renders the subject, and draws the backdrops. The same state of ``rng`` gives the same skin,
-    hair and backdrops also for another pose or other ``lamps``."""
+    hair and backdrops for any pose and ``lamps``."""
     look_rng, pose_rng, dress_rng, set_rng = rng.spawn(4)
     look = worn_look(look or random_look(look_rng), preset, faults)
     pose = world_from_head or random_pose(rig.centre_world(), preset.pose_spread_deg, preset.pose_spread_mm, pose_rng)
@@ -237,8 +237,8 @@ def view_light(view: View, *, subject: bool = True, gain: float = 1.0) -> Float[
 
 
 def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) -> Capture:
-    """Takes the clean plates of a scene, then the shot. Every one of ``faults`` that needs a camera must name it;
-    ``simulate`` chooses one for those that do not."""
+    """Takes the clean plates of a scene, then the shot. Faults that need a camera must name it; ``simulate`` chooses
+    one for faults that do not."""
     names = scene.rig.names
     click_rng, *rngs = rng.spawn(1 + len(names))
 
@@ -266,8 +266,8 @@ def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) 
 def _polarised(
     scene: Scene, source: Mapping[str, str], rng: np.random.Generator
 ) -> dict[str, dict[str, UInt8[np.ndarray, "_ _ 3"]]]:
-    """Returns texture sets of polarised light, of one moment and one exposure. A filter that is crossed with those of
-    the lamps removes reflections of the surface."""
+    """Returns texture sets of polarised light, of one moment and one exposure. A filter crossed with those of the lamps
+    removes surface reflections."""
     sets: dict[str, dict[str, np.ndarray]] = {"cross": {}, "parallel": {}}
     for name, camera_rng in zip(scene.rig.names, rng.spawn(len(scene.rig)), strict=True):
         view = scene.views[source[name]]
@@ -299,7 +299,7 @@ def _settled(fault: Fault, rig: Rig, rng: np.random.Generator) -> Fault:
 
 
 def worn_look(look: Look, preset: Preset, faults: Sequence[Fault]) -> Look:
-    """Returns a look with what the preset and the faults change of it."""
+    """Returns a look with the changes by the preset and the faults."""
     look = replace(restyled(look, preset.hairstyle), pores=preset.pores, oil=preset.oil)
     look = replace(look, scattering_mm=preset.scattering_mm)
     if not preset.hair:
@@ -321,7 +321,7 @@ def _knocked(camera: Camera, faults: Sequence[Fault], rng: np.random.Generator) 
 
 
 def _sway(preset: Preset, rng: np.random.Generator) -> Vector:
-    """Returns how far the subject moves (mm) while a rolling shutter reads all rows."""
+    """Returns the displacement of the subject (mm) while a rolling shutter reads all rows."""
     direction = rng.standard_normal(3)
     return direction / np.linalg.norm(direction) * preset.sway_mm_s * preset.rolling_ms / 1000
 
@@ -330,7 +330,7 @@ def _rolling(
     rig: Rig, light: Mapping[str, Float[np.ndarray, "_ _ 4"]], at_world: Vector, sway_mm: Vector
 ) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
     """Distorts pictures as a rolling shutter does if the subject sways while rows are read. The true position is that
-    at the middle row. The whole image moves as the head's origin does; nearer parts would move by a tenth more."""
+    at the middle row. The whole image moves with the head's origin; parts nearer to it should move by a tenth more."""
     shifts = {camera.name: camera.project_with_jacobian(at_world[None])[1][0] @ sway_mm for camera in rig}
     return {name: rolled(light[name], shifts[name]) for name in light}
 
@@ -413,7 +413,7 @@ def _shadowed(view: View, amount: float) -> Float[np.ndarray, "h w 3"]:
 
 
 def _wrong_masks(scene: Scene, faults: Sequence[Fault]) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Returns masks as after an operator's mistake: mirrored, and shifted by a fifth of the image."""
+    """Returns masks with an operator's mistakes: mirrored, or shifted by a fifth of the image."""
     wrong = [fault.camera for fault in faults if fault.kind == "wrong-mask" and fault.camera]
     masks = {name: scene.views[name].mask[:, ::-1] for name in wrong}
     return {name: np.roll(mask, mask.shape[1] // 5, axis=1) for name, mask in masks.items()}
@@ -445,7 +445,7 @@ def _unhidden(
 def _seen_landmarks(
     coarse: Rig, rig: Rig, depth: Mapping[str, Plane], marks: Mapping[str, Vector]
 ) -> dict[str, dict[str, Float[np.ndarray, " 2"]]]:
-    """Returns the true pixels of each landmark in the cameras that see it, those nearest to the front first."""
+    """Returns the true pixels of each landmark in the cameras that see it, the most frontal cameras first."""
     front = rig[rig.front_camera()].centre_world - rig.centre_world()
     by_angle = sorted(rig, key=lambda c: -float(np.dot(c.centre_world - rig.centre_world(), front)))
     found: dict[str, dict[str, np.ndarray]] = {}

@@ -1,9 +1,9 @@
-"""Computes skin colour at each vertex: an even tone, blotches, and features that are placed by landmarks;
-and gives skin a known relief, as true geometry, where cameras are near enough to see it.
+"""Computes skin colour at each vertex: an even tone, blotches, and features placed by landmarks. If cameras are near
+enough, it also adds a known relief as true geometry.
 
-Real skin is crossed by furrows 20 to 100 um deep and 0.5 to 3 mm apart. Here the relief is a sum of plane waves, a
-function of the place on the head, so that its height is known at every point. The skin's triangles are divided finely
-there, moved along the normals, and lit with the normals of the relief.
+Real skin is crossed by furrows 20 to 100 um deep and 0.5 to 3 mm apart. Here the relief is a sum of plane waves in head
+coordinates, so its height is known at every point. The skin's triangles are finely divided there, moved along the
+normals, and lit with the normals of the relief.
 """
 
 from collections.abc import Mapping
@@ -40,7 +40,7 @@ class SkinRelief:
     radius_mm: float
 
     def share(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Returns how much of the relief there is at points of the head (mm): 1 inside, 0 beyond the radius."""
+        """Returns the strength of the relief at points of the head (mm): 1 inside, 0 beyond the radius."""
         off = np.linalg.norm(places[:, None] - self.centres[None], axis=2).min(axis=1) / self.radius_mm
         inside = np.clip((1.0 - off) / (1.0 - FADE), 0.0, 1.0)
         return inside * inside * (3.0 - 2.0 * inside)
@@ -106,8 +106,8 @@ def skin_paint(
     eyeballs: bool = False,
 ) -> Float[np.ndarray, "v 4"]:
     """Computes the linear albedo of the skin at each vertex (head frame, mm) and, as a fourth number, the strength of
-    its fine structure. ``closed`` says how far the lids of each side are closed, 0 to 1; no eyes are painted
-    for a subject that has ``eyeballs``."""
+    its fine structure. ``closed`` is how far the lids of each side are closed, 0 to 1; a subject with ``eyeballs`` gets
+    no painted eyes."""
     paint = np.ones((len(vertices), 4))
     paint[:, :3] = np.array(tone) * (1 + _blotches(vertices, rng) * (0.5, 1.0, 1.0))
     if body.landmarks:
@@ -212,8 +212,8 @@ def _eye(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EyeGap:
-    """Holds where vertices lie about the gap between two lids: along it (0 at the inner corner, 1 at the outer one),
-    off its middle line (mm), its half height there (mm), how much its lids bend there, and which it may reach."""
+    """Holds the position of vertices relative to the gap between two lids: along it (0 at the inner corner, 1 at the
+    outer), from its middle line (mm), half its height there (mm), how much its lids bend there, and its reach."""
 
     along: Float[np.ndarray, " v"]
     off: Float[np.ndarray, " v"]
@@ -223,8 +223,8 @@ class EyeGap:
 
 
 def eye_gap(vertices: Vertices, inner: Vector, outer: Vector, closed: float) -> EyeGap:
-    """Returns the gap between the lids of an eye that is ``closed`` so far, 0 to 1; the upper lid comes down to the
-    lower one."""
+    """Returns the gap between the lids of an eye that is ``closed`` to a degree from 0 to 1; the upper lid moves down
+    to the lower one."""
     x, y, z = vertices.T
     along = np.clip((x - inner[0]) / (outer[0] - inner[0]), 0, 1)
     bow = 4 * along * (1 - along)

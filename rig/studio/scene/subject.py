@@ -1,4 +1,4 @@
-"""Describes who sits in the studio: a head that the caller provides, and how it looks."""
+"""Describes the subject in the studio: a head from the caller, and its appearance."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -101,9 +101,9 @@ NO_GRAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """Holds a head (head frame, mm). Without landmarks, its skin has neither brows nor lips. ``closed`` says how far
-    the lids of each side are closed, 0 to 1. ``relief`` is what its skin shows close up and its mesh does not.
-    ``eyes`` are eyeballs by side (head frame); without them eyes are painted on the skin."""
+    """Holds a head (head frame, mm). Without landmarks, its skin has neither brows nor lips. ``closed`` is how far the
+    lids of each side are closed, 0 to 1. ``relief`` is fine relief of its skin that the mesh does not have. ``eyes``
+    are eyeballs by side (head frame); without them eyes are painted on the skin."""
 
     mesh: Mesh
     landmarks: Landmarks = field(default_factory=dict)
@@ -116,7 +116,7 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Holds how a subject looks. Colours are linear RGB albedos."""
+    """Holds the appearance of a subject. Colours are linear RGB albedos."""
 
     skin: Colour
     cloth: Colour
@@ -149,11 +149,11 @@ class Piece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dressed:
-    """Holds the lit subject in the world frame (mm): the bare head and what it wears, hair first, since that hides most
-    of the rest.
+    """Holds the lit subject in the world frame (mm): the bare head and what it wears. Hair is first, because it hides
+    most of the rest.
 
-    ``solid`` are vertices and triangles of everything but strands of hair, which decide what hides what. ``surfaces``
-    are the same by name: head, hair, clothes. ``skin`` is the head as cameras see it, with its relief.
+    ``solid`` are vertices and triangles of everything except strands of hair; they decide what is hidden. ``surfaces``
+    are the same by name: head, hair, clothes. ``skin`` is the visible head, with its relief.
     """
 
     head: Part
@@ -165,8 +165,8 @@ class Dressed:
 
 
 def with_gaze(subject: Subject, azimuth_deg: float, elevation_deg: float, rng: np.random.Generator) -> Subject:
-    """Gives a subject eyeballs of a drawn colour that look at a point ``GAZE_MM`` away, in a direction from straight
-    ahead: azimuth to the subject's left, elevation upwards. Raises InputError for a head without landmarks."""
+    """Gives a subject eyeballs of a random colour directed at a point ``GAZE_MM`` away, in a direction relative to
+    straight ahead: azimuth to the subject's left, elevation upwards. Raises InputError for a head without landmarks."""
     marks = anatomy(subject.mesh.vertices, subject.landmarks).landmarks
     if not marks:
         raise InputError("gaze", [compose("eyes-without-landmarks")])
@@ -198,7 +198,7 @@ def random_look(rng: np.random.Generator) -> Look:
 def random_pose(
     centre_world: Float[np.ndarray, " 3"], spread_deg: float, spread_mm: float, rng: np.random.Generator
 ) -> Similarity:
-    """Draws the pose (world_from_head) of a subject about the cameras' common point, slightly turned and displaced."""
+    """Draws the pose (world_from_head) of a subject near the cameras' common point, slightly turned and displaced."""
     rotation = rotation_from_vector(np.radians(rng.normal(0, spread_deg, 3)))
     return Similarity(1.0, rotation, centre_world + rng.normal(0, spread_mm, 3))
 
@@ -262,7 +262,7 @@ def dress(
 
 
 def _uncut(skin: Part, head: Mesh) -> Part:
-    """Returns the head's own vertices and triangles, the first ones of skin that is cut between the lids."""
+    """Returns the head's own vertices and triangles, which come first in skin that is cut between the lids."""
     rows = slice(len(head.vertices))
     vertices = skin.vertices[rows]
     return replace(
@@ -322,7 +322,7 @@ def _hairs(
     worn: tuple[Float[np.ndarray, "_ 3"], np.ndarray] | None,
     rng: np.random.Generator,
 ) -> list[tuple[Hair, HairStyle]]:
-    """Returns all surfaces of hair, that of the scalp first."""
+    """Returns all surfaces of hair, the scalp's first."""
     styles: list[tuple[Hair, HairStyle]] = []
     if appearance.hair:
         scalp = grow(head.vertices, body, appearance.hair, rng)

@@ -1,7 +1,7 @@
-"""Finds what the cameras see of a subject, as points on its true surface: head, hair and clothes.
+"""Finds the visible parts of a subject, as points on its true surface: head, hair and clothes.
 
-A reconstruction of the whole visible surface is compared with these. Strands of hair are left out: they are thinner
-than a pixel, and a mesh can only have the surface that they grow from.
+They serve as reference for a reconstruction of the whole visible surface. Strands of hair are left out: they are
+thinner than a pixel, and a mesh can only have the surface from which they grow.
 """
 
 from collections.abc import Mapping
@@ -42,8 +42,8 @@ class VisiblePoints:
 def visible_points(
     rig: Rig, surfaces: Mapping[str, Mesh], *, renderer: Renderer, rng: np.random.Generator
 ) -> VisiblePoints:
-    """Draws points evenly over the surfaces (by part, world frame, mm), and returns those that at least ``VIEWS_LEAST``
-    cameras see."""
+    """Draws points evenly over the surfaces (by part, world frame, mm), and returns those in view of at least
+    ``VIEWS_LEAST`` cameras."""
     drawn = [sample_surface(mesh, AREA_MM2, rng) for mesh in surfaces.values()]
     points, normals = (np.concatenate(arrays) for arrays in zip(*drawn, strict=True))
     codes = np.array([PARTS.index(name) for name in surfaces], np.uint8)
@@ -63,7 +63,7 @@ def visible_points(
 def part_masks(
     rig: Rig, surfaces: Mapping[str, Mesh], masks: Mapping[str, Bool[np.ndarray, "_ _"]], *, renderer: Renderer
 ) -> dict[str, UInt8[np.ndarray, "_ _"]]:
-    """Returns what every pixel shows, by camera, in the codes of bust.ply: 1 skin, 2 hair, 3 clothes; 0 outside the
+    """Returns the part at every pixel, by camera, in the codes of bust.ply: 1 skin, 2 hair, 3 clothes; 0 outside the
     ``masks``.
 
     Pixels inside a mask that no surface covers show strands of hair.

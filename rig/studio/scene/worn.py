@@ -1,5 +1,5 @@
-"""Makes what is worn: shoulders in a shirt, for a head whose mesh ends at the neck, a cap with a visor, a swim or wig
-cap (the scalp, pushed out), and glasses. Glasses have rims and no panes, as studios request."""
+"""Makes clothing: a shirt with shoulders (for a head whose mesh ends at the neck), a cap with a visor, a swim or wig
+cap (the scalp, pushed out), and glasses. Glasses have rims but no lenses, as studios request."""
 
 from dataclasses import dataclass
 
@@ -77,7 +77,7 @@ def lay_cap(
 
 
 def above_edge_mm(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
-    """Returns how far above the edge of a cap each vertex of a head lies (mm); negative where the cap ends lower."""
+    """Returns the height of each vertex of a head above the edge of a cap (mm); negative below the edge."""
     relative = (vertices - body.ears) / body.unit
     return (relative[:, 1] - np.interp(relative[:, 2], EDGE[:, 0], EDGE[:, 1])) * body.unit
 
@@ -171,7 +171,7 @@ def _temple(head: Vertices, body: Anatomy, start: Vector, sign: float) -> Float[
 
 
 def _tube(path: Float[np.ndarray, "n 3"], radius_mm: float, reference: Vector, *, closed: bool) -> Surface:
-    """Makes a round tube about a path; ``reference`` is never along it."""
+    """Makes a round tube around a path; ``reference`` must not be parallel to it."""
     tangent = np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0) if closed else np.gradient(path, axis=0)
     across = np.cross(tangent, reference)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -239,7 +239,7 @@ def _rings(
 
 
 def _neck(vertices: Float[np.ndarray, "v 3"], y: float, axis: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " c"]:
-    """Returns the radius around the axis by angle, with room for the cloth; 0 below the mesh."""
+    """Returns the radius around the axis by angle, with a margin for the cloth; 0 below the mesh."""
     near = vertices[np.abs(vertices[:, 1] - y) < 9.0] - axis
     radius = np.zeros(CLOTH_COLUMNS, np.float32)
     if len(near) < 20:

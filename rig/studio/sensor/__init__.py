@@ -1,1 +1,1 @@
-"""Turns the light of a scene into pictures: lens and sensor noise, planted faults, presets."""
+"""Turns the light of a scene into pictures: lens and sensor noise, deliberate faults, presets."""

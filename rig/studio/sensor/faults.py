@@ -1,4 +1,4 @@
-"""Describes faults that can be planted in a simulated shot."""
+"""Describes deliberate faults of a simulated shot."""
 
 from dataclasses import dataclass
 
@@ -23,8 +23,8 @@ DEFAULT_AMOUNT = {"dark": 0.02, "lights-off": 0.02, "bumped": 0.6, "exposure": 0
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Holds a fault of one of ``KINDS``. If ``camera`` is None the fault is of the whole rig or, for a kind that only
-    one camera can have, of one that is drawn at random."""
+    """Holds a fault of one of ``KINDS``. If ``camera`` is None, the fault concerns the whole rig; if only a single
+    camera can have this kind, a camera is drawn at random."""
 
     kind: str
     camera: str | None = None

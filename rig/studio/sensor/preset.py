@@ -1,5 +1,5 @@
-"""Sets how imperfect the simulated studio is, and adds by name what real photographs of skin have. ``PRESET`` is what
-every benchmark uses."""
+"""Sets the imperfections of the simulated studio, and adds by name properties of real photographs of skin. Every
+benchmark uses ``PRESET``."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,8 +11,8 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """Holds how imperfect the simulated studio is. Numbers without a unit in their name are shares of full scale or of
-    the light; lengths in the picture are in pixels."""
+    """Holds the imperfections of the simulated studio. Numbers without a unit in their name are fractions of full scale
+    or of the light; lengths in the picture are in pixels."""
 
     noise: float = (
         0.015  # sensor noise at mid grey, standard deviation; grows with the light's square root (shot noise)
@@ -95,5 +95,5 @@ def made_real(preset: Preset, names: Sequence[str]) -> Preset:
 
 
 def realism_names(text: str | None) -> tuple[str, ...]:
-    """Reads the names in ``NAME[,NAME]``; ``all`` stands for all of ``REALISM``, None for none."""
+    """Reads the names in ``NAME[,NAME]``; ``all`` means all of ``REALISM``, None means none."""
     return tuple(REALISM) if text == "all" else tuple(text.split(",")) if text else ()

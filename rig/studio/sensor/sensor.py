@@ -1,5 +1,5 @@
-"""Turns linear light into an 8-bit photograph: lens blur, vignetting, gains, shot noise, the sRGB curve; and smooth
-random fields."""
+"""Turns linear light into an 8-bit photograph: lens blur, vignetting, gains, shot noise, the sRGB curve. Also draws
+smooth random fields."""
 
 from dataclasses import dataclass
 
@@ -47,8 +47,8 @@ def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarra
 
 
 def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "h w 4"]:
-    """Returns the subject as a rolling shutter shows it while it moves by ``shift_px`` between the readouts of the
-    first and the last row. The middle row shows it at its position."""
+    """Returns the subject as a rolling shutter records it while it moves by ``shift_px`` between the readouts of the
+    first and the last row. The middle row records it at its true position."""
     height, width = subject.shape[:2]
     across, down = shift_px / (height - 1)
     source = np.array([[1.0, -across, shift_px[0] / 2], [0.0, 1.0 - down, shift_px[1] / 2]])
@@ -91,15 +91,15 @@ def compressed(picture: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.nd
 
 
 def drift(shape: tuple[int, int], amount: float, rng: np.random.Generator) -> Float[np.ndarray, "h w 1"]:
-    """Draws how the light changes between clean plate and shot, as a gain for each pixel of a picture of this shape: a
-    common factor and a slope over the picture, both with a standard deviation of about ``amount``."""
+    """Draws the change of the light between clean plate and shot, as a gain for each pixel of a picture of this shape:
+    a common factor and a slope over the picture, both with a standard deviation of about ``amount``."""
     level, across, down = amount * rng.standard_normal(3)
     y, x = np.ogrid[-1.0 : 1.0 : shape[0] * 1j, -1.0 : 1.0 : shape[1] * 1j]
     return (1.0 + level + 0.5 * (across * x + down * y)).astype(np.float32)[:, :, None]
 
 
 def volume(rng: np.random.Generator, cells: int) -> UInt8[np.ndarray, "n n n 4"]:
-    """Draws independent random bytes for a 3D texture that repeats, ``cells`` a side."""
+    """Draws independent random bytes for a repeating 3D texture with ``cells`` cells along each side."""
     return rng.integers(0, 256, (cells, cells, cells, 4), np.uint8)
 
 

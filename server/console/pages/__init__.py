@@ -1,1 +1,1 @@
-"""The pages: for each a module here and a Vue component of the same name."""
+"""Contains a module for each page; the page's Vue component has the same name."""

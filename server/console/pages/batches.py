@@ -1,4 +1,4 @@
-"""The page Batches: many captures as one thing, how much of it is done, what failed, and links to its jobs, table and
+"""Implements the page Batches: the progress and failures of many captures together, and links to jobs, table and
 sheet."""
 
 from collections.abc import Callable, Mapping
@@ -25,8 +25,8 @@ class BatchesPage(Page, component="batches.js"):
     """Shows the list of batches, and the selected one with its progress and failed jobs."""
 
     def look(self) -> JsonObject:
-        """Returns the state of the page: a page of the list, and the selected batch, which may be on another page, with
-        its newest failed jobs. ``parquet``: whether Parquet tables can be made."""
+        """Returns the state of the page: a page of the list, and the selected batch (even if it is on another page)
+        with its newest failed jobs. ``parquet``: whether Parquet tables can be made."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
         state: JsonObject = shared.get(
             ("batches", *requested.values()), 0.5, lambda: batches_state(self.service, requested)

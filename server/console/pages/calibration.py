@@ -1,4 +1,5 @@
-"""The page Calibration: shots of the board with live coverage, reports, the calibration in use, and earlier ones."""
+"""Implements the page Calibration: shots of the board with live coverage, reports, the calibration in use, and earlier
+ones."""
 
 import threading
 from collections.abc import Mapping

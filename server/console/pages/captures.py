@@ -164,8 +164,8 @@ class CapturesPage(Page, component="captures.js"):
     """Shows the list of captures, and the selected one with its pictures, outlines and jobs."""
 
     def look(self) -> JsonObject:
-        """Returns the state of the page. The selected capture stays selected when others arrive, so that nobody removes
-        a capture other than the one shown."""
+        """Returns the state of the page. The selection stays when other captures arrive, so the operator always removes
+        the capture that is shown."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
         state: JsonObject = shared.get(
             ("captures", *requested.values()), 0.3, lambda: captures_state(self.service, requested)
@@ -177,7 +177,7 @@ class CapturesPage(Page, component="captures.js"):
 
 def captures_state(service: Service, requested: Mapping[str, str | None]) -> JsonObject:
     """Returns one page of the captures that match what is requested, each with its jobs. Captures that are being
-    removed are left out. ``chosen``: the selected capture, which may be on another page of the list."""
+    removed are left out. ``chosen``: the selected capture, even if it is on another page of the list."""
     order = cast(CaptureOrder, requested["sort"] if requested["sort"] in get_args(CaptureOrder) else "-created")
     query = CaptureQuery(
         requested["find"] or "", requested["session"], requested["verdict"], tag=requested["tag"], order=order
@@ -305,7 +305,7 @@ def bulk(page: Page, event: JsonObject) -> Message | None:
 
 
 def said_of(action: str, count: int) -> Message:
-    """Returns the message that says what was done to ``count`` captures."""
+    """Returns the message that ``action`` was applied to ``count`` captures."""
     said = {
         "reconstruct": compose("captures-queued", count=count),
         "move": compose("captures-moved", count=count),

@@ -1,6 +1,6 @@
-"""The page Features: the seven points of the paper's section 4.2, and others, picked in three or four views.
+"""The page Features: the operator picks the seven points of the paper's section 4.2, and others, in some views.
 
-It may be skipped: without points the pipeline finds the alignment by itself.
+This step is optional: without points the pipeline finds the alignment by itself.
 """
 
 import threading
@@ -30,10 +30,10 @@ CHOICES = 100  # captures to choose from; the page Captures leads to all
 
 @dataclass(slots=True)
 class Picked:
-    """Holds the points of a capture as they are on the page, and as they were saved.
+    """Holds the points of a capture as shown on the page, and as last saved.
 
-    ``suggested``: pixels, from a detected face, for points that are not set there; they count once somebody accepts
-    them. ``unconfirmed``: the points whose contradictions the operator was asked to confirm.
+    ``suggested``: pixels from a detected face, for points that are not set in that view; they count only after the
+    operator accepts them. ``unconfirmed``: the points whose contradictions the operator was asked to confirm.
     """
 
     capture: str
@@ -45,15 +45,15 @@ class Picked:
 
 
 class Drafts:
-    """Keeps the points that operators have picked and not saved, for each operator and capture, so that a reload of the
-    page shows them again. They do not outlive the process."""
+    """Keeps unsaved points for each operator and capture, so that a reload of the page shows them again. They are lost
+    when the process ends."""
 
     def __init__(self, most: int = 200) -> None:
         self._most, self._kept = most, OrderedDict[tuple[str, str], Points]()
 
     def keep(self, caller: str, picked: Picked) -> None:
         """Keeps the points of a page for a caller, or drops the draft if all are saved. Beyond the limit the oldest
-        drafts go."""
+        drafts are dropped."""
         self._kept.pop((caller, picked.capture), None)
         if picked.points != picked.saved:
             self._kept[caller, picked.capture] = picked.points
@@ -90,9 +90,9 @@ class FeaturesPage(Page, component="features.js"):
     def _picking(self, capture_id: str) -> JsonObject:
         """Returns the points of one capture and the aids for picking more; pixels are those of the picture files.
 
-        ``names``: all points, of which the first seven are those of section 4.2; ``suggested``: suggestions that nobody
-        has accepted yet; ``dirty``: there are points that are not saved; ``is_contradictory``: contradictions must be
-        confirmed before the points are saved.
+        ``names``: all points, first the seven of section 4.2; ``suggested``: suggestions that nobody has accepted yet;
+        ``dirty``: some points are not saved; ``is_contradictory``: contradictions must be confirmed before the points
+        are saved.
         """
         record = self.service.store.capture(capture_id)
         rig = shared.get(("cameras", capture_id), 3600.0, lambda: rig_of(self.service.store.capture_files(capture_id)))
@@ -178,7 +178,7 @@ def place(page: FeaturesPage, event: JsonObject) -> None:
 
 
 def suggest(page: FeaturesPage, event: object) -> Message:
-    """Suggests all seven points in every view that shows the face. Suggestions are neither saved nor used before
+    """Suggests all seven points in every view that shows the face. Suggestions are neither saved nor used until
     somebody accepts them. Raises InvalidInput if no face is certain, and what ``found_faces`` raises."""
     picked = page.of_capture()
     suggested = found_faces(page.service, picked.capture)["suggested"]
@@ -218,7 +218,7 @@ def save(page: FeaturesPage, event: JsonObject) -> Message | None:
 
 
 def contradictions(page: FeaturesPage) -> Mapping[str, MessageDocument]:
-    """Returns, by point, what a job would leave out because views contradict each other."""
+    """Returns, by point, the pixels that a job would leave out because views contradict each other."""
     picked = page.of_capture()
     pixels = {p: {c: np.array(at, float) for c, at in views.items()} for p, views in picked.points.items()}
     return picked.guides.helps(pixels, {}, [])["contradictions"]

@@ -1,4 +1,4 @@
-"""The page Jobs: the queue, progress, log, cancel, restart with other settings, and the figures of a finished job."""
+"""Implements the page Jobs: queue, progress, log, cancel, restart with other settings, and figures of a job."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -41,8 +41,8 @@ class JobsPage(Page, component="jobs.js"):
     """Shows the list of jobs, and the selected one with its log and, once it has finished, its figures."""
 
     def look(self) -> JsonObject:
-        """Returns one page of the list, and the selected job, which may be on another page, with its details. Without a
-        selection that is a running job."""
+        """Returns one page of the list, and the selected job with its details, even if it is on another page. Without a
+        selection, a running job is selected."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
         state: JsonObject = shared.get(("jobs", *requested.values()), 0.3, lambda: jobs_state(self.service, requested))
         first = next((job for job in state["jobs"] if job["state"] == "running"), next(iter(state["jobs"]), None))
@@ -55,8 +55,8 @@ class JobsPage(Page, component="jobs.js"):
 
 
 def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JsonObject:
-    """Returns one page of the jobs that match what is requested: those that run, then the queue in its order, then
-    those that have ended, newest first. ``waiting``: how many more wait."""
+    """Returns one page of the jobs that match the request: running jobs, then the queue in its order, then ended jobs,
+    newest first. ``waiting``: how many more wait."""
     sought, after = requested["find"] or "", requested["after"]
     order = cast(JobOrder, requested["sort"] if requested["sort"] in get_args(JobOrder) else "-created")
     state = requested["state"] if requested["state"] in STATUSES else None
@@ -78,8 +78,8 @@ def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JsonObj
 
 
 def active_jobs(service: Service, sought: str, batch: str | None, *, running: bool = True) -> tuple[list[JobOut], int]:
-    """Returns the jobs that run and those that begin next, ``SHOWN`` at most, and how many more wait. ``running``:
-    include those that run."""
+    """Returns the running jobs and the next ones, ``SHOWN`` at most, and how many more wait. ``running``: include the
+    running jobs."""
     query = JobQuery(sought, ACTIVE if running else STATUSES["queued"], batch=batch)
     matching = service.jobs.page(query, SOUGHT_MOST)
     jobs = sorted(matching.items, key=lambda job: (job.state != "running", job.ahead or 0, job.id))
@@ -100,8 +100,8 @@ def job_line(service: Service, job: JobOut) -> JsonObject:
 
 
 def job_detail(service: Service, job_id: str) -> JsonObject:
-    """Returns the log of a job and, once it has finished, what report.json says of each camera, the warnings, and
-    whether there are pictures. They are cached, then for an hour. Raises NotFound."""
+    """Returns the log of a job and, once it has finished, the report of each camera, the warnings, and whether there
+    are pictures. After the job has finished they are cached for an hour. Raises NotFound."""
     finished = service.jobs.state(job_id) in FINISHED
 
     def make() -> JsonObject:

@@ -1,4 +1,4 @@
-"""The page Result: a head in 3D, coloured, measured, compared with others, and its files."""
+"""Implements the page Result: a head in 3D, coloured, measured and compared with others, and its files."""
 
 from collections.abc import Iterable
 from contextlib import suppress
@@ -29,8 +29,8 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
     """Shows one head in 3D with its figures, and the heads to choose from."""
 
     def look(self) -> JsonObject:
-        """Returns the shown head and the heads to choose from: the newest that match the search, those of the shown
-        head's subject, and the shown one, which none that arrives meanwhile replaces. ``total``: how many match."""
+        """Returns the shown head and the heads to choose from: the newest that match the search, those of the same
+        subject, and the shown one, which stays when new heads arrive. ``total``: how many match."""
         sought, chosen = self.choice.get("find") or "", self.choice.get("job")
         results, total = shared.get(("results", sought), 1.0, lambda: newest_heads(self.service, sought))
         if chosen is None:

@@ -1,5 +1,5 @@
-"""The page of the rig: a live picture of each camera with exposure, sharpness, sync and calibration; clean plates; the
-trigger."""
+"""Implements the page of the rig: a live picture of each camera with exposure, sharpness, sync and calibration; clean
+plates; the trigger."""
 
 import json
 from collections.abc import Mapping
@@ -32,16 +32,16 @@ class RigPage(Page, component="rig.js"):
     """Shows the rig: live pictures, state, calibration and clean plates, and the shot that was just taken."""
 
     def look(self) -> JsonObject:
-        """Returns the state of the rig, the shot taken here on which the operator has not decided, and the job started
-        here last."""
+        """Returns the state of the rig, the shot that awaits the operator's decision, and the job that was last started
+        here."""
         state: JsonObject = shared.get("rig", 0.4, lambda: rig_state(self.service))
         job = job_strip(self.service, self.choice.get("job"))
         return {**state, "shot": shot_taken(self.service, self.choice.get("shot")), "job": job}
 
 
 def job_strip(service: Service, identity: str | None) -> JsonObject | None:
-    """Returns what the page shows of a job, with ``detail``: why it failed or cannot begin. Returns None if there is
-    none or it is being removed."""
+    """Returns the shown fields of a job, with ``detail``: why it failed or cannot begin. Returns None if there is none
+    or it is being removed."""
     jobs = service.jobs.of([identity]) if identity is not None and identity not in removals else []
     if not jobs:
         return None
@@ -52,8 +52,7 @@ def job_strip(service: Service, identity: str | None) -> JsonObject | None:
 
 
 def shot_taken(service: Service, identity: str | None) -> JsonObject | None:
-    """Returns the capture about which the operator has not decided yet whether to keep it; None if there is none or it
-    was removed."""
+    """Returns the capture that awaits the operator's decision to keep it; None if there is none or it was removed."""
     if identity is None or identity in removals:
         return None
     with suppress(NotFound):
@@ -62,8 +61,8 @@ def shot_taken(service: Service, identity: str | None) -> JsonObject | None:
 
 
 def rig_state(service: Service) -> JsonObject:
-    """Returns what the page shows beside the live pictures, the same to all callers: drivers, the last shot's sync,
-    which cameras have moved, calibration and clean plates."""
+    """Returns the part of the page beside the live pictures, which is the same for all callers: drivers, the last
+    shot's sync, cameras that have moved, calibration and clean plates."""
     rig = service.rig.describe()
     last = service.captures.newest()
     sync = {} if last is None or last.shot is None else sync_of(last.shot)

@@ -1,4 +1,4 @@
-"""The page about the service itself: API keys, what is kept and removed next, and what lies on the disk."""
+"""Implements the page about the service itself: API keys, retention, and the use of the disk."""
 
 from datetime import UTC, datetime
 
@@ -58,7 +58,7 @@ class ServicePage(Page, component="service.js"):
 
 
 def key_lines(service: Service, caller: Caller) -> list[JsonObject]:
-    """Converts all API keys to entries of the page's list, oldest first. ``caller`` decides which key is yours."""
+    """Converts all API keys to entries of the list, oldest first. ``caller``: to mark the caller's key."""
     return [
         {
             "id": key.id,
@@ -136,7 +136,7 @@ def remove_failed(page: ServicePage, event: object) -> Message:
 
 
 def sweep_now(page: ServicePage, event: object) -> Message:
-    """Removes now what retention would remove at its next turn. The message says how much that was."""
+    """Removes now what retention would remove at its next turn. The message states how much that was."""
     gone = {kind: count for kind, count in sweep(page.service).items() if count}
     forget_storage(page.service)
     removed = [compose("gone-of-kind", count=count, kind=kind) for kind, count in gone.items()]

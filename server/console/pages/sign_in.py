@@ -1,4 +1,4 @@
-"""The page that asks for an API key. The key travels over the page's socket, never in an address."""
+"""Implements the page that asks for an API key. The key is sent over the page's socket, never in an address."""
 
 import asyncio
 
@@ -16,7 +16,7 @@ WRONG_PAUSE_S = 1.0  # after a key that is nobody's
 
 
 class SignIn(Element, component="sign_in.js"):
-    """Shows the form for an API key. A key that is right is noted in the browser's session, and the page of the rig
+    """Shows the form for an API key. A valid key's id is stored in the browser's session, and the page of the rig
     opens. After a wrong one the form waits a second, which slows guessing."""
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class SignIn(Element, component="sign_in.js"):
 
 @ui.page("/sign-in")
 async def sign_in_page() -> None:
-    """Serves the page that asks for an API key. Where none is needed, it leads to the page of the rig."""
+    """Serves the page that asks for an API key. If no key is needed, it redirects to the page of the rig."""
     ui.page_title("Sign in - eigenhead")
     caller = await signed_in()
     if caller is not None and caller.key == "local":

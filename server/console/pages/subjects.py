@@ -1,4 +1,4 @@
-"""The page Subjects: people as cards, each with a picture of the newest head and links to shots and heads."""
+"""Implements the page Subjects: cards of people with a picture of the newest head and links to shots and heads."""
 
 from collections.abc import Mapping
 from typing import cast, get_args

@@ -118,7 +118,7 @@ def list_captures(
 @router.post("/captures/bulk", responses=documented(400, 413, 415, 507))
 def change_captures(service: ServiceOf, caller: Taker, wanted: CaptureBulk) -> BulkOut:
     """Applies one action to many captures. Captures to which it cannot be applied are reported and do not stop the
-    others. ``reconstruct`` needs the scope ``submit``, too, and ``erase`` the scope ``erase``."""
+    others. ``reconstruct`` also needs the scope ``submit``, and ``erase`` the scope ``erase``."""
     caller.check_may({"reconstruct": "submit", "erase": "erase"}.get(wanted.action, "capture"))
     work = ReconstructionRequest(wanted.model, wanted.settings)
     work.check()
@@ -141,7 +141,7 @@ def get_capture(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureO
 
 @router.get("/captures/{capture_id}/checks", responses=documented(404))
 def get_checks(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureChecks:
-    """Returns what decided the verdict: each camera's exposure, sharpness and position, and the subject's outline."""
+    """Returns the reasons for the verdict: exposure, sharpness and position by camera, and the subject's outline."""
     return CaptureChecks.model_validate({"cameras": service.store.checks(capture_id)})
 
 
@@ -186,7 +186,7 @@ def get_features(service: ServiceOf, caller: Reader, capture_id: str) -> NewFeat
 
 @router.get("/captures/{capture_id}/holdings", responses=documented(404))
 def get_holdings(service: ServiceOf, caller: Reader, capture_id: str) -> HoldingsOut:
-    """Returns what a removal of the capture would delete, and what would stay."""
+    """Returns which data a removal of the capture would delete, and which would stay."""
     return service.captures.holdings(capture_id)
 
 
@@ -200,7 +200,7 @@ def delete_capture(
     """Removes a capture with its images. Its jobs and their results, which show the face, stay. 409 while a queued or
     running job needs it.
 
-    With ``erase`` its jobs are cancelled and removed with their results, too; that needs the scope ``erase``, too.
+    With ``erase`` its jobs are cancelled and removed with their results; that also needs the scope ``erase``.
     """
     if erase:
         caller.check_may("erase")

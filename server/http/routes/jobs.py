@@ -193,7 +193,7 @@ def delete_job(service: ServiceOf, caller: Submitter, job_id: str) -> None:
     response_class=PlainTextResponse,
 )
 def get_job_log(service: ServiceOf, caller: Reader, job_id: str) -> str:
-    """Returns what the workers logged about this job: stages, warnings, how it ended. 404 before it begins."""
+    """Returns the workers' log of this job: stages, warnings, outcome. 404 before it begins."""
     return service.jobs.log(job_id)
 
 

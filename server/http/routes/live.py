@@ -1,4 +1,4 @@
-"""Declares the route of the live head: lamps of the cameras, the head of whoever sits before them, what is to do."""
+"""Declares the route of the live head: lamps of the cameras, the head of the subject, and instructions."""
 
 from collections.abc import AsyncIterator
 from typing import Annotated
@@ -30,10 +30,10 @@ def rig_live(
     accept: Annotated[str, Header(max_length=1000)] = "",
     seconds: Annotated[float, Query(gt=0, le=3600, description="after which a stream ends")] = 600.0,
 ) -> Response | LiveOut:
-    """Returns the head that sits before the cameras, lamps of each camera, and what is to do before a shot.
+    """Returns the subject's head, lamps of each camera, and instructions before a shot.
 
-    The cameras are looked at while somebody asks, so the first answers have no head. With ``Accept: text/event-stream``
-    every look is sent as an event ``look``."""
+    The cameras take pictures only while somebody asks, so the first answers have no head. With ``Accept:
+    text/event-stream`` each new state is sent as an event ``look``."""
     if EVENTS in accept:
         return StreamingResponse(_events(service, seconds), media_type=EVENTS, headers=UNKEPT)
     response.headers.update(UNKEPT)

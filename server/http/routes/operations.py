@@ -1,5 +1,5 @@
-"""Declares the routes of storage, retention, health, readiness, metrics, models, templates, keys and webhooks, and the
-page that shows the API; and their documents."""
+"""Declares the routes of storage, retention, health, readiness, metrics, models, templates, keys and webhooks, with
+their documents, and the page that shows the API."""
 
 from importlib.metadata import version
 from pathlib import Path

@@ -42,7 +42,7 @@ def rig_state(service: ServiceOf, caller: Reader) -> RigOut:
     responses={200: {"content": {"image/jpeg": {}}}, **documented(404)},
 )
 def rig_preview(service: ServiceOf, caller: Reader, name: str) -> Response:
-    """Returns a camera's present picture, at most 640 pixels wide."""
+    """Returns a camera's current picture, at most 640 pixels wide."""
     return Response(service.rig.preview(name), media_type="image/jpeg", headers=UNKEPT)
 
 
@@ -105,7 +105,7 @@ def take_background(service: ServiceOf, caller: Taker) -> BackgroundOut:
     """Takes new clean plates of the empty studio and uses them for later captures.
 
     If that fails (503), or if the new plates show a person whom the old ones do not (409), the old ones stay in use.
-    After a 409 the new plates are kept, and ``PUT`` can put them to use nevertheless.
+    After a 409 the new plates are kept, and ``PUT`` can select them nevertheless.
     """
     service.store.reserve(0, service.settings.free_bytes)
     return BackgroundOut.model_validate(service.rig.take_background())
@@ -119,7 +119,7 @@ def list_plates(service: ServiceOf, caller: Reader) -> PlatesList:
 
 @router.put("/background", responses=documented(400, 404, 413, 415, 507))
 def use_plates(service: ServiceOf, caller: Taker, wanted: UsePlates) -> PlatesList:
-    """Puts stored clean plates to use: earlier ones, or refused ones nevertheless."""
+    """Selects stored clean plates for later captures: earlier ones, or refused ones nevertheless."""
     service.rig.use_plates(wanted.version)
     return list_plates(service, caller)
 

@@ -59,6 +59,6 @@ def edit_session(service: ServiceOf, caller: Taker, session_id: str, wanted: Ses
 
 @router.delete("/sessions/{session_id}", status_code=204, responses=documented(404))
 def erase_session(service: ServiceOf, caller: Eraser, session_id: str) -> None:
-    """Erases a session for good: cancels its jobs, then removes images, results, caches and its data in the job
+    """Erases a session permanently: cancels its jobs, then removes images, results, caches and its data in the job
     database."""
     service.sessions.erase(session_id)

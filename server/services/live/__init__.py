@@ -1,5 +1,5 @@
-"""The live head: while somebody looks, every moment's small pictures become a head, lamps of each camera, and words.
+"""Provides the live head: while somebody watches, pictures become a head, lamps of each camera, and instructions.
 
-``live`` holds the thread and its child process, ``look`` what the child does with one moment's pictures, ``seen`` the
-values that it hands over, ``words`` what follows from them for the subject and the operator.
+``live`` holds the thread and its child process, ``looking`` the child's work on one set of pictures, ``seen`` the
+values that it returns, ``words`` the instructions for the subject and the operator.
 """

@@ -1,9 +1,9 @@
-"""Keeps a head of whoever sits before the cameras, as long as somebody looks.
+"""Computes the subject's head while somebody watches.
 
-One thread takes pictures, unless the console's live view offers its own; another hands the newest ones to a child
-process (``look``) and says what it found. The cameras are asked for the next pictures so early that they come when the
-child is done. The child goes before a job's processes, whose two cores it takes a quarter of at most; one that dies or
-does not answer is killed and begun again with the next look. ``IDLE_S`` after the last question threads and child end.
+One thread takes pictures, unless the console's live view provides its own; another sends them to a child process
+(``looking``) and publishes the result. The next pictures are requested early enough to arrive when the child is done.
+The child has priority over a job and takes at most a quarter of its two cores; a child that dies or hangs is replaced
+at the next pictures. ``IDLE_S`` after the last request, threads and child end.
 """
 
 import threading
@@ -44,8 +44,8 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """Holds the pictures of one moment, some of them JPEG files, and when the first of them may have been taken (s, of
-    ``time.monotonic``). ``fault``: why there are none."""
+    """Holds the pictures of one moment, some of them as JPEG files, and the earliest time at which they may have been
+    taken (s, of ``time.monotonic``). ``fault``: why there are none."""
 
     taken_s: float
     pictures: Mapping[str, bytes | ImageRgb]
@@ -53,7 +53,7 @@ class Moment:
 
 
 class Live:
-    """Finds the head while somebody asks. ``rig_toml`` describes the rig, None for the simulated studio."""
+    """Finds the head while somebody asks for it. ``rig_toml`` describes the rig; None: the simulated studio."""
 
     def __init__(self, rig: RigBackend, rig_toml: Path | None) -> None:
         self._rig = rig
@@ -69,8 +69,8 @@ class Live:
         self._closing = False
 
     def newest(self) -> LiveOut:
-        """Returns the newest look, and asks for the next ones. While the first is under way, and when the cameras are
-        lost, the answer has no cameras and says why. Does not block."""
+        """Returns the newest result, and requests the next ones. Before the first result, and when the cameras are
+        lost, the answer has no cameras and states the reason. Does not block."""
         self._polled_s = time.monotonic()
         return self._newest()
 
@@ -84,8 +84,8 @@ class Live:
         return shown[1] if shown is not None and now_s - shown[0] < FRESH_S else nothing(compose("live-starting"))
 
     def offer(self, pictures: Mapping[str, bytes], taken_s: float) -> LiveOut:
-        """Takes the pictures that the live view has just got, so that the cameras need not be asked twice, and returns
-        the newest look."""
+        """Takes pictures from the live view, so that the cameras need not be asked twice, and returns the newest
+        result."""
         self._offered_s = time.monotonic()
         self._hand_on(Moment(taken_s, pictures))
         return self._newest()
@@ -183,14 +183,14 @@ class Live:
 
 
 def nothing(why: Message) -> LiveOut:
-    """Returns a look that found nothing."""
+    """Returns a result in which nothing was found."""
     return LiveOut(
         time="", age_s=0.0, number=0, cameras={}, head=None, steady=False, words=[word_out(Word(why))], ready=False
     )
 
 
 def halved(image: ImageRgb) -> ImageRgb:
-    """Returns a picture reduced by a whole factor, which is fast, to at least ``WIDTH_PX``."""
+    """Returns a picture reduced by a whole factor (which is fast), at least ``WIDTH_PX`` wide."""
     factor = max(1, image.shape[1] // WIDTH_PX)
     size = (image.shape[1] // factor, image.shape[0] // factor)
     return image if factor == 1 else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -212,7 +212,7 @@ def look(
 
 
 def document_of(shown: LiveOut) -> dict[str, object]:
-    """Returns a look as JSON types, for a page."""
+    """Returns a result as JSON types, for a page."""
     head = None if shown.head is None else shown.head.model_dump(include=HEAD_SHOWN)
     words = [{**word.message.model_dump(), "camera": word.camera} for word in shown.words]
     return shown.model_dump(exclude={"head", "words"}) | {"head": head, "words": words}

@@ -1,7 +1,7 @@
-"""Looks at one moment's pictures, in a child process that keeps the head from look to look.
+"""Finds the head in one set of pictures, in a child process that keeps the head from set to set.
 
-Pictures come reduced. Light and sharpness are measured on them, the latter in every other camera in turn; the face is
-found in them at ``SMALL_PX``. A face that is missing where it should be seen is searched anew in one camera a look.
+Pictures come reduced. Light and sharpness are measured on them, sharpness in every other camera in turn; the face is
+found in them at ``SMALL_PX``. A missing face is searched anew, in one camera for each set.
 """
 
 from collections.abc import Mapping
@@ -44,7 +44,7 @@ SHOWN = 6  # every sixth landmark is handed out
 
 @dataclass(slots=True)
 class Kept:
-    """Holds what stays in the child process from look to look."""
+    """Holds the state that the child process keeps from set to set."""
 
     rig: Rig | None = None  # as calibrated
     head: LiveHead | None = None
@@ -65,8 +65,8 @@ def look(
 ) -> Seen:
     """Finds the head, and measures every camera.
 
-    ``pictures``: by camera, those in bytes as JPEG files; ``rig``: the cameras as calibrated, at whatever size;
-    ``front``: the camera that the subject looks at; ``plates``: folder and version of the clean plates.
+    ``pictures``: by camera, bytes being JPEG files; ``rig``: the calibrated cameras, at any size; ``front``: the camera
+    that the subject looks at; ``plates``: folder and version of the clean plates.
     """
     kept: Kept = context.keep("live", Kept)
     cv2.setNumThreads(1)  # a job may run beside
@@ -90,7 +90,7 @@ def look(
 
 
 def _read(picture: bytes | ImageRgb) -> ImageRgb | None:
-    """Returns a picture; None of a file that cannot be decoded, whose camera then counts as one without a picture."""
+    """Returns a picture, or None for a file that cannot be decoded; its camera then counts as one without a picture."""
     if not isinstance(picture, bytes):
         return picture
     pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR_RGB) if picture else None
@@ -103,7 +103,7 @@ def _fits(camera: Camera, image: ImageRgb) -> bool:
 
 
 def _small(image: ImageRgb, camera: Camera) -> tuple[ImageRgb, Camera]:
-    """Returns a picture reduced to ``SMALL_PX``, without lens distortion where the camera is calibrated so."""
+    """Returns a picture reduced to ``SMALL_PX``, and without lens distortion if the camera is calibrated."""
     at_size = replace(camera, intrinsics=camera.intrinsics.at_size(image.shape[1], image.shape[0]))
     if camera.recorded is not None:
         image = camera.recorded.undistort(image, at_size.intrinsics.matrix())
@@ -111,7 +111,7 @@ def _small(image: ImageRgb, camera: Camera) -> tuple[ImageRgb, Camera]:
 
 
 def _plates(kept: Kept, plates: tuple[str, str] | None, names: tuple[str, ...]) -> Mapping[str, np.ndarray]:
-    """Returns the clean plates, reduced to their light."""
+    """Returns the brightness of the clean plates."""
     if plates is None:
         return {}
     folder, version = plates
@@ -125,12 +125,12 @@ def _plates(kept: Kept, plates: tuple[str, str] | None, names: tuple[str, ...]) 
 
 
 def _light(image: ImageRgb) -> Float[np.ndarray, "h w"]:
-    """Returns the light of a picture in parts, each an average of many pixels."""
+    """Returns the brightness of a picture in blocks, each an average of many pixels."""
     return cv2.resize(image, PARTS, interpolation=cv2.INTER_AREA).mean(axis=2) + 1.0
 
 
 def _find(context: WorkerContext, kept: Kept, small: Mapping[str, ImageRgb], rig: Rig | None) -> bool:
-    """Finds the head, first where it was, into ``kept``. Returns whether some picture shows a face."""
+    """Finds the head, first near its last pose, and stores it in ``kept``. Returns whether any picture shows a face."""
     networks: FaceNetworks = context.keep("face networks", load_networks)
     if kept.head is not None and rig is not None and _same(kept.head.who.person.rig, rig):
         kept.head = follow(kept.head, small, networks)
@@ -152,7 +152,7 @@ def _find(context: WorkerContext, kept: Kept, small: Mapping[str, ImageRgb], rig
 
 
 def _same(before: Rig, now: Rig) -> bool:
-    """Tells whether two rigs have the same cameras at the same places, those that give no picture at present aside."""
+    """Returns whether two rigs have the same cameras with the same poses, except those without a picture now."""
     return all(camera.name in before and _placed(camera) == _placed(before[camera.name]) for camera in now)
 
 
@@ -168,14 +168,14 @@ def _alike(thumbs: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]) -
 
 
 def _lit(image: ImageRgb, plate: Float[np.ndarray, "h w"] | None) -> CameraSeen:
-    """Measures a picture's light, against its clean plate: most of it is background."""
+    """Measures a picture's brightness relative to its clean plate, since most of it is background."""
     light = exposure(image)
     share = None if plate is None else float(np.median(_light(image) / plate))
     return CameraSeen(light.mean, share, float(light.clipped_share), None)
 
 
 def _with_head(seen: CameraSeen, camera: Camera, head: LiveHead) -> CameraSeen:
-    """Adds where the head is in a picture."""
+    """Adds the position of the head in a picture."""
     size = np.array([camera.intrinsics.width, camera.intrinsics.height], float)
     facing, landmarks_px = head.facing[camera.name], head.sighting.pixels.get(camera.name)
     pixels = camera.project(head.points_world)
@@ -198,8 +198,8 @@ def _with_head(seen: CameraSeen, camera: Camera, head: LiveHead) -> CameraSeen:
 def _measure_sharpness(
     kept: Kept, seen: dict[str, CameraSeen], images: Mapping[str, ImageRgb], rig: Rig, head: LiveHead
 ) -> None:
-    """Measures the sharpness of the head's face in every other camera in turn, and adds what is known of each. A head
-    that moves is not measured: that is its own blur, not the lens's."""
+    """Measures the sharpness of the head's face in every other camera in turn, and adds the known value of each camera.
+    A moving head is not measured: its blur is not the lens's."""
     before, kept.points = kept.points, head.points_world
     still = before is not None and float(np.linalg.norm(kept.points - before, axis=1).mean()) < STILL_MM
     kept.count += still
@@ -212,7 +212,7 @@ def _measure_sharpness(
 
 
 def _blur_px(image: ImageRgb, face: Float[np.ndarray, "n 2"]) -> float | None:
-    """Measures the sharpness of a face, whose landmarks are at these pixels."""
+    """Measures the sharpness of a face with landmarks at these pixels."""
     margin = FACE_MARGIN * float(np.ptp(face, axis=0).max())
     low = np.maximum(face.min(axis=0) - margin, 0.0).astype(int)
     high = np.maximum(face.max(axis=0) + margin, 0.0).astype(int)
@@ -224,7 +224,7 @@ def _blur_px(image: ImageRgb, face: Float[np.ndarray, "n 2"]) -> float | None:
 def _search_stranger(
     context: WorkerContext, kept: Kept, seen: dict[str, CameraSeen], small: Mapping[str, tuple[ImageRgb, Camera]]
 ) -> None:
-    """Searches a face in one camera that should show the head's and does not, in turn."""
+    """Searches a face in one camera, in turn, that should show the head's and does not."""
     lacking = [name for name, camera in seen.items() if camera.face is False and not camera.stranger and name in small]
     if lacking:
         kept.searched += 1

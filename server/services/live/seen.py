@@ -1,4 +1,4 @@
-"""Holds what one look at the cameras finds, in the child process and in the service, and what is answered of it."""
+"""Defines the findings of one set of pictures, in the child process and in the service, and the answer about them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ Numbers = tuple[float, ...]
 
 @dataclass(frozen=True, slots=True)
 class CameraSeen:
-    """Holds what one camera shows.
+    """Holds the findings of one camera.
 
     Attributes:
         mean: of the picture, 0 to 255; ``light``: its brightness by the clean plate's; None without one.
@@ -38,9 +38,9 @@ class CameraSeen:
 
 
 class HeadOut(Answer):
-    """Describes the head. ``rotation`` (row by row) and ``translation`` (mm): of world_from_head; ``scale``: by the
-    model's mean size; ``left_deg``, ``up_deg``: where the face looks, seen from the front camera; ``right_mm``,
-    ``down_mm``, ``away_mm``: how far the head is, in the front camera's picture, from where all cameras look;
+    """Describes the head. ``rotation`` (row by row) and ``translation`` (mm): of world_from_head; ``scale``: relative
+    to the model's mean size; ``left_deg``, ``up_deg``: direction of the face, seen from the front camera; ``right_mm``,
+    ``down_mm``, ``away_mm``: the head's offset in the front camera's picture from the point that all cameras look at;
     ``vertices`` (mm, in the same directions) and ``triangles``: a small mesh."""
 
     rotation: Numbers
@@ -61,8 +61,8 @@ class HeadOut(Answer):
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """Holds what one look finds. ``faces``: whether some camera shows a face, although no head follows from them;
-    ``calibrated``: whether the cameras' places are known; ``missing``: cameras that deliver no picture."""
+    """Holds the findings of one set of pictures. ``faces``: whether some camera shows a face, even if no head follows;
+    ``calibrated``: whether the cameras' poses are known; ``missing``: cameras that deliver no picture."""
 
     cameras: Mapping[str, CameraSeen]
     head: HeadOut | None
@@ -72,8 +72,8 @@ class Seen:
 
 
 class LampsOut(Answer):
-    """Tells of one camera whether it shows the face, is sharp, well exposed and has the head in its middle, and whether
-    the face looks at it. null: not known, or it need not be."""
+    """States of one camera whether it shows the face, is sharp, is well exposed, has the head in its middle, and
+    whether the face looks at it. null: unknown, or not required."""
 
     face: bool | None
     sharp: bool | None
@@ -85,14 +85,14 @@ class LampsOut(Answer):
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """Holds one thing to do, and the camera that it is about, if it is about one."""
+    """Holds one instruction, and the camera that it is about, if any."""
 
     message: Message
     camera: str | None = None
 
 
 class WordOut(Answer):
-    """Says one thing to do. ``camera``: that it is about, null for the subject."""
+    """Describes one instruction. ``camera``: the camera that it is about; null: the subject."""
 
     code: str
     text: str
@@ -101,9 +101,9 @@ class WordOut(Answer):
 
 
 class LiveOut(Answer):
-    """Describes the newest look. ``time``: when its pictures were taken, empty before the first; ``age_s``: how old
-    they were when the head was ready; ``points`` of ``cameras``: landmarks of the face, as shares of width and height;
-    ``ready``: the head is steady, its eyes are open, and nothing is to do."""
+    """Describes the newest result. ``time``: when its pictures were taken, empty before the first; ``age_s``: their age
+    when the head was ready; ``points`` of ``cameras``: landmarks of the face, as fractions of width and height;
+    ``ready``: the head is steady, its eyes are open, and there are no instructions."""
 
     time: str
     age_s: float
@@ -116,6 +116,6 @@ class LiveOut(Answer):
 
 
 def word_out(word: Word) -> WordOut:
-    """Returns a word as it is answered."""
+    """Returns an instruction as it is answered."""
     message = MessageOut.model_validate(word.message)
     return WordOut(code=message.code, text=word.message.text, camera=word.camera, message=message)

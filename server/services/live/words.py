@@ -1,7 +1,7 @@
-"""Says what is to do before a shot: what one look found, turned into lamps of each camera and words for the subject.
+"""Converts the findings of one set of pictures to lamps of cameras and instructions before a shot.
 
-All limits are stated here. Most words are told when their reason has lasted ``HOLD_S``, so that a blink or a turn
-in passing says nothing; they end with it.
+All limits are stated here. Most instructions follow once their reason has lasted ``HOLD_S``, so a blink has no effect;
+they end with it.
 """
 
 from collections import deque
@@ -30,14 +30,14 @@ LOOKING = 0.5  # cosine: both eyes are seen
 
 
 class Speaker:
-    """Turns look after look into lamps and words. It remembers reasons and poses of the last second."""
+    """Converts one set of findings after the other to lamps and instructions. Remembers a second of them."""
 
     def __init__(self) -> None:
         self._since: dict[tuple[str, str | None], float] = {}
         self._poses: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=64)
 
     def words(self, seen: Seen, time_s: float) -> tuple[Word, ...]:
-        """Returns what is to do at ``time_s`` (a monotonic clock)."""
+        """Returns the instructions at ``time_s`` (a monotonic clock)."""
         reasons = list(reasons_of(seen))
         keys = [(word.message.code, word.camera) for word in reasons]
         self._since = {key: self._since.get(key, time_s) for key in keys}
@@ -46,7 +46,7 @@ class Speaker:
         return tuple(word for word, key, least_s in triples if time_s - self._since[key] >= least_s)
 
     def steady(self, head: HeadOut | None, time_s: float) -> bool:
-        """Tells whether the head has kept its pose for ``STEADY_S``."""
+        """Returns whether the head has kept its pose for ``STEADY_S``."""
         if head is None:
             self._poses.clear()
             return False
@@ -77,7 +77,7 @@ def lamps_of(seen: Seen) -> dict[str, LampsOut]:
 
 
 def reasons_of(seen: Seen) -> Iterator[Word]:
-    """Yields what this look alone finds to do, first for the subject."""
+    """Yields the instructions from these findings alone, those for the subject first."""
     if not seen.calibrated:
         yield Word(compose("live-uncalibrated"))
     elif not seen.cameras:
@@ -129,7 +129,7 @@ def _of_camera(name: str, camera: CameraSeen) -> Iterator[Word]:
 
 
 def _light(seen: Seen) -> Iterator[tuple[str, Word]]:
-    """Yields the cameras whose light is wrong: against their clean plates, else against the other cameras."""
+    """Yields cameras of wrong brightness, relative to their clean plates or else to the other cameras."""
     against = {name: camera.light for name, camera in seen.cameras.items() if camera.light is not None}
     plated = len(against) == len(seen.cameras)
     ratios = against if plated else {name: camera.mean / LEVEL for name, camera in seen.cameras.items()}

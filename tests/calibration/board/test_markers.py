@@ -60,9 +60,9 @@ def test_the_pattern_that_was_printed_is_found(printed: Board) -> None:
 @pytest.mark.parametrize(("printed", "words"), [
     pytest.param(replace(TOLD, columns=7), "7 squares in a row and 6 rows or more, board.toml says 8", id="columns"),
     pytest.param(replace(TOLD, columns=6, rows=8), "6 squares in a row and 8 rows or more", id="turned"),
-    pytest.param(replace(TOLD, marker_ratio=0.6), "board.toml says 0.75: correct marker_ratio", id="ratio"),
-    pytest.param(replace(TOLD, dictionary="DICT_5X5_50"), "are of DICT_5X5_50", id="dictionary"),
-    pytest.param(replace(TOLD, dictionary="DICT_4X4_250", first_marker=60, rows=5), "are of DICT_4X4_100", id="size"),
+    pytest.param(replace(TOLD, marker_ratio=0.6), "board.toml has 0.75: correct marker_ratio", id="ratio"),
+    pytest.param(replace(TOLD, dictionary="DICT_5X5_50"), "are from DICT_5X5_50", id="dictionary"),
+    pytest.param(replace(TOLD, dictionary="DICT_4X4_250", first_marker=60, rows=5), "are from DICT_4X4_100", id="size"),
 ])  # fmt: skip
 def test_the_cause_is_named(printed: Board, words: str) -> None:
     assert words in str(explain(picture(printed), TOLD))

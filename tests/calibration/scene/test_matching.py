@@ -36,5 +36,5 @@ def test_shots_of_two_sizes_are_named(tmp_path: Path) -> None:
     for camera in "abc":
         write_image(tmp_path / "photos" / camera / "1.png", np.zeros((40, 60), np.uint8))
     write_image(tmp_path / "photos" / "b" / "2.png", np.zeros((60, 40), np.uint8))
-    with pytest.raises(InputError, match=r"b/2 is 40 x 60 pixels, its camera's other shots 60 x 40"):
+    with pytest.raises(InputError, match=r"b/2 is 40 x 60 pixels, but the other shots of its camera are 60"):
         match_photographs(find_photographs(tmp_path / "photos"), tmp_path, one_lens=None, report=silent)

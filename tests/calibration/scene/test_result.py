@@ -48,4 +48,4 @@ def test_a_calibration_from_a_scene_is_judged_by_what_it_does_not_know() -> None
         loose = replace(found.uncertainty, pose_sigma_px=np.where(np.arange(len(sharp)) == 2, px, sharp))
         judged = judge_scene(replace(found, uncertainty=loose))
         assert judged.word == word
-        assert judged.missing[0].text.startswith(f"{found.rig.names[2]}: pose looser than")
+        assert judged.missing[0].text.startswith(f"{found.rig.names[2]}: the pose is uncertain by more than")

@@ -24,7 +24,7 @@ def test_a_batch_is_begun_followed_and_tried_again(browser: Browser, screenshots
         page.locator("#new-batch").click()
         page.locator("#prefix").fill("nobody")
         page.get_by_role("button", name="Begin").click()
-        expect(page.get_by_text("no capture of a head is there")).to_be_visible()
+        expect(page.get_by_text("no capture of a head was selected")).to_be_visible()
         expect(page.locator("#prefix")).to_have_value("nobody")
         page.locator("#prefix").fill("SUBJECT")
         page.get_by_role("button", name="Begin").click()

@@ -150,7 +150,7 @@ def test_a_calibration_is_uploaded_shown_and_refused_for_another_rig(
     expect(page.locator("table tr", has_text="cam_3")).to_be_visible()
     verdict = page.locator("#calibration-verdict")
     expect(verdict).to_have_attribute("data-verdict", "usable")
-    expect(verdict).to_contain_text("focal length known no better than 1 %")
+    expect(verdict).to_contain_text("focal length is uncertain by more than 1 %")
     keep_screenshots(page, screenshots, "calibration-report")
     page.get_by_role("button", name="Use this").click()
     expect(page.get_by_text("The calibration is of other cameras than the rig has")).to_be_visible()

@@ -185,8 +185,8 @@ def with_plate_hair(image: np.ndarray, plate: np.ndarray, mask: np.ndarray) -> n
 @pytest.mark.parametrize(
     ("name", "edit", "word"),
     [
-        ("cam00", lambda image, plate, mask: with_chair(image), "moved|move since"),
-        ("cam05", lambda image, plate, mask: with_chair(image), "moved|move since"),
+        ("cam00", lambda image, plate, mask: with_chair(image), "moved|move after"),
+        ("cam05", lambda image, plate, mask: with_chair(image), "moved|move after"),
         ("cam00", with_plate_hair, "lacks"),
         ("cam10", with_plate_hair, "lacks"),
     ],

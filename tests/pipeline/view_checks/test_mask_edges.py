@@ -49,7 +49,7 @@ def test_masks_that_are_all_too_large_or_too_small_are_warned_of_once(px: int, w
     masks = {name: grown(subject(k), px) for k, name in enumerate(NAMES)}
     (warning,) = masks_off_edges(IMAGES, masks, NAMES)
     assert warning.code == "masks-off-edges"
-    assert warning.text.startswith(f"3 of 3 masks lie about 5 px {where} what the photographs show")
+    assert warning.text.startswith(f"3 of 3 masks lie about 5 px {where} the edges in the photographs")
 
 
 def test_tight_masks_and_one_that_is_loose_are_not_warned_of() -> None:

@@ -94,7 +94,7 @@ def test_rotations_that_are_transposed_are_named_where_the_cameras_look_at_the_o
     assert rig_faults(written) == []
     found = wrong_rig(of_all, written)
     assert found is not None
-    assert "camera_from_world holds the rotation transposed" in found.text
+    assert "hold the rotation transposed" in found.text
     assert "transpose each rotation" in found.text
 
 
@@ -190,4 +190,4 @@ def test_focal_lengths_of_another_zoom_are_found(half_size_shot, zoom):
     assert found.factor == pytest.approx(1 / zoom, rel=0.06)
     assert max(map(abs, found.shift)) < 0.02
     assert found.is_other
-    assert "focal lengths (fx, fy) are taken" in found.message().text
+    assert "focal lengths (fx, fy) are multiplied" in found.message().text

@@ -97,7 +97,7 @@ def test_what_is_true_of_many_views_is_said_once(seen: Seen) -> None:
 def test_one_picture_in_all_cameras_is_named_as_such(seen: Seen) -> None:
     rig, silhouettes = seen
     picture = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
-    with pytest.raises(SamePictures, match=r"of 11 cameras hold no picture of their own.*give each camera its own"):
+    with pytest.raises(SamePictures, match=r"of 11 cameras have a copy of another camera.*give each camera its own"):
         judged(rig, silhouettes, Capture(dict.fromkeys(rig.names, picture)))
 
 

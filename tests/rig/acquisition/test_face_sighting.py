@@ -43,6 +43,6 @@ def test_cameras_without_the_face_are_named_unless_a_fault_explains_it() -> None
     sighting = turned(0.0, 0.0, ("cam03", "cam04"))
     assert [remark.parameters["cameras"] for remark in face_remarks(sighting, ())] == [("cam03", "cam04")]
     dark = Fault("dark", "cam03", compose("picture-dark", percent=4.0))
-    assert texts_of(face_remarks(sighting, [dark]))[0].startswith("no face in cam04, though")
+    assert texts_of(face_remarks(sighting, [dark]))[0].startswith("no face was found in cam04, although")
     unset = Fault("plates", "cam04", compose("camera-without-plates"))
     assert [remark.parameters["cameras"] for remark in face_remarks(sighting, [dark, unset])] == [("cam04",)]

@@ -39,7 +39,7 @@ def test_plates_that_were_replaced_are_put_back(tmp_path: Path) -> None:
     use_plates(folder, before.id, CAMERAS)  # they are in use already
     use_plates(folder, newest.id, CAMERAS)
     assert value_in_use(folder) == 20
-    with pytest.raises(InputError, match="not kept"):
+    with pytest.raises(InputError, match="does not exist"):
         use_plates(folder, "../plates", CAMERAS)
     assert value_in_use(folder) == 20
 

@@ -136,7 +136,7 @@ def test_a_stream_that_hangs_is_let_go(make: Make, studio: StudioDevices) -> Non
 def test_a_camera_that_is_not_there(driver: str, identity: str, tmp_path: Path) -> None:
     camera = dataclasses.replace(CameraConfig(name="cam07", driver="opencv", identity=identity), **{"driver": driver})
     opened = driver_for(camera, tmp_path)
-    with pytest.raises(CameraNotFound, match="cam07: no camera") as caught:
+    with pytest.raises(CameraNotFound, match="cam07: there is no camera") as caught:
         opened.open(1.0)
     assert identity in str(caught.value)
     opened.close()

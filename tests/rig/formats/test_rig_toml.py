@@ -90,15 +90,15 @@ def test_a_trigger_port_by_index_is_refused(port: str) -> None:
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"format": "eigenhead-rig/9"}, "format is 'eigenhead-rig/9', wanted 'eigenhead-rig/1'"),
+        ({"format": "eigenhead-rig/9"}, "format is 'eigenhead-rig/9', expected 'eigenhead-rig/1'"),
         ({"cameras": []}, "add one [[cameras]] table"),
-        ({"cameras": {}}, "cameras is {}, wanted a list"),
+        ({"cameras": {}}, "cameras is {}, expected a list"),
         ({"cameras": [7]}, "cameras[0] is no object"),
         ({"front": "cam0"}, "did you mean 'cam00'?"),
         ({"lights": {"outputs": [5]}}, "5 is no output"),
-        ({"lights": {"keep_on": 1}}, "lights.keep_on is 1, wanted true or false"),
+        ({"lights": {"keep_on": 1}}, "lights.keep_on is 1, expected true or false"),
         ({"shot": {"warm_up_frames": 0}}, "shot.warm_up_frames: 0 is not between 1 and 1000"),
-        ({"shot": {"timeout_s": "2"}}, "shot.timeout_s is '2', wanted a finite number"),
+        ({"shot": {"timeout_s": "2"}}, "shot.timeout_s is '2', expected a finite number"),
         ({"trigger": {}}, "trigger.port: missing"),
         ({"trigger": {"port": "/dev/serial/by-id/x", "pulse_us": 0}}, "pulse_us: 0"),
         ({"lights": {"settle_s": -1.0}}, "lights.settle_s: -1.0 is not between 0 and 60"),
@@ -116,13 +116,13 @@ def test_wrong_values_are_named(changes: dict[str, Any], expected: str) -> None:
 @pytest.mark.parametrize(
     ("camera", "expected"),
     [
-        ({"driver": "opencvv"}, "driver is 'opencvv', wanted 'opencv' or 'gphoto'"),
-        ({"rotation_deg": 45}, "rotation_deg is 45, wanted 0 or 90 or 180 or 270"),
-        ({"rotation_deg": True}, "rotation_deg is True, wanted 0 or 90"),
+        ({"driver": "opencvv"}, "driver is 'opencvv', expected 'opencv' or 'gphoto'"),
+        ({"rotation_deg": 45}, "rotation_deg is 45, expected 0 or 90 or 180 or 270"),
+        ({"rotation_deg": True}, "rotation_deg is True, expected 0 or 90"),
         ({"channel": 12}, "channel: 12"),
         ({"channel": 1}, "there is no [trigger] table"),
         ({"delay_us": -1}, "delay_us: -1"),
-        ({"width": 1.5}, "width is 1.5, wanted a whole number or null"),
+        ({"width": 1.5}, "width is 1.5, expected a whole number or null"),
         ({"name": "a/b"}, "name: "),
         ({"identity": ""}, "identity: empty"),
     ],
@@ -138,7 +138,7 @@ def test_every_fault_is_listed_and_doubles_are_found() -> None:
     changed = document(cameras=[camera, dict(camera)], trigger={"port": "/dev/serial/by-id/x"})
     message = faults_of(changed)
     for what in ("name 'a'", "identity 'http://h/1'", "channel 2"):
-        assert f"cameras: {what} is used by 2 cameras" in message
+        assert f"have the same {what}" in message
 
 
 def test_files_that_are_no_rig(tmp_path: Path) -> None:

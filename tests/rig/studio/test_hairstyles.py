@@ -152,7 +152,7 @@ def test_a_head_without_landmarks_says_that_it_can_wear_neither_glasses_nor_bear
 
 
 def test_unknown_hair_is_refused_with_the_names_there_are():
-    with pytest.raises(InputError, match=r"mohawk is none of short, .*glasses"):
+    with pytest.raises(InputError, match=r"mohawk is not one of short, .*glasses"):
         restyled(plain_look(), ["long", "mohawk"])
 
 

@@ -343,7 +343,7 @@ def test_faults_are_read_from_texts(renderer, rig):
     assert all(len(text) > 20 and Fault(kind).strength > 0 for kind, text in KINDS.items())
     assert fault_from_text("dark:cam03=0.1") == Fault("dark", "cam03", 0.1)
     assert fault_from_text("frozen") == Fault("frozen")
-    with pytest.raises(InputError, match="is none of"):
+    with pytest.raises(InputError, match="is not one of"):
         fault_from_text("gremlins")
     with pytest.raises(InputError, match="no number"):
         fault_from_text("dark=very")

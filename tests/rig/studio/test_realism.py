@@ -43,7 +43,7 @@ def test_names_add_up_and_unknown_ones_are_refused() -> None:
     assert both == replace(PRESET, oil=1.0, jpeg_quality=92)
     assert realism_names("all") == tuple(REALISM)
     assert realism_names(None) == ()
-    with pytest.raises(InputError, match="shiny is none of smooth, oily"):
+    with pytest.raises(InputError, match="shiny is not one of smooth, oily"):
         made_real(PRESET, realism_names("smooth,shiny"))
 
 

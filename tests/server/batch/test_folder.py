@@ -77,7 +77,7 @@ def test_files_of_nobody_stop_a_replacement(folder: BatchFolder) -> None:
     folder.check_replaceable("anna")
     folder.check_replaceable("nobody")
     (folder.result("anna") / "notes.txt").write_text("mine")
-    with pytest.raises(ForeignFiles, match=r"holds what is no result \(notes.txt\)"):
+    with pytest.raises(ForeignFiles, match=r"contains files that are no results \(notes.txt\)"):
         publish(folder, "anna", b"another")
     assert (folder.result("anna") / "head.ply").read_bytes() == b"mesh"
 

@@ -57,7 +57,7 @@ def test_another_input_or_setting_and_a_lost_file_are_made_again_and_the_rest_is
         ("memory", "out-of-memory", "fewer --workers"),
         ("segfault", "crash", "signal 11"),
         ("killed", "crash", "fewer --workers"),
-        ("changed", "input", "files changed while it was at work"),
+        ("changed", "input", "files changed during its reconstruction"),
     ],
 )
 def test_whatever_happens_to_one_capture_is_its_own_failure(tmp_path: Path, mode: str, kind: str, words: str) -> None:

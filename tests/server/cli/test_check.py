@@ -141,7 +141,7 @@ def test_one_bad_picture_costs_a_view_and_is_named(masked: tuple[Capture, Rig], 
     (sentence,) = [warning["message"] for warning in found["warnings"] if warning["code"] == "picture-lost"]
     assert sentence.startswith(("images/cam03.png ", "masks/cam03.png "))
     assert words in sentence
-    assert sentence.endswith("; mend that, or go on without cam03, which takes no part")
+    assert sentence.endswith("; correct that, or continue without cam03, which is left out")
     assert (found["faults"], len(found["cameras"])) == ([], len(masked[1]) - 1)
     content, kept = kept_of(folder, tmp_path)
     assert [warning["message"] for warning in found["warnings"]] == texts_of(content.warnings)
@@ -162,7 +162,7 @@ def test_a_capture_of_too_few_good_pictures_is_refused(tmp_path: Path) -> None:
         HARMS["is black all over"](folder / "images" / f"{name}.png")
     *faults, rest = found_in(folder)["faults"]
     assert [fault[:34] for fault in faults] == [f"images/{name}.png is black all over" for name in ("cam01", "cam04")]
-    assert rest.startswith("4 of 6 cameras can be used, and 5 are needed: mend that, or take cameras")
+    assert rest.startswith("4 of 6 cameras can be used, and 5 are needed: correct these faults, or remove cameras")
 
 
 @pytest.mark.gl

@@ -103,8 +103,8 @@ def test_the_same_request_with_the_same_key_is_one_batch(http: httpx.Client, cap
     [
         ({}, "invalid-request", ["Name the captures in one way"]),
         ({"session": "0" * 28, "prefix": "x"}, "invalid-request", ["Name the captures in one way"]),
-        ({"prefix": "nobody is called so"}, "invalid-captures", ["no capture of a head is there"]),
-        ({"prefix": "%"}, "invalid-captures", ["no capture of a head is there"]),
+        ({"prefix": "nobody is called so"}, "invalid-captures", ["no capture of a head was selected"]),
+        ({"prefix": "%"}, "invalid-captures", ["no capture of a head was selected"]),
         ({"prefix": ""}, "invalid-request", ["at least 1 character"]),
         ({"captures": []}, "invalid-request", ["at least 1 item"]),
         ({"captures": ["0" * 28, "0" * 28]}, "invalid-captures", ["named 2 times", "there is no capture 000"]),
@@ -297,7 +297,7 @@ def test_a_queue_that_nobody_serves_is_said(http: httpx.Client, captures: list[s
     assert "No worker serves the queue 'gpu'" in batch["notice"]
     batch_once(http, batch["id"], lambda b: b["counts"]["queued"] == 2)
     check = http.get("/readyz").json()["checks"]["queues"]
-    assert (check["ok"], check["detail"]) == (True, "2 jobs wait where no worker is: gpu")
+    assert (check["ok"], check["detail"]) == (True, "2 jobs wait in queues without a worker: gpu")
     http.post(f"/v1/batches/{batch['id']}/cancel")
     batch_once(http, batch["id"], finished)
     assert http.get("/readyz").json()["checks"]["queues"]["detail"] == "workers serve all in which jobs wait"

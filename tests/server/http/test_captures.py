@@ -66,7 +66,7 @@ def test_photographs_too_few_to_do_without_cameras_say_what_is_missing(http: htt
         (folder / name).unlink()
     shutil.rmtree(folder / "background")
     errors = upload(http, packed(folder)).json()["errors"]
-    assert "holds no cameras.json" in errors[0]
+    assert "contains no cameras.json" in errors[0]
     assert errors[1].startswith("1 photograph; at least 3")
 
 

@@ -51,7 +51,7 @@ def test_photographs_of_a_scene_become_a_calibration(
     found = await_calibration(http, made.json()["id"])
     assert found["state"] == "succeeded", found["error"]
     assert (found["verdict"], found["warnings"]) == ("usable", [])
-    assert all(missing.endswith("at the subject: add views beside it") for missing in found["missing"])
+    assert all(missing.endswith("at the subject: add views near it") for missing in found["missing"])
     assert found["figures"]["rms_px"] < 0.3
     rig = rig_from_document(http.get(f"/v1/calibrations/{found['id']}/cameras.json").json())
     assert image_distance(rig, wedge_rig(), scale=True).max() < 0.1

@@ -36,7 +36,7 @@ def test_requests_that_make_no_sense_are_4xx_problems(http: httpx.Client, archiv
         assert response.headers["content-type"] == "application/problem+json"
         assert response.json()["type"].startswith("urn:eigenhead:problem:")
         assert response.json()["detail"]
-    assert "takes GET, POST, and not PUT" in http.put("/v1/jobs").json()["detail"]
+    assert "accepts GET, POST, but not PUT" in http.put("/v1/jobs").json()["detail"]
     misplaced = http.post("/v1/captures", files={"file": b"x"})
     assert (misplaced.status_code, "POST /v1/captures/uploads" in misplaced.json()["detail"]) == (415, True)
     form = http.post("/v1/captures", data={"label": "x"})
@@ -135,7 +135,7 @@ def test_a_worker_that_loads_is_no_fault(tmp_path: Path) -> None:
     jobs = SimpleNamespace(worker_may_start=lambda: True)
     service = SimpleNamespace(engine=engine, settings=ServiceSettings(data=tmp_path), jobs=jobs)
     early = health._workers(service)  # type: ignore[arg-type]
-    assert (early.ok, early.starting, "being started" in early.detail.text) == (False, True, True)
+    assert (early.ok, early.starting, "is starting" in early.detail.text) == (False, True, True)
     jobs.worker_may_start = lambda: False
     late = health._workers(service)  # type: ignore[arg-type]
     assert (late.ok, late.starting) == (False, False)

@@ -36,7 +36,7 @@ def test_a_clock_that_jumps_stops_retention_until_somebody_looked(tmp_path: Path
         set_back(service, old, days=31)
         await_gone(client, f"/v1/captures/{old}")
         note_sweep(last, days=60)
-        await_readiness(client, "retention", "has gone 60 days")
+        await_readiness(client, "retention", "has advanced 60 days")
         set_back(service, new, days=31)
         time.sleep(1.0)
         assert client.get(f"/v1/captures/{new}").status_code == 200

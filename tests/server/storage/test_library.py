@@ -109,7 +109,7 @@ def test_words_are_found_in_the_capture_and_in_its_session(store: Store, library
 def test_a_cursor_of_nothing_is_refused_by_name(library: Library, cursor: str) -> None:
     with pytest.raises(InputError) as error:
         library.captures(CaptureQuery(), 3, cursor)
-    assert "is not what 'next' of this list" in str(error.value)
+    assert "is no value of 'next' for this list" in str(error.value)
 
 
 def test_a_cursor_of_another_order_is_refused(store: Store, library: Library) -> None:

@@ -7,16 +7,16 @@ leave the surface free to slide between them, so a model is built of what the re
 under a prior of heads, given the scan's landmarks and surface, and from there a smooth displacement along the normals
 onto the scan.
 
-The prior allows more heads than a model's own span. A PCA of 138 heads has 137 directions, and a new head needs others:
-alone, on heads outside its span, it pulls vertices to wrong positions. Two facts are known besides the sample. A head
-and its mirror image are equally likely, so the covariance is averaged with its mirror image. And distant parts of a
-head are nearly independent, so the covariance is multiplied by a Gaussian of the distance between vertices, which keeps
-the correlation of neighbours and frees the rest (localised Gaussian process morphable models, Luethi et al. 2018,
-*Gaussian Process Morphable Models*, section 3.3). The prior is a mixture of the plain and the localised covariance.
+The prior allows more heads than the span of a model. A PCA of 138 heads has 137 directions, and a new head needs
+others: on heads outside its span, the PCA alone pulls vertices to wrong positions. Two facts extend the sample. A head
+and its mirror image are equally likely, so the covariance is averaged with its mirror image. Distant parts of a head
+are nearly independent, so the covariance is also multiplied by a Gaussian of the distance between vertices. This
+retains the correlation of neighbours only (localised Gaussian process morphable models, Luethi et al. 2018, *Gaussian
+Process Morphable Models*, section 3.3). The prior is a mixture of the plain and the localised covariance.
 
-Rays are cast from the vertical axis through the head outwards. A ray is (angle, height): angle 0 looks along +z (out of
-the face), pi/2 along +x (the subject's left); height is y. Scans are worked on in several processes, for SuperLU and
-numpy hold the interpreter."""
+Rays are cast from the vertical axis through the head outwards. A ray is (angle, height): angle 0 points along +z (out
+of the face), pi/2 along +x (the subject's left); height is y. Scans are processed in several processes, because SuperLU
+and numpy hold the interpreter lock."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -164,8 +164,8 @@ def registration_prior(
 def mirror_images(mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " V"] | None:
     """Returns for each vertex its counterpart across the median plane x = 0; None if the mesh is not symmetric.
 
-    It is the cheapest one-to-one assignment. A mean head is not quite symmetric, so the nearest mirrored vertex would
-    be used twice for some."""
+    It is the cheapest one-to-one assignment. A mean head is not exactly symmetric, so taking the nearest mirrored
+    vertex would use some vertices twice."""
     opposite = linear_sum_assignment(cdist(mean, mean * _MIRROR, "sqeuclidean"))[1]
     edges = edges_of(faces)[0].astype(np.int64)
     across = np.sort(opposite[edges], 1)
@@ -259,7 +259,7 @@ def warp_and_resample(
     cylinder: CylinderIndex,
 ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
     """Warps the reference to the target's landmarks and resamples it on the target's surface (steps 3 and 4 of section
-    3.2). Returns the warped reference, its resampling, and where the target has no surface; such vertices keep the
+    3.2). Returns the warped reference, its resampling, and where the target has no surface; such vertices stay at the
     warped position."""
     warped = landmark_warp(shape[index], marks, shape, smoothing=MARK_SMOOTHING_MM)
     angles, heights, radii = coordinates(warped)
@@ -288,8 +288,9 @@ def statistical(
     """Returns the most probable head under the prior, given the scan's landmarks and surface: first with broad modes,
     then with all.
 
-    Smoothness cannot determine where on a plain cheek a vertex belongs; statistics of other heads can. Residuals are
-    point-to-plane and count per cm2 of surface, landmarks along all three axes; six columns are the pose."""
+    On a plain cheek smoothness cannot determine where a vertex belongs; statistics of other heads can. Residuals are
+    point-to-plane and are weighted per cm2 of surface; landmarks count along all three axes; six columns are the
+    pose."""
     mean, areas = prior.mean, vertex_areas(prior.mean, faces)
     shape = landmark_warp(mean[index], target.marks, mean, smoothing=20.0)
     points = np.concatenate([mean, np.repeat(mean[index], 3, axis=0)])  # a landmark is three planes

@@ -1,5 +1,5 @@
-"""Holds the compiled loops that cast rays from the axis of a cylinder. The axis of the cylinder is y; an angle is
-counted about it from z towards x."""
+"""Holds the compiled loops that cast rays from the axis of a cylinder. The axis of the cylinder is y; angles about it
+are counted from z towards x."""
 
 import numpy as np
 

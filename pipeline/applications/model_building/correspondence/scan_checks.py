@@ -1,7 +1,7 @@
 """Checks raw scans before they are averaged: units, sides, orientation of faces, landmarks off the surface, holes.
 
-A problem with one obvious remedy is repaired and reported (units, a mirrored file, exchanged names, inverted faces).
-Everything else is a fault, and all faults of a scan are named. Landmarks are compared with the default model's mean."""
+A problem with one obvious remedy (units, a mirrored file, exchanged names, inverted faces) is repaired and reported.
+All else is a fault, and all faults of a scan are named. Landmarks are compared with the default model's mean."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ _OUTWARD_SHARE = 0.7  # of the area: folds of ear and nostril look inwards even 
 
 
 class BadScan(InputError):
-    """Reports a scan that must not be used. ``faults`` lists everything that is wrong with it."""
+    """Reports a scan with faults. ``faults`` lists all of them."""
 
     def __init__(self, name: str, faults: Iterable[str]) -> None:
         super().__init__(f"scan {name}", faults)
@@ -71,8 +71,8 @@ def _check_complete(scan: Scan) -> None:
 
 
 def _in_millimetres(scan: Scan, template: HeadModel) -> tuple[Scan, list[str]]:
-    """Converts a scan to millimetres. The size by landmarks decides its unit: heads differ by a third, units by a
-    factor of 10."""
+    """Converts a scan to millimetres. The distances between landmarks decide its unit: heads differ by a third, units
+    by a factor of 10."""
     ratio = _radius_of_gyration(stacked(scan.landmarks)) / _radius_of_gyration(_mean_marks(template))
     for unit, factor in UNITS.items():
         if SIZE_RANGE[0] < ratio * factor < SIZE_RANGE[1]:
@@ -130,8 +130,8 @@ def _surface_faults(scan: Scan) -> list[str]:
 
 
 def _hole_faults(scan: Scan, template: HeadModel) -> list[str]:
-    """Returns faults of holes that are too wide, seen from the axis, below the crown. The diameter is that of a disc of
-    the same area."""
+    """Returns a fault for each hole below the crown that is too wide, seen from the axis. The diameter is that of a
+    disc of the same area."""
     void, face = voids(scan, template)
     faults = []
     for where, mask, limit in (("face", void & face, FACE_HOLE_MM), ("head", void, HEAD_HOLE_MM)):
@@ -142,8 +142,8 @@ def _hole_faults(scan: Scan, template: HeadModel) -> list[str]:
 
 
 def voids(scan: Scan, template: HeadModel) -> tuple[Bool[np.ndarray, "H A"], Bool[np.ndarray, "H A"]]:
-    """Returns the cells (4 mm wide, by height and angle, from chin to above the brow) in which the scan has no surface,
-    and which of all cells belong to the face."""
+    """Returns the cells (4 mm wide, by height and angle, from chin to above the brow) without a surface of the scan,
+    and the cells that belong to the face."""
     marks, placed = stacked(scan.landmarks), _placed(scan, template)
     at = dict(zip(NAMES, rigid_fit(marks, _mean_marks(template)).apply(marks), strict=True))
     heights = np.arange(at["gnathion"][1] + 4, at["glabella"][1] + 35, _CELL_MM)
@@ -155,7 +155,7 @@ def voids(scan: Scan, template: HeadModel) -> tuple[Bool[np.ndarray, "H A"], Boo
 
 
 def outward_share(scan: Scan, template: HeadModel) -> float:
-    """Returns the share of the scan's area whose faces point away from the head's axis."""
+    """Returns the fraction of the scan's area whose faces point away from the head's axis."""
     corners = _placed(scan, template)[scan.faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     outward = (doubled * (corners.mean(1) * [1, 0, 1])).sum(1) > 0

@@ -1,7 +1,7 @@
-"""Reads raw scans and their landmarks: a mesh file (PLY, OBJ, GLB) with a landmark file of the same name beside it.
+"""Reads raw scans and their landmarks: a mesh file (PLY, OBJ, GLB) and, in its folder, a landmark file of its name.
 
-Landmark files are ``.json`` (``{"points": {"pronasale": [x, y, z]}}``, or the names at the top), MeshLab's picked
-points ``.pp``, landmarker.io's ``.ljson`` (versions 1 to 3; a label that covers one point names it), and 3D Slicer's
+Landmark files are ``.json`` (``{"points": {"pronasale": [x, y, z]}}``, or the names at the top level), MeshLab's picked
+points ``.pp``, landmarker.io's ``.ljson`` (versions 1 to 3; a label for a single point is its name), and 3D Slicer's
 ``.mrk.json``. Names are the 26 of landmarks.py; case, blanks and hyphens do not matter."""
 
 import json
@@ -26,8 +26,8 @@ LANDMARK_SUFFIXES = (".json", ".mrk.json", ".pp", ".ljson")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """Holds one head as a scanner delivers it: any number of vertices, holes, in a frame of its own. Landmarks are in
-    the same frame."""
+    """Holds one head as a scanner delivers it: any number of vertices, possibly with holes, in a frame of its own.
+    Landmarks are in the same frame."""
 
     name: str
     vertices: Float[np.ndarray, "V 3"]
@@ -68,8 +68,8 @@ def welded(mesh: Mesh) -> tuple[Mesh, Bool[np.ndarray, " F"]]:
     """Returns the mesh with every position stored once, without unused vertices, colours and degenerate triangles; and
     which triangles it kept.
 
-    Files repeat vertices along texture seams, or for each triangle; a surface torn there has no neighbours over which
-    noise could be smoothed."""
+    Files repeat vertices along texture seams, or for each triangle. Such a torn surface lacks the neighbours needed to
+    smooth noise."""
     _, first, index = np.unique(mesh.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
     corners = index.ravel()[mesh.faces]
     proper = (corners != np.roll(corners, 1, axis=1)).all(axis=1)

@@ -1,1 +1,1 @@
-"""Reads models of other sources: MakeHuman's population, other programs' files, downloads."""
+"""Reads models from other sources: MakeHuman's population, other programs' files, downloads."""

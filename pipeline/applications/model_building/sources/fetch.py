@@ -1,7 +1,7 @@
-"""Downloads published models: ICT-FaceKit Light at one pinned commit, imported into the user's folder.
+"""Downloads published models: ICT-FaceKit Light at one fixed (pinned) commit, imported into the user's folder.
 
-The pin is a git commit, a hash over every byte of the tree. Whatever the server or folder answered, the checked-out
-commit must be that one; otherwise it is refused before any of its files is read."""
+The pin is a git commit, a hash over every byte of the tree. The checked-out commit must be the pinned one, whatever the
+server or folder returns; otherwise it is refused before any of its files is read."""
 
 import os
 import re
@@ -21,7 +21,7 @@ from rig.progress import Progress, discard_progress
 
 @dataclass(frozen=True, slots=True)
 class Remote:
-    """Describes where a published model lives, and the commit with which this project was tested."""
+    """Describes the repository of a published model, and the commit with which this project was tested."""
 
     url: str
     commit: str  # 40 hex digits

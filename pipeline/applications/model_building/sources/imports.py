@@ -1,10 +1,10 @@
 """Imports models of other formats: ICT-FaceKit, statismo and Basel HDF5 files, plain npz.
 
 Every reader returns a ``Foreign`` model in millimetres and head axes; ``adopt`` converts it to a model of this project.
-Its vertices are kept. Modes that are not orthogonal become the principal axes of the same Gaussian
-(pca.orthogonalised), so that the probability of every head stays. Landmarks that the source does not name are taken
-from the default model, fitted to the mean and then warped. The face region follows from the landmarks. Openings of eyes
-and mouth are closed with triangles between existing vertices, so that the head hides what is behind it."""
+The model's own vertices stay. Modes that are not orthogonal become the principal axes of the same Gaussian
+(pca.orthogonalised), so the probability of every head stays the same. Landmarks missing in the source come from the
+default model, which is fitted to the mean and then warped. The face region follows from the landmarks. Triangles
+between existing vertices close the openings of eyes and mouth, so that the head hides what is behind it."""
 
 import json
 import re
@@ -48,8 +48,8 @@ class CannotImport(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Foreign:
-    """Holds a model as its file describes it, in mm and the axes of the head frame (x to the subject's left, y up, z
-    out of the face)."""
+    """Holds a model in the form of its file, in mm and the axes of the head frame (x to the subject's left, y up, z out
+    of the face)."""
 
     name: str
     licence: str
@@ -109,7 +109,7 @@ _BASEL_NAMES = {
 def import_model(path: Path, *, name: str | None = None, report: Progress = discard_progress) -> ModelParts:
     """Reads a model of another format and converts it; a model file of this project is only renamed.
 
-    A folder with exactly one model file stands for that file. Raises CannotImport."""
+    A folder with exactly one model file is read as that file. Raises CannotImport."""
     files = [f for f in path.iterdir() if f.suffix.lower() in (".npz", ".h5", ".hdf5")] if path.is_dir() else []
     files = [f for f in files if not f.name.endswith(ICT_EXPRESSIONS)]  # read with the identities beside it
     path = files[0] if len(files) == 1 else path
@@ -141,7 +141,7 @@ def read_ict_compact(path: Path) -> Foreign:
 
 
 def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
-    """Returns the expressions from the file beside that of identities: names, and shapes in mm on the same vertices."""
+    """Returns the expressions from the file beside the identities': names, and shapes in mm on the same vertices."""
     beside = path.with_name(path.stem.removesuffix("_light") + ICT_EXPRESSIONS)
     if not beside.is_file():
         return None
@@ -324,8 +324,8 @@ OPENING_MM = 90.0  # of eyes and mouth; the neck is wider
 def largest_miss(
     original: Float[np.ndarray, "M V 3"], modes: Float[np.ndarray, "K V 3"], sigma: Float[np.ndarray, " K"]
 ) -> float:
-    """Returns the largest distance (mm) between vertices of random heads of the original and their best fits by the
-    converted model."""
+    """Returns the largest distance (mm) between vertices of random heads of the original model and their best fits by
+    the converted model."""
     theirs, ours = (m.reshape(len(m), -1).astype(float) for m in (original, rounded(modes)))
     heads = np.random.default_rng(11).standard_normal((MISSED_DRAWS, len(theirs))) @ theirs
     missed = heads - (heads @ ours.T / sigma**2) @ ours
@@ -382,8 +382,8 @@ def _symmetric(at: Float[np.ndarray, "26 3"], mean: Vertices, surface: SurfaceIn
 
 
 def _start(default: HeadModel, mean: Vertices, known: Mapping[str, int]) -> RigidTransform:
-    """Returns the start of the fit of the default model to a mean head: by shared landmarks, otherwise by the tip of
-    the nose."""
+    """Returns the starting pose for fitting the default model to a mean head: from shared landmarks, otherwise from the
+    tip of the nose."""
     ours = default.vertices(np.zeros(0))
     if len(known) >= 3:
         source = ours[[default.landmarks[name] for name in known]]
@@ -393,7 +393,7 @@ def _start(default: HeadModel, mean: Vertices, known: Mapping[str, int]) -> Rigi
 
 
 def _likeness(default: HeadModel, mean: Vertices, faces: Int[np.ndarray, "F 3"], start: RigidTransform) -> Vertices:
-    """Returns the default model's head that fits the mean head best, its neck left out."""
+    """Returns the default model's head that best fits the mean head without its neck."""
     areas = vertex_areas(mean, faces)
     placed = start.apply(default.vertices(np.zeros(0)))
     chin = placed[default.landmarks["gnathion"]]

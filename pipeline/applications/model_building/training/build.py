@@ -26,7 +26,7 @@ _SHARPENINGS = 4  # steps of the iteration in ``cages_through``
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Built:
-    """Holds a model built from scans, and the names of the scans that were used, repaired or skipped."""
+    """Holds a model built from scans, and the names of the used, repaired and skipped scans."""
 
     parts: ModelParts
     used: tuple[str, ...]
@@ -88,9 +88,9 @@ def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
 def cages_through(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> Float[np.ndarray, "N V0 3"]:
     """Computes cages (mm) whose subdivided surface passes through the points at the cage's vertices.
 
-    The subdivided surface lies inside of the cage. So the cage C must solve S C = P, where S are the rows of the
+    The subdivided surface lies inside the cage. So the cage C must solve S C = P, where S are the rows of the
     subdivision matrix for the cage vertices. S nearly removes detail as fine as the cage itself, so its inverse would
-    amplify noise. A few steps C += P - S C, started with the template's own detail, stop before that."""
+    amplify noise. A few steps C += P - S C, starting from the template's own detail, end before that happens."""
     rows = template.levels["full"].operator[: len(template.mean)]
     mean = template.mean.astype(float)
     away = points - rows @ mean

@@ -1,7 +1,7 @@
 """Draws a model: its first modes (figure 2), correspondence step by step (figure 3), and curves of its quality.
 
-Everything is shaded and drawn in software, so that machines without graphics card and plotting library show the
-same."""
+All shading and drawing is in software, so that machines without graphics card and plotting library give the same
+pictures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,8 +1,7 @@
-"""Turns corresponded heads into the content of a model file: alignment, principal components, levels, face region; and
-measures its compactness, generalisation and specificity (R. Davies, *Learning Shape: Optimal Models for Analysing
-Natural Variability*, 2002, chapter 5). No single one suffices: a model of one head is compact and specific, a model
-that allows any shape generalises.
-"""
+"""Turns corresponded heads into the content of a model file: alignment, principal components, levels, face region. Also
+measures compactness, generalisation and specificity (R. Davies, *Learning Shape: Optimal Models for Analysing Natural
+Variability*, 2002, chapter 5). None of the three is enough: a model of one head is compact and specific, a model that
+allows any shape generalises."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -23,8 +22,7 @@ USED_MODES = 60  # section 4.4
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Training:
-    """Holds corresponded heads (mm, in any common pose, y up, z to the front), and what a model contains besides
-    shape."""
+    """Holds corresponded heads (mm, in any common pose, y up, z to the front), and the other content of a model."""
 
     name: str
     licence: str
@@ -124,7 +122,7 @@ def in_head_frame(heads: Float[np.ndarray, "N V 3"], landmarks: Mapping[str, int
 
 
 def centred(heads: Float[np.ndarray, "N V 3"], landmarks: Mapping[str, int]) -> Float[np.ndarray, "N V 3"]:
-    """Returns all heads shifted alike, so that the origin is in the middle between the mean head's tragia."""
+    """Returns all heads shifted by one vector, so that the origin is midway between the mean head's tragia."""
     return heads - heads.mean(0)[[landmarks["tragion_right"], landmarks["tragion_left"]]].mean(0)
 
 
@@ -150,7 +148,7 @@ def face_region(mean: Float[np.ndarray, "V 3"], landmarks: Mapping[str, int]) ->
 
 
 def compactness(sigma: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
-    """Returns for each m the share of the total variance that the first m modes have."""
+    """Returns, for each m, the fraction of the total variance in the first m modes."""
     return np.cumsum(sigma.astype(float) ** 2) / np.sum(sigma.astype(float) ** 2)
 
 
@@ -161,8 +159,8 @@ def generalisation(
     *,
     report: Progress = discard_progress,
 ) -> dict[int, float]:
-    """Computes the mean vertex distance (mm, over ``region``) of each head to the nearest head in the PCA of all
-    others, by number of modes.
+    """Computes, by number of modes, the mean vertex distance (mm, over ``region``) between each head and its best fit
+    in the PCA of all others.
 
     The heads are rotated into the components' own axes, which is exact for training heads. So each PCA is one of N - 1
     points in N - 1 dimensions instead of 3 V."""

@@ -1,11 +1,11 @@
-"""Writes ``head-NAME.obj`` of a result: the head in a template's vertex order, polygons, groups and texture
-coordinates; and ``head_hair-NAME.obj``, the head pushed out to its hair.
+"""Writes ``head-NAME.obj`` of a result: the head in a template's vertex order, with its polygons, groups and texture
+coordinates. Also writes ``head_hair-NAME.obj``, the head pushed out to its hair.
 
-World frame, mm, as head.ply and head.obj. If both the result has a texture and the template texture coordinates, the
-skin is textured (head-NAME.mtl, head-NAME.jpg, and one more file for each further tile); else the vertices are
-coloured. Every texel of the template's layout lies in one of its triangles, whose corners have positions in the model's
-layout; the texture is read there. Triangles across the cut of the model's layout are filled from the texels beside
-them. Coordinates beyond the unit square are separate tiles (UDIM).
+World frame, mm, like head.ply and head.obj. If the result has a texture and the template has texture coordinates, the
+skin is textured (head-NAME.mtl, head-NAME.jpg, and one more file for each further tile); otherwise the vertices are
+coloured. A texel of the template's layout lies in a triangle whose corners have positions in the model's layout; the
+texture is read there. Triangles across the cut of the model's layout are filled from neighbouring texels. Coordinates
+beyond the unit square are separate tiles (UDIM).
 """
 
 from pathlib import Path
@@ -36,8 +36,8 @@ SKIN_SHARE = 0.1  # of a material's polygons on the skin, beyond which it shows 
 
 
 def corner_tiles(mesh: PolygonMesh) -> Int[np.ndarray, "p 2"]:
-    """Returns the UDIM tile (column, row) of each polygon: the one that the middle of its texture coordinates lies in.
-    (-1, -1) for a polygon without texture coordinates."""
+    """Returns the UDIM tile (column, row) of each polygon: the tile that contains the middle of its texture
+    coordinates. (-1, -1) for a polygon without texture coordinates."""
     if not len(mesh.uv):
         return np.full((len(mesh.sizes), 2), -1)
     first = np.cumsum(mesh.sizes) - mesh.sizes
@@ -57,8 +57,8 @@ def skin_polygons(mesh: PolygonMesh, surface_binding: SurfaceBinding) -> Bool[np
 def template_textures(
     atlas: Atlas, mesh: PolygonMesh, surface_binding: SurfaceBinding
 ) -> dict[Tile, UInt8[np.ndarray, "s s 3"]]:
-    """Returns the texture images (sRGB) of a template, by UDIM tile, for the tiles that its skin lies in; empty if the
-    template has no texture coordinates."""
+    """Returns the texture images (sRGB) of a template, by UDIM tile, for all tiles with skin; empty if the template has
+    no texture coordinates."""
     tiles, on_skin = corner_tiles(mesh), skin_polygons(mesh, surface_binding)
     found = np.unique(tiles[on_skin & (tiles[:, 0] >= 0)], axis=0)
     if not 0 < len(found) <= MAX_TILES:
@@ -77,7 +77,7 @@ def template_textures(
 
 
 def _places(layout: Layout, surface_binding: SurfaceBinding) -> Float[np.ndarray, "t 2"]:
-    """Returns the position of each skin vertex in the model's layout; the other vertices lie at its corner."""
+    """Returns the position of each skin vertex in the model's layout; all other vertices get the layout's corner."""
     attached = surface_binding.attachment
     out = np.zeros((len(surface_binding.rest), 2))
     out[surface_binding.skin] = np.einsum("nk,nkx->nx", attached.weights, layout.uv[layout.faces[attached.triangles]])
@@ -119,8 +119,8 @@ def read_in_tile(
 
 
 def filled(image: UInt8[np.ndarray, "s s 3"], known: Bool[np.ndarray, "s s"]) -> UInt8[np.ndarray, "s s 3"]:
-    """Returns the image with the nearest known texel where none is, a margin for blurred reading and the cut; farther
-    off, shoulders say, the mean colour. The fill is coarse; known texels stay."""
+    """Returns the image with unknown texels filled: near known ones (a margin for blurred reading, and the cut) with
+    the nearest known texel, elsewhere with the mean colour. The fill is coarse; known texels do not change."""
     step = max(1, len(image) // COARSE)
     if not known[::step, ::step].any():
         return image
@@ -171,7 +171,7 @@ def write_template(folder: Path, result: Reconstruction, template: Template) -> 
 
 
 def write_template_hair(folder: Path, result: Reconstruction, template: Template) -> None:
-    """Writes the template on the head with its hair, if the result has hair: its vertices keep their places on the
+    """Writes the template on the head with its hair, if the result has hair; its vertices retain their positions in the
     model's triangles. Raises OSError."""
     hair, faces = result.hair, result.mesh_world.faces
     if hair is None:
@@ -204,7 +204,7 @@ def template_colours(result: Reconstruction, template: Template) -> UInt8[np.nda
 def _carry_colours(
     colours: UInt8[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], template: Template
 ) -> UInt8[np.ndarray, "t 3"]:
-    """Returns the colours of the template's vertices from those of the model's: grey where it has no skin."""
+    """Converts the model's vertex colours to the template's; grey outside its skin."""
     attached = template.surface_binding.attachment
     corners = colours[faces[attached.triangles]].astype(float)
     out = np.full((len(template.surface_binding.rest), 3), NO_SKIN, np.uint8)
@@ -213,8 +213,8 @@ def _carry_colours(
 
 
 def template_materials(template: Template, files: dict[Tile, str]) -> tuple[PolygonMesh, bytes]:
-    """Returns the mesh with a material for each part that has one in its file, or else one for all of it, and the
-    material library. Materials of the skin show the image of the tile that most of their skin lies in."""
+    """Returns the mesh with a material for each part that has one in its file, otherwise one for the whole mesh; also
+    the material library. A skin material shows the image of the tile with most of its skin."""
     mesh = template.mesh
     tiles, skin = corner_tiles(mesh), skin_polygons(mesh, template.surface_binding)
     used = [(before, line.partition(" ")[2]) for before, line in mesh.statements if line.startswith("usemtl ")]

@@ -1,12 +1,12 @@
-"""Writes what applications add to a job's result: ``head-NAME.glb`` and ``head-NAME-shapes.npz``, the template's mesh
-without expression, with shapes; and ``posed.glb``, the same of the model's own mesh, with its texture.
+"""Writes the files that applications add to a job's result. ``head-NAME.glb`` and ``head-NAME-shapes.npz`` are the
+template's mesh without expression, with shapes. ``posed.glb`` is the same for the model's own mesh, with its texture.
 
-Head frame; the GLBs in metres, the archive in mm. Vertices keep their order; in a GLB, eyeballs are parts of
-their own (``extras.rows`` of a node says which vertices it has). Eyeballs, teeth and a tongue that the mesh lacks are
-added, and have none. With the formats OBJ and USDZ, ``head-NAME-parts.obj`` and ``head-NAME-parts.usdz`` are the same
-without shapes: parts by name.
+All are in the head frame: the GLBs in metres, the archive in mm. Vertices keep their order. In a GLB, eyeballs are
+separate parts; ``extras.rows`` of a node lists its vertices. Eyeballs, teeth and a tongue that were added have no
+``rows``. For the formats OBJ and USDZ, ``head-NAME-parts.obj`` and ``head-NAME-parts.usdz`` are the same without
+shapes, with named parts.
 
-An eyeball's picture is an image about the iris, equidistant in angle. The part between the lids has the head's texture;
+The image of an eyeball is centred at the iris, equidistant in angle. The part between the lids has the head's texture;
 hidden parts have the median colour of their ring of the iris, or of the white.
 """
 
@@ -63,7 +63,7 @@ LID_MM = 30.0  # from an eyeball's middle: no other opening is so near
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotographedEyes:
-    """Holds the head as photographed (head frame, mm), the numbers of its triangles between lids and lips, and its
+    """Holds the head as photographed (head frame, mm), the indices of its triangles between lids and lips, and its
     texture, if it has one."""
 
     head: Mesh
@@ -72,7 +72,7 @@ class PhotographedEyes:
 
 
 def eyeball_uv(eyeball: Eyeball, mesh: Mesh) -> Float[np.ndarray, "n 2"]:
-    """Returns the coordinates of an eyeball's vertices, which looks ahead, in its image."""
+    """Returns the image coordinates of the vertices of an eyeball that looks straight ahead."""
     away = mesh.vertices - eyeball.centre
     angle = np.arctan2(np.hypot(away[:, 0], away[:, 1]), away[:, 2])
     aside = np.hypot(away[:, 0], away[:, 1])
@@ -81,7 +81,7 @@ def eyeball_uv(eyeball: Eyeball, mesh: Mesh) -> Float[np.ndarray, "n 2"]:
 
 
 def paint_eyeball(eyeball: Eyeball, photographed: PhotographedEyes) -> UInt8[np.ndarray, "s s 3"] | None:
-    """Returns the image of an eyeball (sRGB), or None if too little of its iris is seen."""
+    """Returns the image of an eyeball (sRGB), or None if too little of its iris is visible."""
     angle, front, directions = _front(eyeball.gaze)
     colours, seen = _photographed(eyeball, directions, photographed)
     iris = angle[front] < np.arcsin(LIMBUS_MM / eyeball.radius_mm)
@@ -103,7 +103,7 @@ def paint_eyeball(eyeball: Eyeball, photographed: PhotographedEyes) -> UInt8[np.
 
 
 def darkest_direction(eyeball: Eyeball, photographed: PhotographedEyes) -> Float[np.ndarray, " 3"] | None:
-    """Returns the direction (unit vector) from the eyeball to the middle of what is darkest between the lids; None if
+    """Returns the direction (unit vector) from the eyeball to the middle of the darkest area between the lids; None if
     nothing is much darker than the rest, as between closed lids."""
     _, _, directions = _front(eyeball.gaze)
     colours, seen = _photographed(eyeball, directions, photographed)
@@ -156,11 +156,11 @@ def load_template_writers(name: str | None, model: HeadModel) -> tuple[ResultWri
 
 
 def template_writers(template: Template) -> tuple[ResultWriter, ...]:
-    """Returns what ``write_result`` calls to write a result in the order of this template too:
+    """Returns the writers with which ``write_result`` also writes a result in this template's order:
 
     - head-NAME.obj with its textures, head_hair-NAME.obj if the head was pushed out to its hair,
-    - with morphs head-NAME.glb and head-NAME-shapes.npz,
-    - flame_param.npz if the template was made of a FLAME model, and ``template`` of report.json.
+    - with morphs: head-NAME.glb and head-NAME-shapes.npz,
+    - flame_param.npz if the template was made from a FLAME model, and ``template`` in report.json.
     """
     writers = (write_flame, write_template, write_template_shapes, write_template_hair)
     return tuple(partial(write, template=template) for write in writers)
@@ -170,8 +170,8 @@ DEEP = 0.1  # how much a vertex off the skin counts
 
 
 def write_flame(folder: Path, result: Reconstruction, template: Template) -> AddedReport:
-    """Fits the template's FLAME model, if it has one, to the head and writes its parameters. Returns what the report
-    says of the template, with the figures of the fit. Raises OSError."""
+    """Fits the template's FLAME model, if it has one, to the head and writes its parameters. Returns the report's entry
+    for the template, with the figures of the fit. Raises OSError."""
     report: TemplateReport = {
         "name": template.name,
         "source": template.source,
@@ -192,8 +192,8 @@ def write_flame(folder: Path, result: Reconstruction, template: Template) -> Add
 
 
 def _flame_figures(fit: FlameFit, skin: np.ndarray) -> dict[str, float]:
-    """Returns how far the skin of the fitted model lies from the head without ``static_offset``, mm, and how unlike the
-    mean its parameters are (RMS, in standard deviations)."""
+    """Returns the distance (mm) of the fitted model's skin from the head without ``static_offset``, and the distance of
+    its parameters from the mean (RMS, in standard deviations)."""
     off_mm = 1000.0 * fit.distances[skin]
     return {
         "residual_median_mm": float(np.median(off_mm)),
@@ -204,7 +204,7 @@ def _flame_figures(fit: FlameFit, skin: np.ndarray) -> dict[str, float]:
 
 
 def write_template_shapes(folder: Path, result: Reconstruction, template: Template) -> None:
-    """Writes the template's mesh with morph targets and pivots, and the same as arrays, if the settings ask for morphs
+    """Writes the template's mesh with morph targets and pivots, and the same as arrays, if the settings request morphs
     and the model has shapes. Raises OSError."""
     blendshape_rig = result.evidence.blendshape_rig
     if blendshape_rig is None or not result.settings.outputs.morphs:
@@ -232,7 +232,7 @@ def write_template_shapes(folder: Path, result: Reconstruction, template: Templa
 
 
 def write_posed(folder: Path, result: Reconstruction) -> None:
-    """Writes posed.glb if the settings ask for morphs and the model has shapes: the head without expression, with its
+    """Writes posed.glb if the settings request morphs and the model has shapes: the head without expression, with its
     texture, shapes, pivots, eyeballs, teeth and tongue, at the weights of the photographed head. Raises OSError."""
     blendshape_rig = result.evidence.blendshape_rig
     if blendshape_rig is None or not result.settings.outputs.morphs:
@@ -261,7 +261,7 @@ def write_posed(folder: Path, result: Reconstruction) -> None:
 
 
 def _is_bridged(pivot: str, result: Reconstruction) -> bool:
-    """Tells whether an eye is closed without a blink of the model."""
+    """Tells whether an eye was closed by bridging, without a blink expression of the model."""
     side, found = pivot.removeprefix("eye_"), result.evidence.blendshape_rig
     eye, blink = result.faces.eyes.get(side), f"eyeBlink{side.title()}"
     return isinstance(eye, UnseenEye) and eye.cause == "closed" and not (found and found.weights.get(blink))
@@ -273,8 +273,8 @@ def _towards_irises(
     from_world: RigidTransform,
     photographed: PhotographedEyes,
 ) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns the directions from added eyeballs to the irises, so that these lie where they were photographed although
-    the ball lies where the lids let it. An iris that was not measured is what is dark between open lids."""
+    """Returns the directions from added eyeballs to the irises. Irises thus lie where they were photographed, although
+    the lids constrain the ball's position. If an iris was not measured, the dark area between open lids replaces it."""
     found = {}
     for name, ball in animated.added.items():
         eye = eyes.get(name.removeprefix("eye_"))
@@ -287,7 +287,7 @@ def _towards_irises(
 
 
 def _with_picture(part: Part, animated: AnimatedMesh, photographed: PhotographedEyes) -> Part:
-    """Returns an added eyeball whose iris was seen with its image; other parts as they are."""
+    """Returns an added eyeball with its image if its iris is visible; other parts unchanged."""
     if part.name not in animated.added or part.name not in animated.gazes:
         return part
     ball = replace(animated.added[part.name], gaze=animated.gazes[part.name])
@@ -298,7 +298,7 @@ def _with_picture(part: Part, animated: AnimatedMesh, photographed: Photographed
 
 
 def _gazes(eyes: Mapping[str, Iris | UnseenEye], from_world: RigidTransform) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns where eyes that are seen look, by pivot (head frame)."""
+    """Returns the directions of measured eyes, by pivot (head frame)."""
     return {f"eye_{side}": from_world.rotation @ eye.gaze for side, eye in eyes.items() if isinstance(eye, Iris)}
 
 
@@ -309,7 +309,7 @@ def animated_scene(
     weights: Mapping[str, float],
     skin: Skin | None = None,
 ) -> Scene:
-    """Returns an animated mesh by named parts: the head with its shapes and ``skin``, eyeballs that turn about their
+    """Returns an animated mesh as named parts: the head with its shapes and ``skin``, eyeballs that rotate about their
     pivots, teeth and tongue."""
     turning = np.zeros(len(animated.neutral), bool)
     for rows in animated.eyeballs.values():
@@ -347,7 +347,7 @@ def _part(
 
 
 def _inner_arrays(animated: AnimatedMesh) -> dict[str, Any]:
-    """Returns teeth and tongue as one mesh; ``inner_parts`` says of each vertex which part it belongs to."""
+    """Returns teeth and tongue as one mesh; ``inner_parts`` is the part of each vertex."""
     inner, vertices, faces, numbers, moves = animated.inner, [], [], [], []
     for number, (name, part) in enumerate(inner.parts.items()):
         faces.append(part.faces + sum(len(each) for each in vertices))

@@ -132,7 +132,7 @@ def test_points_where_no_head_has_them_are_refused() -> None:
 def test_what_is_no_point_list_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "points.mrk.json"
     path.write_text(text)
-    with pytest.raises(InputError, match=r"cannot be read as a point list|no point that is placed|not finite"):
+    with pytest.raises(InputError, match=r"cannot be read as a point list|no point with a position|not finite"):
         read_markups(path, "LPS")
 
 

@@ -135,7 +135,7 @@ def test_pictures_of_rare_endings_are_read_and_folders_of_plates_named(tmp_path:
     capture, _ = read_capture(tmp_path)
     assert (one.stem in capture.images, [r.text.split()[0] for r in capture.remarks]) == (True, ["clean_plates/"])
     two.rename(two.with_suffix(""))
-    with pytest.raises(InputError, match=f"images/{two.stem} is not read: of endingless files"):
+    with pytest.raises(InputError, match=f"images/{two.stem} is not read: endingless files"):
         read_capture(tmp_path)
 
 

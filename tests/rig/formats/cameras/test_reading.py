@@ -50,7 +50,7 @@ def test_what_cameras_have_alike_is_said_once() -> None:
         reading.finish([])
     assert tuple(texts_of(refused.value.faults)) == (
         "3 cameras (a, b, c): shutter is [0, 0.1]: calibrate without it",
-        "0 cameras; between 3 and 64 work",
+        "there are 0 cameras; expected 3 to 64",
     )
 
 
@@ -58,7 +58,7 @@ def test_cameras_that_take_no_part_are_named_where_too_few_are_left() -> None:
     reading = Reading("rig.xml")
     for name in ("a", "b"):
         reading.leave_out(name, compose("left-not-aligned"))
-    with pytest.raises(InputError, match=r"a, b not aligned in rig\.xml: taking no part"):
+    with pytest.raises(InputError, match=r"a, b not aligned in rig\.xml, so left out"):
         reading.finish([])
 
 

@@ -28,8 +28,8 @@ def test_two_points_a_tag_and_a_pair_of_cameras_are_read() -> None:
 @pytest.mark.parametrize(
     ("document", "faults"),
     [
-        ([], ["wants one of points, tag, cameras, holds none of them"]),
-        ({"tag": {}, "cameras": []}, ["holds tag, cameras"]),
+        ([], ["must contain one of points, tag, cameras, but contains none"]),
+        ({"tag": {}, "cameras": []}, ["contains tag, cameras"]),
         ({"points": {"a": POINT}, "distance_mm": 1}, ["two points"]),
         ({"points": {"a": POINT, "b": {"cam00": [1, 2]}}, "distance_mm": 1}, ["points.b", "two cameras or more"]),
         ({"points": {"a": POINT, "b": {"cam00": [1, 2], "cam9": [1, 2]}}, "distance_mm": 1}, ["points.b", "'cam9'"]),
@@ -43,12 +43,12 @@ def test_two_points_a_tag_and_a_pair_of_cameras_are_read() -> None:
             ["points.a.cam00 is [100000000.0, 2], wanted [x, y] in pixels, 0 to 20000", "points.b.cam01 is [3, -40]"],
         ),
         ({"tag": {"dictionary": "DICT_9", "size_mm": "4", "side": 1}}, ["'DICT_9'", "size_mm is '4'", "tag.side"]),
-        ({"tag": "DICT_4X4_50"}, ["tag: wants an object"]),
+        ({"tag": "DICT_4X4_50"}, ["tag: expected an object"]),
         ({"cameras": ["cam00", "cam00"], "distance_mm": 1e9}, ["distance_mm is 1000000000.0", "two cameras"]),
         ({"cameras": ["cam00", "x"], "distance_mm": float("nan")}, ["distance_mm is nan", "'x'"]),
-        ({"tag": {"dictionary": "DICT_4X4_50", "size_mm": 4, "\ud800": 1}}, [r"'tag.\ud800' is no key"]),
+        ({"tag": {"dictionary": "DICT_4X4_50", "size_mm": 4, "\ud800": 1}}, [r"key 'tag.\ud800' does not"]),
         ({"points": {"\ud800": {}, "b": {}}, "distance_mm": 4}, [r"points.\ud800: a point"]),
-        ({"cameras": ["cam00", "cam01"], "distance_cm": 41}, ["distance_mm is None", "'distance_cm' is no key"]),
+        ({"cameras": ["cam00", "cam01"], "distance_cm": 41}, ["distance_mm is None", "key 'distance_cm' does not"]),
     ],
 )
 def test_every_fault_is_named(document: Any, faults: list[str]) -> None:

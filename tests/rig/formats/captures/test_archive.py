@@ -133,7 +133,7 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     ),
     "tar hard link": (lambda: tar_of((tar_entry("a.png", tarfile.LNKTYPE, "/x"), b"")), f"is a hard link{KINDS}"),
     "tar sparse": (lambda: tar_of((tar_entry("a.png", tarfile.GNUTYPE_SPARSE), b"")), f"is a sparse file{KINDS}"),
-    "tar kind": (lambda: tar_of((tar_entry("a.png", b"Q"), b"")), "'a.png' is of a kind (b'Q') that is not unpacked"),
+    "tar kind": (lambda: tar_of((tar_entry("a.png", b"Q"), b"")), "'a.png' has the type b'Q', which is not unpacked"),
     "tar character device": (lambda: tar_of((tar_entry("a.png", tarfile.CHRTYPE), b"")), f"a device or pipe{KINDS}"),
     "tar block device": (lambda: tar_of((tar_entry("a.png", tarfile.BLKTYPE), b"")), "device or pipe"),
     "tar pipe": (lambda: tar_of((tar_entry("a.png", tarfile.FIFOTYPE), b"")), "device or pipe"),

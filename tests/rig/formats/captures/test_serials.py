@@ -102,7 +102,7 @@ def test_what_cannot_be_filed_is_named(tmp_path: Path) -> None:
     faults = "; ".join(texts_of(refused.value.faults))
     for words in (
         "images/IMG_6999.jpg is no camera's name, and its EXIF has no serial number: name it after its camera",
-        "images/IMG_7000.jpg and IMG_6998.jpg were both taken by the body 0007 (cam00): leave one",
+        "images/IMG_7000.jpg and IMG_6998.jpg were both taken by the camera body 0007 (cam00): keep one",
         "background/IMG_6998.jpg was taken by the body 999, and cameras without a picture are 0007, 0017, 0027",
         "images/cam01.png is missing",
     ):
@@ -110,7 +110,7 @@ def test_what_cannot_be_filed_is_named(tmp_path: Path) -> None:
     assert checked(folder, {}, report=lambda *_: None)["faults"]
     document = (folder / "cameras.json").read_text()
     (folder / "cameras.json").write_text(document.replace('"0017"', '"0007"'))
-    with pytest.raises(InputError, match="cam00, cam01 have the serial '0007': one body is one camera"):
+    with pytest.raises(InputError, match="cam00, cam01 have the same serial number '0007', but each camera has"):
         read_capture(folder)
 
 

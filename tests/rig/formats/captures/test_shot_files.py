@@ -145,7 +145,7 @@ def test_masks_that_nobody_can_file_are_one_sentence_with_the_remedy(folder: Pat
         path.rename(path.with_name(f"DSC_{number + 100}.png"))
     fault = only_fault(folder)
     assert fault == (
-        "no camera has a mask in masks/: the cameras are called cam00 to cam04, the files DSC_100.png to DSC_104.png; "
+        "no mask in masks/ fits a camera: the cameras are named cam00 to cam04, the files DSC_100.png to DSC_104.png; "
         "rename either"
     )
 
@@ -205,7 +205,7 @@ def test_pictures_that_are_not_read_are_called_what_they_are(ending: str, kind: 
     for path in [*(folder / "images").iterdir()]:
         path.rename(path.with_suffix(ending))
     fault = only_fault(folder)
-    assert fault.startswith(f"images/cam00{ending} is not read: of {kind} files nothing is; save it as PNG")
+    assert fault.startswith(f"images/cam00{ending} is not read: {kind} files are not supported; save it as PNG")
     assert "the same is true of 4 more (cam01, cam02, cam03, cam04)" in fault
 
 

@@ -77,7 +77,7 @@ SPOILT: dict[str, tuple[Spoil, str]] = {
     ),
     "a kind that is not read": (
         lambda f: (f / "texture_sets/cross/c.png").rename(f / "texture_sets/cross/c.exr"),
-        "texture_sets/cross/c.exr is not read: of OpenEXR files nothing is",
+        "texture_sets/cross/c.exr is not read: OpenEXR files are not supported",
     ),
     "two pictures of a camera": (
         lambda f: write_image(f / "texture_sets/cross/c.jpg", picture()),

@@ -61,7 +61,7 @@ def test_every_fault_of_a_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError) as refused:
         read(tmp_path, broken)
     message = str(refused.value)
-    for word in (*(f"line {line}:" for line in (1, 2, 3, 5, 6, 7, 10)), "vertex 99", "texture 5"):
+    for word in (*(f"line {line}:" for line in (1, 2, 3, 5, 6, 7, 10)), "vertex 99", "coordinate 5"):
         assert word in message, word
     for text, word in (("", "no vertices"), ("v 0 0 0\n", "no faces"), ("f 1/1 2/1 3/1\nv 0 0 0\n", "are none")):
         with pytest.raises(InputError, match=word):
