@@ -79,10 +79,7 @@ def take(
     answer(document, json_out, [str(out / name) for name in ("neutral.ply", "neutral.glb", "moments")])
 
 
-@app.command(
-    epilog="Example: eigenhead sequence films/anna --out tracks/anna   "
-    "One part of four: eigenhead sequence films/anna --out tracks/anna --shard 3/4"
-)
+@app.command(epilog="Example: eigenhead sequence films/anna --out tracks/anna --shard 3/4")
 def sequence(
     folder: Annotated[
         Path,
@@ -92,9 +89,7 @@ def sequence(
     ],
     out: Annotated[Path, typer.Option(help="The result folder; a killed run goes on there.", file_okay=False)],
     *,
-    shard: Annotated[
-        str | None, typer.Option(help="K/N: the K-th of N parts alone, 1/4 say; the last one writes all.")
-    ] = None,
+    shard: Annotated[str | None, typer.Option(help="K/N: one part alone; the last writes all.")] = None,
     usd: Annotated[bool, typer.Option("--usd", help="Write sequence.usdc too, a point cache.")] = False,
     model: Model = None,
     data: Data = None,

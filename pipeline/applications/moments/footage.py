@@ -141,18 +141,18 @@ def open_footage(folder: Path) -> Footage:
             rates[name] = rate
         if not files and count > len(frames):
             frames = tuple(f"{k:05}" for k in range(count))
-    if not faults and len(frames) < MIN_FRAMES:
-        faults.append(compose("sequence-too-short", count=len(frames)))
-    slow, fast = (of(rates, key=lambda name: rates[name], default=None) for of in (min, max))
-    if slow is not None and fast is not None and rates[fast] > (1.0 + SAME_RATE) * rates[slow]:
-        told = {"slow": slow, "slow_fps": rates[slow], "fast": fast, "fast_fps": rates[fast]}
-        faults.append(compose("sequence-rates-differ", **told))
-    shared = max((len(videos) + sum(frame in of for of in files.values()) for frame in frames), default=MIN_VIEWS)
-    if not faults and shared < min(MIN_VIEWS, len(rig)):
-        faults.append(compose("sequence-names-differ", found=[f"{name}/{min(of)}" for name, of in files.items()][:2]))
+    views = [len(videos) + sum(frame in of for of in files.values()) for frame in frames]
+    shared = sum(count >= min(MIN_VIEWS, len(rig)) for count in views)
+    if not faults and shared < MIN_FRAMES:
+        faults.append(compose("sequence-too-short", count=shared))
+    slow, fast = (of(rates, key=lambda name: rates[name], default="") for of in (min, max))
+    if slow and rates[fast] > (1.0 + SAME_RATE) * rates[slow]:
+        faults.append(
+            compose("sequence-rates-differ", slow=slow, slow_fps=rates[slow], fast=fast, fast_fps=rates[fast])
+        )
     if faults:
         raise InputError("sequence", faults)
-    times = _times(folder / TIMES, frames, rates.get(slow or "", FPS))
+    times = _times(folder / TIMES, frames, rates.get(slow, FPS))
     spread = _spread(folder / CLOCK, rig)
     return Footage(folder, rig, work_rig(rig, TRACKED_PIXELS), frames, times, files, videos, spread)
 

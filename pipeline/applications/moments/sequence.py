@@ -39,7 +39,6 @@ from rig.render.renderer import Renderer
 INPUTS = "inputs.json"
 CHUNK = 25  # frames that are kept together
 MIN_ALIKE = 0.5  # correlation of a frame's texture with the reference: .8 to .97 on drawn heads, .1 where it is lost
-ROUNDS = 1  # of fits of the first frames
 KEPT = 0.5  # with all of it, an error along what pictures tell least grew from frame to frame
 SHARE = 0.1  # of the work, that finds the person
 
@@ -111,10 +110,8 @@ def make_tracker(footage: Footage, person: SequencePerson) -> Tracker:
     networks, samples = load_networks(), spread(person)
     shown = [(next(footage.read(key)), motion) for key, motion in zip(person.keys, person.motions, strict=True)]
     tracker = _learn(person, samples, networks, shown)
-    for _ in range(ROUNDS):  # the frames agree on the skin once each is fitted to all of them
-        shown = [(pictures, tracker.fit(pictures, motion).motion) for pictures, motion in shown]
-        tracker = _learn(person, samples, networks, shown)
-    return tracker
+    shown = [(pictures, tracker.fit(pictures, motion).motion) for pictures, motion in shown]
+    return _learn(person, samples, networks, shown)  # they agree on the skin once each is fitted to all of them
 
 
 def _learn(
@@ -144,8 +141,8 @@ def track_sequence(
         person = _kept_person(kept / "person.npz", footage, model)
         assert person is not None
     paths = {first: kept / f"{first:07}.npz" for first in range(0, len(footage.frames), CHUNK)}
-    own = np.array_split(list(paths), share[1])[share[0] - 1].tolist()
-    missing = {first: paths[first] for first in own if not paths[first].is_file()}
+    firsts = np.array_split(list(paths), share[1])[share[0] - 1].tolist()
+    missing = {first: paths[first] for first in firsts if not paths[first].is_file()}
     if missing:
         _track_chunks(footage, person, missing, report)
     if not all(path.is_file() for path in paths.values()):

@@ -122,8 +122,8 @@ def document_of(person: SequencePerson, footage: Footage, course: Course) -> dic
     missing = dict(zip(footage.rig.names, np.count_nonzero(~course.shown, axis=0).tolist(), strict=True))
     missing = {name: count for name, count in missing.items() if count}
     gaps = compose("sequence-pictures-missing", count=sum(missing.values()), cameras=list(missing))
-    told = (lost, failed), (gaps, missing), (torn, skewed > SKEWED_SHARE * len(course))
-    warnings = [*person.warnings, *(said for said, holds in told if holds)]
+    doubts = (lost, failed), (gaps, missing), (torn, skewed > SKEWED_SHARE * len(course))
+    warnings = [*person.warnings, *(said for said, holds in doubts if holds)]
     turn, shift = (np.median(course.deviations[:, rows], axis=0) for rows in (slice(3), slice(3, POSE)))
     return {
         "format": FORMAT,

@@ -1,4 +1,5 @@
-"""Sentences of the live head: what is to do before a shot. They speak to the subject, or name a camera."""
+"""Sentences of the live head: what is to do before a shot. They speak to the subject, or name a camera. And those of
+sequences."""
 
 TEMPLATES = {
     "live-starting": "looking for a head ...",
@@ -30,4 +31,15 @@ TEMPLATES = {
     "live-stranger": "{camera} sees another person, or the face elsewhere",
     "live-no-face": "{camera} sees no face, though you look its way: see what hides it",
     "live-off-centre": "{camera} does not have the whole head in its middle",
+    "sequence-without-cameras": "There are no cameras: put cameras.json into the folder of the sequence.",
+    "sequence-camera-empty": "There are no pictures of {cameras}: expected images/CAMERA/FRAME.png or videos/CAMERA.mp4. Take cameras that did not film out of cameras.json.",
+    "sequence-too-short": "A sequence needs two frames or more that two cameras show under one name, images/CAMERA/FRAME.png: found {count}.",
+    "sequence-rates-differ": "The videos have different rates: {slow} has {slow_fps:.2f} frames a second, {fast} has {fast_fps:.2f}. Convert them to one rate that begins at the same moment.",
+    "sequence-pictures-missing": "{count} pictures of {cameras} are missing, damaged or black; their frames follow from the other cameras.",
+    "sequence-times-wrong": "times.csv must give every frame a time_s, each later than the one before: columns frame,time_s.",
+    "sequence-video-unread": "{file} cannot be decoded: give single pictures, images/CAMERA/FRAME.png.",
+    "sequence-without-face": "The head was found in no frame: see whether the cameras are those of the pictures.",
+    "sequence-clock-wrong": "clock.json must state mean_ms of every camera: measure again with eigenhead clock",
+    "sequence-skewed": "The cameras expose {spread_ms:.0f} ms apart: in {count} of {all} frames the face moves more than {most_mm:.0f} mm in between. Trigger them together.",
+    "sequence-frames-failed": "{count} of {all} frames failed and were interpolated: {frames}.",
 }

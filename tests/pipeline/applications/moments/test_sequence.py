@@ -211,7 +211,7 @@ def test_what_is_wrong_with_a_folder_is_said(film: Path, tmp_path: Path) -> None
     np.testing.assert_allclose(times, np.array([0, 1, 3, 4, 5, 6]) / FPS)
     for path in (tmp_path / "images").glob("*/*"):
         path.rename(path.with_stem(f"{path.parent.name}-{path.stem}"))
-    with pytest.raises(InputError, match="same name"):
+    with pytest.raises(InputError, match="under one name"):
         open_footage(tmp_path)
 
 
