@@ -15,6 +15,7 @@ report.json     what was found, written last
 
 import json
 import shutil
+import tempfile
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -161,21 +162,23 @@ def poses_from_first(course: Course) -> list[RigidTransform]:
 
 
 def write_preview(path: Path, person: SequencePerson, footage: Footage, course: Course, report: Progress) -> None:
-    """Writes preview.mp4, under a temporary name first."""
-    name, scratch = person.rig.front_camera(), path.with_name(f".{path.name}.part.mp4")
-    camera, count = person.rig[name], len(course)
+    """Writes preview.mp4. Shares that end together may both do so."""
+    name, count = person.rig.front_camera(), len(course)
+    camera = person.rig[name]
     size = 2 * camera.intrinsics.width, camera.intrinsics.height
     rate = (count - 1) / max(float(footage.times_s[-1] - footage.times_s[0]), 1e-6)
-    film = cv2.VideoWriter(str(scratch), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
-    try:
-        for number, pictures in enumerate(footage.read(cameras=(name,))):
-            report("preview", number / count)
-            clay = draw_clay(person, camera, course.motion(number))
-            photo = pictures.get(name, np.zeros_like(clay))
-            film.write(np.ascontiguousarray(np.concatenate([photo, clay], axis=1)[:, :, ::-1]))
-    finally:
-        film.release()
-    scratch.replace(path)
+    with tempfile.TemporaryDirectory() as scratch:
+        draft = Path(scratch) / path.name
+        film = cv2.VideoWriter(str(draft), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+        try:
+            for number, pictures in enumerate(footage.read(cameras=(name,))):
+                report("preview", number / count)
+                clay = draw_clay(person, camera, course.motion(number))
+                photo = pictures.get(name, np.zeros_like(clay))
+                film.write(np.ascontiguousarray(np.concatenate([photo, clay], axis=1)[:, :, ::-1]))
+        finally:
+            film.release()
+        write_atomically(path, draft.read_bytes())
 
 
 def draw_clay(person: SequencePerson, camera: Camera, motion: Motion) -> UInt8[np.ndarray, "h w 3"]:
