@@ -89,6 +89,7 @@ def moving_figures(folder: Path, model: HeadModel, renderer: Renderer, bench: Be
     shutil.rmtree(kept, ignore_errors=True)
     begun = time.process_time()
     person, raw = track_sequence(footage, model, SETTINGS, kept, renderer=renderer, report=meter)
+    assert raw is not None, "there are no other shares"
     whole, course = time.process_time() - begun, smoothed(raw)
     with np.load(folder / "moving.truth" / "truth.npz") as arrays:
         truth = dict(arrays)
@@ -159,6 +160,7 @@ def still_figures(folder: Path, model: HeadModel, renderer: Renderer, bench: Ben
     """Returns the jitter of a head that sits still."""
     footage, kept = open_footage(folder / "still"), folder / "still-track" / CHUNKS
     person, raw = track_sequence(footage, model, SETTINGS, kept, renderer=renderer, report=bench.report)
+    assert raw is not None, "there are no other shares"
     face = model.levels["full"].face_region
     return {"jitter": jitter(person, smoothed(raw), face), "raw_jitter": jitter(person, raw, face)}
 

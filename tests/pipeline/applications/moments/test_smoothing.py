@@ -51,6 +51,6 @@ def test_frames_that_failed_at_the_beginning_follow_from_what_rests() -> None:
     measured = np.zeros((12, 50))
     measured[4:6] = rng.uniform(0.0, 0.1, (2, 50))  # the other frames are at a weight's bound
     deviation = np.where(failed[:, None], np.inf, rng.uniform(0.15, 0.2, measured.shape))
-    found, spread = smooth(measured, deviation, failed, np.arange(50)[:, None])
+    found, spread = smooth(measured, deviation, failed, list(np.arange(50)[:, None]))
     assert np.abs(found).max() < 0.6  # a straight line to the first frame
     assert spread[failed].min() > 0.14
