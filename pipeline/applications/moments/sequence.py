@@ -216,7 +216,8 @@ def smoothed(course: Course) -> Course:
 
 
 def inputs_of(footage: Footage, model: HeadModel, settings: Settings) -> dict[str, Any]:
-    """Returns what a sequence's result follows from: its files by name, size and time, the model, and the settings."""
+    """Returns what a sequence's result follows from: its files by name, size and time, the model, the settings, and
+    what of it is kept together."""
     digest, paths = hashlib.sha256(), sorted(path for path in footage.folder.rglob("*") if path.is_file())
     for path in paths:
         status = path.stat()
@@ -226,6 +227,7 @@ def inputs_of(footage: Footage, model: HeadModel, settings: Settings) -> dict[st
         "times_s": footage.times_s.tolist(),
         "model_sha256": model.sha256,
         "settings": document_from_settings(settings),
+        "chunk": CHUNK,
         "version": version("eigenhead"),
     }
 
