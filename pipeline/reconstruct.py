@@ -44,12 +44,12 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     return steps.send(replace(next(steps), solution=None))  # which no later stage needs, and which is large
 
 
-def start_reconstruction(context: ReconstructionContext) -> Generator[Any, HeadFit, None]:
+def start_reconstruction(context: ReconstructionContext, run: Recorder | None = None) -> Generator[Any, HeadFit, None]:
     """Runs a reconstruction up to the fitted head, which it yields; with the head that is sent back it goes on, and
-    yields the result. Several captures of one person meet in between."""
+    yields the result. Several captures of one person meet in between. ``run`` shows the warnings until then."""
     if "usdz" in context.settings.outputs.formats:
         check_usd()
-    run = Recorder(context)
+    run = run or Recorder(context)
     with run.stage("segmentation") as stage:
         views = stage.keep(find_views(stage.context))
     with run.beside("segmentation", lambda quiet: check_lenses(quiet, views)):

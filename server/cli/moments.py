@@ -79,7 +79,7 @@ def take(
     answer(document, json_out, [str(out / name) for name in ("neutral.ply", "neutral.glb", "moments")])
 
 
-@app.command(epilog="Example: eigenhead sequence films/anna --out tracks/anna")
+@app.command(epilog="Example: eigenhead sequence films/anna --out tracks/anna --shard 3/4")
 def sequence(
     folder: Annotated[
         Path,
@@ -89,6 +89,7 @@ def sequence(
     ],
     out: Annotated[Path, typer.Option(help="The result folder; a killed run goes on there.", file_okay=False)],
     *,
+    shard: Annotated[str | None, typer.Option(help="K/N: one part alone; the last writes all.")] = None,
     usd: Annotated[bool, typer.Option("--usd", help="Write sequence.usdc too, a point cache.")] = False,
     model: Model = None,
     data: Data = None,
@@ -97,17 +98,25 @@ def sequence(
     """Track one head through pictures or videos."""
     from pipeline.applications.moments.sequence_files import CACHE, FILES, make_sequence
     from pipeline.settings import settings_from_document
+    from server.batch.captures import WHOLE, read_shard
     from server.cli.heads import head_alone
     from server.cli.reconstruct_local import check_apart
     from server.tasks.prepare import prepare_kernels
     from server.tasks.settings_file import settings_document
 
+    with wrong_usage("--shard"):
+        part = WHOLE if shard is None else read_shard(shard)
     chosen = settings_from_document(head_alone(settings_document(None, detail="photo")))
     check_apart(out, folder)
     prepare_folder(out)
     with progress_bar() as report, terminated_like_interrupted():
         prepare_kernels(report, chosen)
-        document = make_sequence(folder, out, model=model or "default", settings=chosen, report=report, usd=usd)
+        document = make_sequence(
+            folder, out, model=model or "default", settings=chosen, report=report, usd=usd,
+            share=(part.number, part.count),
+        )  # fmt: skip
+    if document is None:
+        return answer({"shard": str(part)}, json_out, [f"part {part} is done; others are not yet"])
     for warning in document["warnings"]:
         warn(f"{warning['code']}: {warning['message']}")
     answer(document, json_out, [str(out / name) for name in (*FILES, *[CACHE][:usd])])

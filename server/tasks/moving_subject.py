@@ -128,8 +128,10 @@ class Film:
             self._views = view_cameras(self.rig, light, self.preset, (), rng)
         return {name: replace(view, subject=light[name]) for name, view in self._views.items()}
 
-    def plates(self, count: int) -> dict[str, list[ImageRgb]]:
-        """Returns clean plates of every camera. ``light`` must have been called."""
+    def plates(self, count: int, first: Pose) -> dict[str, list[ImageRgb]]:
+        """Returns clean plates of every camera. ``first``: the person's pose in a film of which no frame is lit yet."""
+        if not self._views:
+            self.light(first)
         rngs = np.random.default_rng((self.person.seed, 5)).spawn(len(self.rig))
         return {
             name: [expose(view_light(view, subject=False), view.sensor, rng) for _ in range(count)]
@@ -149,15 +151,17 @@ class Film:
             return dict(zip(views, pool.map(one, range(len(views)), views), strict=True))
 
 
-def film(film: Film, poses: list[Pose], report: Callable[[float], None]) -> Iterator[dict[str, ImageRgb]]:
-    """Yields the pictures of every pose. A pose equal to that of the frame before is not rendered anew."""
+def film(
+    film: Film, poses: Mapping[int, Pose], report: Callable[[float], None]
+) -> Iterator[tuple[int, dict[str, ImageRgb]]]:
+    """Yields the numbers and pictures of all poses. A pose that is that of the frame before is not lit anew."""
     before, views = None, {}
-    for number, pose in enumerate(poses):
-        report(number / len(poses))
+    for done, (number, pose) in enumerate(poses.items()):
+        report(done / len(poses))
         if before is None or pose.weights != before.weights or not _alike(pose, before):
             views = film.light(pose)
         before = pose
-        yield film.shot(views, number)
+        yield number, film.shot(views, number)
 
 
 def _alike(pose: Pose, other: Pose) -> bool:
@@ -170,19 +174,28 @@ def simulate_sequence(
     still: bool = False,
 ) -> Path:  # fmt: skip
     """Films a person and writes the folder of a sequence: cameras.json, images/<camera>/<frame>.png, background/ and
-    times.csv. Returns the folder of the truth beside it, with cameras.json and truth.npz: names of expressions, weights
-    (frames, expressions), rotations, translations (mm), vertices (frames, v, 3; world, mm), face (v)."""
+    times.csv. Frames that an earlier call of the same film has written are left. Returns the folder of the truth beside
+    it, with cameras.json and truth.npz: names of expressions, weights (frames, expressions), rotations, translations
+    (mm), vertices (frames, v, 3; world, mm), face (v)."""
     studio, poses = Film(person, rig, preset, renderer), move(person, frames, rig.centre_world(), still=still)
-    truth, names = out.with_name(out.name + ".truth"), person.model.expressions.names
+    lines = ["frame,time_s", *(f"{number:05},{number / FPS:.6f}" for number in range(frames))]
     write_rig(rig, out / "cameras.json")
-    for number, images in enumerate(film(studio, poses, lambda share: report("simulate", share))):
+    write_atomically(out / "times.csv", ("\n".join(lines) + "\n").encode())
+    truth = write_truth(out, person, rig, poses, still=still)
+    paths = [{name: out / "images" / name / f"{number:05}.png" for name in rig.names} for number in range(frames)]
+    left = {k: poses[k] for k in range(frames) if not all(path.is_file() for path in paths[k].values())}
+    for number, images in film(studio, left, lambda share: report("simulate", share)):
         for name, image in images.items():
-            write_image(out / "images" / name / f"{number:05}.png", image)
-    for name, plates in studio.plates(preset.plates).items():
+            write_image(paths[number][name], image)
+    for name, plates in studio.plates(preset.plates, poses[0]).items():
         for k, plate in enumerate(plates):
             write_image(out / "background" / name / f"{k:03}.png", plate)
-    lines = ["frame,time_s", *(f"{number:05},{number / FPS:.6f}" for number in range(frames))]
-    write_atomically(out / "times.csv", ("\n".join(lines) + "\n").encode())
+    return truth
+
+
+def write_truth(out: Path, person: Person, rig: Rig, poses: list[Pose], *, still: bool) -> Path:
+    """Writes the folder of the truth beside ``out``, as ``simulate_sequence`` returns it."""
+    truth, names = out.with_name(out.name + ".truth"), person.model.expressions.names
     write_rig(rig, truth / "cameras.json")
     buffer = io.BytesIO()
     heads = [p.world_from_head.apply(person.model.posed_vertices(person.coefficients, p.weights)) for p in poses]

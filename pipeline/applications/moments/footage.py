@@ -1,8 +1,9 @@
 """Reads a sequence: cameras.json, and either ``images/<camera>/<frame>.<ext>`` or ``videos/<camera>.<ext>``.
 
-The same folder may hold clean plates (``background/``, as in a capture), masks (``masks/<camera>/<frame>.<ext>``),
-``times.csv`` with the columns frame and time_s, and ``clock.json`` of `eigenhead clock`. For tracking, frames are read
-one after another at reduced size. A single frame can also be read as a capture, at the size of a single job.
+Beside them may lie clean plates (``background/``, as in a capture), masks (``masks/<camera>/<frame>.<ext>``),
+``times.csv`` with the columns frame and time_s, and ``clock.json`` of `eigenhead clock`. Without times, frames follow
+each other at the videos' rate or at ``FPS``; numbers that are left out are frames that a recorder dropped. Frames are
+read small, one after another, for tracking; single ones also as a capture, at the size of a single job.
 """
 
 import csv
@@ -31,6 +32,8 @@ from rig.rig import Rig
 TRACKED_PIXELS = 640 * 480  # of a picture that is tracked: a pixel covers 0.9 mm of the usual rig's head
 FPS = 25.0  # where neither times.csv nor a video says it
 MIN_FRAMES = 2
+MIN_VIEWS = 2  # of a frame
+SAME_RATE = 0.01  # share by which videos' rates may differ: a nominal one is rounded, a phone's is a mean
 IMAGES, VIDEOS, TIMES, CLOCK = "images", "videos", "times.csv", "clock.json"
 Pictures = Mapping[str, ImageRgb]  # by camera; one that lacks the frame is left out
 
@@ -130,19 +133,26 @@ def open_footage(folder: Path) -> Footage:
     if absent:
         faults.append(compose("sequence-camera-empty", cameras=absent))
     frames = tuple(sorted({frame for of in files.values() for frame in of}, key=_in_order))
-    rates: list[float] = []
-    for path in videos.values():
+    rates: dict[str, float] = {}
+    for name, path in videos.items():
         with _opened(path) as reel:
             count, rate = int(reel.get(cv2.CAP_PROP_FRAME_COUNT)), reel.get(cv2.CAP_PROP_FPS)
-        rates.append(rate)
+        if rate > 0.0:
+            rates[name] = rate
         if not files and count > len(frames):
             frames = tuple(f"{k:05}" for k in range(count))
-    if not faults and len(frames) < MIN_FRAMES:
-        faults.append(compose("sequence-too-short", count=len(frames)))
+    views = [len(videos) + sum(frame in of for of in files.values()) for frame in frames]
+    shared = sum(count >= min(MIN_VIEWS, len(rig)) for count in views)
+    if not faults and shared < MIN_FRAMES:
+        faults.append(compose("sequence-too-short", count=shared))
+    slow, fast = (of(rates, key=lambda name: rates[name], default="") for of in (min, max))
+    if slow and rates[fast] > (1.0 + SAME_RATE) * rates[slow]:
+        faults.append(
+            compose("sequence-rates-differ", slow=slow, slow_fps=rates[slow], fast=fast, fast_fps=rates[fast])
+        )
     if faults:
         raise InputError("sequence", faults)
-    rate = next((each for each in rates if each > 0.0), FPS)
-    times = _times(folder / TIMES, frames, rate)
+    times = _times(folder / TIMES, frames, rates.get(slow, FPS))
     spread = _spread(folder / CLOCK, rig)
     return Footage(folder, rig, work_rig(rig, TRACKED_PIXELS), frames, times, files, videos, spread)
 
@@ -162,7 +172,10 @@ def _spread(path: Path, rig: Rig) -> float:
 def _times(path: Path, frames: tuple[str, ...], rate: float) -> Float[np.ndarray, " n"]:
     """Returns when each frame was taken (s). Raises InputError if times.csv lacks some frames, or if times decrease."""
     if not path.is_file():
-        return np.arange(len(frames)) / rate
+        numbers = np.array([_in_order(frame)[0] for frame in frames])
+        steps = np.diff(numbers)
+        counted = (steps > 0).all() and (steps % steps.min() == 0).all()
+        return (numbers - numbers[0]) / steps.min() / rate if counted else np.arange(len(frames)) / rate
     try:
         with path.open(newline="", encoding="utf-8") as lines:
             known = {row["frame"]: float(row["time_s"]) for row in csv.DictReader(lines)}

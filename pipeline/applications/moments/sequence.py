@@ -4,13 +4,14 @@ The identity is estimated from the sharpest frames of the first second (``sequen
 from the previous frame's state, extrapolated by the motion (``track_frame``). A lost head is searched anew; if that
 fails too, the frame has failed and is interpolated. At the end all is smoothed over time (``smoothing``).
 
-Results are stored in chunks, each written under a temporary name first. A killed run continues after the last complete
-chunk, from its stored numbers, and gives the same result.
+What is found is kept in chunks, each written under a temporary name first. No chunk needs the one before: a run that
+was killed makes those that are missing, several processes share them, and all find the same.
 """
 
 import hashlib
 import io
 import json
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -21,7 +22,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.applications.moments.appearance import REDUCED, Levels, Samples, observe, spread
 from pipeline.applications.moments.face_evidence import FaceReference, landmarks_of, refer, sight, terms_of
-from pipeline.applications.moments.footage import Footage, Pictures
+from pipeline.applications.moments.footage import MIN_VIEWS, Footage, Pictures
 from pipeline.applications.moments.sequence_person import Motion, SequencePerson, find_person
 from pipeline.applications.moments.smoothing import smooth
 from pipeline.applications.moments.track_frame import POSE, Tracked, fit_frame
@@ -31,22 +32,22 @@ from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings, document_from_settings
 from rig.atomic_write import write_atomically
 from rig.geometry import RigidTransform, rigid_fit, rotation_from_vector, vector_from_rotation
+from rig.messages.message import documents_of, read_message
 from rig.progress import Progress
 from rig.render.renderer import Renderer
 
 INPUTS = "inputs.json"
 CHUNK = 25  # frames that are kept together
-MIN_VIEWS = 2
 MIN_ALIKE = 0.5  # correlation of a frame's texture with the reference: .8 to .97 on drawn heads, .1 where it is lost
-ROUNDS = 1  # of fits of the first frames
 KEPT = 0.5  # with all of it, an error along what pictures tell least grew from frame to frame
 SHARE = 0.1  # of the work, that finds the person
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """Holds the result frame by frame: weights of the model's expressions, pose (world_from_head), standard deviations
-    of rotation (rad), translation (mm) and weights, the correlation of the texture, and which frames have failed."""
+    """Holds what was found frame by frame: weights of the model's expressions, pose (world_from_head), deviations of
+    rotation (rad), translation (mm) and weights, the correlation of the texture, which frames have failed, and which
+    cameras had a picture."""
 
     weights: Float[np.ndarray, "t e"]
     rotations: Float[np.ndarray, "t 3 3"]
@@ -54,6 +55,7 @@ class Course:
     deviations: Float[np.ndarray, "t p"]
     alike: Float[np.ndarray, " t"]
     failed: Bool[np.ndarray, " t"]
+    shown: Bool[np.ndarray, "t k"]
 
     def __len__(self) -> int:
         return len(self.failed)
@@ -84,6 +86,11 @@ class Tracker:
         found = None if again is None else self.fit(pictures, again)
         return found if found is not None and found.alike >= MIN_ALIKE else None
 
+    def begin(self, pictures: Pictures) -> Tracked | None:
+        """Fits a frame without a last one: from far away, and once more from what that finds."""
+        found = self.track(pictures, self.person.motions[0])
+        return None if found is None else self.track(pictures, found.motion)
+
     def fit(self, pictures: Pictures, start: Motion) -> Tracked:
         """Fits one frame from a nearby motion."""
         found = sight(self.person, self.networks, pictures, start)
@@ -103,10 +110,8 @@ def make_tracker(footage: Footage, person: SequencePerson) -> Tracker:
     networks, samples = load_networks(), spread(person)
     shown = [(next(footage.read(key)), motion) for key, motion in zip(person.keys, person.motions, strict=True)]
     tracker = _learn(person, samples, networks, shown)
-    for _ in range(ROUNDS):  # the frames agree on the skin once each is fitted to all of them
-        shown = [(pictures, tracker.fit(pictures, motion).motion) for pictures, motion in shown]
-        tracker = _learn(person, samples, networks, shown)
-    return tracker
+    shown = [(pictures, tracker.fit(pictures, motion).motion) for pictures, motion in shown]
+    return _learn(person, samples, networks, shown)  # they agree on the skin once each is fitted to all of them
 
 
 def _learn(
@@ -117,10 +122,12 @@ def _learn(
 
 
 def track_sequence(
-    footage: Footage, model: HeadModel, settings: Settings, kept: Path, *, renderer: Renderer, report: Progress
-) -> tuple[SequencePerson, Course]:
-    """Tracks a head through all frames. ``kept`` is the folder with an earlier run's results. Returns the person and
-    the courses as measured. Raises like ``find_person``."""
+    footage: Footage, model: HeadModel, settings: Settings, kept: Path, *, renderer: Renderer, report: Progress,
+    share: tuple[int, int] = (1, 1),
+) -> tuple[SequencePerson, Course | None]:  # fmt: skip
+    """Tracks a head through all frames. ``kept`` is the folder of what an earlier run has found. ``share``: which of
+    how many parts of the film is tracked, from 1. Returns the person and the courses as measured; None while other
+    shares lack some. Raises what ``find_person`` raises."""
     inputs = json.dumps(inputs_of(footage, model, settings)).encode()
     if not (kept / INPUTS).is_file() or (kept / INPUTS).read_bytes() != inputs:
         for path in kept.glob("*.npz"):
@@ -128,33 +135,46 @@ def track_sequence(
         write_atomically(kept / INPUTS, inputs)
     person = _kept_person(kept / "person.npz", footage, model)
     if person is None:
-        person = find_person(footage, model, settings, renderer, lambda done: report("identity", SHARE * done))
-        _keep_person(kept / "person.npz", person)
-    count, parts, tracker = len(footage.frames), list[Course](), None
-    for first in range(0, count, CHUNK):
-        path = kept / f"{first:07}.npz"
-        if not path.is_file():
-            tracker = tracker or make_tracker(footage, person)
-            frames = range(first, min(first + CHUNK, count))
-            _keep(path, _track_chunk(tracker, footage, frames, parts[-1] if parts else None, report))
-        parts.append(_read_kept(path))
-    joined = Course(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Course)))
-    return person, joined
+        found = find_person(footage, model, settings, renderer, lambda done: report("identity", SHARE * done))
+        if not (kept / "person.npz").is_file():  # else another share was earlier
+            _keep_person(kept / "person.npz", found)
+        person = _kept_person(kept / "person.npz", footage, model)
+        assert person is not None
+    paths = {first: kept / f"{first:07}.npz" for first in range(0, len(footage.frames), CHUNK)}
+    firsts = np.array_split(list(paths), share[1])[share[0] - 1].tolist()
+    missing = {first: paths[first] for first in firsts if not paths[first].is_file()}
+    if missing:
+        _track_chunks(footage, person, missing, report)
+    if not all(path.is_file() for path in paths.values()):
+        return person, None
+    parts = [_read_kept(path) for path in paths.values()]
+    return person, Course(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Course)))
 
 
-def _track_chunk(tracker: Tracker, footage: Footage, frames: range, before: Course | None, report: Progress) -> Course:
-    """Tracks the frames of a chunk, from the last two motions of the previous one."""
-    person, count = tracker.person, len(footage.frames)
-    last = [before.motion(k) for k in np.flatnonzero(~before.failed)[-2:].tolist()] if before is not None else []
-    last = last or [person.motions[0]]
-    found, pictures = list[Tracked | None](), footage.read(frames.start)
-    for number in frames:
+def _track_chunks(footage: Footage, person: SequencePerson, missing: Mapping[int, Path], report: Progress) -> None:
+    """Tracks the chunks that begin at some frames, and keeps each."""
+    tracker, count = make_tracker(footage, person), len(footage.frames)
+    at, pictures = -1, iter(())
+    for first, path in missing.items():
+        if first != at:  # else the films stand there: to open them anew would decode all that is before
+            pictures = footage.read(first)
+        at = min(first + CHUNK, count)
+        course = _track_chunk(tracker, pictures, range(first, at), count, report)
+        write_arrays(path, **{each.name: getattr(course, each.name) for each in fields(Course)})
+
+
+def _track_chunk(tracker: Tracker, pictures: Iterator[Pictures], frames: range, count: int, report: Progress) -> Course:
+    """Tracks the next pictures, which are those of ``frames`` of a film of ``count``."""
+    found, shown, last = list[Tracked | None](), list[list[bool]](), list[Motion]()
+    for number, taken in zip(frames, pictures, strict=False):  # takes no picture after the last frame
         report(f"frame {number + 1} of {count}", SHARE + (1.0 - SHARE) * number / count)
-        tracked = tracker.track(next(pictures), moved_on(last))
+        tracked = tracker.track(taken, moved_on(last)) if last else tracker.begin(taken)
         found.append(tracked)
+        shown.append([name in taken for name in tracker.person.rig.names])
         if tracked is not None:
             last = [*last[-1:], tracked.motion]
-    lost = Tracked(last[0], np.full(POSE + len(last[0].weights), np.inf), 0.0)
+    nowhere = tracker.person.motions[0]
+    lost = Tracked(nowhere, np.full(POSE + len(nowhere.weights), np.inf), 0.0)
     whole = [lost if each is None else each for each in found]
     return Course(
         np.stack([each.motion.weights for each in whole]),
@@ -163,6 +183,7 @@ def _track_chunk(tracker: Tracker, footage: Footage, frames: range, before: Cour
         np.stack([each.deviation for each in whole]),
         np.array([each.alike for each in whole]),
         np.array([each is None for each in found]),
+        np.array(shown),
     )
 
 
@@ -195,7 +216,8 @@ def smoothed(course: Course) -> Course:
 
 
 def inputs_of(footage: Footage, model: HeadModel, settings: Settings) -> dict[str, Any]:
-    """Returns all that a sequence's result depends on: its files by name, size and time, the model, the settings."""
+    """Returns what a sequence's result follows from: its files by name, size and time, the model, the settings, and
+    what of it is kept together."""
     digest, paths = hashlib.sha256(), sorted(path for path in footage.folder.rglob("*") if path.is_file())
     for path in paths:
         status = path.stat()
@@ -205,12 +227,9 @@ def inputs_of(footage: Footage, model: HeadModel, settings: Settings) -> dict[st
         "times_s": footage.times_s.tolist(),
         "model_sha256": model.sha256,
         "settings": document_from_settings(settings),
+        "chunk": CHUNK,
         "version": version("eigenhead"),
     }
-
-
-def _keep(path: Path, course: Course) -> None:
-    write_arrays(path, **{each.name: getattr(course, each.name) for each in fields(Course)})
 
 
 def _read_kept(path: Path) -> Course:
@@ -226,6 +245,7 @@ def _keep_person(path: Path, person: SequencePerson) -> None:
         neutral=person.neutral,
         shapes=person.shapes,
         keys=np.array(person.keys),
+        warnings=np.array(json.dumps(documents_of(person.warnings))),
         weights=np.stack([each.weights for each in person.motions]),
         rotations=np.stack([each.rotation for each in poses]),
         translations=np.stack([each.translation for each in poses]),
@@ -246,9 +266,9 @@ def _kept_person(path: Path, footage: Footage, model: HeadModel) -> SequencePers
         for rotation, shift, weights in zip(a["rotations"], a["translations"], a["weights"], strict=True)
     ]
     rig = replace(footage.work, cameras=tuple(cameras))
-    return SequencePerson(
-        model, tuple(map(str, a["names"])), a["neutral"], a["shapes"], rig, tuple(map(int, a["keys"])), tuple(motions)
-    )
+    keys, warnings = tuple(map(int, a["keys"])), tuple(map(read_message, json.loads(str(a["warnings"]))))
+    names = tuple(map(str, a["names"]))
+    return SequencePerson(model, names, a["neutral"], a["shapes"], rig, keys, tuple(motions), warnings)
 
 
 def write_arrays(path: Path, **arrays: Any) -> None:

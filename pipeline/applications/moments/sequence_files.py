@@ -15,6 +15,7 @@ report.json     what was found, written last
 
 import json
 import shutil
+import tempfile
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -54,16 +55,22 @@ CLAY, LIGHT = np.array([198.0, 176.0, 158.0]), np.array([-0.35, 0.45, 0.82])  # 
 
 
 def make_sequence(
-    folder: Path, out: Path, *, model: str, settings: Settings, report: Progress, usd: bool = False
-) -> dict[str, Any]:
-    """Tracks the head of a sequence and writes the ``FILES`` into ``out``; with ``usd`` also sequence.usdc. Returns the
-    content of report.json. Raises InputError for a wrong folder, the errors of the identity's single jobs, UnknownModel
-    or BadModel, NoUsd, and OSError."""
+    folder: Path, out: Path, *, model: str, settings: Settings, report: Progress, usd: bool = False,
+    share: tuple[int, int] = (1, 1),
+) -> dict[str, Any] | None:  # fmt: skip
+    """Tracks the head of a sequence and writes the ``FILES`` into ``out``, with ``usd`` sequence.usdc, too. Returns the
+    content of report.json. With a ``share`` (which, of how many) it tracks that part of the frames, and returns None
+    where others lack some still. Raises InputError for a wrong folder, what the identity's single jobs raise,
+    UnknownModel or BadModel, NoUsd, and OSError."""
     if usd:
         check_usd()
-    footage, head_model = open_footage(folder), load_model(model)
+    footage, head_model, kept = open_footage(folder), load_model(model), out / CHUNKS
     with Renderer.create() as renderer:
-        person, course = track_sequence(footage, head_model, settings, out / CHUNKS, renderer=renderer, report=report)
+        person, course = track_sequence(
+            footage, head_model, settings, kept, renderer=renderer, report=report, share=share
+        )
+    if course is None:
+        return None
     if course.failed.all():
         raise EigenheadError(compose("sequence-without-face"))
     found = smoothed(course)
@@ -81,7 +88,7 @@ def make_sequence(
         failed=found.failed,
         skew_mm=skew_mm(person, footage, found),
     )
-    shutil.copyfile(out / CHUNKS / "person.npz", out / "person.npz")
+    shutil.copyfile(kept / "person.npz", out / "person.npz")
     write_atomically(out / "sequence.glb", animation_of(person, footage, found))
     if usd:
         faces = person.model.levels["full"].faces
@@ -113,7 +120,11 @@ def document_of(person: SequencePerson, footage: Footage, course: Course) -> dic
     torn = compose(
         "sequence-skewed", count=skewed, all=len(course), spread_ms=1000.0 * footage.spread_s, most_mm=SKEWED_MM
     )
-    warnings = [said for said, holds in ((lost, failed), (torn, skewed > SKEWED_SHARE * len(course))) if holds]
+    missing = dict(zip(footage.rig.names, np.count_nonzero(~course.shown, axis=0).tolist(), strict=True))
+    missing = {name: count for name, count in missing.items() if count}
+    gaps = compose("sequence-pictures-missing", count=sum(missing.values()), cameras=list(missing))
+    doubts = (lost, failed), (gaps, missing), (torn, skewed > SKEWED_SHARE * len(course))
+    warnings = [*person.warnings, *(said for said, holds in doubts if holds)]
     turn, shift = (np.median(course.deviations[:, rows], axis=0) for rows in (slice(3), slice(3, POSE)))
     return {
         "format": FORMAT,
@@ -124,6 +135,7 @@ def document_of(person: SequencePerson, footage: Footage, course: Course) -> dic
         "cameras": list(footage.rig.names),
         "identity_frames": [footage.frames[key] for key in person.keys],
         "failed": failed,
+        "pictures_missing": missing,
         "deviation": {"rotation_deg": np.degrees(turn).tolist(), "translation_mm": shift.tolist()},
         "alike": {
             "median": float(np.median(course.alike)),
@@ -150,21 +162,23 @@ def poses_from_first(course: Course) -> list[RigidTransform]:
 
 
 def write_preview(path: Path, person: SequencePerson, footage: Footage, course: Course, report: Progress) -> None:
-    """Writes preview.mp4, under a temporary name first."""
-    name, scratch = person.rig.front_camera(), path.with_name(f".{path.name}.part.mp4")
-    camera, count = person.rig[name], len(course)
+    """Writes preview.mp4. Shares that end together may both do so."""
+    name, count = person.rig.front_camera(), len(course)
+    camera = person.rig[name]
     size = 2 * camera.intrinsics.width, camera.intrinsics.height
     rate = (count - 1) / max(float(footage.times_s[-1] - footage.times_s[0]), 1e-6)
-    film = cv2.VideoWriter(str(scratch), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
-    try:
-        for number, pictures in enumerate(footage.read(cameras=(name,))):
-            report("preview", number / count)
-            clay = draw_clay(person, camera, course.motion(number))
-            photo = pictures.get(name, np.zeros_like(clay))
-            film.write(np.ascontiguousarray(np.concatenate([photo, clay], axis=1)[:, :, ::-1]))
-    finally:
-        film.release()
-    scratch.replace(path)
+    with tempfile.TemporaryDirectory() as scratch:
+        draft = Path(scratch) / path.name
+        film = cv2.VideoWriter(str(draft), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+        try:
+            for number, pictures in enumerate(footage.read(cameras=(name,))):
+                report("preview", number / count)
+                clay = draw_clay(person, camera, course.motion(number))
+                photo = pictures.get(name, np.zeros_like(clay))
+                film.write(np.ascontiguousarray(np.concatenate([photo, clay], axis=1)[:, :, ::-1]))
+        finally:
+            film.release()
+        write_atomically(path, draft.read_bytes())
 
 
 def draw_clay(person: SequencePerson, camera: Camera, motion: Motion) -> UInt8[np.ndarray, "h w 3"]:

@@ -20,7 +20,10 @@ from pipeline.head_model.model import HeadModel
 from pipeline.reconstruct import start_reconstruction
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.recorder import Recorder
+from rig.errors import Cancelled, EigenheadError
 from rig.geometry import RigidTransform, rotation_from_vector
+from rig.messages.message import Message
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
@@ -49,6 +52,7 @@ class SequencePerson:
     rig: Rig
     keys: tuple[int, ...]  # frames by which the identity was found ...
     motions: tuple[Motion, ...]  # ... and what the head does there
+    warnings: tuple[Message, ...] = ()  # of these frames' fits, one of each code
 
     def head(self, weights: Float[np.ndarray, " e"]) -> Float[np.ndarray, "v 3"]:
         """Returns the head with an expression."""
@@ -58,18 +62,30 @@ class SequencePerson:
 def find_person(
     footage: Footage, model: HeadModel, settings: Settings, renderer: Renderer, report: Callable[[float], None]
 ) -> SequencePerson:
-    """Solves the best frames of the first second as a take. Raises like ``reconstruct``, with the frame's name; also
-    InputError for the method simplex."""
-    keys, solved = best_frames(footage), list[ContourSolution]()
+    """Solves the best frames of the first second as a take, without those that show no head. Raises what
+    ``reconstruct`` raises where none does, with the first one's name, and InputError for the method simplex."""
+    keys, solved, refused = best_frames(footage), dict[int, ContourSolution](), list[EigenheadError]()
+    warnings: dict[str, Message] = {}
     for done, key in enumerate(keys):
         report(done / (len(keys) + 1))
-        with named(footage.frames[key]), footage.capture(key) as (capture, rig):
-            steps = start_reconstruction(ReconstructionContext(capture, rig, model, settings, renderer))
-            solved.append(solution_of(next(steps)))
-            steps.close()
+        try:
+            with named(footage.frames[key]), footage.capture(key) as (capture, rig):
+                context = ReconstructionContext(capture, rig, model, settings, renderer)
+                run = Recorder(context)
+                steps = start_reconstruction(context, run)
+                solved[key] = solution_of(next(steps))
+                steps.close()
+            warnings = {each.code: each for each in run.warnings} | warnings
+        except Cancelled:
+            raise
+        except EigenheadError as error:
+            refused.append(error)
+    if not solved:
+        raise refused[0]
     report(len(keys) / (len(keys) + 1))
-    joint = fit_jointly(solved, min(settings.fitting.modes, len(model.modes))) if len(solved) > 1 else tuple(solved)
-    return person_of(footage, model, keys, joint)
+    alone = tuple(solved.values())
+    joint = fit_jointly(alone, min(settings.fitting.modes, len(model.modes))) if len(alone) > 1 else alone
+    return replace(person_of(footage, model, tuple(solved), joint), warnings=tuple(warnings.values()))
 
 
 def best_frames(footage: Footage) -> tuple[int, ...]:

@@ -19,7 +19,9 @@ STIFFNESS = 0.1  # q by the noise
 ROUNDS = 12
 QUIET = 0.25  # quantile of accelerations that are noise: people rest between movements
 QUIET_NORMAL = 0.3186 * 6.0**0.5  # the same quantile for unit noise
-TINY = 1e-9
+MIN_NOISE = (
+    1e-3  # of a deviation, that noise is at least: a weight that stays 0 has none, and would be infinitely stiff
+)
 Courses = Float[np.ndarray, "t p"]
 
 
@@ -41,7 +43,7 @@ def smooth(
     spread = np.stack([np.interp(np.arange(len(measured)), known, column[known]) for column in deviation.T], axis=1)
     jerks = np.abs(np.diff(course, 2, axis=0))[~(failed[:-2] | failed[1:-1] | failed[2:])]
     level = np.quantile(jerks, QUIET, axis=0) / QUIET_NORMAL if len(jerks) else np.median(spread, axis=0)
-    noise = spread * np.minimum(level / np.maximum(np.median(spread, axis=0), TINY), 1.0) + TINY
+    noise = spread * np.clip(level / np.median(spread, axis=0), MIN_NOISE, 1.0)
     information = np.where(failed[:, None], 0.0, noise**-2)
     least = (STIFFNESS * np.median(noise, axis=0)) ** 2
     held, found = np.ones((len(course) - 2, course.shape[1])), course

@@ -1,4 +1,4 @@
-"""Messages of the live head: instructions before a shot. They address the subject, or name a camera."""
+"""Messages of the live head, which tell the subject or name a camera, and messages of sequences."""
 
 TEMPLATES = {
     "live-starting": "looking for a head ...",
@@ -30,4 +30,15 @@ TEMPLATES = {
     "live-stranger": "{camera} sees another person, or the face at another position",
     "live-no-face": "{camera} sees no face, although you face it: check what hides the face",
     "live-off-centre": "{camera} does not show the whole head in the middle of its picture",
+    "sequence-without-cameras": "cameras.json is missing: put it into the folder of the sequence.",
+    "sequence-camera-empty": "There are no pictures of {cameras}: expected images/CAMERA/FRAME.png or videos/CAMERA.mp4. Remove cameras that did not film from cameras.json.",
+    "sequence-too-short": "A sequence needs two frames or more that two cameras show under one name, images/CAMERA/FRAME.png: found {count}.",
+    "sequence-rates-differ": "The videos have different rates: {slow} has {slow_fps:.2f} frames a second, {fast} has {fast_fps:.2f}. Convert them to one rate that begins at the same moment.",
+    "sequence-pictures-missing": "{count} pictures of {cameras} are missing, damaged or black; their frames follow from the other cameras.",
+    "sequence-times-wrong": "times.csv must give every frame a time_s, each later than the previous one; its columns are frame,time_s.",
+    "sequence-video-unread": "{file} cannot be decoded: supply single pictures, images/CAMERA/FRAME.png.",
+    "sequence-without-face": "The head was not found in any frame: check that cameras.json belongs to these pictures.",
+    "sequence-clock-wrong": "clock.json must state mean_ms of every camera: measure again with eigenhead clock",
+    "sequence-skewed": "The cameras expose {spread_ms:.0f} ms apart; in {count} of {all} frames the face moves by more than {most_mm:.0f} mm in that time. Trigger the cameras together.",
+    "sequence-frames-failed": "{count} of {all} frames failed and were interpolated: {frames}.",
 }

@@ -45,10 +45,11 @@ SETTINGS = settings_from_document(head_alone(settings_document(None, detail="pho
 
 
 def sequences(model: HeadModel, renderer: Renderer, bench: Bench, folder: Path, frames: int) -> Outcome:
-    """Runs the leg ``--sequence``. Films and results are kept in ``folder``."""
+    """Runs the leg ``--sequence``. Films and results are kept in ``folder``, by the number of frames: a run that was
+    killed films on."""
+    folder = folder / str(frames)
     for name, count in (("moving", frames), ("still", STILL_FRAMES)):
-        if not (folder / f"{name}.truth" / "truth.npz").is_file():
-            film(folder / name, model, renderer, count, bench, still=name == "still")
+        film(folder / name, model, renderer, count, bench, still=name == "still")
     figures = moving_figures(folder, model, renderer, bench) | still_figures(folder, model, renderer, bench)
     figures |= killed_figures(folder, bench)
     return {"figures": {name: round(value, 4) for name, value in figures.items()}, "rows": []}
@@ -56,7 +57,6 @@ def sequences(model: HeadModel, renderer: Renderer, bench: Bench, folder: Path, 
 
 def film(folder: Path, model: HeadModel, renderer: Renderer, frames: int, bench: Bench, *, still: bool) -> None:
     """Films a person of the model's population."""
-    shutil.rmtree(folder, ignore_errors=True)
     coefficients = np.random.default_rng((SEED, 0)).standard_normal(len(model.modes))
     studio, person = work_rig(default_layout(), TRACKED_PIXELS), Person(model, coefficients, SEED)
     simulate_sequence(folder, person, studio, PRESET, frames, renderer=renderer, report=bench.report, still=still)
@@ -89,6 +89,7 @@ def moving_figures(folder: Path, model: HeadModel, renderer: Renderer, bench: Be
     shutil.rmtree(kept, ignore_errors=True)
     begun = time.process_time()
     person, raw = track_sequence(footage, model, SETTINGS, kept, renderer=renderer, report=meter)
+    assert raw is not None, "there are no other shares"
     whole, course = time.process_time() - begun, smoothed(raw)
     with np.load(folder / "moving.truth" / "truth.npz") as arrays:
         truth = dict(arrays)
@@ -159,6 +160,7 @@ def still_figures(folder: Path, model: HeadModel, renderer: Renderer, bench: Ben
     """Returns the jitter of a head that sits still."""
     footage, kept = open_footage(folder / "still"), folder / "still-track" / CHUNKS
     person, raw = track_sequence(footage, model, SETTINGS, kept, renderer=renderer, report=bench.report)
+    assert raw is not None, "there are no other shares"
     face = model.levels["full"].face_region
     return {"jitter": jitter(person, smoothed(raw), face), "raw_jitter": jitter(person, raw, face)}
 

@@ -15,8 +15,10 @@ from typer.testing import CliRunner
 from pipeline.applications.moments import sequence, sequence_person
 from pipeline.applications.moments.footage import open_footage
 from pipeline.applications.moments.sequence_files import CACHE, CHUNKS, FILES
+from pipeline.applications.moments.sequence_person import find_person
 from pipeline.head_model.model import HeadModel
-from rig.errors import InputError
+from pipeline.settings import settings_from_document
+from rig.errors import EigenheadError, InputError
 from rig.formats.meshes.usdz import ROOT, openusd_module
 from rig.formats.pictures.images import read_image
 from rig.formats.pictures.work_size import work_rig
@@ -24,8 +26,10 @@ from rig.geometry import vector_from_rotation
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.sensor.preset import CLEAN
+from server.cli.heads import head_alone
 from server.cli.main import app
 from server.tasks.moving_subject import FPS, Person, simulate_sequence
+from server.tasks.settings_file import settings_document
 from tests.support.services import small_capture
 
 FRAMES, LOST, PIXELS = 7, 4, 320 * 240
@@ -46,8 +50,8 @@ def film(model: HeadModel, renderer: Renderer, tmp_path_factory: pytest.TempPath
     return folder
 
 
-def run(film: Path, out: Path) -> dict[str, Any]:
-    result = CliRunner().invoke(app, ["sequence", str(film), "--out", str(out), "--usd", "--json"])
+def run(film: Path, out: Path, *options: str) -> dict[str, Any]:
+    result = CliRunner().invoke(app, ["sequence", str(film), "--out", str(out), "--usd", "--json", *options])
     assert result.exit_code == 0, result.output
     return json.loads(result.stdout)
 
@@ -71,7 +75,9 @@ def test_every_frame_has_the_heads_pose(done: tuple[Path, dict[str, Any]], film:
     out, document = done
     assert document == json.loads((out / "report.json").read_text())
     assert document["failed"] == [f"{LOST:05}"]
-    assert [each["code"] for each in document["warnings"]] == ["sequence-frames-failed", "sequence-skewed"]
+    said = ["sequence-frames-failed", "sequence-pictures-missing", "sequence-skewed"]
+    assert [each["code"] for each in document["warnings"]] == said
+    assert document["pictures_missing"] == dict.fromkeys(CAMERAS[1:], 1)
     with np.load(out / "sequence.npz") as found, np.load(film.with_name("anna.truth") / "truth.npz") as truth:
         assert found["frames"].tolist() == [f"{k:05}" for k in range(FRAMES)]
         assert np.flatnonzero(found["failed"]).tolist() == [LOST]
@@ -126,7 +132,7 @@ def test_the_point_cache_moves_as_the_weights_and_poses_do(done: tuple[Path, dic
             np.testing.assert_allclose(head.GetExtentAttr().Get(float(k)), [found.min(axis=0), found.max(axis=0)])
 
 
-def test_a_run_that_was_cut_short_goes_on_to_the_same_bytes(
+def test_a_run_that_was_cut_short_and_shared_goes_on_to_the_same_bytes(
     done: tuple[Path, dict[str, Any]], film: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "again"
@@ -136,22 +142,41 @@ def test_a_run_that_was_cut_short_goes_on_to_the_same_bytes(
     (out / CHUNKS / ".0000003.npz.x.part").write_bytes(b"half of it")
     kept = {path.name: path.stat().st_mtime_ns for path in (out / CHUNKS).glob("*.npz")}
     assert len(kept) == 2
-    run(film, out)
+    assert run(film, out, "--shard", "2/2") == {"shard": "2/2"}  # the last chunk, without the one before
+    assert not (out / "report.json").exists()
+    assert len(list((out / CHUNKS).glob("0*.npz"))) == 2
+    run(film, out, "--shard", "1/2")
     assert {name: (out / CHUNKS / name).stat().st_mtime_ns for name in kept} == kept  # they were not made anew
     for name in (*FILES, CACHE):
         assert (out / name).read_bytes() == (done[0] / name).read_bytes(), name
+
+
+def test_a_frame_without_a_head_does_not_hide_the_person(
+    film: Path, model: HeadModel, renderer: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    footage = open_footage(film)
+    chosen = settings_from_document(head_alone(settings_document(None, detail="photo")))
+    for keys in ((LOST,), (LOST, 2)):
+        monkeypatch.setattr(sequence_person, "best_frames", lambda footage, keys=keys: keys)
+        if len(keys) == 1:
+            with pytest.raises(EigenheadError, match=f"{LOST:05}"):
+                find_person(footage, model, chosen, renderer, lambda share: None)
+        else:
+            assert find_person(footage, model, chosen, renderer, lambda share: None).keys == (2,)
+
+
+def write_video(film: Path, path: Path, rate: float) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate, (320, 240))
+    for k in range(LOST):
+        writer.write(np.ascontiguousarray(read_image(film / "images" / path.stem / f"{k:05}.png")[:, :, ::-1]))
+    writer.release()
 
 
 def test_videos_are_read_from_any_frame(film: Path, tmp_path: Path) -> None:
     shutil.copy(film / "cameras.json", tmp_path / "cameras.json")
     (tmp_path / "videos").mkdir()
     for name in CAMERAS:
-        film_of = cv2.VideoWriter(
-            str(tmp_path / "videos" / f"{name}.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (320, 240)
-        )
-        for k in range(LOST):
-            film_of.write(np.ascontiguousarray(read_image(film / "images" / name / f"{k:05}.png")[:, :, ::-1]))
-        film_of.release()
+        write_video(film, tmp_path / "videos" / f"{name}.avi", 30.0)
     footage = open_footage(tmp_path)
     np.testing.assert_allclose(footage.times_s, np.arange(LOST) / 30.0)
     whole, later = list(footage.read()), list(footage.read(2))
@@ -161,6 +186,9 @@ def test_videos_are_read_from_any_frame(film: Path, tmp_path: Path) -> None:
     with footage.capture(3) as (capture, rig):
         assert np.array_equal(capture.images["cam00"], whole[3]["cam00"])
         assert rig.names == tuple(CAMERAS)
+    write_video(film, tmp_path / "videos" / "cam03.avi", 60.0)
+    with pytest.raises(InputError, match=r"30\.00 .*cam03 .*60\.00"):
+        open_footage(tmp_path)
 
 
 def test_what_is_wrong_with_a_folder_is_said(film: Path, tmp_path: Path) -> None:
@@ -177,6 +205,14 @@ def test_what_is_wrong_with_a_folder_is_said(film: Path, tmp_path: Path) -> None
         with pytest.raises(InputError, match=name.replace(".", r"\.")):
             open_footage(tmp_path)
         (tmp_path / name).unlink()
+    for name in CAMERAS:
+        (tmp_path / "images" / name / "00002.png").unlink(missing_ok=True)
+    times = open_footage(tmp_path).times_s  # a recorder dropped that frame
+    np.testing.assert_allclose(times, np.array([0, 1, 3, 4, 5, 6]) / FPS)
+    for path in (tmp_path / "images").glob("*/*"):
+        path.rename(path.with_stem(f"{path.parent.name}-{path.stem}"))
+    with pytest.raises(InputError, match="under one name"):
+        open_footage(tmp_path)
 
 
 def test_the_studio_films_a_subject_over_an_earlier_capture(tmp_path: Path, model: HeadModel) -> None:

@@ -44,3 +44,13 @@ def test_a_failed_frame_follows_from_its_neighbours_with_a_larger_deviation() ->
     assert np.isfinite(spread).all()
     assert spread[61, 0] > spread[~failed].max()
     assert np.abs(found - true)[failed].max() < 3.0 * spread[61, 0]
+
+
+def test_frames_that_failed_at_the_beginning_follow_from_what_rests() -> None:
+    rng, failed = np.random.default_rng(3), np.isin(np.arange(12), (0, 1, 2, 3, 7))
+    measured = np.zeros((12, 50))
+    measured[4:6] = rng.uniform(0.0, 0.1, (2, 50))  # the other frames are at a weight's bound
+    deviation = np.where(failed[:, None], np.inf, rng.uniform(0.15, 0.2, measured.shape))
+    found, spread = smooth(measured, deviation, failed, list(np.arange(50)[:, None]))
+    assert np.abs(found).max() < 0.6  # a straight line to the first frame
+    assert spread[failed].min() > 0.14
