@@ -68,8 +68,8 @@ def rim_of(seen: Points, centre: Float[np.ndarray, " 3"], down: Float[np.ndarray
     sector = np.floor((angle / (2.0 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     farthest = []
     for number in np.flatnonzero(np.bincount(sector, minlength=SECTORS) >= MIN_SEEN):
-        own = np.flatnonzero(sector == number)
-        farthest.append(np.median(seen[own[far[own] >= np.quantile(far[own], FARTHEST)]], axis=0))
+        members = np.flatnonzero(sector == number)
+        farthest.append(np.median(seen[members[far[members] >= np.quantile(far[members], FARTHEST)]], axis=0))
     return Rim(np.array(farthest), centre, across) if farthest else None
 
 
