@@ -26,7 +26,7 @@ def nested(depth: int) -> list[Any]:
         ({"warnings": []}, "unknown key 'warnings'"),
         ({"surface": "head"}, "unknown key 'surface'; did you mean 'outputs.surface'?"),
         ({"outputs": {"texture_sizes": 1}}, "unknown key 'outputs.texture_sizes'; did you mean 'texture_size'?"),
-        ({"bust": {"spacing_mm": 0.4}}, "bust.spacing_mm is 0.4, wanted 0.5 to 3"),
+        ({"bust": {"spacing_mm": 0.4}}, "bust.spacing_mm is 0.4, expected 0.5 to 3"),
         ({"bust": {"spacing_mm": 10**400}}, "bust.spacing_mm is 1000"),
         ({"bust": {"spacing_mm": 10**5000}}, "bust.spacing_mm is too large a value"),
         ({"bust": {"spacing_mm": True}}, "bust.spacing_mm is True"),

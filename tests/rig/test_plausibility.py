@@ -68,7 +68,7 @@ def test_strong_but_real_lenses_and_fisheyes_have_no_faults():
 
 
 ONE_PLACE = reposed(STUDIO, lambda pose: RigidTransform(pose.rotation, -pose.rotation @ np.array([1.0, 2.0, 3.0])))
-TOO_LARGE = "*translations are wanted in millimetres; "
+TOO_LARGE = "*translations must be in millimetres: "
 FAULTS = {
     **{
         f"k1 of {k1:g}": (lensed(STUDIO, "cam05", Distortion(k1=k1)), "cam05: the lens is absurd (k1 = *")
@@ -92,7 +92,7 @@ FAULTS = {
     ),
     "shares of the picture": (
         relensed(STUDIO, lambda k: replace(k, fx=1.2, fy=1.6, cx=0.5, cy=0.5)),
-        "fx, fy, cx and cy are shares of the pictures' size*",
+        "fx, fy, cx and cy are fractions of the pictures' size*",
     ),
     **{
         f"pictures of {size} times the size": (

@@ -43,7 +43,7 @@ def test_good_views_agree_and_planted_faults_are_told(rig: Rig, traced: dict[str
     judged = judge_agreement(
         silhouettes | {"cam02": silhouette_from_mask(more), "cam06": silhouette_from_mask(less)}, rig
     )
-    assert "other cameras see nothing" in judged["cam02"].quality.warnings[0].text
+    assert "other cameras exclude the subject" in judged["cam02"].quality.warnings[0].text
     assert "lacks" in judged["cam06"].quality.warnings[0].text
     assert not judged["cam06"].quality.usable
     fine = [judged[name] for name in rig.names if name not in ("cam02", "cam06")]

@@ -250,7 +250,7 @@ def test_missing_inputs_are_named(renderer):
             silhouettes.xor_costs(mesh.vertices)
         with pytest.raises(InputError, match="no mask for camera cam01"):
             silhouettes.set_inputs({"cam00": np.zeros((120, 160), bool)}, {})
-        with pytest.raises(InputError, match="3 of them"):
+        with pytest.raises(InputError, match="vertices: there are 3,"):
             silhouettes.masks(mesh.vertices[:3])
 
 

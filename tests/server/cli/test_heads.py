@@ -75,7 +75,7 @@ OPTIONS = ("--noise", "--light-drift", "--defocus", "--rolling-ms", "--fps")
     ("option", "value", "text"),
     [
         *((option, value, option) for option in OPTIONS for value in ("nan", "inf")),
-        ("--realism", "oily,shiny", "shiny is none of smooth, oily, scattering, mosaic, jpeg"),
+        ("--realism", "oily,shiny", "shiny is not one of smooth, oily, scattering, mosaic, jpeg"),
     ],
 )
 def test_a_wrong_value_is_wrong_usage_and_is_named(option: str, value: str, text: str, tmp_path: Path) -> None:

@@ -300,7 +300,10 @@ def test_a_queue_that_nobody_serves_is_said(http: httpx.Client, captures: list[s
     assert (check["ok"], check["detail"]) == (True, "2 jobs wait in queues without a worker: gpu")
     http.post(f"/v1/batches/{batch['id']}/cancel")
     batch_once(http, batch["id"], finished)
-    assert http.get("/readyz").json()["checks"]["queues"]["detail"] == "workers serve all in which jobs wait"
+    assert (
+        http.get("/readyz").json()["checks"]["queues"]["detail"]
+        == "there is a worker for every queue with waiting jobs"
+    )
 
 
 def test_batches_are_listed_by_pages_newest_first(http: httpx.Client, captures: list[str]) -> None:

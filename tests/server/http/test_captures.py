@@ -40,7 +40,7 @@ def test_a_form_field_that_nobody_knows_is_named(
 
 
 BAD = {case: SPOILT[case] for case in ("missing image", "NaN in a rotation", "image of another size")}
-BAD |= {"cut off": (bool, "damaged or cut off"), "no cameras": (removes("cameras.json"), "holds no cameras.json")}
+BAD |= {"cut off": (bool, "damaged or cut off"), "no cameras": (removes("cameras.json"), "contains no cameras.json")}
 
 
 @pytest.mark.parametrize("case", BAD)

@@ -35,7 +35,7 @@ def test_what_can_be_done_is_not_refused() -> None:
 
 def test_a_template_that_there_is_not_or_that_another_model_carries_is_refused() -> None:
     subject, (fault,) = refusal_of(outputs={"template": "ict"})
-    assert (subject, "outputs.template: no template 'ict': known are damaged, flame" in fault.text) == (
+    assert (subject, "outputs.template: there is no template 'ict'; known are damaged, flame" in fault.text) == (
         "settings",
         True,
     )

@@ -100,7 +100,7 @@ def test_landmarks_place_a_mesh_in_any_unit_and_too_few_are_refused() -> None:
 
 def test_what_is_no_head_in_any_unit_is_refused() -> None:
     ball = trimesh.creation.icosphere(subdivisions=2, radius=40.0)
-    with pytest.raises(InputError, match="no head in mm, cm, dm, m"):
+    with pytest.raises(InputError, match="too little for a head in mm, cm, dm, m"):
         find_place(load_model(), surface(ball), "ball.obj")
 
 

@@ -75,7 +75,7 @@ def test_what_makes_no_model_is_named(tmp_path: Path) -> None:
         find_results(tmp_path)
     deliver(tmp_path / "a", 1)
     deliver(tmp_path / "b", 2, warnings=("pose-doubtful",))
-    with pytest.raises(InputError, match=r"1 results can be used, and 3 are needed.*b: warns pose-doubtful"):
+    with pytest.raises(InputError, match=r"1 results can be used, but 3 are needed.*b: warns pose-doubtful"):
         build_from_results(tmp_path, tmp_path / "out.npz", name="out")
     deliver(tmp_path / "c", 3)
     (tmp_path / "c" / "head.ply").write_bytes(b"ply\n")

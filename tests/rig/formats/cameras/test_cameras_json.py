@@ -84,7 +84,7 @@ MIRROR = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]
     [
         ("format", "eigenhead-cameras/9", "format is 'eigenhead-cameras/9'"),
         ("format", ..., "format is None"),
-        ("unit", "m", "unit is 'm', wanted 'mm'"),
+        ("unit", "m", "unit is 'm', expected 'mm'"),
         ("unit", "m", "multiply the translations by 1000 and write 'mm'"),
         ("unit", "cm", "multiply the translations by 10 and write 'mm'"),
         ("unit", "Inch", "multiply the translations by 25.4 and write 'mm'"),

@@ -61,7 +61,7 @@ def test_opencv_matrices_in_one_file(unit: float, vectors: bool, tmp_path: Path)
 
 
 def test_an_unknown_format_and_a_yaml_of_opencv_without_cameras_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="'ply' is none of eigenhead, colmap"):
+    with pytest.raises(InputError, match="'ply' is not one of eigenhead, colmap"):
         write_rig_file(fan(), tmp_path / "x", "ply")
     (tmp_path / "board.yml").write_text("%YAML:1.0\n---\nsquare: 25.\n")
     with pytest.raises(InputError, match=r"board\.yml: holds no camera; wanted are K_<name>, dist_<name>, R_<name>"):

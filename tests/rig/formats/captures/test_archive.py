@@ -465,4 +465,4 @@ def test_a_long_name_s_header_has_a_limit_of_its_own(tmp_path: Path, monkeypatch
     monkeypatch.setattr(rules, "HEADER_BYTES_MOST", 112)
     assert len(unpacked(data, tmp_path, ArchiveLimits(depth=60))) == 1
     monkeypatch.setattr(rules, "HEADER_BYTES_MOST", 111)
-    assert refused(data, tmp_path / "more") == ("'././@LongLink' has a header of 112 bytes",)
+    assert refused(data, tmp_path / "more") == ("'././@LongLink' has a header of 112 bytes, which is too large",)
