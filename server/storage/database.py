@@ -18,6 +18,7 @@ from sqlalchemy import event
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import IntegrityError, InterfaceError, InternalError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
+from sqlalchemy.schema import CreateIndex, CreateTable
 
 from rig.errors import EigenheadError
 from rig.messages.message import compose
@@ -235,8 +236,14 @@ def open_database(settings: ServiceSettings) -> sa.Engine:
         patience = {"connect_timeout": CONNECT_S}
         engine = sa.create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10, connect_args=patience)
     try:
-        metadata.create_all(engine)
+        tables = metadata.sorted_tables  # each in one statement: a worker may create them at the same moment
+        with engine.begin() as connection:
+            for table in tables:
+                connection.execute(CreateTable(table, if_not_exists=True))
         _add_columns(engine)
+        with engine.begin() as connection:
+            for index in (index for table in tables for index in table.indexes):
+                connection.execute(CreateIndex(index, if_not_exists=True))
     except (SQLAlchemyError, sqlite3.Error) as error:
         raise DatabaseUnavailable(settings.place, error) from error
     return engine
