@@ -230,19 +230,19 @@ def open_database(settings: ServiceSettings) -> sa.Engine:
         def prepare(connection: Any, record: Any) -> None:
             connection.isolation_level = "IMMEDIATE"  # a writer that starts as a reader could not wait for its turn
             connection.execute("PRAGMA busy_timeout=30000")
-            connection.execute("PRAGMA journal_mode=WAL")  # kept in the file: the job engine's connections read it too
+            with suppress(sqlite3.OperationalError):  # locked: another process is just setting it
+                connection.execute("PRAGMA journal_mode=WAL")  # kept in the file: the job engine's connections read it
             connection.execute("PRAGMA synchronous=FULL")  # WAL's default loses the last commits with the power
     else:
         patience = {"connect_timeout": CONNECT_S}
         engine = sa.create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10, connect_args=patience)
     try:
-        tables = metadata.sorted_tables  # each in one statement: a worker may create them at the same moment
         with engine.begin() as connection:
-            for table in tables:
+            for table in metadata.sorted_tables:  # in one statement each: a worker may create them at the same moment
                 connection.execute(CreateTable(table, if_not_exists=True))
         _add_columns(engine)
         with engine.begin() as connection:
-            for index in (index for table in tables for index in table.indexes):
+            for index in (index for table in metadata.sorted_tables for index in table.indexes):
                 connection.execute(CreateIndex(index, if_not_exists=True))
     except (SQLAlchemyError, sqlite3.Error) as error:
         raise DatabaseUnavailable(settings.place, error) from error
