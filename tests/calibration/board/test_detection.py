@@ -69,8 +69,8 @@ def test_a_mirrored_picture_is_refused_and_named(board: Board) -> None:
 @pytest.mark.parametrize(
     ("board", "columns", "said"),
     [
-        pytest.param(CHECKERBOARD, 7, "it shows 9 x 6", marks=pytest.mark.slow),
-        pytest.param(CHECKERBOARD, 10, "it shows 9 x 6", marks=pytest.mark.slow),
+        pytest.param(CHECKERBOARD, 7, "the picture shows 9 x 6", marks=pytest.mark.slow),
+        pytest.param(CHECKERBOARD, 10, "the picture shows 9 x 6", marks=pytest.mark.slow),
         (CHARUCO, 7, "it shows 9 squares in a row"),
     ],
 )
