@@ -1,8 +1,7 @@
 """Finds the curve along which a bust ends where outlines end it inside the pictures.
 
-Masks of other programs cut a person off at the chest. Matching fails beside such a cut, and the surface frays there.
-Around the head the bust therefore ends at one smooth distance from it, which meets neck, shoulders and chest nearly at
-right angles.
+Masks of other programs cut a person off at the chest. Depth fails beside such a cut, and the surface frays. The bust then
+ends at a smooth distance from the head, which meets neck, shoulders and chest nearly at right angles.
 """
 
 from dataclasses import dataclass
@@ -31,8 +30,7 @@ class Rim:
     across: Float[np.ndarray, "3 2"]  # two unit vectors across the direction from the head to its neck
 
     def share_ended(self, views: ViewStack) -> float:
-        """Returns the share (0 to 1) of the rim's points that outlines end: a step outwards most pictures that hold the
-        place show no subject."""
+        """Returns the share (0 to 1) of the rim beyond which most pictures that hold the place show no subject."""
         outwards = self.points - self.centre
         frame_mm, outline_mm = views.outside(
             self.points + STEP_MM * outwards / np.linalg.norm(outwards, axis=1, keepdims=True)

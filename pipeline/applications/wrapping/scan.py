@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -59,7 +60,7 @@ class RawScan:
             return mesh
         vertices, faces, painted = mesh.vertices, mesh.faces, {"uv": self.painted.uv}
         while len(faces) < DRAWN_TRIANGLES:
-            vertices, faces, painted = subdivide(vertices, faces, vertex_attributes=painted)
+            vertices, faces, painted = cast(Any, subdivide)(vertices, faces, vertex_attributes=painted)
         return Mesh(vertices, faces.astype(np.int32), _texels(self.painted.image, painted["uv"]))
 
 

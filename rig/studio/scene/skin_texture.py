@@ -8,6 +8,7 @@ normals, and lit with the normals of the relief.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -80,7 +81,7 @@ def relieved(head: Mesh, relief: SkinRelief, values: Mapping[str, Float[np.ndarr
     near = (relief.share(places) > 0)[head.faces].any(axis=1)
     inner, outer = head.faces[near], head.faces[~near]
     while len(inner) and np.median(np.linalg.norm(places[inner[:, 0]] - places[inner[:, 1]], axis=1)) > EDGE_MM:
-        places, inner, attributes = subdivide(places, inner, vertex_attributes=attributes)
+        places, inner, attributes = cast(Any, subdivide)(places, inner, vertex_attributes=attributes)
     normals = attributes.pop("normals")
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     slopes = relief.slopes(places)

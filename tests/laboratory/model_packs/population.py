@@ -22,7 +22,7 @@ from pipeline.head_model.landmarks import NAMES
 from pipeline.head_model.model import load_model
 from pipeline.head_model.model_file import ModelParts, save_model
 from pipeline.head_model.model_names import DEFAULT, PACKS
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 from tests.laboratory.model_packs import makehuman
 from tests.laboratory.model_packs.makehuman import Base, HeadCut, Source
 
@@ -163,7 +163,7 @@ def _clipped(rng: np.random.Generator, limit: float) -> float:
 
 
 def sample_shapes(
-    base: Base, targets: Targets, sampling: Sampling, *, report: Progress | None = None
+    base: Base, targets: Targets, sampling: Sampling, *, report: Progress = discard_progress
 ) -> Float[np.ndarray, "N V 3"]:
     """Draws the subjects of the database. Returns their whole base meshes (decimetres), males first. Subject k depends
     only on the seed and k."""
@@ -178,8 +178,7 @@ def sample_shapes(
             for name, value in local_weights(rng, list(targets.local[folder]), width, sampling).items():
                 shape += value * targets.local[folder][name]
         shapes.append(shape)
-        if report:
-            report("sampling", (k + 1) / SUBJECTS["total"])
+        report("sampling", (k + 1) / SUBJECTS["total"])
     return np.array(shapes)
 
 
@@ -200,7 +199,7 @@ def landmark_vertices(base: Base, cut: HeadCut) -> dict[str, int]:
     return {name: out[name] for name in NAMES}
 
 
-def build(source: Path, sampling: Sampling | None = None, *, report: Progress | None = None) -> ModelParts:
+def build(source: Path, sampling: Sampling | None = None, *, report: Progress = discard_progress) -> ModelParts:
     """Builds the parts of the default model from MakeHuman's data. Raises NoMakeHuman."""
     sampling = sampling or Sampling()
     files = Source(source)
