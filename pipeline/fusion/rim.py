@@ -1,6 +1,6 @@
 """Finds the curve along which a bust ends where outlines end it inside the pictures.
 
-Masks of other programs cut a person off at the chest. Depth fails beside such a cut, and the surface frays. The bust then
+Masks of other programs cut a person off at the chest. Depth fails beside the cut, and the surface frays. The bust then
 ends at a smooth distance from the head, which meets neck, shoulders and chest nearly at right angles.
 """
 
