@@ -21,8 +21,7 @@ def views() -> ViewStack:
 
 
 def test_nothing_lies_behind_what_cameras_see_and_the_end_is_a_plane() -> None:
-    """A head of 50 mm without what is lower than -30, before cameras from +z; points of it and of a chest are seen, and
-    masks hold both."""
+    """A head of 50 mm without what is lower than -30, before cameras from +z; masks hold it and a chest."""
     made = scene([Ellipsoid((0, -40, 0), (60, 130, 60))], fan(200, 150))
     views = stack_views(made.maps, made.silhouettes, made.rig)
     sphere = trimesh.creation.icosphere(5, 50.0)
@@ -50,8 +49,7 @@ def test_bust_ends_where_all_photographs_but_one_end(views: ViewStack) -> None:
 
 
 def test_a_frayed_rim_that_masks_end_becomes_smooth(views: ViewStack) -> None:
-    """Points of a collar end between 50 and 62 mm from the head's centre; a ball of 60 mm, or one of 150, is in the
-    masks."""
+    """Points of a collar end 50 to 62 mm from the head's centre; masks show a ball of 60 mm, or one of 150."""
     rng = np.random.default_rng(0)
     angle, far = rng.uniform(-np.pi, np.pi, 9000), rng.uniform(30.0, 56.0, 9000)
     far += 6.0 * np.sin(40.0 * angle) * (far > 50.0)
