@@ -180,7 +180,7 @@ def _repository_expressions(folder: Path, neutral: Vertices, report: Progress) -
 
 def _displacements(
     folder: Path, paths: list[Path], neutral: Vertices, stage: str, report: Progress
-) -> Float[np.ndarray, "M V 3"]:
+) -> Float[np.ndarray, "M S 3"]:
     """Returns how meshes (cm) of the repository ``folder`` differ from the neutral one, mm. Raises CannotImport."""
     shapes = []
     for k, path in enumerate(paths):
