@@ -31,7 +31,7 @@ from pipeline.fusion.refinement import (
     seen_deviation_mm,
     without_islands,
 )
-from pipeline.fusion.signed_distance import Level, NoSurface, solve
+from pipeline.fusion.signed_distance import HeadEars, Level, NoSurface, solve
 from pipeline.fusion.skin import HeadSkin, combine_with_head
 from pipeline.fusion.untangling import CLEAN, MeshFaults, mesh_faults, smooth_spots, topology_of
 from pipeline.fusion.view_stack import silence_contradicted, stack_views
@@ -98,6 +98,7 @@ def fuse(
     report: Progress,
     hair: Places | None = None,
     scatter: float = 0.0,
+    ears: Sequence[Bool[np.ndarray, " h"]] = (),
 ) -> DepthSurface:
     """Fuses the depth maps to one closed surface.
 
@@ -111,6 +112,7 @@ def fuse(
         report: called with the stage's progress.
         hair: of which the depth maps say nothing; None if there is none.
         scatter: how far (0 to 1) the depth of hair is noise.
+        ears: vertices of each bare ear of the head, which is taken if few views agree on the depth.
 
     Raises:
         NoSurface: fewer than three views have any depth, or they contradict each other.
@@ -120,7 +122,10 @@ def fuse(
         raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
     views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
-    level, cut = solve(maps, views, head_world, spacing_mm, hair)
+    agreed = np.median(np.concatenate([depth_map.views[depth_map.known] for depth_map in maps]))
+    few = agreed <= MIN_VIEWS and len(ears) > 0
+    taken = HeadEars.of(head_world, ears, views) if few and head_world is not None else None
+    level, cut = solve(maps, views, head_world, spacing_mm, hair, taken)
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
     report("bust", 0.8)
@@ -130,9 +135,8 @@ def fuse(
     names = [depth_map.camera.name for depth_map in maps]
     warnings = tuple(mask_warnings(names, contradicted))
     straight = without_bias(mesh, measured.views > 0, bias)
-    return DepthSurface(
-        straight, safe, measured, warnings, capped, scatter, hair if hair is None else shell_deviation_mm(hair, views)
-    )
+    shell_mm = None if hair is None else shell_deviation_mm(hair, views)
+    return DepthSurface(straight, safe, measured, warnings, capped, scatter, shell_mm)
 
 
 @traced
@@ -162,12 +166,13 @@ def finished(
         shares = part_shares(votes if head is None else parts_over_head(votes, head.mesh_world), mesh.vertices)
     skin, moved_mm = shares[:, Part.SKIN.channel], np.zeros(len(seen))
     strands, neck = surface.scatter * shares[:, Part.HAIR.channel], np.zeros(len(seen))
-    if head is not None:
-        mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured), seen_vertices)
-        if seen.any() and np.median(measured.views[seen]) <= MIN_VIEWS:  # the relief of a neck is noise
-            neck[seen] = skin[seen] * below_head(head.mesh_world, mesh.vertices[seen])
     clothes, noise_mm = shares[:, Part.CLOTHES.channel], seen_deviation_mm(measured)
-    mesh = smooth_unresolved(mesh, np.maximum(strands, neck), clothes, noise_mm, seen_vertices, surface.capped)
+    if head is not None:
+        mesh = combine_with_head(mesh, seen * skin, head, noise_mm, seen_vertices)
+        neck[seen] = skin[seen] * below_head(head.mesh_world, mesh.vertices[seen])
+    few = seen.any() and np.median(measured.views[seen]) <= MIN_VIEWS  # then all relief of a neck is noise
+    hair = np.maximum(strands, neck) if few else strands
+    mesh = smooth_unresolved(mesh, hair, clothes, neck, noise_mm=noise_mm, seen=seen_vertices, held=surface.capped)
     if surface.shell_deviation_mm is None:
         mesh, moved_mm = grown_to_outlines(mesh, strands, silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))

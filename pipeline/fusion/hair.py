@@ -46,6 +46,7 @@ RESOLVED_MM = 4.0  # standard deviation of the mean that a vertex of hair takes:
 CLOTHES_DEVIATIONS = 2.0  # of depth, by which that mean may move clothes: shirts lose half of their gravel, a rim stays
 STEP_SHARE = 0.46  # variance of one step of a mean, by the area of a vertex
 OFF_HEAD_MM = 8.0  # from the head there is no skin: strands that hang before it have skin's colours in shade
+NECK_MM = 45.0  # above the head's end necks are off their model's place, and below it is a chest
 FRAME_PX = 3  # from the border of a photograph, where the outline is the photograph's
 STRANDS = 0.2, 0.6  # probability of hair from which on it is moved to its outlines, and wholly
 TANGENT = 0.25, 0.5  # cosine to a camera up to which its outline bounds the surface, and from which on not: there a
@@ -238,7 +239,7 @@ def parts_over_head(votes: PartVotes, head_world: Mesh, stubble: bool = True) ->
     weight = out[alike, hair] + 1e-9
     mean_mm = (weight * height[alike]).sum(axis=1) / weight.sum(axis=1)
     over = np.interp(mean_mm, STUBBLE_MM, (0.0, 1.0)) if stubble else 1.0
-    off = (far > OFF_HEAD_MM) & ~near_rim(head_world, head_world.vertices)[near]  # below its end is a chest
+    off = (far > OFF_HEAD_MM) & ~near_rim(head_world, head_world.vertices, NECK_MM)[near]
     out[:, hair] = np.where(off, both, over * out[:, hair])
     out[:, skin] = both - out[:, hair]
     return replace(votes, probability=out)
@@ -255,25 +256,31 @@ def smooth_unresolved(
     mesh_world: Mesh,
     hair: Float[np.ndarray, " v"],
     clothes: Float[np.ndarray, " v"],
+    neck: Float[np.ndarray, " v"],
+    *,
     noise_mm: Float[np.ndarray, " v"],
     seen: SeenVertices,
     held: Bool[np.ndarray, " v"],
 ) -> Mesh:
-    """Returns the mesh with the vertices of hair, of clothes, and those far from all that is seen, moved to the mean of
-    their surroundings: relief that is narrower is noise. Clothes have edges: they move by little more than their noise.
+    """Returns the mesh with the vertices of hair, clothes and neck, and those far from all that is seen, moved to the
+    mean of their surroundings: relief that is narrower is noise. Clothes and necks have edges: they move by little more
+    than their noise.
 
-    ``mesh_world``: closed, mm. ``hair``, ``clothes``: probability that a vertex shows them. ``noise_mm``: standard
-    deviation of depth. ``seen``: by a view; the others are what is seen next to them. ``held``: vertices that stay.
+    ``mesh_world``: closed, mm. ``hair``, ``clothes``, ``neck``: probability that a vertex shows them. ``noise_mm``:
+    standard deviation of depth. ``seen``: by a view; the others are the hair or clothes next to them. ``held``: of the
+    cap that ends the bust; they stay, but for its edge.
     """
     beside = neighbours(mesh_world.faces, len(hair))
-    share = skin_share(beside, 1.0 - np.maximum(hair, clothes), seen)
+    share = np.minimum(skin_share(beside, 1.0 - np.maximum(hair, clothes), seen), 1.0 - neck)
     share *= EDGE_MM / np.maximum(seen.guess_deviation_mm(), EDGE_MM)
-    share = np.where(held, 1.0, share)[:, None]
+    around = mean_around(beside, held.astype(float), np.ones(len(held)))
+    edge = 4.0 * around * (1.0 - around)  # of the cap, which the grid cuts like a saw
+    share = (np.where(held, 1.0, share) * (1.0 - edge))[:, None]
     area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / len(hair)
     mean = blurred_over_mesh(mesh_world.vertices, *beside, round(RESOLVED_MM**2 / (STEP_SHARE * area_mm2)))
     way = (1.0 - share) * (mean - mesh_world.vertices)
     most_mm = CLOTHES_DEVIATIONS * mean_around(beside, noise_mm, seen.themselves.astype(float))
-    bounded = seen.themselves & (clothes > hair)
+    bounded = seen.themselves & (np.maximum(clothes, neck) > hair) & (edge < LIKELY)
     way[bounded] *= np.minimum(1.0, most_mm / np.maximum(np.linalg.norm(way, axis=1), 1e-9))[bounded, None]
     return Mesh(mesh_world.vertices + way, mesh_world.faces)
 

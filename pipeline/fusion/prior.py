@@ -9,9 +9,10 @@ that all stand on one side, it is the other way round.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.surface_index import SurfaceIndex
 from rig.mesh import Mesh, boundary_edges
 
 THICKEST_MM = 60.0  # of hair: farther out a point belongs to something else
@@ -20,6 +21,10 @@ EVERY = 4  # vertices of the head stand for the others: 3 mm apart is enough for
 MIN_POINTS = 3  # of the surface near a vertex, for a thickness
 NEAREST, EVEN_MM = 64, 5.0  # vertices that a mean is taken of, and the distance within which they count alike
 SURE_MM = 0.5  # no guess is better
+# About an ear within which the head says where it ends. And how far it may stand out of its outlines, which would cut a
+# thin rim to shreds.
+EAR_MM, EAR_SPARED_MM = 15.0, 4.0
+CANDIDATES = 8  # of the head's triangles, for the one nearest to a place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,12 +82,26 @@ def _offsets(
     return (share * mean_mm[:, near]).sum(axis=2), (share * mean_mm[:, near] ** 2).sum(axis=2) + SURE_MM**2
 
 
-def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Tells which points lie within ``RIM_MM`` of the head's open border, at the neck."""
+def distance_about_ears(
+    head_world: Mesh, ears: Float[np.ndarray, "m 3"], places: Float[np.ndarray, "n 3"]
+) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Returns the rows of the points within ``EAR_MM`` of places on ears, and their signed distances (mm, positive
+    outside) to the head."""
+    low, high = ears.min(axis=0) - EAR_MM, ears.max(axis=0) + EAR_MM
+    rows = np.flatnonzero(((places > low) & (places < high)).all(axis=1))
+    rows = rows[nearest(PointTree.of(ears), places[rows], within=EAR_MM)[0] < EAR_MM]
+    about = places[rows]
+    hit = SurfaceIndex(head_world.vertices, head_world.faces).closest(about, CANDIDATES)
+    normals = np.einsum("nk,nkx->nx", hit.weights, head_world.normals()[head_world.faces[hit.triangles]])
+    return rows, np.copysign(hit.distances, ((about - hit.points) * normals).sum(axis=1))
+
+
+def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"], within_mm: float = RIM_MM) -> Bool[np.ndarray, " n"]:
+    """Tells which points lie near the head's open border, at the neck."""
     rim = np.unique(boundary_edges(head_world.faces))
     if not len(rim):
         return np.zeros(len(places), bool)
-    return nearest(PointTree.of(head_world.vertices[rim]), places, within=RIM_MM)[0] < RIM_MM
+    return nearest(PointTree.of(head_world.vertices[rim]), places, within=within_mm)[0] < within_mm
 
 
 def below_head(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:

@@ -22,7 +22,7 @@ from pipeline.fusion import grid_kernels
 from pipeline.fusion.grid import Grid, at_points, everywhere, marked_box, refined, whole_box
 from pipeline.fusion.grid_kernels import Membrane, relax
 from pipeline.fusion.hair import Places, distance_to_shell
-from pipeline.fusion.prior import SeenSurface, distance_to_subject, near_rim
+from pipeline.fusion.prior import EAR_SPARED_MM, SeenSurface, distance_about_ears, distance_to_subject, near_rim
 from pipeline.fusion.rim import rim_of
 from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE, ViewStack
 from pipeline.fusion.vote_kernels import CENTRE, vote
@@ -38,6 +38,8 @@ FAR_MM = 100.0  # distances count up to this one
 ONE_SIDED = 0.3  # length of the mean direction to the cameras above which nobody stands behind the subject
 BEHIND_QUANTILE, THICK_QUANTILE = 0.998, 0.9  # of seen points (to the front, too), and of their heights: the hair
 MIN_ENDED = 0.4  # of the rim, ended by outlines: people16's masks .67 and .70; where photographs end the bust, .15
+OUT_QUANTILE = 0.95  # of an ear's vertices: so far it stands out of its outlines
+FLATTENINGS, FLATTEST = 4, 0.5  # of such an ear, and by what share of its height at most each time
 HEAD_EVERY = 4  # vertices of the head stand for the others
 Field = Float32[np.ndarray, " n"]
 Points = Float[np.ndarray, "m 3"]
@@ -185,6 +187,40 @@ def ended(votes: Votes, grid: Grid, cut: Cut) -> Votes:
     return replace(votes, bound=np.maximum(votes.bound, beyond))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadEars:
+    """Holds ears that are taken from the head, since depth shows only fragments of them."""
+
+    head_world: Mesh
+    around: Points  # vertices of such ears, as they were and as they lie: about them depth does not count
+
+    @classmethod
+    def of(cls, head_world: Mesh, ears: Sequence[Bool[np.ndarray, " v"]], views: ViewStack) -> "HeadEars":
+        """Lays the head's ears flat, as far as they stand out of the views' outlines. ``ears``: vertices of each."""
+        placed, around = head_world.vertices.copy(), list[Points]()
+        for ear in ears:
+            way = placed[ear].mean(axis=0) - placed.mean(axis=0)
+            way /= np.linalg.norm(way)
+            for _ in range(FLATTENINGS):  # pictures are known to a few millimetres beside the subject
+                height = placed[ear] @ way
+                height -= height.min()
+                edges_mm, outlines_mm = views.outside(placed[ear])
+                out_mm = np.quantile(np.where(edges_mm > 0.0, 0.0, outlines_mm).max(axis=0), OUT_QUANTILE)
+                placed[ear] -= np.clip(out_mm / height.max(), 0.0, FLATTEST) * height[:, None] * way
+            around += [head_world.vertices[ear], placed[ear]]
+        return cls(Mesh(placed, head_world.faces), np.concatenate(around))
+
+    def among(self, grid: Grid, votes: Votes, start: Field) -> tuple[Votes, Field]:
+        """Returns the votes without those about the ears, and the start with the head's distance there."""
+        rows, distance = distance_about_ears(self.head_world, self.around, grid.places())
+        inner = ~grid.outer[rows]
+        rows, distance = rows[inner], distance[inner]
+        weight, bound, start = votes.weight.copy(), votes.bound.copy(), start.copy()
+        weight[rows], start[rows] = 0.0, distance
+        bound[rows] -= EAR_SPARED_MM
+        return replace(votes, weight=weight, bound=bound), start
+
+
 @traced
 def solve(
     depth_maps: Sequence[DepthMap],
@@ -192,9 +228,10 @@ def solve(
     head_world: Mesh | None,
     spacing_mm: float,
     hair: Places | None = None,
+    ears: HeadEars | None = None,
 ) -> tuple[Level, Cut]:
     """Computes the signed distance near the surface, on a sparse grid with a step of ``spacing_mm``, from coarse to
-    fine. ``hair`` is the hair that depth maps miss."""
+    fine. ``hair`` is the hair that depth maps miss, ``ears`` are those that they show in fragments."""
     halvings = 1
     while spacing_mm * 2**halvings < COARSEST_MM:
         halvings += 1
@@ -214,26 +251,35 @@ def solve(
         shell, outside = distance_to_shell(hair, views, grid)  # of hair, where photographs show its outside
         mixed = outside * np.maximum(shell, votes.bound) + (1.0 - outside) * guess
         guess = np.where(grid.outer | (votes.weight >= WEAK), guess, mixed).astype(np.float32)
+    if ears is not None:
+        votes, guess = ears.among(grid, votes, guess)
+        seen = np.concatenate([seen, ears.around])
     level = solve_level(grid, votes, guess, SWEEPS, FACTOR)
     box = level.field.reshape(grid.shape)
     for halving in range(halvings):
         wanted = grid_kernels.grown(marked_box(level.grid, grid_kernels.crossed(level.field, level.grid.neighbours)))
-        level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views, cut)
+        level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views, cut, ears)
         if halving < halvings - 1:
             box = everywhere(level.grid, level.field, box)
     return level, cut
 
 
 def _finer(
-    coarse: Grid, box: Float32[np.ndarray, "nx ny nz"], wanted: Bool[np.ndarray, "nx ny nz"], views: ViewStack, cut: Cut
+    coarse: Grid,
+    box: Float32[np.ndarray, "nx ny nz"],
+    wanted: Bool[np.ndarray, "nx ny nz"],
+    views: ViewStack,
+    cut: Cut,
+    ears: HeadEars | None,
 ) -> Level:
-    """Computes the signed distance at half the step about the ``wanted`` nodes. ``cut`` tells where the bust
-    ends. The grid is widened while the surface would leave it; raises NoSurface if it
-    still does after ``WIDENINGS``."""
+    """Computes the signed distance at half the step about the ``wanted`` nodes. ``cut`` tells where the bust ends. The
+    grid is widened while the surface would leave it; raises NoSurface if it still does after ``WIDENINGS``."""
     for _ in range(WIDENINGS + 1):
         grid = refined(coarse, wanted)
         start = grid_kernels.interpolated(box, grid.index)
         votes = ended(votes_at(grid, views), grid, cut)
+        if ears is not None:
+            votes, start = ears.among(grid, votes, start)
         level = solve_level(grid, votes, start, FINE_SWEEPS, FINE_FACTOR)
         if not grid_kernels.crossed_at_rim(level.field, grid.neighbours, grid.outer):
             return level

@@ -14,9 +14,9 @@ from pipeline.fusion.skin import HeadSkin
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.projection import depth_maps
 from pipeline.head_model.model import HeadModel
-from pipeline.head_model.regions import scalp
+from pipeline.head_model.regions import pinnae, scalp
 from pipeline.part_labels.codes import Part
-from pipeline.part_labels.votes import PartVotes
+from pipeline.part_labels.votes import PartVotes, part_shares
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
 from pipeline.stages.part_labels import PartLabels
@@ -98,10 +98,18 @@ def fuse_depth(
             report=context.progress,
             hair=hair,
             scatter=scatter,
+            ears=[] if parts is None else bare_ears(context.model, head_world, parts),
         )
     except NoSurface as reason:
         return Staged(None, [compose("no-bust", reason=reason.message)])
     return Staged(surface, surface.warnings)
+
+
+def bare_ears(model: HeadModel, head_world: Mesh, votes: PartVotes) -> list[Bool[np.ndarray, " v"]]:
+    """Returns the vertices of each ear about which the votes are for skin rather than for hair."""
+    shares, left = part_shares(votes, head_world.vertices), model.vertices(np.zeros(0))[:, 0] > 0.0
+    bare = shares[:, Part.SKIN.channel] - shares[:, Part.HAIR.channel]
+    return [ear for side in (left, ~left) if bare[ear := pinnae(model) & side].mean() > 0.0]
 
 
 def shape_bust(

@@ -107,37 +107,42 @@ def test_height_over_the_head_decides_between_skin_and_hair(height_mm: float, sh
     assert (shares[:, part.channel] > 0.99).all()
 
 
-def test_a_chest_below_the_end_of_the_head_is_no_hair() -> None:
-    head, chest = ball(OUTLINE_MM), np.array([[0.0, -OUTLINE_MM - 20.0, 30.0], [0.0, OUTLINE_MM + 20.0, 30.0]])
+def test_neither_a_neck_off_the_head_nor_a_chest_below_it_is_hair() -> None:
+    head, off = ball(OUTLINE_MM), OUTLINE_MM + 20.0
+    places = np.array([[0.0, -off, 30.0], [0.0, -0.6 * off, 0.8 * off], [0.0, off, 30.0]])  # chest, neck, hair
     kept = head.faces[head.vertices[head.faces][:, :, 1].min(axis=1) > -0.8 * OUTLINE_MM]
     used, joined = np.unique(kept, return_inverse=True)
     neck = Mesh(head.vertices[used], joined.reshape(-1, 3).astype(np.int32))
-    votes = PartVotes(chest.min(axis=0), np.array([9, 99, 9]), np.arange(2), chest, np.tile([1.0, 0.0, 0.0], (2, 1)))
-    assert parts_over_head(votes, neck).probability[:, Part.SKIN.channel].tolist() == [1.0, 0.0]
+    votes = PartVotes(places.min(axis=0), np.array([9, 99, 99]), np.arange(3), places, np.tile([1.0, 0.0, 0.0], (3, 1)))
+    assert parts_over_head(votes, neck).probability[:, Part.SKIN.channel].tolist() == [1.0, 1.0, 0.0]
 
 
 def test_scatter_of_strands_is_smoothed_and_skin_stays() -> None:
     rng, mesh = np.random.default_rng(0), ball(OUTLINE_MM)
     noisy = Mesh(mesh.vertices * (1.0 + rng.normal(0.0, 1.0 / OUTLINE_MM, (len(mesh.vertices), 1))), mesh.faces)
     side = mesh.vertices[:, 0]
-    held = mesh.vertices[:, 2] > 40.0
+    held, inner = mesh.vertices[:, 2] > 0.0, mesh.vertices[:, 2] > 55.0  # the cap's edge is smoothed
     hair, none, seen = (side <= 0.0).astype(float), np.zeros(len(side)), SeenVertices.of(noisy.vertices, side < np.inf)
-    smooth = smooth_unresolved(noisy, hair, none, none, seen, held)
-    assert np.array_equal(smooth.vertices[held], noisy.vertices[held])
-    off = radii(smooth)[(side < -20.0) & ~held] - OUTLINE_MM
+    smooth = smooth_unresolved(noisy, hair, none, none, noise_mm=none, seen=seen, held=held)
+    assert np.array_equal(smooth.vertices[inner], noisy.vertices[inner])
+    far = mesh.vertices[:, 2] < -30.0
+    off = radii(smooth)[(side < -20.0) & far] - OUTLINE_MM
     assert off.std() < 0.25  # of 1 mm: the 45 vertices about one leave a seventh, and near ones count more
     assert np.median(off) == pytest.approx(0.0, abs=0.5)
-    assert smooth.vertices[side > 20.0] == pytest.approx(noisy.vertices[side > 20.0], abs=0.05)
+    skin = (side > 20.0) & far
+    assert smooth.vertices[skin] == pytest.approx(noisy.vertices[skin], abs=0.05)
 
 
-def test_clothes_lose_their_gravel_and_keep_their_rims() -> None:
+@pytest.mark.parametrize("part", ["clothes", "neck"])
+def test_clothes_and_necks_lose_their_gravel_and_keep_their_rims(part: str) -> None:
     rng, mesh = np.random.default_rng(0), ball(OUTLINE_MM)
     rim = np.abs(mesh.vertices[:, 1]) < 4.0  # a belt that stands off by 10 mm
     true = mesh.vertices * (1.0 + rim[:, None] / 6.0)
     noisy = Mesh(true * (1.0 + rng.normal(0.0, 1.0 / OUTLINE_MM, (len(true), 1))), mesh.faces)
     none, every = np.zeros(len(true)), np.ones(len(true))
     seen = SeenVertices.of(noisy.vertices, every > 0.0)
-    smooth = smooth_unresolved(noisy, none, every, every, seen, every < 0.0)
+    shown = (every, none) if part == "clothes" else (none, every)
+    smooth = smooth_unresolved(noisy, none, *shown, noise_mm=every, seen=seen, held=every < 0.0)
     flat = np.abs(mesh.vertices[:, 1]) > 20.0
     assert (radii(smooth) - OUTLINE_MM)[flat].std() < 0.3  # of 1 mm
     assert (radii(smooth) - OUTLINE_MM)[rim].mean() > 7.0  # the mean alone leaves less than half of it

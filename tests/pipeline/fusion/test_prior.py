@@ -5,8 +5,11 @@ import pytest
 
 from pipeline.fusion.grid import whole_box
 from pipeline.fusion.prior import SeenSurface, distance_to_subject
-from pipeline.fusion.signed_distance import FACTOR, SWEEPS, Votes, at_points, solve_level
+from pipeline.fusion.signed_distance import FACTOR, SWEEPS, HeadEars, Votes, at_points, solve_level
+from pipeline.fusion.view_stack import stack_views
 from rig.mesh import Mesh
+from tests.support.ellipsoid_depths import Ellipsoid, scene
+from tests.support.scenes import fan
 from tests.support.subdivided_spheres import subdivided_sphere
 
 RADIUS_MM = 60.0
@@ -76,3 +79,21 @@ def test_values_of_a_box_are_read_linearly() -> None:
     assert at_points(box, (places @ (1.0, 2.0, 3.0)).astype(np.float32), points) == pytest.approx(
         points @ (1.0, 2.0, 3.0), abs=1e-4
     )
+
+
+def test_an_ear_is_laid_into_its_outlines_and_replaces_fragments_of_depth() -> None:
+    """A head of 56 mm has an ear on one side that stands off by 16 mm; pictures show a ball of 60 mm."""
+    made = scene([Ellipsoid((0, 0, 0), (60, 60, 60))], fan(200, 150))
+    head = ball(56.0, 0.0)
+    ear = head.vertices[:, 0] > 50.0
+    standing = Mesh(head.vertices + np.where(ear, 16.0, 0.0)[:, None] * (1.0, 0.0, 0.0), head.faces)
+    ears = HeadEars.of(standing, [ear], stack_views(made.maps, made.silhouettes, made.rig))
+    assert standing.vertices[ear, 0].max() > 71.0
+    assert 58.0 < ears.head_world.vertices[ear, 0].max() < 67.0  # laid flat as a whole, its middle stands out
+    assert np.array_equal(ears.head_world.vertices[~ear], standing.vertices[~ear])
+    box = whole_box(np.array([30.0, -20.0, -20.0]), np.array([60.0, 40.0, 40.0]), 3.0)
+    height = (box.places()[:, 0] - 40.0).astype(np.float32)  # fragments that depth shows 20 mm too deep
+    votes = Votes(height, np.full(len(box), 20.0, np.float32), np.full(len(box), -20.0, np.float32))
+    level = solve_level(box, *ears.among(box, votes, height), SWEEPS, FACTOR)
+    last = np.flatnonzero(level.field.reshape(box.shape)[:, 6, 6] < 0.0).max()
+    assert box.corner[0] + box.step_mm * last == pytest.approx(ears.head_world.vertices[ear, 0].max(), abs=3.1)
