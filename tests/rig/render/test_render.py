@@ -200,17 +200,6 @@ def test_xor_is_the_weighted_sum_and_repeats_to_the_bit(renderer):
     np.testing.assert_allclose(gone, [weights[n][masks[n]].sum(dtype=float) for n in rig.names], rtol=1e-5)
 
 
-def test_xor_counts_the_model_outside_every_input(renderer):
-    mesh, rig = lumpy_head(3), fan(2)
-    with renderer.silhouette_set(rig, mesh.faces) as silhouettes:
-        masks = silhouettes.masks(mesh.vertices)
-        empty = {name: np.zeros_like(mask) for name, mask in masks.items()}
-        ones = {name: np.ones(mask.shape, np.float32) for name, mask in masks.items()}
-        silhouettes.set_inputs(empty, ones)
-        costs = silhouettes.xor_costs(mesh.vertices)
-    assert costs.tolist() == [masks[name].sum() for name in rig.names]
-
-
 def test_sixty_four_cameras_are_packed_without_overlap():
     rig = fan(64, sizes=((1024, 768), (2048, 1536), (640, 480)))
     pages = pack(rig.cameras, 4096)

@@ -38,7 +38,7 @@ def test_the_slope_on_a_surface_is_the_one_asked_for() -> None:
     assert abs(np.sqrt((on_surface**2).sum(axis=1).mean()) / SLOPE - 1.0) < 0.25
 
 
-def test_skin_is_divided_and_moved_within_the_radius_alone() -> None:
+def test_skin_is_divided_moved_within_the_radius_alone_and_shaded_as_it_rises() -> None:
     head = sheet()
     found = relieved(head, relief(), {"paint": head.vertices[:, :1] + 10.0})
     off = np.linalg.norm(found.places, axis=1)
@@ -51,10 +51,5 @@ def test_skin_is_divided_and_moved_within_the_radius_alone() -> None:
     first, second = (found.places[found.faces[:, k]] - found.places[found.faces[:, 0]] for k in (1, 2))
     area = np.cross(first, second)[:, 2]
     np.testing.assert_allclose(area.sum() / 2, 16.0**2)  # nothing is lost, nothing lies twice
-
-
-def test_normals_follow_the_relief() -> None:
-    head = sheet()
-    found = relieved(head, relief(), {})
     tilted = -found.normals[:, :2] / found.normals[:, 2:]
     np.testing.assert_allclose(tilted, relief().slopes(found.places)[:, :2], atol=1e-9)

@@ -10,7 +10,6 @@ import pytest
 from rig.errors import InputError
 from rig.formats.captures.capture_folder import full_size_reader, read_capture, write_capture
 from rig.formats.pictures.images import read_image, write_image
-from tests.support.shared_data import shared
 from tests.support.small_captures import (
     FEATURES,
     HEIGHT,
@@ -173,13 +172,6 @@ def test_a_rig_s_faults_come_with_its_file_s_name_and_captures_in_a_folder_are_n
         write_capture(folder.parent / "week" / name, small_capture(), small_rig())
     with pytest.raises(InputError, match="but monday, tuesday do: give one of these"):
         read_capture(folder.parent / "week")
-
-
-def test_the_shared_capture_is_read() -> None:
-    capture, rig = read_capture(shared("data/captures/scan-a"))
-    assert len(rig) == len(capture.images) == 11
-    assert not any(camera.intrinsics.distortion.is_zero for camera in rig)
-    assert len(capture.features) == 7
 
 
 @pytest.mark.parametrize("locked", ["a.png", "cameras.json"])
