@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import vertex_deviation_mm
-from pipeline.detail.dense_points import SurfacePoints, thinned, with_scaled_deviation
+from pipeline.detail.dense_points import SurfacePoints, with_scaled_deviation
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids
 from pipeline.detail.refine import SHARED_ERROR, DeformedSurface, deform_to_points, folded, refine_to_surface
 from pipeline.fusion.untangling import head_topology, spoilt_faces
@@ -102,15 +102,6 @@ def test_hair_bounds_and_does_not_pull() -> None:
         off = np.linalg.norm(found.vertices, axis=1) - radius
         assert -0.6 < off.min() <= off.max() < 0.15
         assert not found.observed.any()
-
-
-def test_thinning_keeps_parts_and_sides_apart() -> None:
-    points = np.zeros((4, 3))
-    normals = np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, -1.0], [0, 0, 1.0]])
-    part = np.array([Part.SKIN, Part.SKIN, Part.SKIN, Part.HAIR], np.uint8)
-    thin = thinned(SurfacePoints(points, normals, np.full(4, 0.2), part), 1.0)
-    assert sorted(zip(thin.part.tolist(), thin.normals[:, 2].tolist(), strict=True)) == [(1, -1.0), (1, 1.0), (2, 1.0)]
-    np.testing.assert_allclose(thin.deviation_mm, 0.2)
 
 
 def head_points(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generator) -> SurfacePoints:

@@ -2,22 +2,9 @@
 
 import numpy as np
 
-from pipeline.results.overlays import DARKEST, LAMP, PART_COLOURS, SKIN, TINT, clay, lit, tinted
+from pipeline.results.overlays import DARKEST, LAMP, SKIN, clay, lit
 from rig.mesh import Mesh
 from tests.support.scenes import ellipsoid
-
-
-def test_a_pixel_moves_towards_the_colours_of_its_parts() -> None:
-    rng = np.random.default_rng(0)
-    image = rng.integers(0, 256, (12, 17, 3), dtype=np.uint8)
-    parts = np.zeros((12, 17, 3), np.float32)
-    parts[3:9, 4:12] = rng.dirichlet([1.0, 1.0, 1.0], (6, 8))
-    colours = np.array(list(PART_COLOURS.values()), float)
-    expected = image * (1.0 - TINT * parts.sum(axis=2, keepdims=True)) + TINT * parts @ colours
-    found = tinted(image, parts)
-    np.testing.assert_allclose(found, expected, atol=0.501)
-    np.testing.assert_array_equal(found[:3], image[:3])
-
 
 BALL = ellipsoid(3)
 WHITE = (255, 255, 255)

@@ -1,5 +1,5 @@
 """Colours against a pattern that is a formula, photographed by a ray tracer that shares no code with the pipeline;
-labels against enumeration and what a seam costs; levelling against a sparse solver."""
+labels and seams against enumeration; levelling against a sparse solver."""
 
 from dataclasses import replace
 from itertools import product
@@ -26,14 +26,14 @@ from pipeline.texturing.vertex_colours import (
     texture,
     wide_doubtful_surface,
 )
-from pipeline.texturing.view_selection_kernels import OUTLIER, RING_SHARE, differences, fill_slots, propagate
+from pipeline.texturing.view_selection_kernels import OUTLIER, RING_SHARE, differences, fill_slots
 from pipeline.texturing.visibility import see_weights, sharpened
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import grid_faces
-from tests.support.photographs import SCREEN, Shot, shoot, trace
+from tests.support.photographs import SCREEN, Shot, shoot
 from tests.support.scenes import ellipsoid, fan, pattern
 
 EXPOSURES = np.array([0.8, 1.2, 0.9, 1.1, 1.2, 0.8, 1.0])[:, None] * np.array([1.0, 0.98, 1.03])
@@ -238,13 +238,6 @@ def test_the_compiled_depth_maps_are_the_renderers(renderer: Renderer) -> None:
         assert np.median(difference) < 0.01
 
 
-def test_the_tracer_and_the_mesh_agree() -> None:
-    camera = fan(640, 480).cameras[2]
-    mesh = ellipsoid()
-    _, mask = trace(camera, 0.0)
-    assert np.count_nonzero(mask ^ np.isfinite(depth_map(camera, mesh.vertices, mesh.faces)[0])) < 0.01 * mask.sum()
-
-
 OPENING_MM = 12.0
 
 
@@ -318,23 +311,6 @@ def chain(count: int) -> Neighbourhood:
 def strip(rows: int, columns: int) -> Neighbourhood:
     """A grid of triangles."""
     return Neighbourhood.of(*neighbours(grid_faces(rows, columns, closed=False).astype(np.int32), rows * columns))
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_labels_of_a_chain_are_the_best_of_all(seed: int) -> None:
-    """Belief propagation is exact on a tree."""
-    rng = np.random.default_rng(seed)
-    around = chain(6)
-    costs = rng.uniform(0, 1, (6, 3)).astype(np.float32)
-    views = np.tile(np.arange(3, dtype=np.int32), (6, 1))
-    penalty = np.full(len(around.indices), 0.4, np.float32)
-    found = propagate(views, costs, around.starts, around.indices, around.opposite, penalty, 3, 6)
-
-    def total(labels: tuple[int, ...]) -> float:
-        return float(costs[np.arange(6), labels].sum() + 0.4 * np.count_nonzero(np.diff(labels)))
-
-    best = min(product(range(3), repeat=6), key=total)
-    assert total(tuple(found.tolist())) == pytest.approx(total(best), abs=1e-5)
 
 
 def test_a_seam_keeps_out_of_where_views_differ() -> None:
