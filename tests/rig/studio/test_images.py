@@ -14,6 +14,7 @@ from rig.geometry import Similarity
 from rig.mesh import Mesh
 from rig.rig import Rig
 from rig.studio.devices.folder import simulate_to_folder
+from rig.studio.scene.anatomy import grid_faces
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import Scene, SimulatedCapture, _rolling, _sway, shoot, simulate
 from rig.studio.scene.subject import Look, Subject, random_look
@@ -35,10 +36,7 @@ def egg_head() -> Subject:
     vertices = (unit * (76, 130, 96)).reshape(-1, 3)
     nose = np.exp(-((vertices - (0, -22, 94)) ** 2 / (150, 250, 900)).sum(axis=1))
     vertices[:, 2] += 22 * nose
-    i, j = np.meshgrid(np.arange(rings - 1), np.arange(columns), indexing="ij")
-    a, b = i * columns + j, i * columns + (j + 1) % columns
-    c, d = a + columns, b + columns
-    faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)])
+    faces = grid_faces(rings, columns)
     points = {"glabella": (0, 36, 92), "pronasale": (0, -22, 116), "subnasale": (0, -34, 94), "stomion": (0, -53, 87),
               "labiale_superius": (0, -46, 88), "labiale_inferius": (0, -62, 84), "gnathion": (0, -90, 68)}  # fmt: skip
     for side, sign in (("right", -1), ("left", 1)):

@@ -3,6 +3,7 @@
 import numpy as np
 
 from rig.mesh import Mesh
+from rig.studio.scene.anatomy import grid_faces
 from rig.studio.scene.skin_texture import EDGE_MM, FADE, SkinRelief, relieved
 from tests.support.drawn_relief import draw_relief
 
@@ -15,10 +16,8 @@ def relief() -> SkinRelief:
 
 def sheet(side: int = 9, reach_mm: float = 8.0) -> Mesh:
     x, y = np.meshgrid(*[np.linspace(-reach_mm, reach_mm, side)] * 2, indexing="ij")
-    corners = np.arange(side * side).reshape(side, side)
-    a, b, c, d = (part.ravel() for part in (corners[:-1, :-1], corners[1:, :-1], corners[1:, 1:], corners[:-1, 1:]))
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(side * side)], axis=1)
-    return Mesh(vertices, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]))
+    return Mesh(vertices, grid_faces(side, side, closed=False))
 
 
 def test_slopes_are_the_gradient_of_the_heights() -> None:
