@@ -64,10 +64,12 @@ def test_ball_before_another_hides_it() -> None:
         assert np.mean(np.abs(error) < 2.0) > 0.95
 
 
-def test_blank_ball_is_met_with_silence() -> None:
+def test_a_blank_ball_and_views_without_a_neighbour_are_met_with_silence() -> None:
     balls = (Ball(contrast=0.0),)
     for each in estimate(fan(4, 20.0), balls):
         assert each.known.sum() < 0.03 * ball_pixels(each, balls)
+    rig, balls = fan(3, 80.0), (Ball(),)  # 80 degrees apart
+    assert not any(each.known.any() for each in estimate(rig, balls))
 
 
 def test_result_does_not_depend_on_the_number_of_threads() -> None:
@@ -82,11 +84,6 @@ def test_result_does_not_depend_on_the_number_of_threads() -> None:
     for a, b in zip(many, one, strict=True):
         assert a.depth_mm.tobytes() == b.depth_mm.tobytes()
         assert a.deviation_mm.tobytes() == b.deviation_mm.tobytes()
-
-
-def test_views_without_a_neighbour_know_nothing() -> None:
-    rig, balls = fan(3, 80.0), (Ball(),)  # 80 degrees apart
-    assert not any(each.known.any() for each in estimate(rig, balls))
 
 
 PIXEL_MM, MOST_PX = 2.0, 30
