@@ -150,9 +150,7 @@ def test_the_demo_runs_none_of_it_either(installed_with_loops: Path, tmp_path: P
 
 
 @pytest.mark.nightly
-def test_the_wheel_carries_its_loops_compiled(
-    installed_with_loops: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wheel_carries_its_loops(installed_with_loops: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EIGENHEAD_CACHE", str(tmp_path / "cache"))
     answer = json.loads(run(tmp_path, installed_with_loops / "eigenhead", "prepare", "--json"))
     assert answer["compiled"] == 0

@@ -21,7 +21,7 @@ from rig.formats.cameras.cameras_file import read_rig_file
 from rig.formats.cameras.cameras_json import read_rig
 from rig.geometry import RigidTransform
 from rig.rig import Rig
-from tests.support.board_sessions import CHECKERBOARD, Session, session, visible
+from tests.support.board_sessions import CHECKERBOARD, Session, session
 from tests.support.changed_rigs import relensed, reposed
 from tests.support.shared_data import shared
 
@@ -58,19 +58,6 @@ def mirror_one_camera(source: Session) -> Detections:
     return with_views(source.detections, change)
 
 
-def another_size_in_one_shot(source: Session) -> Detections:
-    board = replace(CHECKERBOARD, square_mm=22.0)
-    pose, rng = source.poses["shot10"], np.random.default_rng(1)
-
-    def change(view: View) -> View:
-        if view.shot != "shot10":
-            return view
-        _, pixels = visible(source.rig[view.camera], pose, board)
-        return replace(view, found=replace(view.found, corners=pixels + rng.normal(scale=0.2, size=pixels.shape)))
-
-    return with_views(source.detections, change)
-
-
 def one_camera_is_blind(source: Session) -> Detections:
     return with_views(source.detections, lambda view: None if view.camera == "cam04" else view)
 
@@ -90,19 +77,6 @@ def blurred_shots(source: Session) -> Detections:
         source.detections,
         lambda view: replace(view, found=replace(view.found, rise_px=19.0)) if view.shot == "shot10" else view,
     )
-
-
-def a_shot_that_moved(source: Session) -> Detections:
-    other, rng = source.poses["shot11"], np.random.default_rng(3)
-
-    def change(view: View) -> View | None:
-        if view.shot != "shot10" or view.camera != "cam03":
-            return view
-        ids, pixels = visible(source.rig[view.camera], other, CHECKERBOARD)
-        noisy = pixels + rng.normal(scale=0.2, size=pixels.shape)
-        return replace(view, found=replace(view.found, corners=noisy)) if len(ids) else None
-
-    return with_views(source.detections, change)
 
 
 def two_rigs(source: Session) -> Detections:
@@ -143,10 +117,8 @@ REFUSED = {
     "two groups": (two_rigs, PoseGraphError, "shares no shot with the others"),
 }
 NAMED = {
-    "wrong square size in one shot": (another_size_in_one_shot, "shot10", "its squares measure 22.0 mm"),
     "swapped names": (names_swapped_in_two_shots, "shot10", "names are swapped"),
     "blurred shots": (blurred_shots, "shot10", "blurred, edges are 19 px wide"),
-    "shots mixed up": (a_shot_that_moved, "shot10", "it is the picture of shot11"),
 }
 
 

@@ -20,7 +20,7 @@ def calibration() -> Calibration:
     return calibrate_detections(session(cameras=5, shots=12, seed=4).detections)
 
 
-def test_the_page_is_complete_needs_nothing_else_and_takes_no_text_for_markup(calibration: Calibration) -> None:
+def test_the_page_is_complete_draws_residuals_and_takes_no_text_for_markup(calibration: Calibration) -> None:
     page = report_page(calibration)
     assert not re.search(r"(src|href)\s*=|https?://|@import", page)
     for name in calibration.rig.names:
@@ -31,10 +31,6 @@ def test_the_page_is_complete_needs_nothing_else_and_takes_no_text_for_markup(ca
         ElementTree.fromstring(drawing)
     hostile = report_page(replace(calibration, warnings=(verbatim("<script>alert(1)</script>"),)))
     assert "<script>" not in hostile
-
-
-def test_vectors_are_the_residuals_magnified(calibration: Calibration) -> None:
-    page = report_page(calibration)
     drawn = re.findall(r"M([-\d.]+) ([-\d.]+)L([-\d.]+) ([-\d.]+)", page)
     lines = np.array(drawn, dtype=float)
     assert len(lines) == calibration.figures()["corners"]

@@ -85,12 +85,6 @@ def test_points_and_pixels_beyond_the_valid_radius_are_nan() -> None:
     assert (np.diff(grown) > 0).all()
 
 
-def test_centre_and_axis() -> None:
-    ours = camera(LENSES[0])
-    np.testing.assert_allclose(ours.centre_world, [400.0, 150.0, 1000.0])
-    np.testing.assert_allclose(ours.axis_world, -ours.centre_world / np.linalg.norm(ours.centre_world), atol=1e-12)
-
-
 @pytest.mark.parametrize("factor", [0.5, 0.25, 2.0])
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_scaled_camera_sees_the_same_scene(factor: float, lens: Distortion) -> None:

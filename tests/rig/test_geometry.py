@@ -1,4 +1,4 @@
-"""Rigid motions and similarities: the group laws, and scipy's rotations beside ours."""
+"""Rigid motions and similarities: the group laws, and scipy's rotations beside ours; vertices of parabolas."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,9 @@ from rig.geometry import (
     nearest_to_rays,
     rigid_fit,
     rotation_from_vector,
+    second_difference,
     vector_from_rotation,
+    vertex_offset,
 )
 
 POINTS = np.random.default_rng(0).normal(0, 100.0, (5, 3))
@@ -147,3 +149,14 @@ def test_the_point_nearest_to_rays_is_where_they_meet_and_weights_decide_where_t
     np.testing.assert_allclose(nearest_to_rays(centres, rays, weights), points, atol=1e-6)
     along = np.array([[0.0, 0.0, 1.0]] * 2)  # parallel: the ridge keeps the point finite
     np.testing.assert_allclose(nearest_to_rays(np.array([[1.0, 0, 0], [3.0, 0, 0]]), along), [2.0, 0, 0], atol=1e-6)
+
+
+ARRAYS = np.array([0.1, -0.2, 0.4]), np.array([-1.0, -3.0, 2.0])
+
+
+@pytest.mark.parametrize(("vertex", "bend"), [(0.0, -2.0), (0.3, -0.5), (-0.45, 3.0), (1.7, -1.0), ARRAYS])
+def test_a_planted_vertex_is_found(vertex: float | np.ndarray, bend: float | np.ndarray) -> None:
+    before, middle, after = (np.asarray(0.5 * bend * (x - vertex) ** 2 + 7.0) for x in (-1.0, 0.0, 1.0))
+    curvature = second_difference(before, middle, after)
+    assert curvature == pytest.approx(bend, abs=1e-12)
+    assert vertex_offset(before, after, curvature) == pytest.approx(vertex, abs=1e-12)

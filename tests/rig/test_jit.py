@@ -4,6 +4,7 @@ import logging
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from types import FunctionType
 
@@ -56,9 +57,7 @@ def test_a_function_compiled_once_is_found_by_the_next(folder: Path) -> None:
     assert len(list(folder.iterdir())) == 2, "one for each type of argument"
 
 
-def test_what_a_wheel_carries_is_found_unless_it_is_damaged(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_what_a_wheel_carries_is_found_if_whole(folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     njit()(copy_of(_sum))(3.0)
     carried = folder.rename(tmp_path / "carried")
     monkeypatch.setattr(compiled, "CARRIED", carried)
@@ -107,23 +106,17 @@ def test_a_folder_that_cannot_be_written_is_told_once_and_the_work_goes_on(
     assert line.startswith("compiled loops and arrays of head models are not kept in")
 
 
+def output_of(code: str, env: Mapping[str, str]) -> str:
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, env=env, cwd=ROOT, capture_output=True, text=True, check=True, timeout=300).stdout
+
+
 def test_another_process_with_another_hash_seed_finds_it(folder: Path) -> None:
     code = (
         "from pipeline.geometry.projection_kernels import distorted; import numpy as np;"
         "distorted(0.1, 0.2, np.zeros(5)); print(len(distorted.stats.cache_hits))"
     )
-    found = [
-        subprocess.run(
-            [sys.executable, "-c", code],
-            env=os.environ | {"PYTHONHASHSEED": seed},
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=300,
-        ).stdout
-        for seed in ("1", "2")
-    ]
+    found = [output_of(code, os.environ | {"PYTHONHASHSEED": seed}) for seed in ("1", "2")]
     assert found == ["0\n", "1\n"]
 
 
@@ -135,10 +128,7 @@ def test_what_one_machine_compiled_runs_on_the_next(variables: dict[str, str]) -
         pytest.skip("another processor: it compiles for itself")
     code = "from rig.jit import machine; print(machine())"
     environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")} | variables
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
-    )
-    assert repr(variables.get("NUMBA_CPU_NAME", compiled.PORTABLE_CPU)) in done.stdout
+    assert repr(variables.get("NUMBA_CPU_NAME", compiled.PORTABLE_CPU)) in output_of(code, environment)
 
 
 def test_every_compiled_loop_of_the_project_is_kept() -> None:

@@ -98,9 +98,7 @@ DEPTH_ROUNDS = 12  # of the search for where a ray meets the relief; it halves i
 EYES_MM = ((-33.0, 20.0), (33.0, 20.0))  # x to the subject's left, y up: the drawn eyes' middles, the right one first
 
 
-def photographed_face(
-    camera: Camera, world_from_face: Similarity, *, flat: bool = False, behind: ImageRgb | None = None
-) -> ImageRgb:
+def photographed_face(camera: Camera, world_from_face: Similarity, *, flat: bool = False) -> ImageRgb:
     """A camera's picture of the drawn face on a head (its relief: an ellipsoid with a nose), or on a flat poster.
 
     Face frame: origin between the ears, z out of the face. From behind there is hair.
@@ -111,11 +109,7 @@ def photographed_face(
     face_from_world = world_from_face.inverse()
     start = face_from_world.apply(camera.centre_world[None])[0]
     rays = camera.rays_world(pixels) @ face_from_world.rotation.T
-    image = (
-        np.tile(np.array(WALL, np.float32), (len(pixels), 1))
-        if behind is None
-        else behind.reshape(-1, 3).astype(np.float32)
-    )
+    image = np.tile(np.array(WALL, np.float32), (len(pixels), 1))
     if start[2] <= 0.0 and flat:
         return np.rint(image).astype(np.uint8).reshape(k.height, k.width, 3)
     if not flat:

@@ -1,13 +1,10 @@
-"""What tests plant: wrong contours, loose masks, close-ups, cameras that are off, and expressions."""
+"""What tests plant: wrong contours, and cameras that are off."""
 
 import numpy as np
 import pytest
 
-from pipeline.head_model.model import load_model
-from pipeline.imaging.silhouette import silhouette_from_mask
 from rig.studio.scene.layout import default_layout
-from tests.support.drawn_expressions import JAW, WEIGHTS, drawn_weights
-from tests.support.spoilt_captures import CLOSE_UP, LOOSE_PX, WRONG_RADII_PX, WRONG_SHARE, close_up, loosened, spoiled
+from tests.support.spoilt_captures import WRONG_RADII_PX, WRONG_SHARE, spoiled
 from tests.support.subjects import off_by, stated
 
 
@@ -37,30 +34,3 @@ def test_cameras_are_off_by_what_was_asked() -> None:
     # 330 cameras with about three numbers each that dominate: a standard error of 4 % in squares.
     assert np.mean(squares) == pytest.approx(0.5**2 * 2 * (1 + 1 / 3 + 1 / 3), rel=0.16)
     assert all(camera.covariance is not None for camera in stated(rig, 0.5))
-
-
-def test_draws_are_faces_that_people_make() -> None:
-    names, smiles = load_model().expressions.names, 0
-    for seed in range(60):
-        weights = drawn_weights(np.random.default_rng(seed), names)
-        assert all(0.0 < weight <= 1.0 for weight in weights.values())
-        assert weights.get("jawOpen", 0.0) <= JAW * WEIGHTS[1]
-        assert weights.get("mouthClose", 0.0) <= 0.5 * weights.get("jawOpen", 0.0)
-        sides = [weights.get(f"mouthSmile{side}", 0.0) for side in ("Left", "Right")]
-        smiles += min(sides) > 0.0
-        assert seed < 0 or min(sides) == 0.0 or abs(sides[0] - sides[1]) < 0.5
-    assert 22 < smiles < 50  # 60 of 0.6, within four deviations
-
-
-def test_loose_masks_reach_farther_on_every_side():
-    rows, columns = np.ogrid[:120, :160]
-    disk = silhouette_from_mask((rows - 60) ** 2 + (columns - 80) ** 2 < 30**2)
-    (loose,) = loosened({"cam": disk}).values()
-    np.testing.assert_allclose(disk.distance[60, 75:] - loose.distance[60, 75:], LOOSE_PX, atol=0.5)
-
-
-def test_a_close_up_shows_the_crown_lower():
-    camera = default_layout()["cam00"]
-    near, crown = close_up(camera), np.array([[0.0, 120.0, 0.0]])
-    assert near.intrinsics.fx == CLOSE_UP * camera.intrinsics.fx
-    assert 0.0 < near.project(crown)[0, 1] < near.intrinsics.height / 2

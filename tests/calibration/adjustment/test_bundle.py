@@ -6,25 +6,14 @@ import numpy as np
 import pytest
 
 from calibration.adjustment.bundle import HUBER, BundleSolution, CornerTerm, Free, bundle_problem
-from calibration.adjustment.gauge import (
-    align_world,
-    gauge_projection,
-    image_distance,
-    image_sigma,
-    intrinsics_jacobian,
-    moved,
-    pose_jacobian,
-    subject_points,
-    world_motions,
-)
+from calibration.adjustment.gauge import align_world, gauge_projection, image_distance, image_sigma, world_motions
 from calibration.adjustment.lens_prior import LensPrior, weak_prior
-from calibration.adjustment.state import PER_CAMERA, PER_SHOT, Observations, intrinsics_of, observations, residuals
+from calibration.adjustment.state import PER_CAMERA, PER_SHOT, Observations, observations, residuals
 from calibration.board.board import Board
 from calibration.calibrate import calibrate_detections
 from pipeline.estimation.levenberg_marquardt import Evidence
 from pipeline.estimation.terms import NormalEquations
 from rig.geometry import RigidTransform, rotation_from_vector
-from rig.rig import Rig
 from tests.support.board_sessions import CHARUCO, Session, planted, rig_of, session
 from tests.support.changed_rigs import reposed
 
@@ -56,26 +45,6 @@ def test_views_add_their_blocks_to_the_normal_equations() -> None:
     np.testing.assert_allclose(equations.matrix / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-12)
     slope = np.einsum("n,nap,na->p", weight, rows, here.residual)
     np.testing.assert_allclose(equations.gradient / scale, slope / scale, atol=1e-9)
-
-
-def test_jacobians_of_pose_and_lens_are_finite_differences() -> None:
-    camera = rig_of(3, np.random.default_rng(1)).cameras[0]
-    points = subject_points(Rig((camera, *rig_of(3, np.random.default_rng(1)).cameras[1:])), 90.0, 12)
-    for index in range(6):
-        step = np.zeros(6)
-        step[index] = 1e-5
-        numeric = (moved(camera, step).project(points) - moved(camera, -step).project(points)) / 2e-5
-        np.testing.assert_allclose(pose_jacobian(camera, points)[:, :, index], numeric, atol=1e-4, rtol=1e-6)
-    values = camera.intrinsics.values()
-    for index in range(9):
-        step = np.zeros(9)
-        step[index] = 1e-6
-        size = (camera.intrinsics.width, camera.intrinsics.height)
-        ahead, behind = (
-            replace(camera, intrinsics=intrinsics_of(values + sign * step, size)).project(points) for sign in (1, -1)
-        )
-        numeric = (ahead - behind) / 2e-6
-        np.testing.assert_allclose(intrinsics_jacobian(camera, points)[:, :, index], numeric, atol=1e-3, rtol=1e-5)
 
 
 def test_a_rig_moved_as_a_whole_is_the_same_rig() -> None:

@@ -11,7 +11,6 @@ import pytest
 from calibration.board.board import Board, read_board, write_board, write_board_pdf
 from calibration.board.corners import detect
 from rig.errors import InputError
-from tests.support.shared_data import shared
 
 BOARDS = [
     Board("checkerboard", 9, 6, 25.0),
@@ -72,11 +71,6 @@ def test_the_ruler_is_100_mm_long_and_the_same_board_gives_the_same_bytes(tmp_pa
 def test_what_is_written_is_read_back(board: Board, tmp_path: Path) -> None:
     write_board(board, tmp_path / "board.toml")
     assert read_board(tmp_path / "board.toml") == board
-
-
-def test_boards_of_the_recordings_are_read() -> None:
-    assert read_board(shared("data/multicam-board/board.toml")) == Board("charuco", 4, 5, 54.0, inverted=True)
-    assert read_board(shared("data/checkerboards/board.toml")).grid == (4, 7)
 
 
 def test_every_fault_of_a_board_is_named(tmp_path: Path) -> None:

@@ -9,11 +9,8 @@ from calibration.scene.matching import match_photographs
 from calibration.scene.photographs import find_photographs
 from rig.errors import InputError
 from rig.formats.pictures.images import write_image
+from rig.progress import discard_progress
 from tests.support.textured_wedge import photograph, wedge_rig
-
-
-def silent(stage: str, fraction: float) -> None:
-    """No progress is shown."""
 
 
 def test_pictures_of_different_shots_are_not_matched(tmp_path: Path) -> None:
@@ -23,7 +20,7 @@ def test_pictures_of_different_shots_are_not_matched(tmp_path: Path) -> None:
         write_image(tmp_path / "photos" / camera / f"{shot}.png", picture)
     (tmp_path / "scratch").mkdir()
     found = match_photographs(
-        find_photographs(tmp_path / "photos"), tmp_path / "scratch", one_lens=False, report=silent
+        find_photographs(tmp_path / "photos"), tmp_path / "scratch", one_lens=False, report=discard_progress
     )
     assert found.matched["a", "b"] > 500
     assert not found.matched.get(("a", "c"), 0)
@@ -37,4 +34,4 @@ def test_shots_of_two_sizes_are_named(tmp_path: Path) -> None:
         write_image(tmp_path / "photos" / camera / "1.png", np.zeros((40, 60), np.uint8))
     write_image(tmp_path / "photos" / "b" / "2.png", np.zeros((60, 40), np.uint8))
     with pytest.raises(InputError, match=r"b/2 is 40 x 60 pixels, but the other shots of its camera are 60"):
-        match_photographs(find_photographs(tmp_path / "photos"), tmp_path, one_lens=None, report=silent)
+        match_photographs(find_photographs(tmp_path / "photos"), tmp_path, one_lens=None, report=discard_progress)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.scene.result import judge_scene
-from calibration.scene.scale import ASSUMED
+from calibration.scene.result import judge_scene, scene_page
+from calibration.scene.scale import ASSUMED, scale_from_head
 from rig.formats.cameras.cameras_json import rig_from_document
 from rig.messages.message import texts_of, verbatim
 from tests.support.textured_wedge import solved
@@ -49,3 +49,18 @@ def test_a_calibration_from_a_scene_is_judged_by_what_it_does_not_know() -> None
         judged = judge_scene(replace(found, uncertainty=loose))
         assert judged.word == word
         assert judged.missing[0].text.startswith(f"{found.rig.names[2]}: the pose is uncertain by more than")
+
+
+def test_the_page_names_views_that_did_not_join_and_escapes_them() -> None:
+    page = scene_page(replace(solved(), left_out={"<cam9>": verbatim("dark")}))
+    assert "6 of 7 views joined" in page
+    assert "&lt;cam9&gt;: dark" in page
+    assert "<cam9>" not in page
+    assert all(name in page for name in solved().rig.names)
+
+
+def test_an_assumed_scale_stands_out_on_the_page() -> None:
+    found = solved()
+    assert "class='good'>1 tag of 40 mm (7)" in scene_page(found)
+    assumed = replace(found, scale=scale_from_head(found.structure, found.structure.points))
+    assert "class='bad'>an ASSUMPTION" in scene_page(assumed)

@@ -67,9 +67,7 @@ def test_they_are_made_once_and_mapped_read_only_and_aligned(folder: Path) -> No
     assert all(array.flags.writeable for array in MADE.values())
 
 
-def test_another_input_another_thread_count_and_another_source_are_another_file(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_input_thread_count_or_source_is_another_file(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     maker = Maker()
     maker()
     for inputs in (

@@ -1,14 +1,14 @@
-"""A fit to the eigenheads says that it is off where the head is none of theirs."""
+"""A fit to the eigenheads says that it is off where the head is none of theirs, and how far."""
 
 import numpy as np
 import pytest
 
 from pipeline.contour_fit.contour import finish, judged_by, solve_contour, with_span_misfit
 from pipeline.contour_fit.fit import Fit
-from pipeline.contour_fit.posterior import vertex_deviation_mm
-from pipeline.head_model.gaussian_process import with_kernel
+from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, vertex_deviation_mm, with_estimated_prior
+from pipeline.head_model.gaussian_process import model_basis, with_kernel
 from pipeline.head_model.model import HeadModel, load_model, with_modes
-from pipeline.settings import FittingSettings
+from pipeline.settings import FittingSettings, Settings
 from rig.geometry import Similarity
 from rig.mesh import vertex_normals
 from rig.studio.scene.layout import default_layout
@@ -65,3 +65,35 @@ def test_a_head_beyond_the_span_is_said_to_be_farther_off(span, wider, renderer)
     assert stated["beyond"] > 3.0 * stated["inside"]
     assert 0.3 * error["beyond"] < stated["beyond"] < 3.0 * error["beyond"]
     assert plain["beyond"] < 0.3 * error["beyond"]  # what the narrow fit's own covariance said
+
+
+EIGENHEADS, STRAYS = 60, 1.3
+
+
+@pytest.fixture(scope="module")
+def model() -> HeadModel:
+    return model_basis(load_model(), Settings(detail="kernel"))
+
+
+def known_well(model: HeadModel) -> Fit:
+    """Every coefficient to a thousandth, of a head that strays from the eigenheads by 1.3 times the kernel's prior."""
+    count = len(model.modes)
+    coefficients = np.zeros(count)
+    coefficients[EIGENHEADS:] = STRAYS * np.tile([1.0, -1.0], count)[: count - EIGENHEADS]
+    covariance = 1e-6 * np.eye(count + 7)
+    return Fit("contour", coefficients, Similarity.identity(), 1, "converged", covariance)
+
+
+def test_relief_that_no_mode_follows_grows_with_how_far_the_head_strays(model: HeadModel) -> None:
+    ears_off = model.levels["full"].face_region
+    for relief_mm in (RELIEF_MM, RELIEF_OF_OUTLINES * RELIEF_MM):
+        fit = with_estimated_prior(model, known_well(model), EIGENHEADS, relief_mm=relief_mm)
+        stated = vertex_deviation_mm(model, fit)[ears_off]
+        np.testing.assert_allclose(np.median(stated), STRAYS * relief_mm, rtol=0.05)
+
+
+def test_a_fit_without_a_covariance_or_without_the_kernel_states_nothing_new(model: HeadModel) -> None:
+    fit = known_well(model)
+    assert with_estimated_prior(model, fit, len(fit.coefficients), relief_mm=RELIEF_MM) is fit
+    silent = Fit("simplex", fit.coefficients, fit.world_from_head, 1, "converged")
+    assert with_estimated_prior(model, silent, EIGENHEADS, relief_mm=RELIEF_MM) is silent

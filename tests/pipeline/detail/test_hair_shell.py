@@ -39,9 +39,7 @@ def test_hair_is_covered_and_skin_stays(capped: tuple[Mesh, Mesh, np.ndarray]) -
     assert np.median(made.height_mm[top]) == pytest.approx(HAIR_MM - HEAD_MM, abs=1.0)
 
 
-def test_no_vertex_lies_inside_the_skin_and_a_head_without_hair_is_the_head(
-    capped: tuple[Mesh, Mesh, np.ndarray],
-) -> None:
+def test_no_vertex_lies_in_the_skin_and_a_head_without_hair_is_the_head(capped: tuple[Mesh, Mesh, np.ndarray]) -> None:
     head, bust, part = capped
     sunk = Mesh(bust.vertices * np.where(part == Part.HAIR, 1.0, 0.97)[:, None], bust.faces)
     made = hair_shell(head, sunk, part)

@@ -5,9 +5,9 @@ import pytest
 
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import vertex_deviation_mm
-from pipeline.detail.dense_points import SurfacePoints, thinned, with_scaled_deviation
+from pipeline.detail.dense_points import SurfacePoints, with_scaled_deviation
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids
-from pipeline.detail.refine import SHARED_ERROR, DeformedSurface, deform_to_points, folded, refine_to_surface
+from pipeline.detail.refine import SHARED_ERROR, DeformedSurface, deform_to_points, folded, refine_to_surface, unfolded
 from pipeline.fusion.untangling import head_topology, spoilt_faces
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
@@ -104,15 +104,6 @@ def test_hair_bounds_and_does_not_pull() -> None:
         assert not found.observed.any()
 
 
-def test_thinning_keeps_parts_and_sides_apart() -> None:
-    points = np.zeros((4, 3))
-    normals = np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, -1.0], [0, 0, 1.0]])
-    part = np.array([Part.SKIN, Part.SKIN, Part.SKIN, Part.HAIR], np.uint8)
-    thin = thinned(SurfacePoints(points, normals, np.full(4, 0.2), part), 1.0)
-    assert sorted(zip(thin.part.tolist(), thin.normals[:, 2].tolist(), strict=True)) == [(1, -1.0), (1, 1.0), (2, 1.0)]
-    np.testing.assert_allclose(thin.deviation_mm, 0.2)
-
-
 def head_points(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generator) -> SurfacePoints:
     """Vertices of a head that stand in the front half, with noise along their normals."""
     normals = vertex_normals(vertices, faces)
@@ -165,3 +156,17 @@ def test_white_or_iris_between_the_lids_means_open() -> None:
     assert not EyeEvidence(white=0.1, dark=0.0, views=3).closed
     assert not EyeEvidence(white=0.0, dark=0.3, views=3).closed
     assert not EyeEvidence(white=0.0, dark=0.0, views=0).closed
+
+
+def test_a_planted_fold_gives_way_and_what_is_smooth_stays() -> None:
+    vertices, faces, _ = subdivided_sphere()
+    moved = vertices.copy()
+    moved[500] += 3.0 * (vertices[faces[(faces == 500).any(axis=1)][0]].mean(axis=0) - vertices[500])
+    assert folded(vertices, moved, faces).any()
+    mended = unfolded(vertices, moved, faces)
+    assert not folded(vertices, mended, faces).any()
+    far = np.linalg.norm(vertices - vertices[500], axis=1) > 50.0
+    np.testing.assert_array_equal(mended[far], moved[far])
+    moved = vertices * (1.0 + 0.02 * np.sin(vertices[:, :1] / 20.0))
+    assert not folded(vertices, moved, faces).any()
+    assert unfolded(vertices, moved, faces) is moved

@@ -27,9 +27,7 @@ def posed() -> tuple[HeadModel, Fit, Mesh]:
     return model, fit, Mesh(PLACE.apply(model.vertices(z)), model.levels["full"].faces)
 
 
-def test_a_report_names_what_is_strong_and_sure_or_what_the_finished_surface_tells(
-    posed: tuple[HeadModel, Fit, Mesh],
-) -> None:
+def test_a_report_names_what_is_strong_and_sure_or_what_the_surface_tells(posed: tuple[HeadModel, Fit, Mesh]) -> None:
     model, fit, _ = posed
     found = found_expressions(model, fit)
     assert [(each.words, round(each.weight, 6)) for each in found] == [
@@ -53,9 +51,7 @@ def test_closed_eyes_blink(posed: tuple[HeadModel, Fit, Mesh]) -> None:
     assert shut_eyes(model, shut) == {"right"}
 
 
-def test_without_its_expression_a_head_is_neutral_and_the_morphs_give_it_back(
-    posed: tuple[HeadModel, Fit, Mesh],
-) -> None:
+def test_without_its_expression_a_head_is_neutral_and_morphs_give_it_back(posed: tuple[HeadModel, Fit, Mesh]) -> None:
     model, fit, mesh = posed
     neutral = neutral_mesh(model, PLACE, mesh, found_expressions(model, fit))
     taken_back = {"jawOpen": WEIGHTS["jawOpen"]}  # the least weights stay

@@ -8,7 +8,17 @@ import pytest
 from jaxtyping import Float
 
 from pipeline.faces.detection import FaceDetection
-from pipeline.faces.irises import BEHIND_MM, EYEBALL_MM, Iris, UnseenEye, believed, find_irises, looking_together
+from pipeline.faces.irises import (
+    BEHIND_MM,
+    EYEBALL_MM,
+    Iris,
+    UnseenEye,
+    believed,
+    find_irises,
+    looking_together,
+    pupils_px,
+)
+from pipeline.faces.limbus import EyeView
 from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.points import LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS
 from rig.camera import Camera, Intrinsics
@@ -173,3 +183,39 @@ def test_the_gaze_turns_with_the_world() -> None:
     assert isinstance(here, Iris)
     np.testing.assert_allclose(here.centre, motion.apply(there.centre[None])[0], atol=0.02)
     np.testing.assert_allclose(here.gaze, motion.rotation @ there.gaze, atol=0.005)
+
+
+SIDE_PX, FOCAL_PX, AWAY_MM = 80, 2400.0, 1200.0  # 2 px/mm
+AXES = np.eye(3)[:2]
+IRIS_LIGHT, PUPIL_LIGHT, WHITE_LIGHT, LAMP_LIGHT = 0.15, 0.02, 1.0, 3.0  # brightness, by the white's
+
+
+def eye(
+    pupil_mm: tuple[float, float], *, dark: float = PUPIL_LIGHT, lamp_mm: tuple[float, float] | None = None
+) -> EyeView:
+    """An eye in the plane z = 0, straight ahead, as a view has it."""
+    middle = (SIDE_PX - 1) / 2
+    lens = Intrinsics(SIDE_PX, SIDE_PX, FOCAL_PX, FOCAL_PX, middle, middle)
+    pose = look_at(np.array([0.0, 0.0, AWAY_MM]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    x, y = np.meshgrid(np.arange(SIDE_PX) - middle, middle - np.arange(SIDE_PX))
+    across, up = x * AWAY_MM / FOCAL_PX, y * AWAY_MM / FOCAL_PX
+    brightness = np.where(np.hypot(across, up) < 5.85, IRIS_LIGHT, WHITE_LIGHT)
+    brightness[np.hypot(across - pupil_mm[0], up - pupil_mm[1]) < 2.0] = dark
+    if lamp_mm is not None:
+        brightness[np.hypot(across - lamp_mm[0], up - lamp_mm[1]) < 0.5] = LAMP_LIGHT
+    plane = np.zeros((SIDE_PX, SIDE_PX), np.float32)
+    return EyeView(Camera("cam0", lens, pose), np.zeros(2), brightness.astype(np.float32), plane, plane)
+
+
+@pytest.mark.parametrize("highlight", [None, (-1.2, 1.0)])
+def test_a_pupil_is_found_beside_a_highlight(highlight: tuple[float, float] | None) -> None:
+    views = [eye(place, lamp_mm=highlight) for place in ((0.6, -0.4), (-0.5, 0.3))]
+    found = pupils_px(views, np.zeros(3), AXES)
+    for view, place, pixel in zip(views, ((0.6, -0.4), (-0.5, 0.3)), found, strict=True):
+        assert pixel is not None
+        assert np.linalg.norm(pixel - view.camera.project(np.array([[*place, 0.0]]))[0]) < 0.5
+
+
+def test_an_iris_without_a_pupil_has_none() -> None:
+    assert pupils_px([eye((0.0, 0.0), dark=IRIS_LIGHT)], np.zeros(3), AXES) == [None]
+    assert pupils_px([], np.zeros(3), AXES) == []

@@ -25,7 +25,7 @@ def of_model(model: HeadModel) -> LandmarkMap:
     return landmark_map(model)
 
 
-def test_the_shipped_model_has_a_measured_map_whose_jaw_line_and_forehead_slide(
+def test_the_shipped_map_is_measured_and_its_jaw_line_and_forehead_slide(
     model: HeadModel, of_model: LandmarkMap
 ) -> None:
     assert (of_model.rows == built_in_map("makehuman").rows).all()
@@ -38,9 +38,7 @@ def test_the_shipped_model_has_a_measured_map_whose_jaw_line_and_forehead_slide(
     assert of_model.slides.mean() < 0.4
 
 
-def test_points_lie_on_their_landmarks_halves_are_alike_and_they_move_with_the_head(
-    model: HeadModel, of_model: LandmarkMap
-) -> None:
+def test_points_lie_on_landmarks_are_alike_and_move_with_the_head(model: HeadModel, of_model: LandmarkMap) -> None:
     head = model.vertices(np.zeros(0))
     points = of_model.points(head)
     for index, name in NAMED.items():

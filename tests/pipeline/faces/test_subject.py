@@ -1,36 +1,37 @@
 """The subject's face through a whole rig: drawn heads and posters as cameras see them, and real recordings."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from pipeline.faces.landmark_map import built_in_map
 from pipeline.faces.networks import FaceNetworks, load_networks
-from pipeline.faces.subject import find_subject
-from rig.camera import Camera, Intrinsics
+from pipeline.faces.points import point_table
+from pipeline.faces.subject import DISTANCE_SHARE, find_subject, match_alone, place_from_one_view
+from rig.camera import Camera, Distortion, Intrinsics
 from rig.capture import ImageRgb
 from rig.formats.cameras.cameras_file import read_rig_file
 from rig.formats.captures.capture_folder import read_capture
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.formats.pictures.images import read_image
-from rig.geometry import RigidTransform, Similarity, look_at, rotation_from_vector
+from rig.geometry import RigidTransform, Similarity, look_at, rotation_from_vector, vector_from_rotation
 from rig.rig import Rig
-from tests.support.drawn_faces import EYES_MM, photographed_face, relief_mm
+from tests.support.drawn_faces import EYES_MM, photographed_face, relief_mm, seen_face
 from tests.support.landmark_figures import ICT_VERTICES, chi_square, head_axes
 from tests.support.shared_data import shared
 
 DIRECTIONS_DEG = ((0, 0), (-30, 5), (30, 10), (0, 25), (-50, 0), (180, 0))
 HEAD = Similarity(1.0, rotation_from_vector(np.array([0.05, 0.1, 0.0])), np.array([5.0, -10.0, 0.0]))
-POSTER = Similarity(1.2, np.eye(3), np.array([-150.0, 60.0, -250.0]))
 
 
-def studio(roll_deg: float = 0.0) -> Rig:
-    """Five cameras around the front, every second one turned by ``roll_deg``, and one behind."""
+def studio() -> Rig:
+    """Five cameras around the front, and one behind."""
     cameras = []
     for k, (azimuth, elevation) in enumerate(np.radians(DIRECTIONS_DEG)):
         away = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
-        turn = rotation_from_vector(np.array([0.0, 0.0, np.radians(roll_deg) if k % 2 else 0.0]))
-        pose = RigidTransform(turn, np.zeros(3)) @ look_at(1000.0 * away, np.zeros(3), np.array([0.0, 1.0, 0.0]))
+        pose = look_at(1000.0 * away, np.zeros(3), np.array([0.0, 1.0, 0.0]))
         size = (480, 640) if k == 2 else (640, 480)
         lens = Intrinsics(*size, 900.0, 900.0, (size[0] - 1) / 2, (size[1] - 1) / 2)
         cameras.append(Camera(f"cam{k}", lens, pose))
@@ -64,24 +65,10 @@ def test_a_head_is_found_in_all_views_but_from_behind(networks: FaceNetworks, pi
     assert front.irises_px is not None
     drawn = studio()["cam0"].project(eyes_world())
     assert np.linalg.norm(front.irises_px[[0, 5]] - drawn, axis=1).max() < 4.0
-
-
-def test_the_same_pictures_give_the_same_bytes(networks: FaceNetworks, pictures: dict[str, ImageRgb]) -> None:
-    first, second = (find_subject(pictures, studio(), each).matched for each in (networks, load_networks()))
-    assert first is not None
-    assert second is not None
-    assert first.points_world.tobytes() == second.points_world.tobytes()
-    assert first.covariances.tobytes() == second.covariances.tobytes()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("roll", [90.0, 180.0])
-def test_cameras_on_their_side_or_head_find_the_same(networks: FaceNetworks, roll: float) -> None:
-    rig = studio(roll)
-    found = find_subject({camera.name: photographed_face(camera, HEAD) for camera in rig}, rig, networks)
-    assert found.matched is not None
-    assert len(found.matched.detections) == 5
-    assert_on_eyes(found.matched.points_world)
+    again = find_subject(pictures, studio(), load_networks()).matched
+    assert again is not None
+    assert again.points_world.tobytes() == found.matched.points_world.tobytes()
+    assert again.covariances.tobytes() == found.matched.covariances.tobytes()
 
 
 def test_a_poster_alone_is_nobody(networks: FaceNetworks) -> None:
@@ -90,16 +77,6 @@ def test_a_poster_alone_is_nobody(networks: FaceNetworks) -> None:
     found = find_subject({c.name: photographed_face(c, poster, flat=True) for c in rig}, rig, networks)
     assert sum(map(bool, found.found.values())) >= 3  # it is seen, and told to be flat
     assert found.matched is None
-
-
-@pytest.mark.slow
-def test_a_poster_behind_the_subject_is_passed_over(networks: FaceNetworks) -> None:
-    rig = studio()
-    walls = {camera.name: photographed_face(camera, POSTER, flat=True) for camera in rig}
-    pictures = {camera.name: photographed_face(camera, HEAD, behind=walls[camera.name]) for camera in rig}
-    found = find_subject(pictures, rig, networks)
-    assert found.matched is not None
-    assert_on_eyes(found.matched.points_world)
 
 
 @pytest.mark.parametrize("names", [("cam0", "cam1"), ("cam1", "cam2"), ("cam3", "cam4"), ("cam0", "cam2", "cam5")])
@@ -237,3 +214,59 @@ def _camera(name: str, matrix: np.ndarray, shape: tuple[int, ...]) -> Camera:
     scale = np.linalg.norm(np.linalg.solve(lens, matrix[:, :3])[2])
     intrinsics = Intrinsics(shape[1], shape[0], lens[0, 0], lens[1, 1], lens[0, 2], lens[1, 2])
     return Camera(name, intrinsics, RigidTransform(motion, translation / scale))
+
+
+LENS = Distortion(-0.12, 0.05, 1e-3, -8e-4, 0.01)
+TURNS = ((0.0, 0.0, 0.0), (0.3, -0.4, 0.1), (-0.4, 0.7, 1.5), (0.1, 0.2, 3.0))
+
+
+def camera() -> Camera:
+    pose = look_at(np.array([200.0, 300.0, 1000.0]), np.array([20.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
+    return Camera("front", Intrinsics(1024, 768, 1500.0, 1480.0, 520.0, 377.0, LENS), pose)
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_a_planted_pose_comes_back(turn: tuple[float, float, float]) -> None:
+    face = Similarity(1.0, rotation_from_vector(np.array(turn)), np.array([30.0, -20.0, 10.0]))
+    found = place_from_one_view(seen_face(face, camera(), np.random.default_rng(0)), camera())
+    assert found is not None
+    assert np.degrees(np.linalg.norm(vector_from_rotation(found.rotation.T @ face.rotation))) < 0.7
+    # 468 points with 1 px of noise: a size to 0.02 %; the bias, taken off in three rounds, leaves more.
+    assert np.linalg.norm(found.translation - face.translation) < 6.0
+    assert found.scale == 1.0
+
+
+def test_a_child_is_taken_for_an_adult_farther_away() -> None:
+    child = Similarity(0.8, np.eye(3), np.zeros(3))
+    found = place_from_one_view(seen_face(child, camera(), np.random.default_rng(0)), camera())
+    assert found is not None
+    away = np.linalg.norm(found.translation - camera().centre_world) / np.linalg.norm(camera().centre_world)
+    assert abs(away - 1.0 / 0.8) < 0.02
+
+
+def test_points_outside_the_lens_are_no_pose() -> None:
+    """A lens whose model turns back at 1.1 of the focal length: nothing is seen beyond."""
+    face = seen_face(Similarity.identity(), camera(), np.random.default_rng(0))
+    narrow = replace(camera(), intrinsics=replace(camera().intrinsics, distortion=Distortion(k1=-0.28)))
+    far_off = replace(face, landmarks_px=face.landmarks_px + (3000.0, 0.0))
+    assert place_from_one_view(face, narrow) is not None
+    assert place_from_one_view(far_off, narrow) is None
+    assert match_alone("front", far_off, narrow) is None
+
+
+def test_what_one_view_leaves_open_is_said() -> None:
+    """Along the rays a tenth of the distance, across them what pixels leave: a child's points are among the likely."""
+    child = Similarity(0.9, rotation_from_vector(np.array([0.1, -0.2, 0.0])), np.array([10.0, 5.0, 0.0]))
+    found = match_alone("front", seen_face(child, camera(), np.random.default_rng(0)), camera())
+    assert found is not None
+    assert list(found.detections) == ["front"]
+    modes = found.shared_mm.reshape(len(found.shared_mm), -1)
+    error = found.points_world - child.apply(point_table().shape_mm)
+    assert np.linalg.norm(error, axis=1).mean() > 90.0  # taken for an adult, farther away
+    covariance = modes.T @ modes
+    for k, block in enumerate(found.covariances):
+        covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += block
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), error.ravel())
+    assert (whitened**2).mean() < 2.0
+    along = found.points_world - camera().centre_world
+    assert np.allclose(found.shared_mm[0], DISTANCE_SHARE * along)

@@ -167,8 +167,6 @@ def test_random_heads_and_expressions_come_out_clean_on_a_coarse_level(wide_mode
         for first in range(2, 202, SEEDS_A_TEST)
     ],
 )
-def test_two_hundred_random_heads_and_expressions_come_out_clean(
-    wide_model: HeadModel, hostile: Displacement, first: int
-) -> None:
+def test_two_hundred_random_heads_come_out_clean(wide_model: HeadModel, hostile: Displacement, first: int) -> None:
     for seed in range(first, first + SEEDS_A_TEST):
         check_clean(wide_model, seed, hostile)

@@ -1,9 +1,9 @@
-"""Closest points beside a search through every pair, by the plain formula."""
+"""Closest points beside a search through every pair, by the plain formula; fans and normals."""
 
 import numpy as np
 import pytest
 
-from pipeline.geometry.surface_index import closest_candidates
+from pipeline.geometry.surface_index import closest_candidates, corners_at_vertices, facing_cosine
 from tests.support.closest_points import closest_candidates_naive, closest_on_triangles_naive
 
 
@@ -59,3 +59,20 @@ def test_triangles_without_area_have_a_closest_point() -> None:
     for corners, expected in ((line, [6.0, 0.0, 0.0]), (point, [0.0, 0.0, 0.0])):
         _, weights = closest_candidates(np.array([[6.0, 5.0, 0.0]]), np.zeros((1, 1), int), corners[None])
         np.testing.assert_allclose(weights[0] @ corners, expected, atol=1e-12)
+
+
+def test_corners_are_those_of_a_stable_sort() -> None:
+    faces = np.random.default_rng(4).integers(0, 90, (300, 3))
+    start, corner = corners_at_vertices(faces, 100)
+    np.testing.assert_array_equal(corner, np.argsort(faces.ravel(), kind="stable"))
+    np.testing.assert_array_equal(np.diff(start), np.bincount(faces.ravel(), minlength=100))
+    assert start[0] == 0
+
+
+def test_cosines_are_those_between_normals_and_lines_of_sight() -> None:
+    rng = np.random.default_rng(5)
+    place, points, towards = rng.normal(size=3), rng.normal(size=(50, 3)), rng.normal(size=(50, 3))
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    sight = place - points
+    expected = (sight * towards).sum(axis=1) / np.linalg.norm(sight, axis=1)
+    np.testing.assert_allclose(facing_cosine(place, points, towards), expected, atol=1e-12)

@@ -4,16 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.nearest import PointTree, nearest, sorted_into_cells
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("count", [1, 4])
 @pytest.mark.parametrize("queries", [0, 1, 1000])
 @pytest.mark.parametrize("axes", [2, 3])
-def test_they_are_those_of_scipy(
-    threads: int, count: int, queries: int, axes: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_they_are_scipys(threads: int, count: int, queries: int, axes: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EIGENHEAD_THREADS", str(threads))
     rng = np.random.default_rng(3)
     points, places = rng.normal(size=(500, axes)), rng.normal(size=(queries, axes))
@@ -43,3 +41,25 @@ def test_of_equally_far_points_the_first_comes_first() -> None:
     distance, row = nearest(PointTree.of(np.ones((1000, 3))), np.ones((1, 3)), count=3, within=1.0)  # one place
     np.testing.assert_array_equal(distance, np.zeros((1, 3)))
     np.testing.assert_array_equal(row, [[0, 1, 2]])
+
+
+WIDE = 2.0
+
+
+def test_near_points_are_at_fixed_steps_of_the_key() -> None:
+    points = np.random.default_rng(0).uniform(-9.0, 7.0, (400, 3))
+    cells = sorted_into_cells(points, WIDE)
+    key_of = np.empty(len(points), np.int64)
+    key_of[cells.order] = cells.keys
+    steps = {(i * cells.spans[1] + j) * cells.spans[2] + k for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)}
+    apart = np.linalg.norm(points[:, None] - points, axis=2)
+    for a, b in np.argwhere(apart < WIDE):
+        assert key_of[b] - key_of[a] in steps
+
+
+def test_keys_are_sorted_and_the_outermost_cells_are_empty() -> None:
+    cells = sorted_into_cells(np.random.default_rng(1).normal(size=(50, 3)), 0.7)
+    assert (np.diff(cells.keys) >= 0).all()
+    index = np.stack(np.unravel_index(cells.keys, cells.spans))
+    assert (index >= 1).all()
+    assert (index < cells.spans[:, None] - 1).all()

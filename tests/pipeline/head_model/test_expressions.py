@@ -1,5 +1,7 @@
-"""Expressions of a model: names, Apple's counterparts, what a file keeps of them, and heads that make faces."""
+"""Expressions of a model: names, Apple's counterparts, what a file keeps of them, and heads that make faces;
+the shapes of speech."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,9 +10,11 @@ import pytest
 
 from pipeline.head_model.expressions import (
     ARKIT,
+    VISEMES,
     Expressions,
     arkit_parts,
     closed_lids,
+    mixed,
     visible,
     weights_from_text,
     words,
@@ -105,3 +109,29 @@ def test_what_moves_no_skin_is_no_expression_and_blinks_close_their_own_eye() ->
     shapes[1, 2, 0] = 3.0
     assert visible(Expressions(("tongueOut", "jawOpen"), shapes)).names == ("jawOpen",)
     assert closed_lids({"eyeBlink_L": 0.7, "jawOpen": 1.0}) == {"right": 0.0, "left": 0.7}
+
+
+NAMES = ["sil", "PP", "FF", "TH", "DD", "kk", "CH", "SS", "nn", "RR", "aa", "E", "I", "O", "U"]
+PAGE = Path(__file__).parents[3] / "docs" / "templates.md"
+
+
+def test_the_fifteen_are_mixtures_of_apples_shapes() -> None:
+    assert list(VISEMES) == [f"viseme_{name}" for name in NAMES]
+    for mixture in VISEMES.values():
+        assert set(mixture) <= set(ARKIT)
+        assert all(0.0 < weight <= 1.0 for weight in mixture.values())
+    assert not VISEMES["viseme_sil"]
+    # What a model lacks is left out.
+    shapes = {"jawOpen": np.full((4, 3), 2.0)}
+    np.testing.assert_allclose(mixed(shapes, VISEMES["viseme_TH"]), 0.24)
+
+
+def test_the_page_states_every_weight() -> None:
+    rows = dict(re.findall(r"^\| `viseme_(\w+)` \| .*? \| (.*?) \|$", PAGE.read_text(), flags=re.MULTILINE))
+    assert list(rows) == NAMES
+    for name, text in rows.items():
+        stated: dict[str, float] = {}
+        for shape, weight in re.findall(r"(\w+) (0\.\d+)", text):
+            sides = [shape] if shape in ARKIT else [f"{shape}Left", f"{shape}Right"]
+            stated |= dict.fromkeys(sides, float(weight))
+        assert stated == VISEMES[f"viseme_{name}"], name

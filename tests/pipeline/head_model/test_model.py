@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.head_model import landmarks
-from pipeline.head_model.model import HeadModel, load_model, with_modes
+from pipeline.head_model.model import HeadModel, load_model, model_info, with_modes
 from pipeline.head_model.model_file import BadModel, read_parts, save_model
 from pipeline.head_model.model_names import UnknownModel, list_models, model_path
 from pipeline.head_model.subdivision import boundary_loops, check_manifold, opened_faces
@@ -22,6 +22,10 @@ def test_the_database_is_the_papers(model: HeadModel) -> None:
     assert len(model.sha256) == 64
     assert set(model.landmarks) == set(landmarks.NAMES)
     assert len(landmarks.NAMES) == 26
+    info = model_info(model)
+    assert (info["modes"], info["landmarks"], info["sha256"]) == (137, 26, model.sha256)
+    assert info["faces"] > info["vertices"]
+    assert 0.5 < info["generalisation_mm"] < 2.0
 
 
 def test_the_mean_head_has_a_human_size_and_the_head_frame(model: HeadModel) -> None:
@@ -109,9 +113,7 @@ def test_coefficients_are_standard_deviations(model: HeadModel) -> None:
     assert (np.diff(model.sigma) <= 0).all()
 
 
-def test_saving_and_loading_keeps_everything_also_by_name(
-    tmp_path: Path, model: HeadModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_saved_model_is_the_same_by_name(tmp_path: Path, model: HeadModel, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EIGENHEAD_MODELS", str(tmp_path))
     parts, _ = read_parts(model_path("default"))
     save_model(tmp_path / "again.npz", parts)

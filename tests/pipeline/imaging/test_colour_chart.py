@@ -1,11 +1,19 @@
-"""Charts drawn here, warped and tinted by known matrices, and pictures in which there is none."""
+"""Charts drawn here, warped and tinted by known matrices, pictures in which there is none, and plates."""
 
 import cv2
 import numpy as np
 import pytest
 
 from pipeline.imaging import colour_chart
-from pipeline.imaging.colour_chart import Chart, chart_correction, chart_normal, find_chart, true_colours
+from pipeline.imaging.colour_chart import (
+    Chart,
+    chart_correction,
+    chart_normal,
+    charts_in,
+    empty_plates,
+    find_chart,
+    true_colours,
+)
 from rig.camera import Camera, Intrinsics
 from rig.colour_space import srgb_from_linear
 from rig.geometry import look_at
@@ -88,3 +96,34 @@ def test_the_way_that_a_chart_faces() -> None:
     points = middle + grid @ np.stack([right, np.cross(normal, right)])
     found = chart_normal(Chart(camera.project(points), true_colours()), camera)
     np.testing.assert_allclose(found, normal, atol=1e-3)
+
+
+WALL = photograph(placed(0.01, 0.0), np.eye(3))
+CHART = photograph(placed(200, 5), np.eye(3))
+
+
+def noisy(seed: int, level: float = 1.0) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(0, 3, WALL.shape)
+    return np.clip(np.rint(level * WALL + noise), 0, 255).astype(np.uint8)
+
+
+def test_the_plate_with_the_chart_is_left_out_unless_it_is_the_only_one() -> None:
+    plates = (noisy(1), CHART, noisy(2, 1.1))
+    assert [plate is CHART for plate in empty_plates(plates)] == [False, False]
+    assert len(charts_in(plates)) == 1
+    assert empty_plates((CHART,)) == (CHART,)
+    assert len(charts_in((CHART,))) == 1
+    assert charts_in(()) == []
+
+
+def test_plates_that_are_alike_are_all_kept_and_the_first_is_looked_at() -> None:
+    plates = (noisy(1), noisy(2, 0.8))
+    assert empty_plates(plates) == plates
+    assert charts_in(plates) == []
+    hung = (CHART, photograph(placed(200, 5), np.eye(3), seed=1))
+    assert empty_plates(hung) == hung, "a chart that hangs at the wall is in the shot, too"
+    assert len(charts_in(hung)) == 1
+    walked = noisy(3)
+    walked[100:400, 200:300] = 20  # somebody walks through the picture
+    plates = (noisy(1), walked)
+    assert empty_plates(plates) == plates

@@ -19,9 +19,7 @@ def traced(rig: Rig) -> dict[str, Silhouette]:
     return {camera.name: silhouette_from_mask(trace(camera, 0.0)[1]) for camera in rig}
 
 
-def test_the_extent_is_about_the_body_and_views_that_are_not_usable_do_not_count(
-    rig: Rig, traced: dict[str, Silhouette]
-) -> None:
+def test_the_extent_is_about_the_body_and_unusable_views_do_not_count(rig: Rig, traced: dict[str, Silhouette]) -> None:
     centre, edge = hull_extent(traced, rig)
     assert np.linalg.norm(centre) < 5.0
     assert 2 * SEMI_AXES.max() < edge < 3 * SEMI_AXES.max()

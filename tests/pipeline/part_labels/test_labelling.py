@@ -24,7 +24,7 @@ from pipeline.part_labels.labelling import (
 )
 from rig.mesh import Mesh
 from rig.rig import Rig
-from rig.studio.scene.anatomy import anatomy
+from rig.studio.scene.anatomy import anatomy, grid_faces
 from rig.studio.scene.hair import HairStyle, grow, grow_beard
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import Subject
@@ -57,11 +57,7 @@ def shoulders() -> Mesh:
     turn, drop = np.meshgrid(np.linspace(0, 2 * np.pi, 60, endpoint=False), np.linspace(0, 1, 20))
     reach = 45 + 110 * drop
     points = np.stack([reach * np.sin(turn), -100 - 90 * drop, reach * np.cos(turn)], axis=-1).reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(19), np.arange(60), indexing="ij")
-    a, b = i * 60 + j, i * 60 + (j + 1) % 60
-    return Mesh(
-        points, np.concatenate([np.stack([a, a + 60, b], -1), np.stack([b, a + 60, b + 60], -1)]).reshape(-1, 3)
-    )
+    return Mesh(points, grid_faces(20, 60))
 
 
 def full_beard(head: Mesh) -> Mesh:
@@ -170,17 +166,6 @@ def test_nothing_is_said_outside_the_subject_and_of_views_that_do_not_count(rig)
         assert not each.probability[made.truth[name] == 0].any()
         assert each.probability.min() >= 0.0
         assert each.probability.sum(axis=2).max() <= 1.0 + 1e-6
-
-
-def test_the_same_photographs_give_the_same_bytes_and_none_no_map(rig):
-    made, subject = planted(rig, "dark", "blue"), egg_head()
-    assert subject.face_region is not None
-    head = rig, subject.mesh, subject.face_region, subject.landmarks
-    one, two = (
-        classify_parts(made.images, made.silhouettes, *head, report=lambda stage, share: None) for _ in range(2)
-    )
-    assert all(np.array_equal(one[name].probability, two[name].probability) for name in one)
-    assert not classify_parts({}, {}, *head, report=lambda stage, share: None)
 
 
 def test_starts_lie_on_the_cheeks_over_the_crown_and_below_the_neck(rig):

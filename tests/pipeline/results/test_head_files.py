@@ -12,9 +12,18 @@ import pytest
 import trimesh
 
 from pipeline.applications.templates.write.writers import load_template_writers
+from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.expression import build_blendshape_rig
+from pipeline.evidence.measurements import Landmark
 from pipeline.head_model.model import load_model
-from pipeline.results.head_files import head_mesh, printable, write_formats, write_head_ply, write_skin_maps
+from pipeline.results.head_files import (
+    head_mesh,
+    landmarks_document,
+    printable,
+    write_formats,
+    write_head_ply,
+    write_skin_maps,
+)
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document, skin_document
 from pipeline.results.write import write_result
@@ -29,10 +38,13 @@ from pipeline.texturing.sets.texture_sets import SetTextures
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.meshes.ply import read_head_ply
+from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
+from server.storage.result_folder import RESULT_FILE
 from tests.rig.formats.pictures.test_exr import read_exr
 from tests.support.glb import opened_glb
-from tests.support.made_up_results import textured_result
+from tests.support.made_up_results import made_up_result, textured_result
+from tests.support.scenes import ellipsoid
 
 ALL = ("glb", "ply", "obj", "usdz", "stl", "3mf")
 
@@ -119,9 +131,7 @@ def test_open_lids_are_closed_by_strips() -> None:
     assert len(np.unique(closed.faces)) == len(used) + 1  # the neck's middle alone is new
 
 
-def test_the_albedo_is_written_and_the_glb_shows_it_where_that_is_asked_for(
-    result: Reconstruction, tmp_path: Path
-) -> None:
+def test_the_albedo_is_written_and_the_glb_shows_it_where_wanted(result: Reconstruction, tmp_path: Path) -> None:
     assert result.texturing.atlas is not None
     image = np.full((1024, 1024, 3), (40, 180, 90), np.uint8)
     coefficients = np.arange(27.0).reshape(9, 3)
@@ -156,9 +166,7 @@ def with_sets(result: Reconstruction) -> Reconstruction:
     return replace(result, texturing=replace(result.texturing, sets=SetTextures(sets, specular)))
 
 
-def test_texture_sets_are_written_and_the_glb_mirrors_what_polarised_light_shows(
-    result: Reconstruction, tmp_path: Path
-) -> None:
+def test_texture_sets_are_written_and_the_glb_mirrors_polarised_light(result: Reconstruction, tmp_path: Path) -> None:
     polarised = with_sets(result)
     written(polarised, tmp_path)
     maps = {path.relative_to(tmp_path).as_posix() for path in (tmp_path / "texture").rglob("*") if path.is_file()}
@@ -285,3 +293,54 @@ def test_a_program_reads_millimetres_by_what_the_report_says(tmp_path: Path) -> 
         assert tuple(read[0, 0].tolist()) == first
     assert document["repeated"] == [0.5, 0.25]
     assert document["views"] == ["a", "b"]
+
+
+PLACE = Similarity(1.25, rotation_from_vector(np.array([0.1, -0.3, 0.05])), np.array([12.0, -7.0, 30.0]))
+HEAD_MM = {"pronasale": (0.0, -8.0, 90.0), "tragion_left": (70.0, 0.0, 0.0), "vertex": (0.0, 120.0, -5.0)}
+
+
+@pytest.fixture(scope="module")
+def marked() -> Reconstruction:
+    deviations = {"pronasale": np.array([0.3, 0.4, 1.2]), "tragion_left": None, "vertex": None}
+    landmarks = {
+        name: Landmark(PLACE.rotation @ np.array(place) + PLACE.translation, deviations[name])
+        for name, place in HEAD_MM.items()
+    }
+    head = ellipsoid(2)
+    fit = Fit("contour", np.array([0.5]), PLACE, 42, "the cost no longer falls")
+    settings = settings_from_document({"outputs": {"slicer": True}})
+    return made_up_result(Mesh(PLACE.apply(head.vertices), head.faces), fit, landmarks=landmarks, settings=settings)
+
+
+def test_the_list_is_what_slicers_schema_asks_for(marked: Reconstruction) -> None:
+    document = json.loads(json.dumps(landmarks_document(marked), allow_nan=False))
+    assert set(document) == {"@schema", "markups"}
+    assert document["@schema"].endswith("markups-schema-v1.0.3.json#")
+    [markup] = document["markups"]
+    assert markup["type"] in ("Fiducial", "Line", "Angle", "Curve", "ClosedCurve", "Plane", "ROI")
+    assert (markup["type"], markup["coordinateSystem"], markup["coordinateUnits"]) == ("Fiducial", "LPS", "mm")
+    for point in markup["controlPoints"]:
+        assert [type(point[key]) for key in ("id", "label", "description", "positionStatus")] == [str] * 4
+        assert point["positionStatus"] == "defined"
+        assert len(point["position"]) == 3
+        assert all(type(value) is float for value in point["position"])
+    assert len({point["id"] for point in markup["controlPoints"]}) == len(HEAD_MM)
+
+
+def test_points_say_how_sure_they_are(marked: Reconstruction) -> None:
+    points = {point["label"]: point for point in landmarks_document(marked)["markups"][0]["controlPoints"]}
+    assert points["pronasale"]["description"].startswith("standard deviation 1.300 mm;")  # hypot(0.3, 0.4, 1.2)
+    assert {points[name]["description"] for name in ("tragion_left", "vertex")} == {"standard deviation unknown"}
+
+
+def test_the_written_file_leads_back_to_the_reports_landmarks(marked: Reconstruction, tmp_path: Path) -> None:
+    write_result(tmp_path, marked, Capture({}))
+    report = json.loads((tmp_path / "report.json").read_text())
+    place = report["world_from_head"]
+    markup = json.loads((tmp_path / "landmarks.mrk.json").read_text())["markups"][0]
+    for point in markup["controlPoints"]:
+        left, posterior, superior = point["position"]
+        head = np.array([left, superior, -posterior])
+        world = np.array(place["rotation"]) @ head + place["scale"] * np.array(place["translation"])
+        np.testing.assert_allclose(world, report["landmarks"][point["label"]]["position"], atol=1e-6)
+    assert RESULT_FILE.match("landmarks.mrk.json")  # so that a second run without it takes it away

@@ -226,9 +226,7 @@ def test_operator_masks_need_no_plate_and_a_camera_with_neither_is_refused(scan:
     ("across_px", "value", "coarse", "holes"),
     [(3, 0.1, 0.9, 0), (8, 0.1, 0.9, 0), (14, 0.1, 0.9, 1), (28, 0.4, 1.0, 0), (28, 0.4, 0.9, 1)],
 )
-def test_a_hole_is_filled_that_is_small_or_that_the_coarse_level_calls_subject(
-    across_px: int, value: float, coarse: float, holes: int
-) -> None:
+def test_which_holes_are_filled(across_px: int, value: float, coarse: float, holes: int) -> None:
     """3e-4 of a subject of 240,000 px are 72 px: 8 x 8 are filled, as the white of an eye is, and 14 x 14 stay, as
     between an arm and the body."""
     alpha = np.zeros((600, 700), np.float32)

@@ -109,9 +109,7 @@ def test_a_smile_is_no_reason_to_doubt_a_view(seed: int, renderer: Renderer) -> 
         assert silhouette.quality.figures["strange_share"] == 0.0
 
 
-def test_the_median_view_of_the_preset_with_its_plates_and_without(
-    measured: tuple[Measured, Measured, list[str]],
-) -> None:
+def test_the_median_view_of_the_preset_with_plates_and_without(measured: tuple[Measured, Measured, list[str]]) -> None:
     plates, bare, silent = measured
     assert np.median(plates.iou) >= 0.995
     assert np.median(plates.rms_px) <= 0.35
@@ -120,9 +118,7 @@ def test_the_median_view_of_the_preset_with_its_plates_and_without(
     assert silent == []
 
 
-def test_the_worst_view_of_the_preset(
-    measured: tuple[Measured, Measured, list[str]], request: pytest.FixtureRequest
-) -> None:
+def test_the_presets_worst_view(measured: tuple[Measured, Measured, list[str]], request: pytest.FixtureRequest) -> None:
     """Holds for three captures. In five, some views stay beyond 0.8 px: mostly grey coats before grey walls and small
     real gaps in hair (``python -m tests.laboratory studio_masks`` prints them)."""
     plates, _, _ = measured

@@ -82,9 +82,7 @@ def slowly(context: ReconstructionContext, pauses: int, done: list[int]) -> Stag
     return Staged(pauses, [BESIDE])
 
 
-def test_a_stage_beside_others_has_the_seconds_that_were_waited_for_it(
-    context: ReconstructionContext, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stage_beside_has_the_seconds_waited(context: ReconstructionContext, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EIGENHEAD_THREADS", "2")
     reported: list[str] = []
     run, done = Recorder(replace(context, progress=lambda name, _: reported.append(name))), list[int]()

@@ -4,14 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import minimum_filter
 
-from pipeline.texturing.view_selection_kernels import (
-    POOR,
-    SLOPE_SLACK,
-    WINDOW,
-    nearest_sample,
-    sample_colours,
-    visibility_weights,
-)
+from pipeline.texturing.view_selection_kernels import POOR, SLOPE_SLACK, WINDOW, sample_colours, visibility_weights
 from pipeline.texturing.visibility import unclipped
 from rig.colour_space import linear_from_srgb
 
@@ -104,14 +97,6 @@ def test_a_surface_that_faces_the_camera_is_hidden_at_exactly_the_limit() -> Non
         assert weight(3.001, column) == pytest.approx(POOR * best, rel=1e-3)
     for column in (12, 6):
         assert weight(3.001, column) == pytest.approx(best, rel=1e-3)
-
-
-def test_the_nearest_sample_is_scipys() -> None:
-    depth = np.random.default_rng(5).uniform(0, 1, (7, 9)).astype(np.float32)
-    for reach in (0, 1, 2):
-        expected = minimum_filter(depth, 2 * reach + 1, mode="constant", cval=np.inf)
-        found = [[nearest_sample(depth, row, column, reach) for column in range(9)] for row in range(7)]
-        np.testing.assert_array_equal(found, expected)
 
 
 def test_colours_are_a_gaussian_mean_of_codes_read_from_the_table() -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.segmentation.segment import segment
 from pipeline.view_checks.image_assignment import (
     ExchangedPictures,
     WrongRig,
@@ -47,10 +46,13 @@ def filed_right(shot, found):
     )
 
 
-def test_a_good_capture_is_left_as_it_is(half_size_shot):
+def test_a_good_capture_is_left_as_it_is_and_plates_of_one_backdrop_are_nobodys(half_size_shot):
     found = judged(half_size_shot, half_size_shot.capture)
     assert (found.pictures, found.plates, found.warnings) == ({}, {}, ())
     assert filed_right(half_size_shot, found)
+    shot, capture = half_size_shot, half_size_shot.capture
+    same = Capture(capture.images, {name: capture.backgrounds["cam00"] for name in shot.rig.names})
+    assert misplaced_plates(same, shot.rig) == {}
 
 
 @pytest.mark.parametrize(
@@ -120,23 +122,3 @@ def test_a_picture_that_was_encoded_anew_is_a_duplicate(half_size_shot):
     masks = {**shot.masks, "cam08": shot.masks["cam07"]}
     silhouettes = {name: silhouette_from_mask(mask) for name, mask in masks.items()}
     assert duplicate_views(replace(shot.capture, images=images), silhouettes, shot.rig) == {"cam08": "cam07"}
-
-
-def test_plates_of_one_backdrop_are_nobodys(half_size_shot):
-    """Where every camera has the same cloth behind the subject, nothing is said about whose plate is whose."""
-    shot, capture = half_size_shot, half_size_shot.capture
-    same = Capture(capture.images, {name: capture.backgrounds["cam00"] for name in shot.rig.names})
-    assert misplaced_plates(same, shot.rig) == {}
-
-
-def test_segmentation_of_exchanged_cables_ends_where_that_of_good_ones_does(half_size_shot):
-    shot = half_size_shot
-
-    def segmented(capture: Capture):
-        return segment(capture, shot.rig, report=lambda stage, share: None)
-
-    found = assign_images(
-        reassign_images(shot.capture, pictures=EXCHANGE, plates=EXCHANGE), shot.rig, segmented, exchanged="repair"
-    )
-    good = segmented(shot.capture)
-    assert all(np.array_equal(found.silhouettes[name].mask, good[name].mask) for name in shot.rig.names)

@@ -52,13 +52,10 @@ def test_masks_that_are_all_too_large_or_too_small_are_warned_of_once(px: int, w
     assert warning.text.startswith(f"3 of 3 masks lie about 5 px {where} the edges in the photographs")
 
 
-def test_tight_masks_and_one_that_is_loose_are_not_warned_of() -> None:
+def test_tight_masks_one_that_is_loose_and_pictures_without_edges_warn_of_none() -> None:
     masks = {name: grown(subject(k), 6 if k == 0 else 0) for k, name in enumerate(NAMES)}
     assert masks_off_edges(IMAGES, masks, NAMES) == []
     assert masks_off_edges(IMAGES, masks, ()) == []
-
-
-def test_a_picture_without_edges_says_nothing() -> None:
     grey = {name: np.full((240, 320, 3), 128, np.uint8) for name in NAMES}
     masks = {name: grown(subject(k), 0) for k, name in enumerate(NAMES)}
     assert masks_off_edges(grey, masks, NAMES) == []

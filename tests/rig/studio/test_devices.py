@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -91,11 +92,9 @@ def test_simulated_driver_photographs_a_mesh_file(tmp_path: Path) -> None:
         CameraConfig(name="cam05", driver="opencv", identity="egg.ply", trigger="free"), driver="simulated"
     )
     driver = driver_for(camera, tmp_path)
-    driver.open(60.0)
-    try:
+    with closing(driver):
+        driver.open(60.0)
         image = grab_frame(driver, 5.0).image
-    finally:
-        driver.close()
     assert image.shape == (768, 1024, 3)
     nowhere = driver_for(dataclasses.replace(camera, identity="egg.ply#cam77"), tmp_path)
     with pytest.raises(CameraNotFound, match="the studio has cam00"):

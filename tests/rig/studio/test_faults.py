@@ -109,9 +109,7 @@ def test_a_rig_that_is_well_has_no_fault(studio: StudioDevices, config: RigConfi
 
 
 @pytest.mark.parametrize("kind", TABLE)
-def test_a_fault_alone_is_named_and_nothing_else_is(
-    studio: StudioDevices, session: RigSession, limit_s: float, kind: str
-) -> None:
+def test_a_fault_alone_is_named_alone(studio: StudioDevices, session: RigSession, limit_s: float, kind: str) -> None:
     fault, expected = TABLE[kind]
     studio.clear()
     session.warm_up()
@@ -133,9 +131,7 @@ def test_a_fault_alone_is_named_and_nothing_else_is(
         for pair in itertools.combinations(TABLE, 2)
     ],
 )
-def test_two_faults_are_both_named(
-    studio: StudioDevices, config: RigConfig, limit_s: float, one: str, other: str
-) -> None:
+def test_two_faults_are_named(studio: StudioDevices, config: RigConfig, limit_s: float, one: str, other: str) -> None:
     expected = TABLE[one][1] | TABLE[other][1]
     for pair in ((one, other), (other, one)):
         if pair in CANNOT_SHOW:

@@ -8,7 +8,7 @@ import pytest
 from rig.errors import InputError
 from rig.mesh import Mesh, face_normals, vertex_normals
 from rig.render.renderer import Renderer
-from rig.studio.scene.anatomy import Anatomy, anatomy, finer_grid, grid_faces
+from rig.studio.scene.anatomy import Anatomy, anatomy, finer_grid
 from rig.studio.scene.hair import HairStyle, beard_share, curled, grow, hang, knot
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
@@ -44,13 +44,6 @@ def test_finer_grid_keeps_its_vertices_and_closes():
     assert fine.shape == (19, 36, 3)
     np.testing.assert_allclose(fine[::3, ::3], field)
     np.testing.assert_allclose(fine[0, 35], (field[0, 11] + 2 * field[0, 0]) / 3)
-
-
-@pytest.mark.parametrize("closed", [True, False])
-def test_grid_has_two_triangles_a_cell(closed):
-    faces = grid_faces(4, 6, closed=closed)
-    assert len(faces) == 2 * 3 * (6 if closed else 5)
-    assert faces.max() == 23
 
 
 def test_no_curls_where_their_amount_is_zero():
@@ -151,12 +144,7 @@ def test_a_head_without_landmarks_says_that_it_can_wear_neither_glasses_nor_bear
         dress(renderer, bare, replace(plain_look(), **changes), pose.scene.world_from_head, clothes=False, rng=rng())
 
 
-def test_unknown_hair_is_refused_with_the_names_there_are():
-    with pytest.raises(InputError, match=r"mohawk is not one of short, .*glasses"):
-        restyled(plain_look(), ["long", "mohawk"])
-
-
-def test_names_add_up_in_their_order():
+def test_names_add_up_in_their_order_and_unknown_ones_are_refused():
     look = restyled(plain_look(), ["curly", "beard", "glasses"])
     assert look.hair is not None
     assert look.beard is not None
@@ -164,6 +152,8 @@ def test_names_add_up_in_their_order():
     assert look.glasses
     assert restyled(look, ["bald"]).hair is None
     assert restyled(plain_look(), []) == plain_look()
+    with pytest.raises(InputError, match=r"mohawk is not one of short, .*glasses"):
+        restyled(plain_look(), ["long", "mohawk"])
 
 
 def photographed(renderer: Renderer, *hairstyle: str) -> SimulatedCapture:

@@ -26,6 +26,7 @@ from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.mesh import Mesh, vertex_normals
+from rig.studio.scene.anatomy import grid_faces
 from tests.pipeline.applications.templates.conftest import moves
 from tests.pipeline.applications.templates.test_contact import EVERY, dent, sheets
 
@@ -62,9 +63,7 @@ def photographed() -> PhotographedEyes:
     directions = np.column_stack([aside, np.sqrt(12.0**2 - (0.8 * aside**2).sum(axis=1))])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     vertices = EYEBALL.centre + EYEBALL.reach(directions)[:, None] * directions
-    index = np.arange(len(aside)).reshape(41, 41)
-    a, b, c, d = (each.ravel() for each in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
+    faces = grid_faces(41, 41, closed=False)[:, ::-1].astype(np.int32)
     image = np.full((200, 200, 3), WHITE, np.uint8)
     uv = 0.5 + aside / (2.0 * HALF_MM[0]) * (1.0, -1.0)
     at = (np.stack(np.meshgrid(*[(np.arange(200) + 0.5) / 200] * 2), axis=2) - 0.5) * (20.0, -20.0)
@@ -72,7 +71,7 @@ def photographed() -> PhotographedEyes:
     there = np.column_stack([flat, np.sqrt(np.maximum(144.0 - 0.8 * (flat**2).sum(axis=1), 1.0))])
     angle = np.arccos(there @ GAZE / np.linalg.norm(there, axis=1)).reshape(200, 200)
     image[angle < np.arcsin(5.9 / 12.0)], image[angle < np.arcsin(2.0 / 12.0)] = IRIS, PUPIL
-    atlas = Atlas(Layout(uv, faces, index.ravel()), image)
+    atlas = Atlas(Layout(uv, faces, np.arange(len(aside))), image)
     return PhotographedEyes(Mesh(vertices, faces), np.arange(len(faces)), atlas)
 
 
@@ -140,12 +139,10 @@ def coarse(model: HeadModel, mean: np.ndarray, *parts: trimesh.Trimesh) -> tuple
     return surface_binding(rest, rows, attachment, wholes), triangles
 
 
-def carried(
-    model: HeadModel, mean: np.ndarray, binding: SurfaceBinding, triangles: np.ndarray
-) -> dict[str, np.ndarray]:
+def carried(model: HeadModel, mean: np.ndarray, binding: SurfaceBinding, faces: np.ndarray) -> dict[str, np.ndarray]:
     marks = {name: mean[row] for name, row in model.landmarks.items()}
     neutral = Neutral(mean, model.levels["full"].faces, binding.on(mean, model.levels["full"].faces))
-    return carried_shapes(binding, triangles, neutral, moves(model, *NAMES), marks)
+    return carried_shapes(binding, faces, neutral, moves(model, *NAMES), marks)
 
 
 def test_the_insides_of_lips_move_with_their_own_lip(model: HeadModel, mean: np.ndarray) -> None:

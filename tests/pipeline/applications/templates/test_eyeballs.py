@@ -17,6 +17,7 @@ from rig.formats.meshes.scene import Part, Scene
 from rig.formats.meshes.usdz import scene_usdz_bytes
 from rig.geometry import rotation_from_vector
 from rig.mesh import Mesh, boundary_edges, vertex_normals
+from rig.studio.scene.anatomy import grid_faces
 from tests.support.glb import opened_glb
 
 AHEAD = np.array([0.0, 0.0, 1.0])
@@ -29,9 +30,7 @@ def lids(*, slit: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, n
     way down (each vertex to where it is turned to), and the corners of both eyes."""
     x, y = np.meshgrid(np.linspace(-11, 11, 45), np.linspace(-9, 9, 37))
     flat = np.stack([x, y, np.sqrt(np.maximum(LID_MM**2 - x**2 - y**2, 4.0))], axis=2).reshape(-1, 3)
-    index = np.arange(x.size).reshape(x.shape)
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
-    faces = np.concatenate([np.stack([a, b, c], 2).reshape(-1, 3), np.stack([a, c, d], 2).reshape(-1, 3)])
+    faces = grid_faces(*x.shape, closed=False)[:, ::-1]
     middle = flat[faces].mean(axis=1)
     opening = (middle[:, 0] / 9.5) ** 2 + (middle[:, 1] / 4.5) ** 2 < 1.0
     upper = np.clip((flat[:, 1] + 0.1) / 4.0, 0.0, 1.0) * (1.0 - (flat[:, 0] / 11.5) ** 2) * (flat[:, 1] > 0)

@@ -82,7 +82,7 @@ def test_what_the_model_cannot_be_becomes_offsets(model: FlameModel, arrays: dic
 
 
 @pytest.mark.parametrize("protocol", [2, 4])
-def test_a_published_pickle_is_read_without_chumpy(
+def test_pickles_are_read_without_chumpy(
     arrays: dict[str, Any], model: FlameModel, tmp_path: Path, protocol: int
 ) -> None:
     read = read_flame(write_pickle(tmp_path / "generic_model.pkl", arrays, protocol))

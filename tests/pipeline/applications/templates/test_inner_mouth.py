@@ -71,9 +71,7 @@ def test_the_shipped_parts_are_closed_and_cross_neither_themselves_nor_each_othe
     assert np.linalg.norm(out[behind[:50]], axis=1).mean() < 0.5 * np.linalg.norm(out[behind[-50:]], axis=1).mean()
 
 
-def test_upper_teeth_stay_and_lower_ones_turn_about_the_jaws_hinge(
-    inner: InnerMouth, points: dict[str, np.ndarray]
-) -> None:
+def test_upper_teeth_stay_and_lower_ones_turn_about_the_hinge(inner: InnerMouth, points: dict[str, np.ndarray]) -> None:
     assert inner.absence is None
     assert inner.moves["teeth_upper"] == {}
     assert "tongueOut" in inner.moves["tongue"]
@@ -90,9 +88,7 @@ def test_upper_teeth_stay_and_lower_ones_turn_about_the_jaws_hinge(
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.5, 1.0])
-def test_an_opening_mouth_meets_neither_teeth_nor_tongue(
-    model: HeadModel, mean: np.ndarray, inner: InnerMouth, weight: float
-) -> None:
+def test_an_open_mouth_meets_no_part(model: HeadModel, mean: np.ndarray, inner: InnerMouth, weight: float) -> None:
     skin, shapes = skin_of(model, mean)
     posed = skin + weight * shapes["jawOpen"]
     assert not meeting_triangles(posed, parted_faces(model), inner.posed("jawOpen", weight), inner).any()
@@ -100,9 +96,7 @@ def test_an_opening_mouth_meets_neither_teeth_nor_tongue(
     assert meeting_triangles(posed, parted_faces(model), ahead, inner).any()
 
 
-def test_nothing_is_added_behind_sealed_lips_beside_own_teeth_or_where_there_is_no_room(
-    model: HeadModel, mean: np.ndarray, points: dict[str, np.ndarray]
-) -> None:
+def test_nothing_is_added_without_room(model: HeadModel, mean: np.ndarray, points: dict[str, np.ndarray]) -> None:
     faces, count = parted_faces(model), model.levels["p95"].count
     assert placed(model, mean, points, np.asarray(model.levels["p95"].faces)).absence == "mouth-sealed"
     middle = points["stomion"]

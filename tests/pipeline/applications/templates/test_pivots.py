@@ -9,7 +9,7 @@ from tests.pipeline.applications.templates.conftest import moves
 Points = dict[str, np.ndarray]
 
 
-def test_pivots_lie_where_anatomy_has_them(model: HeadModel, mean: np.ndarray, points: Points) -> None:
+def test_pivots_lie_where_anatomy_or_an_eyeball_has_them(model: HeadModel, mean: np.ndarray, points: Points) -> None:
     found = pivots(points, mean, moves(model, "eyeBlinkRight", "eyeBlinkLeft"), [])
     assert set(found) == {"jaw", "eye_right", "eye_left", "neck"}
     assert abs(found["jaw"][0]) < 1.0
@@ -22,9 +22,6 @@ def test_pivots_lie_where_anatomy_has_them(model: HeadModel, mean: np.ndarray, p
         assert 0.0 < corners[2] - eye[2] < EYE_RADIUS_MM  # the ball's middle lies behind its opening
     assert found["neck"][1] < found["jaw"][1]
     assert found["neck"][2] < found["jaw"][2]
-
-
-def test_an_eyeball_of_the_mesh_is_the_pivot(mean: np.ndarray, points: Points) -> None:
     ball = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]) * 12.0 + (31.0, 12.0, 66.0)
     found = pivots(points, mean, {}, [ball])
     np.testing.assert_allclose(found["eye_left"], (31.0, 12.0, 66.0))

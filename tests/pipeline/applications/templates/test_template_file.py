@@ -106,9 +106,7 @@ def test_a_name_that_would_leave_the_folder_is_refused(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_result_has_the_templates_order_and_its_texture_at_the_same_places(
-    template: Template, model: HeadModel, tmp_path: Path
-) -> None:
+def test_a_result_has_the_templates_order_and_texture(template: Template, model: HeadModel, tmp_path: Path) -> None:
     layout, level = model_layout(model).layout, model.levels["p99"]
     image = np.zeros((1024, 1024, 3), np.uint8)
     image[..., 0], image[..., 1] = np.linspace(0, 255, 1024)[None, :], np.linspace(0, 255, 1024)[:, None]

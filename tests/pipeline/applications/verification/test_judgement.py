@@ -1,26 +1,31 @@
-"""Planted errors come out as the figures that they are."""
+"""Planted errors and scatter come out as the figures that they are; limits are settings."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipeline.applications.verification.judgement import Limits, judge, judge_one, weighted_range
+from pipeline.applications.verification.judgement import (
+    Limits,
+    checks,
+    judge,
+    judge_one,
+    limits_from_document,
+    scatter,
+    weighted_range,
+)
 from pipeline.applications.verification.reference import Reference
+from pipeline.head_model.subdivision import vertex_areas
 from rig.errors import InputError
+from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
 from tests.support.measured_heads import mannequin, marks, measured_head
+from tests.support.scenes import ellipsoid
+from tests.support.visits import bumped
 
 SCAN = Reference.of(mannequin(), marks(), "scan.ply")
 SHIFT_MM = np.array([3.0, -40.0, 8.0])
 TOP = int(np.argmin(np.linalg.norm(mannequin().vertices - marks()["glabella"], axis=1)))
-
-
-def bumped(height_mm: float, radius_mm: float = 12.0) -> np.ndarray:
-    """The mannequin with a bump on its forehead."""
-    vertices, normals = mannequin().vertices, mannequin().normals()
-    away = np.linalg.norm(vertices - marks()["glabella"], axis=1)
-    return vertices + (height_mm * np.exp(-((away / radius_mm) ** 2)))[:, None] * normals
 
 
 def test_a_perfect_head_has_no_error_wherever_it_lies() -> None:
@@ -52,19 +57,23 @@ def test_a_reference_one_percent_larger_is_a_size_error_and_fails() -> None:
 
 
 def test_a_bump_is_found_where_it_is_and_as_high_as_it_is() -> None:
-    one = judge_one(measured_head(bumped(2.0)), SCAN)
+    one = judge_one(measured_head(bumped("glabella", 2.0, 12.0)), SCAN)
     # The fit gives way by the bump's mean over the face: 2 mm * pi * 144 mm2 of 25,000 mm2 or so, and for the tilt.
     assert one.deviation_mm[TOP] == pytest.approx(2.0, abs=0.25)
     assert np.nanargmax(one.deviation_mm) == TOP
     assert one.probing_form_mm == pytest.approx(2.0, abs=0.5)
     assert one.regions["face"].mean_mm == pytest.approx(0.0, abs=0.05)
     assert one.regions["mouth"].rms_mm < 0.2
-    assert judge_one(measured_head(bumped(-2.0)), SCAN).deviation_mm[TOP] == pytest.approx(-2.0, abs=0.25)
+    assert judge_one(measured_head(bumped("glabella", -2.0, 12.0)), SCAN).deviation_mm[TOP] == pytest.approx(
+        -2.0, abs=0.25
+    )
 
 
 def test_what_every_capture_repeats_is_told_from_what_scatters() -> None:
     """Two heads with bumps of 1 and 3 mm: 2 mm in common, scatter of sqrt(2) mm at the top."""
-    found = judge([measured_head(bumped(h), str(h)) for h in (1.0, 3.0)], SCAN, Limits(repeatability_mm=0.05))
+    found = judge(
+        [measured_head(bumped("glabella", h, 12.0), str(h)) for h in (1.0, 3.0)], SCAN, Limits(repeatability_mm=0.05)
+    )
     assert found.repeated_mm[TOP] == pytest.approx(2.0, abs=0.3)
     failed = {check.name for check in found.checks if check.passed is False}
     assert "repeatability_mm" in failed
@@ -92,3 +101,61 @@ def test_the_range_leaves_out_the_tails_weight() -> None:
     values, weights = np.arange(1001.0), np.ones(1001)
     assert weighted_range(values, weights, 0.9) == pytest.approx(900.0, abs=1.5)
     assert weighted_range(np.r_[values, 1e9], np.r_[weights, 1e-9], 0.997) < 1001
+
+
+def test_limits_are_read_and_wrong_ones_named() -> None:
+    assert limits_from_document({"face_rms_mm": 1}) == Limits(face_rms_mm=1.0)
+    with pytest.raises(InputError) as error:
+        limits_from_document({"face_rms": 1.0, "least_covered": "much"}, "limits.toml")
+    assert "limits.toml: unknown key 'face_rms'; did you mean 'face_rms_mm'?" in str(error.value)
+    assert "least_covered is 'much', expected a finite number" in str(error.value)
+
+
+def test_the_most_and_the_least() -> None:
+    values = dict.fromkeys(Limits.__slots__, None) | {"face_rms_mm": 0.5, "least_covered": 0.5, "distance_mm": 3.0}
+    passed = {check.name: check.passed for check in checks(Limits(face_rms_mm=0.4, distance_mm=3.0), values)}
+    assert (passed["face_rms_mm"], passed["least_covered"], passed["distance_mm"]) == (False, False, True)
+    assert passed["repeatability_mm"] is None
+    assert checks(Limits(face_rms_mm=0.5), values)[0].passed
+
+
+HEAD = ellipsoid(3)  # 642 vertices
+EVERYWHERE = np.ones(len(HEAD.vertices), bool)
+AREAS = vertex_areas(HEAD.vertices, HEAD.faces)
+
+
+def seated(vertices: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return RigidTransform(rotation_from_vector(rng.normal(0, 0.3, 3)), rng.normal(0, 40, 3)).apply(vertices)
+
+
+def test_poses_are_no_scatter_and_one_head_has_none() -> None:
+    rng = np.random.default_rng(1)
+    heads = np.stack([seated(HEAD.vertices, rng) for _ in range(5)])
+    found = scatter(heads, HEAD.faces, EVERYWHERE)
+    assert found.position_mm.max() < 1e-6
+    np.testing.assert_allclose(found.mean, heads[0], atol=1e-6)
+    with pytest.raises(ValueError, match="two are needed"):
+        scatter(heads[:1], HEAD.faces, EVERYWHERE)
+
+
+def test_planted_scatter_is_found_and_compared_with_what_was_stated() -> None:
+    rng = np.random.default_rng(2)
+    stated = np.where(HEAD.vertices[:, 2] > 0, 0.1, 0.3)  # mm along the normal
+    normals = HEAD.normals()
+    noisy = [HEAD.vertices + normals * (stated * rng.standard_normal(len(stated)))[:, None] for _ in range(40)]
+    found = scatter(np.stack([seated(head, rng) for head in noisy]), HEAD.faces, EVERYWHERE)
+    front = found.figures(stated, AREAS, HEAD.vertices[:, 2] > 20)
+    figures = found.figures(stated, AREAS, EVERYWHERE)
+    # 39 degrees of freedom at each of some 250 vertices: the RMS is known to 1 %; the motions take 6 of 642 away.
+    assert front["rms_mm"] == pytest.approx(0.1, rel=0.05)
+    assert figures["normal_rms_mm"] == pytest.approx(figures["stated_mm"], rel=0.05)
+    assert figures["scatter_over_stated"] == pytest.approx(1.0, rel=0.05)
+    assert figures["rank_correlation"] > 0.8
+    assert figures["normal_rms_mm"] <= figures["rms_mm"] <= figures["p95_mm"]
+
+
+def test_a_size_that_changes_is_scatter() -> None:
+    heads = np.stack([scale * HEAD.vertices for scale in (0.99, 1.01)])
+    found = scatter(heads, HEAD.faces, EVERYWHERE)
+    radius = np.linalg.norm(HEAD.vertices - HEAD.vertices.mean(axis=0), axis=1)
+    np.testing.assert_allclose(found.position_mm, np.sqrt(2.0) * 0.01 * radius, rtol=1e-6)

@@ -39,14 +39,6 @@ def test_a_scan_is_read_with_the_landmarks_beside_it(tmp_path: Path) -> None:
     assert read_reference(tmp_path / "scan.ply", tmp_path / "seven.json").landmarks.keys() == {"pronasale"}
 
 
-@pytest.mark.parametrize("share", [0.2, 0.6, 0.98])
-def test_a_file_that_is_cut_short_is_refused(tmp_path: Path, share: float) -> None:
-    data = coloured(mannequin())
-    (tmp_path / "scan.ply").write_bytes(data[: int(share * len(data))])
-    with pytest.raises(InputError, match=r"scan\.ply"):
-        read_reference(tmp_path / "scan.ply")
-
-
 def test_half_an_obj_is_named(tmp_path: Path) -> None:
     data = obj_bytes(replace(mannequin(), colours=np.full((len(mannequin().vertices), 3), 128, np.uint8)))
     start = data.index(b"\nf ")

@@ -1,14 +1,12 @@
 """A scan wrapped from its file to the files of the result; a template drawn onto it, what lies deeper following."""
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from pipeline.applications.templates.likeness import SurfaceMarks
 from pipeline.applications.templates.placement import Surface
 from pipeline.applications.templates.template_file import Template
 from pipeline.applications.wrapping.scan import raw_scan, read_raw_scan
@@ -108,7 +106,7 @@ def marked_scan(model: HeadModel, factor: float) -> tuple[PlacedScan, np.ndarray
     moved = mean @ turn.T * factor + 3.0
     where = {name: model.vertices(np.zeros(0))[row] @ turn.T * factor + 3.0 for name, row in model.landmarks.items()}
     scan = raw_scan(TexturedMesh(Mesh(moved, np.ascontiguousarray(faces[:, ::-1]))), "scan")
-    return place_scan(scan, model, where), turn
+    return place_scan(scan, model, where | {"nobody": np.zeros(3)}), turn
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1.0, "mm"), (0.1, "cm"), (0.001, "m"), (0.0043, None)])
@@ -134,15 +132,5 @@ def test_landmarks_place_a_scan_in_any_unit(model: HeadModel, factor: float, uni
     ("scale", "expected"),
     [(1.1, ("mm", 1.0)), (0.09, ("cm", 10.0)), (0.04, ("in", 25.4)), (0.001, ("m", 1000.0)), (0.5, (None, 2.0))],
 )
-def test_a_faces_size_tells_the_unit_and_one_of_no_unit_becomes_a_mean_adults(
-    scale: float, expected: tuple[str | None, float]
-) -> None:
+def test_a_faces_size_tells_the_unit_or_is_a_mean_adults(scale: float, expected: tuple[str | None, float]) -> None:
     assert unit_of(scale) == expected
-
-
-def test_marks_lie_where_landmarks_do(model: HeadModel) -> None:
-    mean = model.vertices(np.zeros(0))
-    named: Mapping[str, np.ndarray] = {name: mean[row] for name, row in model.landmarks.items()}
-    marks = SurfaceMarks.of_landmarks(model, {**named, "nobody": np.zeros(3)})
-    np.testing.assert_allclose(marks.on(mean), marks.points, atol=1e-9)
-    assert len(marks.points) == len(model.landmarks)

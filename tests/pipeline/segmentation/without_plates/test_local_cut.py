@@ -29,8 +29,3 @@ def test_the_edge_is_found_from_a_mask_that_is_off(grown: int) -> None:
     # One pixel all around is 2 * pi * 90 of 25,447 pixels, 2.2 %.
     assert np.count_nonzero(found ^ truth) < 0.022 * truth.sum()
     assert np.count_nonzero(found ^ truth) < 0.5 * np.count_nonzero(wide ^ truth)
-
-
-def test_the_same_picture_is_cut_alike_twice() -> None:
-    image, truth = scene()
-    assert (cut_along(image, truth, BANDS[1]) == cut_along(image, truth, BANDS[1])).all()

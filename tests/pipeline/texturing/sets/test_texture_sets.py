@@ -109,9 +109,7 @@ def error_db(light: np.ndarray, truth: np.ndarray) -> float:
     return float(20 * np.log10(np.sqrt(np.mean((scale * light - truth) ** 2) / np.mean(truth**2))))
 
 
-def test_the_diffuse_texture_is_nearer_to_scattered_light_than_the_plain_one(
-    shiny: Coloured, found: SetTextures
-) -> None:
+def test_the_diffuse_texture_is_nearer_to_scattered_light_than_a_plain_one(shiny: Coloured, found: SetTextures) -> None:
     assert found.diffuse is not None
     truth = shiny.truth[shiny.seen]
     plain, diffuse = (

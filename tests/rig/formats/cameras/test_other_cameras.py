@@ -1,5 +1,8 @@
 """Foreign rig files: what is written is read back the same, by us and by pycolmap; damage always ends in InputError."""
 
+import re
+import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +10,8 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from rig.camera import Distortion, Intrinsics
 from rig.errors import InputError
@@ -175,3 +180,90 @@ def test_a_csv_that_a_spreadsheet_saved_with_semicolons_is_read(tmp_path: Path) 
     assert saved.names == plain.names
     for one, other in zip(saved, plain, strict=True):
         np.testing.assert_allclose(one.project(POINTS), other.project(POINTS))
+
+
+Change = Callable[[bytes], bytes]
+FAULTS: dict[str, tuple[str, str, Change, str]] = {
+    "truncated cameras": ("colmap", "cameras", lambda data: data[:-30], "promises|truncated"),
+    "truncated images": ("colmap", "images", lambda data: data[:-3], "truncated"),
+    "empty": ("colmap", "cameras", lambda data: b"", "truncated"),
+    "a huge count": ("colmap", "cameras", lambda data: struct.pack("<Q", 1 << 60) + data[8:], f"states {1 << 60}"),
+    "a huge count of points": (
+        "colmap", "images", lambda data: data[:-8] + struct.pack("<Q", 1 << 62), f"states {1 << 62}"
+    ),
+    "NaN focal length": (
+        "colmap", "cameras", lambda data: data[:32] + struct.pack("<d", np.nan) + data[40:], "cam00.intrinsics.fx"
+    ),
+    "the model FOV": ("colmap", "cameras", lambda data: data[:12] + struct.pack("<i", 7) + data[16:], "number 7"),
+    "NaN translation": (
+        "colmap-text", "images", lambda data: re.sub(rb"(?m)^(1( \S+){4}) \S+", rb"\1 nan", data, count=1),
+        "cam00.camera_from_world.translation",
+    ),
+    "zero quaternion": (
+        "colmap-text", "images", lambda data: re.sub(rb"(?m)^1( \S+){4}", b"1 0 0 0 0", data, count=1),
+        "cam00.camera_from_world.rotation",
+    ),
+    "unknown camera": (
+        "colmap-text", "images", lambda data: data.replace(b"3 cam02.png", b"77 cam02.png"), "'cam02' names camera 77"
+    ),
+    "a parameter is missing": (
+        "colmap-text", "cameras", lambda data: data.replace(b" 0 0 0\n", b" 0 0\n", 1), "has 11 parameters"
+    ),
+    "too many images": (
+        "colmap-text", "images", lambda data: b"\n\n".join([data.splitlines()[4]] * 1100), "images; a rig has at most"
+    ),
+    "no TOML": ("aniposelib", "cameras", lambda data: b"[cam_0\n", "cannot be understood"),
+    "NaN rotation": (
+        "aniposelib", "cameras", lambda data: data.replace(b"rotation = [", b"rotation = [nan, ", 1), "rotation"
+    ),
+    "a missing matrix": (
+        "aniposelib", "cameras", lambda data: data.replace(b"matrix", b"motrix", 1), "matrix is missing"
+    ),
+    "a fisheye of five coefficients": (
+        "aniposelib", "cameras", lambda data: data.replace(b'name = "cam01"', b'name = "cam01"\nfisheye = true'),
+        r"cam01.distortions must be at most 4 coefficients \(k1 k2 k3 k4\)",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("form", "file", "change", "words"), FAULTS.values(), ids=FAULTS)
+def test_each_fault_is_named(form: str, file: str, change: Change, words: str, tmp_path: Path) -> None:
+    write_rig_file(fan(), tmp_path / NAMES[form], form)
+    path = find_cameras(tmp_path)
+    damaged = path.with_name(path.name.replace("cameras", file))
+    damaged.write_bytes(change(damaged.read_bytes()))
+    with pytest.raises(InputError, match=words):
+        read_rig_file(path)
+
+
+def test_a_model_without_its_images_is_named(tmp_path: Path) -> None:
+    write_rig_file(fan(), tmp_path, "colmap")
+    (tmp_path / "images.bin").unlink()
+    with pytest.raises(InputError, match="is missing: copy all files of the model"):
+        read_rig_file(tmp_path / "cameras.bin")
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    kind=st.sampled_from([kind for kind in NAMES if kind not in ("eigenhead", "blender")]),
+    which=st.integers(0, 1),
+    cut=st.integers(0, 2000),
+    at=st.integers(0, 2000),
+    patch=st.binary(max_size=12),
+)
+def test_no_damage_is_another_error(kind: str, which: int, cut: int, at: int, patch: bytes, tmp_path: Path) -> None:
+    folder = tmp_path / kind
+    write_rig_file(square(fan(3)), folder / NAMES[kind], kind)
+    write_blanks(fan(3), folder)
+    path = find_cameras(folder)
+    damaged = path.with_name(path.name.replace("cameras", "images")) if which and "colmap" in kind else path
+    if which and kind == "opencv-yaml":
+        damaged = path.with_name("extri.yml")
+    data = damaged.read_bytes()
+    data = data[:at] + patch + data[at + len(patch) :]
+    damaged.write_bytes(data[: len(data) - cut] if cut < len(data) // 2 else data)
+    try:
+        rig = read_rig_file(path)
+    except InputError:
+        return
+    assert all(np.isfinite(camera.camera_from_world.rotation).all() for camera in rig)

@@ -149,9 +149,6 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
         lambda: tar_of(("images/c\u0430m00.png", b"1")),
         "mixes letters of several alphabets in its name: rename it",
     ),
-    "right to left": (lambda: tar_of(("images/cam\u202egnp.exe", b"1")), "invisible"),
-    "zero width": (lambda: tar_of(("images/cam\u200b00.png", b"1")), "invisible"),
-    "newline": (lambda: tar_of(("images/cam\n00.png", b"1")), "invisible or control"),
     "file and folder": (lambda: tar_of(("images", b"1"), ("images/a.png", b"2")), "occurs twice"),
     "long name": (lambda: tar_of(("a" * 300 + ".png", b"1")), "longer than"),
     "deep": (lambda: tar_of(("a/" * 40 + "a.png", b"1")), "folders deep"),
@@ -220,7 +217,7 @@ NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), min_si
 
 @settings(max_examples=60, deadline=None)
 @given(names=st.lists(NAMES, min_size=1, max_size=4), cut=st.integers(0, 3000))
-def test_no_name_and_no_cut_writes_outside_or_raises_anything_else(
+def test_no_name_and_no_cut_writes_outside(
     names: list[str], cut: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     root = tmp_path_factory.mktemp("any")
@@ -381,7 +378,7 @@ def test_an_archive_of_another_kind_is_called_what_it_is(sign: bytes, word: str,
         extract_archive(tmp_path / "upload", tmp_path / "out")
 
 
-@pytest.mark.parametrize("character", ["\ue000", "\u0378", "\u2028", "\u2029", "\u200b", "\x7f"])
+@pytest.mark.parametrize("character", ["\ue000", "\u0378", "\u2028", "\u2029", "\u200b", "\u202e", "\n", "\x7f"])
 def test_characters_that_nobody_sees_are_refused(character: str, tmp_path: Path) -> None:
     (fault,) = refused(tar_of((f"a{character}b", b""), form=tarfile.GNU_FORMAT), tmp_path)
     assert fault.endswith(" has an invisible or control character in its name: rename it")

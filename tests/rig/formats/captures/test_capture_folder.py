@@ -1,16 +1,20 @@
-"""Capture folders: what is written is read back; every layout of docs/capture-format.md; every fault named at once."""
+"""Capture folders: what is written is read back; every layout of docs/capture-format.md; every fault named;
+masks and texture sets."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from rig.capture import Capture, reassign_images
 from rig.errors import InputError
 from rig.formats.captures.capture_folder import full_size_reader, read_capture, write_capture
 from rig.formats.pictures.images import read_image, write_image
-from tests.support.shared_data import shared
+from rig.messages.message import texts_of
 from tests.support.small_captures import (
     FEATURES,
     HEIGHT,
@@ -43,21 +47,6 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     files = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
     assert set(again.digests) == files
     assert list(again.digests) == sorted(again.digests)
-
-
-def test_a_colmap_model_in_place_of_cameras_json(folder: Path) -> None:
-    from rig.formats.cameras.colmap import write_colmap
-
-    rig = small_rig()
-    (folder / "cameras.json").unlink()
-    write_colmap(rig, folder / "sparse" / "0")
-    capture, again = read_capture(folder)
-    assert again.names == rig.names
-    # Both files that were read count for the digest, and the points, which were not, do not.
-    assert {path for path in capture.digests if path.startswith("sparse")} == {
-        "sparse/0/cameras.txt",
-        "sparse/0/images.txt",
-    }
 
 
 def astray(folder: Path) -> None:
@@ -154,15 +143,6 @@ def test_two_spellings_of_one_name_are_no_guess(folder: Path) -> None:
     assert any("images/A.png is missing" in fault.text for fault in caught.value.faults)
 
 
-def test_all_faults_are_named_at_once(folder: Path) -> None:
-    (folder / "images" / "a.png").unlink()
-    (folder / "images" / "b.png").write_bytes(b"")
-    (folder / "features.json").write_text("[]")
-    with pytest.raises(InputError) as caught:
-        read_capture(folder)
-    assert len(caught.value.faults) == 3
-
-
 def test_a_rig_s_faults_come_with_its_file_s_name_and_captures_in_a_folder_are_named(folder: Path) -> None:
     (folder / "cameras.json").write_text("{}")
     with pytest.raises(InputError, match=r"capture: cameras\.json: "):
@@ -175,17 +155,8 @@ def test_a_rig_s_faults_come_with_its_file_s_name_and_captures_in_a_folder_are_n
         read_capture(folder.parent / "week")
 
 
-def test_the_shared_capture_is_read() -> None:
-    capture, rig = read_capture(shared("data/captures/scan-a"))
-    assert len(rig) == len(capture.images) == 11
-    assert not any(camera.intrinsics.distortion.is_zero for camera in rig)
-    assert len(capture.features) == 7
-
-
 @pytest.mark.parametrize("locked", ["a.png", "cameras.json"])
-def test_what_may_not_be_read_is_neither_damaged_nor_wrong(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, locked: str
-) -> None:
+def test_what_may_not_be_read_is_called_unreadable(folder: Path, monkeypatch: pytest.MonkeyPatch, locked: str) -> None:
     read_bytes = Path.read_bytes
 
     def refused(path: Path) -> bytes:
@@ -207,3 +178,173 @@ def test_a_reduced_picture_is_read_at_full_size(tmp_path: Path) -> None:
     (tmp_path / "images" / "b.png").unlink()
     with pytest.raises(InputError):
         read("b")
+
+
+@pytest.fixture
+def polarised(folder: Path) -> Path:
+    """A capture with two complete sets."""
+    for kind in ("cross", "parallel"):
+        for name in "abc":
+            write_image(folder / "texture_sets" / kind / f"{name}.png", picture())
+    return folder
+
+
+def test_sets_are_read_and_reduced_with_the_photographs(polarised: Path) -> None:
+    capture, _ = read_capture(polarised)
+    assert {kind: set(images) for kind, images in capture.texture_sets.items()} == {
+        "cross": set("abc"),
+        "parallel": set("abc"),
+    }
+    assert capture.texture_sets["cross"]["a"].shape == (HEIGHT, WIDTH, 3)
+    assert "texture_sets/parallel/c.png" in capture.digests
+    assert capture.remarks == ()
+    capture, _ = read_capture(polarised, pixels_most=HEIGHT * WIDTH // 4)
+    assert capture.texture_sets["cross"]["b"].shape == (HEIGHT // 2, WIDTH // 2, 3)
+
+
+def test_pictures_of_exchanged_cameras_are_exchanged_in_every_set(polarised: Path) -> None:
+    capture, _ = read_capture(polarised)
+    turned = reassign_images(capture, pictures={"a": "b", "b": "a"})
+    np.testing.assert_array_equal(turned.texture_sets["cross"]["a"], capture.texture_sets["cross"]["b"])
+    assert turned.digests["texture_sets/cross/a.png"] == capture.digests["texture_sets/cross/b.png"]
+
+
+def _many(folder: Path) -> None:
+    for number in range(7):
+        shutil.copytree(folder / "texture_sets" / "cross", folder / "texture_sets" / f"set{number}")
+
+
+Spoil = Callable[[Path], object]
+SPOILT: dict[str, tuple[Spoil, str]] = {
+    "a view is missing": (
+        lambda f: (f / "texture_sets/cross/b.png").unlink(),
+        "texture_sets/cross/ lacks the picture of b",
+    ),
+    "two views are missing": (
+        lambda f: [(f / f"texture_sets/cross/{name}.png").unlink() for name in "ac"],
+        "texture_sets/cross/ lacks the pictures of a, c",
+    ),
+    "an empty set": (lambda f: (f / "texture_sets/uv").mkdir(), "texture_sets/uv/ lacks the pictures of a, b, c"),
+    "a camera that does not exist": (
+        lambda f: write_image(f / "texture_sets/parallel/nobody.png", picture()),
+        "texture_sets/parallel/nobody.png has no camera",
+    ),
+    "another size": (
+        lambda f: write_image(f / "texture_sets/cross/a.png", picture()[:-4]),
+        f"texture_sets/cross/a.png is {WIDTH} x {HEIGHT - 4} pixels, but its camera is {WIDTH} x {HEIGHT}",
+    ),
+    "a damaged picture": (
+        lambda f: (f / "texture_sets/cross/c.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(40)),
+        "texture_sets/cross/c.png is damaged",
+    ),
+    "a kind that is not read": (
+        lambda f: (f / "texture_sets/cross/c.png").rename(f / "texture_sets/cross/c.exr"),
+        "texture_sets/cross/c.exr is not read: OpenEXR files are not supported",
+    ),
+    "two pictures of a camera": (
+        lambda f: write_image(f / "texture_sets/cross/c.jpg", picture()),
+        "texture_sets/cross/ holds c.jpg, c.png: which one is meant?",
+    ),
+    "a name with capitals and spaces": (
+        lambda f: (f / "texture_sets/cross").rename(f / "texture_sets/Cross polarised"),
+        "texture_sets/Cross polarised/ cannot name a file of the result",
+    ),
+    "a picture beside the sets": (
+        lambda f: write_image(f / "texture_sets/a.png", picture()),
+        "texture_sets/a.png lies in no texture set",
+    ),
+    "nine sets": (_many, "texture_sets/ holds 9 sets; at most 8 are read"),
+    "a folder almost of that name": (
+        lambda f: (f / "texture_sets").rename(f / "texture-sets"),
+        "texture-sets/ is not read: call it texture_sets/",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_every_fault_of_a_set_is_one_sentence(polarised: Path, case: str) -> None:
+    spoil, sentence = SPOILT[case]
+    spoil(polarised)
+    with pytest.raises(InputError) as refusal:
+        read_capture(polarised)
+    (fault,) = texts_of(refusal.value.faults)
+    assert fault.startswith(sentence)
+
+
+def test_names_are_matched_as_those_of_photographs_are_and_junk_is_passed_over(polarised: Path) -> None:
+    place = polarised / "texture_sets" / "cross"
+    (polarised / "texture_sets" / ".DS_Store").write_bytes(b"x")
+    (place / "Thumbs.db").write_bytes(b"x")
+    for name in small_rig().names:
+        (place / f"{name}.png").rename(place / f"shot_{name.upper()}.png")
+    sets = read_capture(polarised)[0].texture_sets
+    assert (len(sets), set(sets["cross"])) == (2, set("abc"))
+
+
+ROWS, COLUMNS = np.indices((HEIGHT, WIDTH))
+BUST = (np.hypot(COLUMNS - 32, ROWS - 22) < 10) | ((ROWS > 32) & (np.abs(COLUMNS - 32) < 22))
+
+
+@pytest.fixture
+def masked(tmp_path: Path) -> Path:
+    images = {name: picture() for name in "abc"}
+    write_capture(tmp_path, Capture(images, masks=dict.fromkeys("abc", BUST)), small_rig())
+    return tmp_path
+
+
+def write_mask(masked: Path, name: str, pixels: np.ndarray) -> None:
+    cv2.imwrite(str(masked / "masks" / f"{name}.png"), pixels)
+
+
+@pytest.mark.parametrize(("names", "words"), [("abc", "all masks are inverted"), ("b", "masks/b.png is inverted")])
+def test_inverted_masks_are_turned_and_told(masked: Path, names: str, words: str) -> None:
+    for name in names:
+        write_mask(masked, name, np.where(BUST, 0, 255).astype(np.uint8))
+    capture, _ = read_capture(masked)
+    for name in "abc":
+        np.testing.assert_array_equal(capture.masks[name], BUST)
+    (remark,) = capture.remarks
+    assert remark.code == "mask-inverted"
+    assert words in remark.text
+
+
+def test_soft_masks_keep_their_greys_and_are_written_with_them(masked: Path, tmp_path: Path) -> None:
+    soft = cv2.GaussianBlur(BUST.astype(np.uint8) * np.uint8(255), (0, 0), 0.8)
+    write_mask(masked, "a", 255 - soft)
+    capture, rig = read_capture(masked)
+    assert set(capture.soft_masks) == {"a"}
+    np.testing.assert_allclose(capture.soft_masks["a"].astype(float), soft, atol=2)
+    write_capture(tmp_path / "again", capture, rig)
+    again, _ = read_capture(tmp_path / "again")
+    np.testing.assert_array_equal(again.masks["a"], capture.masks["a"])
+
+
+def test_specks_apart_from_the_subject_are_taken_away_and_told(masked: Path) -> None:
+    specked = BUST.astype(np.uint8) * np.uint8(255)
+    specked[3:7, 2:5] = 255
+    specked[5, 3] = 0  # a hole in a speck goes with it
+    specked[20, 60] = 255
+    write_mask(masked, "b", specked)
+    capture, _ = read_capture(masked)
+    np.testing.assert_array_equal(capture.masks["b"], BUST)
+    (remark,) = capture.remarks
+    assert remark.code == "mask-specks"
+    assert remark.text.startswith("masks/b.png: small pieces apart from the subject")
+
+
+def test_a_head_above_a_collar_that_cuts_it_off_stays(masked: Path) -> None:
+    parted = BUST & ((ROWS < 28) | (ROWS > 33))
+    write_mask(masked, "b", parted.astype(np.uint8) * np.uint8(255))
+    capture, _ = read_capture(masked)
+    np.testing.assert_array_equal(capture.masks["b"], parted)
+    assert capture.remarks == ()
+
+
+def test_what_is_true_of_all_masks_is_said_once(masked: Path) -> None:
+    for name in "abc":
+        write_mask(masked, name, np.where(BUST, 1 + ROWS // 12, 0).astype(np.uint8))
+    with pytest.raises(InputError) as refused:
+        read_capture(masked)
+    (fault,) = refused.value.faults
+    assert fault.text.startswith("masks/a.png holds areas of 4 values")
+    assert fault.text.endswith("the same is true of 2 more (b, c)")

@@ -75,9 +75,7 @@ def test_a_dng_is_developed_in_its_own_rows(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("begins", "kind"), [(b"\0\0\0\x20ftypavif", "AVIF"), (b"\0\0\0\x18ftypmp42", "video"), (b"GIF89a", "GIF")]
 )
-def test_a_file_of_another_kind_than_its_name_says_is_called_what_it_is(
-    tmp_path: Path, begins: bytes, kind: str
-) -> None:
+def test_a_file_of_another_kind_than_its_name_is_called_what_it_is(tmp_path: Path, begins: bytes, kind: str) -> None:
     (tmp_path / "a.png").write_bytes(begins + bytes(100))
     with pytest.raises(InputError, match=f"is of the kind {kind}"):
         read_image(tmp_path / "a.png")

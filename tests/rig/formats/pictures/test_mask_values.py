@@ -1,4 +1,5 @@
-"""Masks in every form that programs write: the same subject in all, and a sentence for what is no mask."""
+"""Masks in every form that programs write: the same subject in all, a sentence for what is no mask, and
+which level is the subject."""
 
 from collections.abc import Callable
 
@@ -6,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rig.formats.pictures.mask_values import mask_plane, read_masks
+from rig.formats.pictures.mask_values import inverted_masks, mask_plane, read_masks, subject_convention
 from rig.messages.message import Message
 
 HEIGHT, WIDTH = 240, 320
@@ -106,3 +107,25 @@ def test_soft_edges_are_told(soften: Callable[[np.ndarray], np.ndarray]) -> None
     reading = read_masks({"cam00": soften(MASK)})["cam00"]
     assert reading.soft
     assert np.count_nonzero((reading.share > 127) != INSIDE) < 500
+
+
+HEAD = ((COLUMNS - 160) / 60.0) ** 2 + ((ROWS - 110) / 75.0) ** 2 < 1.0
+BUST = HEAD | ((ROWS > 170) & (np.abs(COLUMNS - 160) < 150))  # wide shoulders, to the bottom and half up the sides
+CLOSE_UP = np.hypot(COLUMNS - 160, ROWS - 150) < 175  # three borders and more
+
+
+@pytest.mark.parametrize("turns", range(4))
+@pytest.mark.parametrize("subject", [HEAD, BUST], ids=["head", "bust"])
+def test_the_borders_are_background(subject: np.ndarray, turns: int) -> None:
+    assert subject_convention(np.rot90(subject, turns)) == "white"
+    assert subject_convention(np.rot90(~subject, turns)) == "black"
+
+
+def test_single_masks_may_be_inverted_and_a_close_up_follows_the_others() -> None:
+    masks = {"a": BUST, "b": ~BUST, "c": HEAD, "d": CLOSE_UP}
+    assert inverted_masks(masks, {}) == ["b"]
+    assert subject_convention(CLOSE_UP) is None
+    middle = np.array([160.0, 120.0])
+    assert inverted_masks({"a": CLOSE_UP}, {"a": middle}) == []
+    masks = {"a": ~BUST, "b": ~HEAD, "c": ~CLOSE_UP}
+    assert inverted_masks(masks, dict.fromkeys(masks, middle)) == ["a", "b", "c"]

@@ -132,9 +132,7 @@ def test_the_mixture_keeps_each_vertex_variance(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.slow
-def test_the_prior_takes_a_head_for_as_likely_as_its_mirror_image(
-    model: HeadModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_head_is_as_likely_as_its_mirror_image(model: HeadModel, monkeypatch: pytest.MonkeyPatch) -> None:
     """Landmarks' names say what lies opposite. The covariance of any two places is that of their mirror images."""
     monkeypatch.setattr(prior, "KEPT", 0)  # the localised part is a product of two symmetric ones
     faces, mean = model.levels["cage"].faces, model.mean.astype(float)

@@ -114,16 +114,3 @@ def test_a_cancelled_fetch_leaves_nothing(models: Path, empty_repository: tuple[
 
 def test_the_real_pin_is_a_full_commit() -> None:
     assert all(len(remote.commit) == 40 and remote.url.startswith("https://") for remote in REMOTES.values())
-
-
-def test_info_has_the_keys_of_the_contract() -> None:
-    info = model_info(load_model())
-    assert info["name"] == "makehuman-138"
-    assert info["subjects"] == {"total": 138, "male": 97, "female": 41}
-    assert (info["modes"], info["landmarks"]) == (137, 26)
-    assert info["vertices"] >= 48_000
-    assert info["faces"] > info["vertices"]
-    assert info["licence"].startswith("CC0")
-    assert len(info["sha256"]) == 64
-    assert info["generalisation_mm"] is not None
-    assert 0.5 < info["generalisation_mm"] < 2.0

@@ -62,9 +62,7 @@ def found(known: Population, heads: np.ndarray, deviation_mm: np.ndarray) -> Pop
 
 
 @pytest.mark.parametrize("count", [4, 12, 40])
-def test_heads_that_nobody_saw_are_nearer_to_it_than_to_either_alone(
-    known: Population, others: Population, count: int
-) -> None:
+def test_unseen_heads_are_nearer_to_it_than_to_either_alone(known: Population, others: Population, count: int) -> None:
     rng = np.random.default_rng(count)
     heads, unseen = draws(others, rng, count), draws(others, rng, 30)
     after = left_mm(found(known, heads, np.full((count, VERTICES), 0.1)), unseen)
