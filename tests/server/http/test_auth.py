@@ -27,9 +27,11 @@ from tests.support.services import (
     upload,
 )
 
+Guarded = tuple[RunningService, dict[str, str]]
+
 
 @pytest.fixture(scope="module")
-def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RunningService, dict[str, str]]]:
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
     """A service with one key for each scope."""
     data = tmp_path_factory.mktemp("guarded") / "data"
     engine = open_database(ServiceSettings(data=data))
@@ -44,9 +46,7 @@ def client_of(service: RunningService, key: str | None) -> httpx.Client:
     return httpx.Client(base_url=service.url, headers=headers, timeout=30)
 
 
-def test_each_scope_does_what_it_may_and_no_more(
-    guarded: tuple[RunningService, dict[str, str]], tmp_path: Path
-) -> None:
+def test_each_scope_does_what_it_may_and_no_more(guarded: Guarded, tmp_path: Path) -> None:
     service, keys = guarded
     files = {"file": packed(small_capture(tmp_path / "capture"))}
     calls: dict[str, Any] = {
@@ -70,9 +70,7 @@ def test_each_scope_does_what_it_may_and_no_more(
             assert client.get("/healthz").status_code == 200
 
 
-def test_erasing_captures_with_their_heads_needs_the_scope_erase(
-    guarded: tuple[RunningService, dict[str, str]],
-) -> None:
+def test_erasing_captures_with_their_heads_needs_the_scope_erase(guarded: Guarded) -> None:
     service, keys = guarded
     with client_of(service, keys["capture"]) as client:
         refused = client.delete("/v1/captures/" + "0" * 28, params={"erase": "true"})
@@ -96,7 +94,7 @@ def test_every_answer_has_the_headers_that_browsers_heed(service: RunningService
             assert answer.headers["x-content-type-options"] == "nosniff"
 
 
-def test_a_json_body_is_not_awaited_from_nobody(guarded: tuple[RunningService, dict[str, str]]) -> None:
+def test_a_json_body_is_not_awaited_from_nobody(guarded: Guarded) -> None:
     service, _ = guarded
     head = f"POST /v1/sessions HTTP/1.1\r\nHost: 127.0.0.1:{service.port}\r\nContent-Type: application/json\r\n"
     with socket.create_connection(("127.0.0.1", service.port), timeout=10) as client:
@@ -104,21 +102,20 @@ def test_a_json_body_is_not_awaited_from_nobody(guarded: tuple[RunningService, d
         assert client.recv(1 << 16).split()[1] == b"401"
 
 
-def test_a_key_cannot_remove_itself_and_a_removed_one_is_refused(
-    guarded: tuple[RunningService, dict[str, str]],
-) -> None:
+def test_a_key_cannot_remove_itself_and_a_removed_one_is_refused(guarded: Guarded) -> None:
     service, keys = guarded
     with client_of(service, keys["admin"]) as admin:
         made = admin.post("/v1/keys", json={"name": "short", "scopes": ["read"]}).json()
         with client_of(service, made["key"]) as client:
-            assert client.get("/v1/jobs").status_code == 200
+            foreign = {"host": "heads.example", "origin": "http://evil.example"}  # no cookie to steal
+            assert client.get("/v1/jobs", headers=foreign).status_code == 200
             assert admin.delete(f"/v1/keys/{made['id']}").status_code == 204
             assert client.get("/v1/jobs").status_code == 401
         assert admin.delete(f"/v1/keys/{keys['admin'].split('_')[1]}").status_code == 409
 
 
 @pytest.mark.parametrize("url", ["http://[", "http://", "https://a..b/"])
-def test_a_webhook_at_no_address_is_refused(guarded: tuple[RunningService, dict[str, str]], url: str) -> None:
+def test_a_webhook_at_no_address_is_refused(guarded: Guarded, url: str) -> None:
     service, keys = guarded
     with client_of(service, keys["admin"]) as admin:
         refused = admin.post("/v1/webhooks", json={"url": url})
@@ -126,7 +123,7 @@ def test_a_webhook_at_no_address_is_refused(guarded: tuple[RunningService, dict[
         assert admin.get("/v1/webhooks").json() == {"webhooks": []}
 
 
-def test_a_key_has_a_limit_of_jobs(guarded: tuple[RunningService, dict[str, str]], tmp_path: Path) -> None:
+def test_a_key_has_a_limit_of_jobs(guarded: Guarded, tmp_path: Path) -> None:
     service, keys = guarded
     with client_of(service, keys["admin"]) as client:
         capture = upload(client, packed(small_capture(tmp_path / "capture"))).json()

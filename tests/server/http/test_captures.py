@@ -204,16 +204,3 @@ def test_a_change_may_be_meant_for_one_state_alone_and_head_is_get_without_conte
     assert http.delete(path, headers={"If-Match": http.get(path).headers["ETag"]}).status_code == 204
     assert http.delete(path, headers=known).status_code == 404
     assert http.head(path).status_code == 404
-
-
-def test_the_description_names_the_server_and_what_changes_conditionally(http: httpx.Client) -> None:
-    document = http.get("/openapi.json").json()
-    assert document["servers"] == [{"url": "/"}]
-    calls = document["paths"]["/v1/captures/{capture_id}"]
-    assert "ETag" in calls["get"]["responses"]["200"]["headers"]
-    for method in ("patch", "delete"):
-        assert "If-Match" in [parameter["name"] for parameter in calls[method]["parameters"]]
-        assert "412" in calls[method]["responses"]
-    answer = http.patch("/v1/captures/x", content=b'{"label": ', headers={"content-type": "application/json"})
-    assert answer.status_code == 422
-    assert "is no JSON" in answer.json()["errors"][0]
