@@ -70,24 +70,6 @@ def test_faults_of_scale_json_end_it_before_the_work(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ((), "--board"),
-        (("--from", "sky"), "'sky' is not one of 'board', 'scene'"),
-        (("--from", "scene", "--lenses", "two"), "'two' is not one of 'one', 'each'"),
-        (("--from", "scene", "--board", "{file}"), "is for a board"),
-        (("--scale", "{file}"), "is for --from scene"),
-    ],
-)
-def test_options_that_do_not_go_together_are_wrong_usage(tmp_path: Path, options: tuple[str, ...], text: str) -> None:
-    (tmp_path / "file").write_text("")
-    arguments = [option.format(file=tmp_path / "file") for option in options]
-    done = run("calibrate", str(tmp_path), "--out", str(tmp_path / "cameras.json"), *arguments)
-    assert done.returncode == 2
-    assert text in done.stderr
-
-
-@pytest.mark.parametrize(
     ("kind", "out", "text"),
     [
         ("eigenhead", "file/cameras.json", "cannot be written"),
@@ -123,13 +105,6 @@ def test_formats_of_several_files_are_told_from_those_of_one(tmp_path: Path) -> 
     for kind in FORMATS:
         write_rig_file(wedge_rig(), tmp_path / kind, kind)
         assert (tmp_path / kind).is_dir() == (kind in FOLDER_FORMATS), kind
-
-
-def test_a_board_is_written_as_pdf_alone(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["board", "--out", str(tmp_path / "b.xyz")])
-    assert done.exit_code == 2
-    assert "'.xyz': a board is written as .pdf" in " ".join(done.stderr.replace("│", " ").split())
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_one_board_is_the_default_of_command_page_and_documents(tmp_path: Path) -> None:

@@ -63,12 +63,15 @@ def test_data_keys_and_models_follow_one_rule(monkeypatch: pytest.MonkeyPatch, t
 
 
 def test_a_key_is_made_where_data_says_and_says_so(run: Run, tmp_path: Path) -> None:
-    made = run("keys", "add", "console", "--data", tmp_path / "heads", "--json")
+    made = run("keys", "add", "console", "--scope", "read", "--data", tmp_path / "heads", "--json")
     assert json.loads(made.out)["data"] == str(tmp_path / "heads")
     assert made.err == f"eigenhead: a key of the service whose data is {tmp_path / 'heads'}\n"
     assert not (tmp_path / "variable").exists()
-    listed = json.loads(run("keys", "list", "--data", tmp_path / "heads", "--json").out)
-    assert [key["name"] for key in listed["keys"]] == ["console"]
+    (listed,) = json.loads(run("keys", "list", "--data", tmp_path / "heads", "--json").out)["keys"]
+    assert (listed["id"], listed["name"], listed["scopes"]) == (json.loads(made.out)["id"], "console", ["read"])
+    assert json.loads(made.out)["key"].startswith(f"eh_{listed['id']}_")
+    for status in (0, 1):
+        assert run("keys", "remove", listed["id"], "--data", tmp_path / "heads").status == status
 
 
 def test_models_lie_in_the_data_folder_that_is_named(run: Run, tmp_path: Path) -> None:
@@ -105,6 +108,8 @@ def test_help_version_and_a_model_are_told_in_words(run: Run) -> None:
     text = run("model", "info").out
     assert not any(sign in text for sign in "{}[]'\"")
     assert "female: 41; male: 97; total: 138" in text
+    assert json.loads(run("model", "info", "--json").out)["landmarks"] == 26
+    assert run("model", "info", "nobody").status == 1
 
 
 @pytest.mark.parametrize(
@@ -152,23 +157,46 @@ def test_a_database_that_is_down_is_one_line_without_its_password(
     assert "secret" not in done.err
 
 
+NUMBERS = ("--noise", "--light-drift", "--defocus", "--rolling-ms", "--fps")
+
+
 @pytest.mark.parametrize(
-    "arguments",
+    ("line", "words"),
     [
-        ["reconstruct", "CAPTURE", "--out", "OUT", "--method", "magic"],
-        ["reconstruct", "CAPTURE", "--out", "OUT", "--detail", "everything"],
-        ["reconstruct", "CAPTURE", "--out", "OUT", "--surface", "feet"],
-        ["simulate", "OUT", "--fault", "dark:cam00=much"],
-        ["simulate", "OUT", "--expression", "mouthSmile=0.5"],
-        ["board", "--out", "OUT", "--kind", "chess"],
-        ["convert", "CAPTURE", "--out", "OUT", "--to", "paper"],
+        ("--colour", "No such option: --colour"),
+        ("reconstruct", "Missing"),
+        ("reconstruct /nowhere --out {out}", "/nowhere"),
+        ("reconstruct {shots}/a --out {out} --method magic", "'magic' is not one of"),
+        ("reconstruct {shots}/a --out {out} --detail everything", "'everything' is not one of"),
+        ("reconstruct {shots}/a --out {out} --surface feet", "'feet' is not one of"),
+        ("batch {shots} --out {out} --shard 9/8", "is no share such as 2/8"),
+        ("batch {shots} --out {out} --workers 0", "--workers"),
+        ("batch {shots} --out {out} --detail deep", "'deep' is not one of 'span', 'kernel', 'photo', 'fine', 'pores'"),
+        ("batch {shots} --out {out} --formats fbx", "'fbx' is none of"),
+        ("serve --port 99999999", "port: Input should be less than or equal to 65535"),
+        ("keys add x --scope everything", "everything"),
+        ("simulate", "--serve"),
+        *((f"simulate {{out}} {option} {value}", option) for option in NUMBERS for value in ("nan", "inf")),
+        ("simulate {out} --realism oily,shiny", "shiny is not one of smooth, oily, scattering, mosaic, jpeg"),
+        ("simulate {out} --fault dark:cam00=much", "much"),
+        ("simulate {out} --expression mouthSmile=0.5", "mouthSmile"),
+        ("board --out {out} --kind chess", "'chess' is not one of"),
+        ("board --out {out}.pdf --squares seven", "seven"),
+        ("board --out {out}.xyz", "'.xyz': a board is written as .pdf"),
+        ("convert {shots}/a --out {out} --to paper", "'paper' is not one of"),
+        ("calibrate {shots} --out {out}", "--board"),
+        ("calibrate {shots} --out {out} --from sky", "'sky' is not one of 'board', 'scene'"),
+        ("calibrate {shots} --out {out} --from scene --lenses two", "'two' is not one of 'one', 'each'"),
+        ("calibrate {shots} --out {out} --from scene --board {file}", "is for a board"),
+        ("calibrate {shots} --out {out} --scale {file}", "is for --from scene"),
     ],
 )
-def test_a_wrong_value_of_an_option_is_wrong_usage(run: Run, tmp_path: Path, arguments: list[str]) -> None:
-    places = {"CAPTURE": str(small_capture(tmp_path / "capture")), "OUT": str(tmp_path / "out")}
-    done = run(*[places.get(argument, argument) for argument in arguments])
-    assert done.status == 2, done.err
-    assert not (tmp_path / "out").exists()
+def test_wrong_usage_is_status_2_and_is_named(run: Run, tmp_path: Path, line: str, words: str) -> None:
+    file = small_capture(tmp_path / "shots" / "a") / "cameras.json"
+    done = run(*line.format(shots=tmp_path / "shots", file=file, out=tmp_path / "out").split())
+    assert (done.status, done.out) == (2, "")
+    assert words in " ".join(done.err.split())
+    assert [path.name for path in tmp_path.iterdir()] == ["shots"]
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "calibrate", "board", "model build"])

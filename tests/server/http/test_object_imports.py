@@ -2,7 +2,6 @@
 503 that says when to ask again."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -97,10 +96,3 @@ def test_a_store_that_is_away_is_a_503_and_the_next_call_goes_through(
     way.fail(fault, 1, "GET")
     assert imported(service, "s3://studio-in/in/anna.tar").status_code == 201
     way.heal()
-
-
-def test_a_service_without_prefixes_takes_nothing(tmp_path: Path) -> None:
-    with running_service(tmp_path / "data", worker=False) as service:
-        answer = imported(service, "s3://studio-in/in/anna.tar")
-        assert (answer.status_code, answer.json()["type"]) == (403, "urn:eigenhead:problem:imports-off")
-        assert "EIGENHEAD_IMPORT_PREFIXES" in answer.json()["detail"]

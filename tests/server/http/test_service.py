@@ -82,15 +82,6 @@ def test_settings_that_no_answer_could_repeat_make_no_job(http: httpx.Client, ar
     assert http.get("/v1/jobs", params={"capture": capture}).json()["jobs"] == []
 
 
-def test_a_bad_model_does_not_hide_bad_settings(http: httpx.Client, archive: bytes) -> None:
-    capture = upload(http, archive).json()["id"]
-    wanted = {"capture_id": capture, "model": "nobody", "settings": {"metod": "contour", "fitting": {"modes": "many"}}}
-    refused = http.post("/v1/jobs", json=wanted)
-    assert refused.status_code == 422
-    text = " | ".join(refused.json()["errors"])
-    assert all(word in text for word in ("'nobody' is not at hand", "metod", "fitting.modes")), text
-
-
 def test_an_upload_of_what_is_announced_too_large_is_refused_unread(service: RunningService) -> None:
     head = f"POST /v1/captures/uploads HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: {1 << 50}\r\n\r\n"
     with socket.create_connection(("127.0.0.1", service.port), timeout=10) as connection:
@@ -115,10 +106,15 @@ def test_templates_are_listed_and_a_job_may_name_those_of_its_model(
     assert http.get("/v1/templates").json() == {"templates": []}
     mine = header_file(service.data, "mine")
     other = header_file(service.data, "other", model_name="other", model_sha256="ee" * 32)
+    wrong = header_file(service.data, "wrong")
+    wrong.write_bytes(b"PK")
     try:
-        first, second = http.get("/v1/templates").json()["templates"]
+        first, second, damaged = http.get("/v1/templates").json()["templates"]
         assert (first["id"], first["vertices"], first["registration"]["off_p95_mm"]) == ("mine", 5023, 0.094)
-        assert (second["model"], second["models"]) == ("other", [])
+        assert (first["model"], first["models"]) == ("makehuman-138", ["default", "makehuman-138"])
+        assert (second["model"], second["models"], second["fault"]) == ("other", [], None)
+        assert (damaged["model"], damaged["models"], damaged["registration"]) == (None, [], None)
+        assert str(service.data) not in damaged["fault"]
         wanted = {"capture_id": upload(http, archive).json()["id"], "settings": {"outputs": {"template": "mine"}}}
         assert http.post("/v1/jobs", json=wanted).status_code == 202
         wanted["settings"] = {"outputs": {"template": "other", "formats": ["xyz"]}}
@@ -128,8 +124,8 @@ def test_templates_are_listed_and_a_job_may_name_those_of_its_model(
         assert "'xyz' is none of" in text
         assert "'other' was registered to the model 'other'" in text
     finally:
-        mine.unlink()
-        other.unlink()
+        for template in (mine, other, wrong):
+            template.unlink()
 
 
 def test_a_worker_that_loads_is_no_fault(tmp_path: Path) -> None:
