@@ -16,10 +16,11 @@ from server.console import media as module
 from server.console.media import found_faces
 from server.errors import Conflict, Unavailable
 from server.services.keys import LOCAL, Caller
-from server.storage.records import CameraSize, CaptureRecord
-from server.storage.store import Store, new_id
+from server.storage.records import CameraSize
+from server.storage.store import Store
 from server.tasks.child import ChildProcessPool, WorkerContext
 from tests.support.drawn_studio import LENS, drawn_studio, hidden_from, write_drawn_capture
+from tests.support.stored_captures import stored_files
 
 
 @pytest.fixture(scope="module")
@@ -32,15 +33,10 @@ def children() -> Iterator[ChildProcessPool]:
 def service_with(children: ChildProcessPool, data: Path, *, board: bool = False) -> tuple:
     """A service that has one capture, and the capture's id."""
     store = Store(data)
-    files = write_drawn_capture(data / "incoming" / "new" / "files")
-    inputs = {path.relative_to(files).as_posix(): "0" for path in files.rglob("*") if path.is_file()}
     sizes = tuple(CameraSize(name, LENS.width, LENS.height) for name in drawn_studio().names)
-    created = "2026-01-01T00:00:00+00:00"
-    record = CaptureRecord(
-        new_id(), created, "upload", None, "", "", sizes, "cam0", inputs, bytes=0, features=False, board=board
-    )
-    store.add_capture(data / "incoming" / "new", record)
-    return SimpleNamespace(store=store, children=children), record.id
+    files = write_drawn_capture(data / "drawn")
+    capture = stored_files(store, files, cameras=sizes, front="cam0", board=board)
+    return SimpleNamespace(store=store, children=children), capture
 
 
 def test_they_are_found_once_and_kept_with_the_capture(children: ChildProcessPool, tmp_path: Path) -> None:

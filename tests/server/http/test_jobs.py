@@ -159,10 +159,11 @@ def test_a_cancelled_job_stops_in_the_midst_of_its_work(
         ("fail", "invalid-capture", "2 faults"),
         ("crash", "work-crashed", "signal 11"),
         ("bug", "internal-error", "planted"),
+        ("killed", "out-of-memory", "memory"),
     ],
 )
-def test_a_failed_job_says_why_and_the_next_one_works(
-    client: Client, http: httpx.Client, archive: bytes, mode: str, kind: str, word: str
+def test_a_failed_job_says_why_leaves_nothing_and_the_next_one_works(
+    client: Client, http: httpx.Client, service: RunningService, archive: bytes, mode: str, kind: str, word: str
 ) -> None:
     capture = upload(http, archive).json()["id"]
     with pytest.raises(JobEnded) as caught:
@@ -172,4 +173,5 @@ def test_a_failed_job_says_why_and_the_next_one_works(
     assert error["type"].endswith(kind)
     assert word in error["detail"]
     assert error["detail_message"]["message"] == error["detail"]
+    assert not [*(service.data / "jobs" / caught.value.job["id"]).glob("attempt-*")]
     assert client.wait(client.submit(capture)["id"])["state"] == "succeeded"

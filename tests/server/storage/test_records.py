@@ -22,36 +22,12 @@ from server.storage.records import (
     CAPTURE,
     UPLOAD,
     CalibrationRecord,
-    CameraSize,
     CaptureRecord,
     SessionRecord,
     UploadRecord,
 )
 from server.storage.store import Store, new_id
-
-
-def capture_record() -> CaptureRecord:
-    return CaptureRecord(
-        id=new_id(),
-        created="2026-01-01T00:00:00.000Z",
-        source="upload",
-        session=None,
-        label="anna",
-        expression="",
-        cameras=(CameraSize("cam00", 64, 48),),
-        front="cam00",
-        inputs={"images/cam00.png": "0" * 64},
-        bytes=10,
-        features=False,
-        shot={"sync": {"cameras": {}}},
-    )
-
-
-def stored(store: Store, record: CaptureRecord) -> Path:
-    with store.incoming() as folder:
-        (folder / "capture" / "files").mkdir(parents=True)
-        store.add_capture(folder / "capture", record)
-    return store.folder("captures", record.id) / "record.json"
+from tests.support.stored_captures import capture_record, stored
 
 
 def test_a_capture_comes_back_as_it_was_stored(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from server.storage.library import Library
 from server.storage.records import CaptureRecord
 from server.storage.store import Store, new_id
 from server.worker.capture_source import CaptureSource
+from tests.support.stored_captures import stored_files
 
 PICTURE = os.urandom(1 << 17)
 
@@ -58,15 +59,10 @@ def source(remote: Store, settings: ServiceSettings, runs: Callable[[str], bool]
 
 
 def taken(store: Store) -> CaptureRecord:
-    with store.incoming() as folder:
-        files = folder / "files"
-        files.mkdir()
+    with store.incoming() as files:
         (files / "cameras.json").write_bytes(b"{}")
         (files / "cam00.png").write_bytes(PICTURE)
-        inputs = {path.name: sha256_of(path) for path in files.iterdir()}
-        record = CaptureRecord(new_id(), "2026-01-01T00:00:00Z", "upload", None, "", "", (), "", inputs, 9, False)
-        store.add_capture(folder, record)
-    return record
+        return store.capture(stored_files(store, files))
 
 
 def test_files_come_from_the_store_and_new_feature_points_too(
