@@ -8,7 +8,7 @@ import pytest
 
 from rig.messages.message import compose
 from server.batch.captures import WHOLE, Shard
-from server.batch.folder import BatchFolder, FailureRecord, ForeignFiles, Origin, ShareTaken, file_name
+from server.batch.folder import BatchFolder, FailureRecord, ForeignFiles, Origin, file_name
 
 ORIGIN = Origin("11" * 32, "22" * 32, "33" * 32, "0.1.0")
 
@@ -62,16 +62,6 @@ def test_a_new_result_takes_the_place_of_the_old_one_as_a_whole(folder: BatchFol
     assert not (folder.result("anna") / "head.obj").exists()
 
 
-def test_of_two_who_publish_the_second_is_refused(folder: BatchFolder) -> None:
-    """Where both found nothing there; a folder with files is never replaced by a rename."""
-    first, second = folder.new_attempt(Shard(1, 2)), folder.new_attempt(Shard(2, 2))
-    for attempt in (first, second):
-        (attempt / "result" / "report.json").write_text("{}")
-    folder.publish("anna", first, ORIGIN)
-    with pytest.raises(OSError, match="not empty"):
-        (second / "result").rename(folder.result("anna"))
-
-
 def test_files_of_nobody_stop_a_replacement(folder: BatchFolder) -> None:
     publish(folder, "anna")
     folder.check_replaceable("anna")
@@ -108,13 +98,6 @@ def test_attempts_of_ended_shares_and_empty_folders_go(folder: BatchFolder) -> N
         (folder.work / "1-of-2.lock").touch()
     assert not dead.exists()
     assert not folder.work.exists()
-
-
-def test_a_share_is_of_one_process(folder: BatchFolder) -> None:
-    with folder.share(WHOLE), pytest.raises(ShareTaken, match="share 1/1"), folder.share(WHOLE):
-        pass
-    with folder.share(WHOLE):
-        pass
 
 
 def test_file_names_are_short_readable_and_apart() -> None:

@@ -55,24 +55,6 @@ def test_every_column_of_a_heads_table_has_its_unit_and_words_in_the_schema() ->
     assert {str(field.type) for field in schema} == {"string", "double", "int64", "bool"}
 
 
-def test_pandas_opens_both_files(tmp_path: Path) -> None:
-    pandas = pytest.importorskip("pandas", reason="pandas is not installed: pip install pandas")
-    write_table(tmp_path, COLUMNS, ROWS)
-    parquet = pandas.read_parquet(tmp_path / "heads.parquet")
-    written = pandas.read_csv(tmp_path / "heads.csv")
-    for frame in (parquet, written):
-        assert [*frame.columns] == [column.name for column in COLUMNS]
-        assert frame["nose_length_mm"].dtype == "float64"
-        assert [*frame["nose_length_mm"].dropna()] == [0.1 + 0.2, 1e-9]
-        assert [*frame["warning_count"].dropna()] == [3, 0]
-        assert [*frame["capture"]] == ['anna, "A"\nlate', "bert", "Ä\\udcff"]
-
-
-def test_a_table_of_nothing_has_its_columns() -> None:
-    assert csv_bytes(COLUMNS, []) == b"capture,nose_length_mm,warning_count,pose_doubtful\r\n"
-    assert pyarrow.parquet.read_table(io.BytesIO(parquet_bytes(COLUMNS, []))).num_columns == 4
-
-
 def test_without_pyarrow_there_is_the_csv_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [path.name for path in write_table(tmp_path, COLUMNS, ROWS)] == ["heads.csv", "heads.parquet"]
     real = builtins.__import__

@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 from rig.capture import Capture
 from rig.formats.cameras.cameras_file import read_rig_file
 from rig.formats.captures.capture_folder import read_capture, write_capture
-from rig.formats.meshes.ply import write_ply
 from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
@@ -31,6 +30,7 @@ from tests.support.dataset_readers import (
     with_dots,
 )
 from tests.support.made_up_flame import flame_surface, made_up_flame, some_parameters
+from tests.support.result_folders import write_head
 from tests.support.scenes import ellipsoid
 from tests.support.small_studio import small_studio_captures
 from tests.support.textured_wedge import HEIGHT, WIDTH, wedge_rig, write_photographs
@@ -140,15 +140,6 @@ def test_pictures_and_masks_of_a_pinhole_are_kept_as_they_are(shot: tuple[Path, 
         assert ((read_png(tmp_path / f"out/masks/{name}.png") > 0) == capture.masks[name]).all()
 
 
-def write_head(folder: Path, mesh: Mesh) -> np.ndarray:
-    """Writes head.ply and returns its colours."""
-    count = len(mesh.vertices)
-    colours = np.arange(3 * count).reshape(count, 3).astype(np.uint8)
-    quality, views = np.zeros(count, np.float32), np.ones(count, np.uint8)
-    write_ply(folder / "head.ply", mesh, normals=mesh.normals(), colours=colours, quality=quality, views=views)
-    return colours
-
-
 @pytest.mark.parametrize("form", ["nerfstudio", "gaussian-avatars"])
 def test_a_results_head_becomes_the_point_cloud_in_the_same_frame(
     shot: tuple[Path, np.ndarray], tmp_path: Path, form: str
@@ -158,7 +149,8 @@ def test_a_results_head_becomes_the_point_cloud_in_the_same_frame(
     count = len(head.vertices)
     mesh = Mesh(head.vertices + rig.centre_world(), head.faces)
     result = tmp_path / "result"
-    colours = write_head(result, mesh)
+    colours = np.arange(3 * count).reshape(count, 3).astype(np.uint8)
+    write_head(result, mesh, colours=colours)
     (result / "report.json").write_text(json.dumps({"inputs": dict(capture.digests)}))
     answer = exported(shot[0], tmp_path / "out", form, "--result", str(result))
     assert answer["points"] == count

@@ -9,7 +9,6 @@ import pytest
 from pipeline.applications.verification.judgement import Limits
 from pipeline.head_model.model import load_model
 from rig.errors import InputError
-from rig.formats.meshes.ply import write_ply
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
 from server.cli.heads import read_limits, verify_captures
@@ -17,6 +16,7 @@ from tests.server.cli.test_main import run
 from tests.support.glb import obj_bytes
 from tests.support.landmark_files import write_landmarks
 from tests.support.measured_heads import mannequin
+from tests.support.result_folders import mean_head_result
 from tests.support.services import small_capture
 
 SCAN_FROM_HEAD = RigidTransform(rotation_from_vector(np.array([0.4, -1.0, 0.2])), np.array([80.0, 900.0, -50.0]))
@@ -51,18 +51,7 @@ def test_limits_come_from_a_file(tmp_path: Path) -> None:
 def planted_result(folder: Path, scale: float) -> Path:
     """What a reconstruction of the mean head leaves, ``scale`` times too large."""
     model = load_model()
-    mesh = Mesh(scale * model.vertices(np.zeros(0)), model.levels["full"].faces)
-    count = len(mesh.vertices)
-    write_ply(
-        folder / "head.ply", mesh, normals=mesh.normals(), colours=np.full((count, 3), 90, np.uint8),
-        quality=np.full(count, 0.1, np.float32), views=np.ones(count, np.uint8),
-    )  # fmt: skip
-    marks = {name: {"position": mesh.vertices[row].tolist(), "std": 0.2} for name, row in model.landmarks.items()}
-    place = {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
-    named = {"name": model.name, "sha256": model.sha256}
-    document = {"model": named, "landmarks": marks, "world_from_head": place, "warnings": []}
-    (folder / "report.json").write_text(json.dumps(document))
-    return folder
+    return mean_head_result(folder, Mesh(scale * model.vertices(np.zeros(0)), model.levels["full"].faces))
 
 
 @pytest.mark.slow

@@ -15,7 +15,6 @@ from starlette.types import Scope
 
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.errors import InputError
-from rig.formats.meshes.ply import write_ply
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
 from rig.messages.message import compose, verbatim
@@ -35,6 +34,7 @@ from server.services.work import ReconstructionRequest
 from server.settings import ServiceSettings
 from server.storage.database import open_database
 from server.storage.events import JobEvent
+from tests.support.result_folders import write_head
 from tests.support.services import await_true
 
 SHOWN = nothing(compose("live-starting"))
@@ -136,28 +136,14 @@ def test_a_removal_that_fails_shows_the_thing_again() -> None:
     await_true(lambda: removals.waiting() == {})
 
 
-def grid(size: int = 12, step: float = 10.0) -> Mesh:
+def grid(size: int = 12) -> Mesh:
     """A flat square of triangles in the plane z = 0."""
-    y, x = np.mgrid[:size, :size] * step
+    y, x = np.mgrid[:size, :size] * 10.0
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(size * size)], axis=1)
     corner = (np.arange(size - 1)[:, None] * size + np.arange(size - 1)).ravel()
     one = np.stack([corner, corner + 1, corner + size], axis=1)
     other = np.stack([corner + 1, corner + size + 1, corner + size], axis=1)
     return Mesh(vertices, np.concatenate([one, other]).astype(np.int32))
-
-
-def write_head(folder: Path, mesh: Mesh, quality: np.ndarray) -> Path:
-    count = len(mesh.vertices)
-    write_ply(
-        folder / "head.ply",
-        mesh,
-        normals=np.tile([0.0, 0.0, 1.0], (count, 1)),
-        colours=np.zeros((count, 3), np.uint8),
-        quality=quality.astype(np.float32),
-        views=np.ones(count, np.uint8),
-        comments=["unit mm"],
-    )
-    return folder
 
 
 def test_quality_and_distance_come_in_the_order_of_the_vertices(tmp_path: Path) -> None:
@@ -181,8 +167,7 @@ def test_heads_of_two_captures_are_compared_after_a_rigid_motion(tmp_path: Path,
     moved = Mesh(motion.apply(bumpy.vertices), bumpy.faces)
     if not shared_vertices:  # two more vertices that no face uses: the meshes are no longer of one model
         moved = Mesh(np.concatenate([moved.vertices, moved.vertices[:2]]), moved.faces)
-    mine = write_head(tmp_path / "mine", bumpy, np.ones(len(bumpy.vertices)))
-    theirs = write_head(tmp_path / "theirs", moved, np.ones(len(moved.vertices)))
+    mine, theirs = write_head(tmp_path / "mine", bumpy), write_head(tmp_path / "theirs", moved)
     distance = media.to_surface(mine, theirs / "head.ply", align=True)
     # the files hold float32: 3e-5 mm at 300 mm; nearest points converge to less than a hundredth of the step
     assert distance.max() < (1e-3 if shared_vertices else 0.1)

@@ -50,19 +50,14 @@ def test_they_are_found_once_and_kept_with_the_capture(children: ChildProcessPoo
     assert face["box_px"] == [*points.min(axis=0), *points.max(axis=0)]
     assert np.hypot(*(points.mean(axis=0) - (159.5, 119.5))) < 20.0
     assert found["suggested"].keys() == set(SEVEN_POINTS)
+    answer = media.faces((service, Caller(LOCAL, frozenset({"read"}))), capture)
+    assert json.loads(bytes(answer.body)) == found["faces"]
+    assert "immutable" in answer.headers["Cache-Control"]
     (kept,) = (service.store.cache_of(capture) / "faces").iterdir()
     kept.write_text(json.dumps(found | {"suggested": {}}))
     assert found_faces(service, capture)["suggested"] == {}, "the second time they come from there"
     service.store.remove_capture(capture)
     assert not kept.exists()
-
-
-def test_the_address_gives_what_the_pages_draw(children: ChildProcessPool, tmp_path: Path) -> None:
-    service, capture = service_with(children, tmp_path)
-    who = (service, Caller(LOCAL, frozenset({"read"})))
-    answer = media.faces(who, capture)
-    assert json.loads(bytes(answer.body)) == found_faces(service, capture)["faces"]
-    assert "immutable" in answer.headers["Cache-Control"]
 
 
 def test_a_shot_of_the_board_has_none(children: ChildProcessPool, tmp_path: Path) -> None:

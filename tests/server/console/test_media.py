@@ -75,9 +75,3 @@ def test_a_camera_is_found_by_its_name_alone(tmp_path: Path) -> None:
     for other in ("cam1", "../images/cam01", "cam01.png", ""):
         with pytest.raises(NotFound):
             media._image_name(record, other)
-
-
-def test_numbers_go_out_as_little_endian_floats() -> None:
-    answer = media._floats(np.array([0.5, np.pi], np.float64))
-    assert answer.media_type == "application/octet-stream"
-    np.testing.assert_array_equal(np.frombuffer(bytes(answer.body), "<f4"), np.array([0.5, np.pi], np.float32))

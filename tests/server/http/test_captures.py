@@ -1,7 +1,6 @@
 """Captures and sessions over HTTP, against a running service: uploads, what is refused, features, erasure."""
 
 import io
-import json
 import shutil
 import tarfile
 from pathlib import Path
@@ -68,17 +67,6 @@ def test_photographs_too_few_to_do_without_cameras_say_what_is_missing(http: htt
     errors = upload(http, packed(folder)).json()["errors"]
     assert "contains no cameras.json" in errors[0]
     assert errors[1].startswith("1 photograph; at least 3")
-
-
-def test_every_fault_is_listed(http: httpx.Client, tmp_path: Path) -> None:
-    folder = small_capture(tmp_path / "capture")
-    (folder / "images" / "cam00.png").unlink()
-    (folder / "background" / "cam02.png").write_bytes(b"no picture")
-    points = {"pronasale": {"cam07": [1, 2]}}
-    (folder / "features.json").write_text(json.dumps({"format": "eigenhead-features/1", "points": points}))
-    errors = upload(http, packed(folder)).json()["errors"]
-    for word in ("images/cam00", "background/cam02", "cam07"):
-        assert any(word in error for error in errors)
 
 
 def test_a_capture_in_use_is_not_removed_and_a_finished_job_is(http: httpx.Client, archive: bytes) -> None:
