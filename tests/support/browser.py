@@ -91,9 +91,8 @@ class Visit:
         assert [address for address in self.addresses if not address.startswith(inside)] == []
 
 
-def visit(browser: Browser, base: str, size: str = "1366x768") -> Visit:
-    width, height = SIZES[size]
-    window = ViewportSize(width=width, height=height)
+def visit(browser: Browser, base: str) -> Visit:
+    window = ViewportSize(width=1366, height=768)
     context = browser.new_context(viewport=window, accept_downloads=True, color_scheme="dark")
     return Visit(context.new_page(), base)
 

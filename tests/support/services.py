@@ -133,15 +133,20 @@ def served_client(data: Path, **settings: Any) -> Iterator[tuple[RunningService,
 
 
 def worker_pids(service: RunningService) -> list[int]:
-    """Worker processes of a service's data folder, told by their environment."""
+    """Worker processes of a service's data folder."""
+    return pids_of(service, lambda words: b"worker" in words)
+
+
+def pids_of(service: RunningService, fits: Callable[[list[bytes]], bool]) -> list[int]:
+    """Processes of a service's data folder, told by their environment, whose command fits."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
-            command = (folder / "cmdline").read_bytes()
-            environment = (folder / "environ").read_bytes()
+            command, environment = ((folder / name).read_bytes() for name in ("cmdline", "environ"))
         except OSError:
             continue
-        if b"\0worker\0" in command and f"EIGENHEAD_DATA={service.data}\0".encode() in environment + b"\0":
+        ours = f"EIGENHEAD_DATA={service.data}\0".encode() in environment + b"\0"
+        if ours and fits(command.rstrip(b"\0").split(b"\0")):
             found.append(int(folder.name))
     return found
 

@@ -152,9 +152,16 @@ def test_a_calibration_is_uploaded_shown_and_refused_for_another_rig(
     expect(verdict).to_have_attribute("data-verdict", "usable")
     expect(verdict).to_contain_text("focal length is uncertain by more than 1 %")
     keep_screenshots(page, screenshots, "calibration-report")
+    (made,) = httpx.get(service.url + "/v1/calibrations").json()["calibrations"]
+    address = f"{service.url}/v1/calibrations/{made['id']}"
+    assert made["figures"]["rms_px"] <= 1.1
+    cameras = httpx.get(address + "/cameras.json").json()["cameras"]
+    assert [camera["name"] for camera in cameras] == [path.name for path in sorted((folder / "IMAGES").iterdir())]
+    assert "<html" in httpx.get(address + "/report.html").text[:2000].lower()
     page.get_by_role("button", name="Use this").click()
     expect(page.get_by_text("The calibration is of other cameras than the rig has")).to_be_visible()
     page.get_by_role("button", name="New calibration").click()
     page.locator("#shoot").click()  # the studio has a person in it, and no board
     expect(page.get_by_text("No camera saw the board")).to_be_visible(timeout=LONG_MS)
     assert httpx.get(service.url + "/v1/captures").json()["captures"] == []
+    assert httpx.delete(address).status_code == 204

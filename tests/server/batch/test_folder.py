@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from rig.messages.message import compose
 from server.batch.captures import WHOLE, Shard
-from server.batch.folder import BatchFolder, FailureRecord, ForeignFiles, Origin, file_name
+from server.batch.folder import BatchFolder, Origin, file_name
 
 ORIGIN = Origin("11" * 32, "22" * 32, "33" * 32, "0.1.0")
 
@@ -62,29 +61,10 @@ def test_a_new_result_takes_the_place_of_the_old_one_as_a_whole(folder: BatchFol
     assert not (folder.result("anna") / "head.obj").exists()
 
 
-def test_files_of_nobody_stop_a_replacement(folder: BatchFolder) -> None:
-    publish(folder, "anna")
-    folder.check_replaceable("anna")
-    folder.check_replaceable("nobody")
-    (folder.result("anna") / "notes.txt").write_text("mine")
-    with pytest.raises(ForeignFiles, match=r"contains files that are no results \(notes.txt\)"):
-        publish(folder, "anna", b"another")
-    assert (folder.result("anna") / "head.ply").read_bytes() == b"mesh"
-
-
 def test_the_version_is_no_reason_to_make_a_head_again() -> None:
     assert ORIGIN.is_of(replace(ORIGIN, version="0.2.0"))
     for other in ("input_sha256", "settings_sha256", "model_sha256"):
         assert not ORIGIN.is_of(replace(ORIGIN, **{other: "44" * 32}))
-
-
-def test_a_failure_is_kept_until_the_capture_is_done(folder: BatchFolder) -> None:
-    failure = FailureRecord("input", compose("batch-list-empty"), (compose("settings-no-table"),), ORIGIN)
-    folder.note_failure("anna", failure)
-    assert folder.failure("anna") == failure
-    assert folder.failure("bert") is None
-    publish(folder, "anna")
-    assert folder.failure("anna") is None
 
 
 def test_attempts_of_ended_shares_and_empty_folders_go(folder: BatchFolder) -> None:

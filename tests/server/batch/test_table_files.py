@@ -9,9 +9,7 @@ from typing import Any
 import pyarrow.parquet
 import pytest
 
-from pipeline.head_model.model_file import expression_names
-from pipeline.head_model.model_names import model_path
-from server.batch.table import Column, Row, columns_of, csv_bytes, has_parquet, parquet_bytes, write_table
+from server.batch.table import Column, Row, csv_bytes, has_parquet, parquet_bytes, write_table
 
 COLUMNS = (
     Column("capture", "text", "", "its name"),
@@ -43,16 +41,6 @@ def test_parquet_has_types_units_and_no_value_where_there_is_none() -> None:
     assert [str(field.type) for field in table.schema] == ["string", "double", "int64", "bool"]
     assert table.schema.field("nose_length_mm").metadata == {b"unit": b"mm", b"description": b"a length"}
     assert parquet_bytes(COLUMNS, ROWS) == data
-
-
-def test_every_column_of_a_heads_table_has_its_unit_and_words_in_the_schema() -> None:
-    """As arrow::read_parquet of R and pandas have them: both read by the schema that is tested here."""
-    columns = columns_of(expression_names(model_path("default")))
-    schema = pyarrow.parquet.read_schema(io.BytesIO(parquet_bytes(columns, [])))
-    assert schema.names == [column.name for column in columns]
-    said = [(field.metadata[b"unit"].decode(), field.metadata[b"description"].decode()) for field in schema]
-    assert said == [(column.unit, column.words) for column in columns]
-    assert {str(field.type) for field in schema} == {"string", "double", "int64", "bool"}
 
 
 def test_without_pyarrow_there_is_the_csv_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

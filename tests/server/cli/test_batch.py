@@ -75,11 +75,6 @@ def test_status_2_for_a_list_with_every_fault_of_it(shots: Path, tmp_path: Path)
     assert done.exit_code == 2
     assert "shots/s0000: " in message_of(done)
     assert "shots/s0001: " in message_of(done)
-    (tmp_path / "study.csv").write_text("capture\ngone\nlost\n")
-    done = invoke(tmp_path / "study.csv", "--out", tmp_path / "heads")
-    assert done.exit_code == 2
-    assert "line 2: " in message_of(done)
-    assert "line 3: " in message_of(done)
 
 
 def test_results_never_lie_within_a_capture(shots: Path) -> None:

@@ -13,9 +13,8 @@ from typer.testing import CliRunner
 
 from calibration.board.board import board_poses, photograph_board, write_board
 from rig.formats.cameras.cameras_file import FOLDER_FORMATS, FORMATS, write_rig_file
-from rig.formats.cameras.cameras_json import read_rig, write_rig
+from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.pictures.images import write_image
-from server.cli.answers import CannotWrite
 from server.cli.main import app
 from server.http.schemas import NewCalibration
 from tests.server.cli.test_main import run
@@ -67,27 +66,6 @@ def test_faults_of_scale_json_end_it_before_the_work(tmp_path: Path) -> None:
     assert "distance_mm is -1" in done.stderr
     assert "cameras names 'd'" in done.stderr
     assert not (tmp_path / "cameras.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("kind", "out", "text"),
-    [
-        ("eigenhead", "file/cameras.json", "cannot be written"),
-        ("eigenhead", "folder", "it is a folder"),
-        ("colmap", "file", "it is a file, and a folder is written"),
-        ("colmap", "file/sparse", "cannot be written"),
-    ],
-)
-def test_a_place_where_no_cameras_can_be_written_is_named(tmp_path: Path, kind: str, out: str, text: str) -> None:
-    (tmp_path / "file").write_text("")
-    (tmp_path / "folder").mkdir()
-    write_rig(wedge_rig(), tmp_path / "cameras.json")
-    done = CliRunner().invoke(
-        app, ["convert", str(tmp_path / "cameras.json"), "--to", kind, "--out", str(tmp_path / out)]
-    )
-    assert isinstance(done.exception, CannotWrite)
-    assert str(done.exception).startswith(f"{tmp_path / out} ")
-    assert text in str(done.exception)
 
 
 def test_cameras_that_take_no_part_are_told_where_a_file_is_converted(tmp_path: Path) -> None:

@@ -36,11 +36,12 @@ from tests.support.small_studio import small_studio_captures
 from tests.support.textured_wedge import HEIGHT, WIDTH, wedge_rig, write_photographs
 
 pytestmark = pytest.mark.gl
+Shot = tuple[Path, np.ndarray]
 OFFSETS_MM = np.array([(0, 0, 0), (0, 62, 0), (0, -60, 0)], float)
 
 
 @pytest.fixture(scope="module")
-def shot(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> tuple[Path, np.ndarray]:
+def shot(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> Shot:
     """A capture with plates, and points (mm) inside the head that every picture shows as dots."""
     folder = small_studio_captures(tmp_path_factory.mktemp("shots"), 1, renderer, first=2) / "s2"  # all are usable
     capture, rig = read_capture(folder)
@@ -58,7 +59,7 @@ def exported(shot: Path, out: Path, form: str, *options: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module", params=[("nerfstudio", nerfstudio_pixel), ("gaussian-avatars", avatar_pixel)])
 def made(
-    request: pytest.FixtureRequest, shot: tuple[Path, np.ndarray], tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, shot: Shot, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Callable[[dict[str, Any], np.ndarray], np.ndarray]]:
     form, project = request.param
     out = tmp_path_factory.mktemp(form)
@@ -66,7 +67,7 @@ def made(
     return out, project
 
 
-def test_points_lie_in_the_pictures_where_the_files_say(made, shot: tuple[Path, np.ndarray]) -> None:
+def test_points_lie_in_the_pictures_where_the_files_say(made, shot: Shot) -> None:
     (out, project), (_, points) = made, shot
     errors = []
     for frame in frames_of(out):
@@ -109,7 +110,7 @@ def test_avatars_come_before_white_in_divisions_that_share_no_camera(shot, tmp_p
         assert (picture[mask == 255] < 255).any()
 
 
-def test_our_own_reader_finds_the_rig_again(made, shot: tuple[Path, np.ndarray]) -> None:
+def test_our_own_reader_finds_the_rig_again(made, shot: Shot) -> None:
     _, rig = read_capture(shot[0])
     found = read_rig_file(made[0] / "transforms.json")
     for camera, original in zip(found, rig, strict=True):
@@ -132,7 +133,7 @@ def with_masks(shot: Path, folder: Path) -> tuple[Capture, Rig]:
     return masked, straight
 
 
-def test_pictures_and_masks_of_a_pinhole_are_kept_as_they_are(shot: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+def test_pictures_and_masks_of_a_pinhole_are_kept_as_they_are(shot: Shot, tmp_path: Path) -> None:
     capture, rig = with_masks(shot[0], tmp_path / "masked")
     exported(tmp_path / "masked", tmp_path / "out", "nerfstudio")
     for name in rig.names:
@@ -141,9 +142,7 @@ def test_pictures_and_masks_of_a_pinhole_are_kept_as_they_are(shot: tuple[Path, 
 
 
 @pytest.mark.parametrize("form", ["nerfstudio", "gaussian-avatars"])
-def test_a_results_head_becomes_the_point_cloud_in_the_same_frame(
-    shot: tuple[Path, np.ndarray], tmp_path: Path, form: str
-) -> None:
+def test_a_results_head_becomes_the_point_cloud_in_the_same_frame(shot: Shot, tmp_path: Path, form: str) -> None:
     capture, rig = read_capture(shot[0])
     head = ellipsoid(2)
     count = len(head.vertices)
@@ -164,9 +163,7 @@ def test_a_results_head_becomes_the_point_cloud_in_the_same_frame(
     assert (np.stack([points[channel] for channel in "rgb"], 1) == colours).all()
 
 
-def test_flame_parameters_of_a_result_make_its_head_where_the_pictures_show_it(
-    shot: tuple[Path, np.ndarray], tmp_path: Path
-) -> None:
+def test_flame_parameters_of_a_result_make_its_head_where_the_pictures_show_it(shot: Shot, tmp_path: Path) -> None:
     """Read as GaussianAvatars' loader does: a file of parameters a moment, named by frames, and a canonical one."""
     capture, _ = read_capture(shot[0])
     arrays, parameters, result = made_up_flame(), some_parameters(), tmp_path / "result"
@@ -192,7 +189,7 @@ def test_flame_parameters_of_a_result_make_its_head_where_the_pictures_show_it(
     assert "damaged" in str(CliRunner().invoke(app, [*arguments, str(result)]).exception)
 
 
-def test_a_result_of_another_capture_is_refused_by_its_files(shot: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+def test_a_result_of_another_capture_is_refused_by_its_files(shot: Shot, tmp_path: Path) -> None:
     capture, _ = read_capture(shot[0])
     write_head(tmp_path, ellipsoid(2))
     inputs = dict(capture.digests) | {"cameras.json": "ab" * 32}
@@ -206,7 +203,7 @@ def test_a_result_of_another_capture_is_refused_by_its_files(shot: tuple[Path, n
     assert "has no report.json" in str(CliRunner().invoke(app, [*arguments, str(tmp_path)]).exception)
 
 
-def test_a_data_set_is_replaced_only_on_request(shot: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+def test_a_data_set_is_replaced_only_on_request(shot: Shot, tmp_path: Path) -> None:
     out = tmp_path / "out"
     exported(shot[0], out, "gaussian-avatars")
     again = ["export", str(shot[0]), "--as", "nerfstudio", "--out", str(out)]

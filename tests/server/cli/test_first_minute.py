@@ -130,7 +130,7 @@ def test_a_shell_completes_commands_options_and_what_they_may_be(line: str, offe
     assert completed.stdout.split() == offered
 
 
-def test_serve_says_in_one_line_that_its_rig_file_is_missing_or_its_port_is_taken(run: Run, tmp_path: Path) -> None:
+def test_serve_says_in_one_line_that_its_rig_file_its_port_or_its_folder_is_no_good(run: Run, tmp_path: Path) -> None:
     done = run("serve", "--rig", tmp_path / "rig.toml")
     assert (done.status, done.err.count("\n")) == (1, 1)
     assert "rig.toml: cannot be read (No such file or directory)" in done.err
@@ -141,6 +141,10 @@ def test_serve_says_in_one_line_that_its_rig_file_is_missing_or_its_port_is_take
         done = run("serve", "--port", port)
     assert (done.status, done.err.count("\n")) == (1, 1)
     assert f"cannot listen on 127.0.0.1:{port}: another program listens there" in done.err
+    (tmp_path / "file").touch()
+    done = run("serve", "--port", "0", "--data", tmp_path / "file" / "x")
+    assert (done.status, done.err.count("\n")) == (1, 1)
+    assert "cannot be used (" in done.err
 
 
 @pytest.mark.parametrize("command", ["serve", "worker"])
@@ -199,25 +203,27 @@ def test_wrong_usage_is_status_2_and_is_named(run: Run, tmp_path: Path, line: st
     assert [path.name for path in tmp_path.iterdir()] == ["shots"]
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "calibrate", "board", "model build"])
-def test_an_output_that_cannot_be_written_is_found_before_the_work(run: Run, tmp_path: Path, command: str) -> None:
+@pytest.mark.parametrize(
+    ("line", "place", "why"),
+    [
+        ("reconstruct {shot}", "file/inside/out", "cannot be written"),
+        ("calibrate {shot} --board {shot}/cameras.json", "file/inside/out", "cannot be written"),
+        ("board", "file/inside/out", "cannot be written"),
+        ("model build {shot}", "file/inside/out", "cannot be written"),
+        ("convert {shot}", "file/cameras.json", "cannot be written"),
+        ("convert {shot}", "shot", "it is a folder"),
+        ("convert {shot} --to colmap", "file", "it is a file, and a folder is written"),
+        ("convert {shot} --to colmap", "file/sparse", "cannot be written"),
+    ],
+)
+def test_an_output_that_cannot_be_written_is_found_before_the_work(
+    run: Run, tmp_path: Path, line: str, place: str, why: str
+) -> None:
     (tmp_path / "file").touch()
-    capture, out = small_capture(tmp_path / "capture"), tmp_path / "file" / "inside" / "out"
-    arguments = {
-        "reconstruct": [capture],
-        "calibrate": [capture, "--board", capture / "cameras.json"],
-        "model build": [capture],
-    }
-    done = run(*command.split(), *arguments.get(command, []), "--out", out)
-    assert done.status == 1
-    assert f"{out} cannot be written" in done.err
-
-
-def test_an_empty_archive_is_refused(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "empty.zip").write_bytes(b"")
-    done = run("reconstruct", tmp_path / "empty.zip", "--out", tmp_path / "out")
-    assert (done.status, done.err.count("\n")) == (1, 1)
-    assert [path.name for path in tmp_path.iterdir()] == ["empty.zip"]
+    shot = small_capture(tmp_path / "shot")
+    done = run(*line.format(shot=shot).split(), "--out", tmp_path / place)
+    assert (done.status, done.err.startswith(f"eigenhead: {tmp_path / place} ")) == (1, True)
+    assert why in done.err
 
 
 def test_nothing_that_is_there_is_overwritten_unasked(run: Run, tmp_path: Path) -> None:

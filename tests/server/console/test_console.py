@@ -13,6 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from starlette.types import Scope
 
+from pipeline.head_model.model import load_model
+from pipeline.settings import settings_from_document
+from pipeline.texturing.paint import find_layout
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.errors import InputError
 from rig.geometry import RigidTransform, rotation_from_vector
@@ -23,7 +26,7 @@ from server.console import coverage, guides, live, media
 from server.console.identity import caller_of, cookie_secret, is_foreign, is_rebound, permit
 from server.console.live import look_bytes
 from server.console.mount import path_below
-from server.console.pages.captures import chosen_work, settings_of
+from server.console.pages.captures import PRESETS, Preset, chosen_work, settings_of
 from server.console.pages.jobs import chosen_settings, log_lines
 from server.console.removal import Removals
 from server.errors import Conflict, Forbidden, NotFound, Unauthenticated, Unavailable
@@ -255,6 +258,12 @@ def test_the_captures_form_becomes_work() -> None:
         "ict", {"outputs": {"formats": ["glb", "ply", "obj", "usdz"], "template": "flame"}}
     )
     assert settings_of("texture") == {"outputs": {"formats": ["glb", "ply", "obj", "usdz"]}}  # as it was
+
+
+@pytest.mark.parametrize("preset", PRESETS, ids=lambda preset: preset.id or "standard")
+def test_no_preset_is_warned_of(preset: Preset) -> None:
+    _, warnings = find_layout(load_model(), settings_from_document(preset.settings))
+    assert [warning.text for warning in warnings] == []
 
 
 def test_a_look_on_the_wire_holds_every_picture() -> None:

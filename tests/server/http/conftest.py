@@ -6,7 +6,7 @@ import httpx
 import pytest
 
 from server.cli.client import Client
-from tests.support.services import RunningService, packed, running_service, small_capture
+from tests.support.services import RunningService, packed, running_service, small_capture, upload
 
 
 @pytest.fixture(scope="session")
@@ -26,6 +26,12 @@ def http(service: RunningService) -> Iterator[httpx.Client]:
 def client(service: RunningService) -> Iterator[Client]:
     with Client(service.url) as client:
         yield client
+
+
+@pytest.fixture
+def capture(http: httpx.Client, archive: bytes) -> str:
+    """The id of a capture that was uploaded for this test."""
+    return upload(http, archive).json()["id"]
 
 
 @pytest.fixture(scope="session")

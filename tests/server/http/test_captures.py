@@ -1,16 +1,15 @@
 """Captures and sessions over HTTP, against a running service: uploads, what is refused, features, erasure."""
 
-import io
 import shutil
-import tarfile
 from pathlib import Path
 
 import httpx
 import pytest
 
 from server.cli.client import Client, ServiceError
-from tests.server.http.test_hostile import SPOILT, removes
+from tests.server.http.test_hostile import SPOILT
 from tests.support.services import RunningService, await_state, packed, small_capture, stored, upload
+from tests.support.small_captures import remove
 
 
 def test_upload_and_job_in_one_call(http: httpx.Client, archive: bytes) -> None:
@@ -39,7 +38,7 @@ def test_a_form_field_that_nobody_knows_is_named(
 
 
 BAD = {case: SPOILT[case] for case in ("missing image", "NaN in a rotation", "image of another size")}
-BAD |= {"cut off": (bool, "damaged or cut off"), "no cameras": (removes("cameras.json"), "contains no cameras.json")}
+BAD |= {"cut off": (bool, "damaged or cut off"), "no cameras": (remove("cameras.json"), "contains no cameras.json")}
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -69,8 +68,7 @@ def test_photographs_too_few_to_do_without_cameras_say_what_is_missing(http: htt
     assert errors[1].startswith("1 photograph; at least 3")
 
 
-def test_a_capture_in_use_is_not_removed_and_a_finished_job_is(http: httpx.Client, archive: bytes) -> None:
-    capture = upload(http, archive).json()["id"]
+def test_a_capture_in_use_is_not_removed_and_a_finished_job_is(http: httpx.Client, capture: str) -> None:
     job = http.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
     assert http.delete(f"/v1/captures/{capture}").status_code == 409
     assert http.delete(f"/v1/jobs/{job}").status_code in (204, 409)
@@ -83,8 +81,7 @@ def test_a_capture_in_use_is_not_removed_and_a_finished_job_is(http: httpx.Clien
     assert http.get(f"/v1/jobs/{job}").status_code == 404
 
 
-def test_features_are_stored_or_refused_by_name(http: httpx.Client, service: RunningService, archive: bytes) -> None:
-    capture = upload(http, archive).json()["id"]
+def test_features_are_stored_or_refused_by_name(http: httpx.Client, service: RunningService, capture: str) -> None:
     points = {"pronasale": {"cam00": [3.0, 4.0], "cam01": [5.0, 6.0]}}
     assert http.put(f"/v1/captures/{capture}/features", json={"points": points}).json()["features"] is True
     assert http.get(f"/v1/captures/{capture}/features").json()["points"] == points
@@ -157,13 +154,6 @@ def test_the_client_uploads_folders_and_checks_downloads(client: Client, tmp_pat
     with pytest.raises(ServiceError, match=r"images/cam00.png is missing") as caught:
         client.upload(tmp_path / "capture")
     assert caught.value.status == 422
-
-
-def test_a_tar_made_elsewhere_with_one_enclosing_folder_works(http: httpx.Client, tmp_path: Path) -> None:
-    folder, buffer = small_capture(tmp_path / "capture"), io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode="w:gz") as archive:
-        archive.add(folder, arcname="Anna")
-    assert upload(http, buffer.getvalue()).status_code == 201
 
 
 def test_a_session_without_captures_is_asked_as_much(http: httpx.Client) -> None:

@@ -14,8 +14,7 @@ from tests.support.services import RunningService, await_state, upload
 from tests.support.template_headers import header_file
 
 
-def test_requests_that_make_no_sense_are_4xx_problems(http: httpx.Client, archive: bytes) -> None:
-    capture = upload(http, archive).json()["id"]
+def test_requests_that_make_no_sense_are_4xx_problems(http: httpx.Client, capture: str) -> None:
     wrong = [
         (http.get("/v1/captures/../../etc/passwd"), 404),
         (http.get("/v1/captures/" + "0" * 28), 404),
@@ -75,8 +74,7 @@ def test_text_that_no_database_keeps_is_refused_wherever_it_comes_in(http: httpx
         f'{{"front": {"[" * 500 + "]" * 500}}}',
     ],
 )
-def test_settings_that_no_answer_could_repeat_make_no_job(http: httpx.Client, archive: bytes, settings: str) -> None:
-    capture = upload(http, archive).json()["id"]
+def test_settings_that_no_answer_could_repeat_make_no_job(http: httpx.Client, capture: str, settings: str) -> None:
     body = f'{{"capture_id": "{capture}", "settings": {settings}}}'
     assert http.post("/v1/jobs", content=body, headers={"Content-Type": "application/json"}).status_code == 422
     assert http.get("/v1/jobs", params={"capture": capture}).json()["jobs"] == []
@@ -141,11 +139,10 @@ def test_a_worker_that_loads_is_no_fault(tmp_path: Path) -> None:
     engine.dispose()
 
 
-def test_info_tells_limits_waiting_jobs_and_default_settings(http: httpx.Client, archive: bytes) -> None:
+def test_info_tells_limits_waiting_jobs_and_default_settings(http: httpx.Client, capture: str) -> None:
     info = http.get("/v1/info").json()
     assert info["version"] == http.get("/healthz").json()["version"]
     assert (info["cameras_least"], info["cameras_most"], info["jobs_per_key_most"]) == (3, 64, 200)
-    capture = upload(http, archive).json()["id"]
     job = http.post("/v1/jobs", json={"capture_id": capture, "settings": info["settings"]}).json()["id"]
     busy = http.get("/v1/info").json()
     assert busy["queued"] + busy["running"] >= 1

@@ -168,14 +168,12 @@ def files_of(job: dict[str, Any]) -> dict[str, str]:
 
 
 @contextmanager
-def pinned_worker(service: RunningService, core: int | None = None) -> Iterator["subprocess.Popen[bytes]"]:
-    """A worker of its own, perhaps bound to one core with everything that it starts."""
+def own_worker(service: RunningService) -> Iterator["subprocess.Popen[bytes]"]:
+    """A worker that no service started."""
     environment = os.environ | service.environment | {"EIGENHEAD_DATA": str(service.data)}
-    pin = (lambda: os.sched_setaffinity(0, {core})) if core is not None else None
     with service.log.open("ab") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "server.cli", "worker"], env=environment, cwd=ROOT, stderr=log, preexec_fn=pin
-        )
+        command = [sys.executable, "-m", "server.cli", "worker"]
+        process = subprocess.Popen(command, env=environment, cwd=ROOT, stderr=log)
     try:
         yield process
     finally:
@@ -235,12 +233,12 @@ def test_the_job_of_a_worker_that_never_returns_is_taken_over_within_30_s(kind: 
         served_client(tmp_path / "data", worker=False, tiny_s="3", **settings) as (service, client),
     ):
         capture = uploaded_capture(service, tmp_path)
-        with pinned_worker(service) as first:
+        with own_worker(service) as first:
             job = submit(service, capture, 0)
             await_state(client, job, ("running",))
             stop_between_writes(first, service.data / "eigenhead.sqlite" if kind == "sqlite" else None)
             stopped = time.monotonic()
-            with open_transaction(settings, job), pinned_worker(service):
+            with open_transaction(settings, job), own_worker(service):
                 await_state(client, job, ("succeeded",), 40)
                 taken_s = time.monotonic() - stopped
             assert taken_s < 30 + 3
