@@ -4,7 +4,6 @@ import hashlib
 import os
 import re
 import shlex
-import subprocess
 import sys
 import tarfile
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ import httpx
 import pytest
 
 from tests.support import fork_server
+from tests.support.attacks import add_keys
 from tests.support.services import ROOT, RunningService, running_service, small_capture
 
 GUIDE = ROOT / "docs" / "http.md"
@@ -57,8 +57,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService
 
 @pytest.fixture(scope="module")
 def key(service: RunningService) -> str:
-    command = [sys.executable, "-m", "server.cli", "keys", "add", "lab", "--data", str(service.data)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60).stdout.strip()
+    return add_keys(service, "read,capture,submit")[0]
 
 
 @pytest.fixture(scope="module")

@@ -86,8 +86,9 @@ def silent_connections(
         yield opened
 
 
-def client(service: RunningService, key: str, timeout_s: float = 60.0) -> httpx.Client:
-    return httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {key}"}, timeout=timeout_s)
+def client(service: RunningService, key: str | None, timeout_s: float = 60.0) -> httpx.Client:
+    headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+    return httpx.Client(base_url=service.url, headers=headers, timeout=timeout_s)
 
 
 def half_body(path: str, key: str | None = None) -> bytes:

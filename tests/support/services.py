@@ -222,3 +222,20 @@ def stored(service: RunningService) -> list[str]:
 
 def upload(http: httpx.Client, data: bytes, path: str = "/v1/captures/uploads", **fields: str) -> httpx.Response:
     return http.post(path, files={"file": ("capture.tar", data)}, data=fields)
+
+
+def imported(service: RunningService, url: str) -> httpx.Response:
+    return httpx.post(service.url + "/v1/captures/imports", json={"url": url, "label": "Anna"}, timeout=60)
+
+
+def kill_workers(service: RunningService) -> None:
+    for pid in worker_pids(service):
+        os.kill(pid, signal.SIGKILL)
+
+
+def made_head(http: httpx.Client, folder: Path, seed: int = 0, **fields: str) -> str:
+    """The job that made a head of a small capture."""
+    capture = upload(http, packed_capture(folder, seed).read_bytes(), **fields).json()["id"]
+    job = http.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
+    await_state(http, job, ("succeeded",))
+    return job

@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.end_to_end.console.test_every_page import fill
 from tests.support.browser import Visit, violations, visit
-from tests.support.services import RunningService, await_state, packed_capture, running_service
+from tests.support.services import RunningService, made_head, running_service
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -93,9 +93,7 @@ def test_a_persons_heads_fit_in_german(browser: Browser, screenshots: Path, tmp_
         client = httpx.Client(base_url=running.url, timeout=60)
         session = client.post("/v1/sessions", json={"label": "Anna"}).json()["id"]
         for seed in range(2):
-            file = {"file": packed_capture(tmp_path, seed).read_bytes()}
-            capture = client.post("/v1/captures/uploads", files=file, data={"session": session}).json()["id"]
-            await_state(client, client.post("/v1/jobs", json={"capture_id": capture}).json()["id"], ("succeeded",))
+            made_head(client, tmp_path, seed, session=session)
         v = german(browser, running)
         page = v.go("/result")
         page.wait_for_selector("canvas[data-loaded$=head]")

@@ -106,10 +106,8 @@ def test_a_result_that_is_gone_is_told(examine: Callable[..., dict], tmp_path: P
     engine.dispose()
     for job in (kept, gone):
         (tmp_path / "jobs" / job / "result").mkdir(parents=True)
-    assert examine(data=tmp_path)["results"] == {
-        "ok": True,
-        "detail": "of 2 jobs, all there; the files of 0 were compared",
-    }
+    all_there = {"ok": True, "detail": "of 2 jobs, all there; the files of 0 were compared"}
+    assert examine(data=tmp_path)["results"] == all_there
     shutil.rmtree(tmp_path / "jobs" / gone)
     found = examine(data=tmp_path)["results"]
     assert not found["ok"]

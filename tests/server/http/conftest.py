@@ -17,12 +17,6 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService
 
 
 @pytest.fixture
-def http(service: RunningService) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=service.url, timeout=120) as client:
-        yield client
-
-
-@pytest.fixture
 def client(service: RunningService) -> Iterator[Client]:
     with Client(service.url) as client:
         yield client

@@ -2,9 +2,7 @@
 
 import csv
 import io
-import os
 import re
-import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,10 +18,10 @@ from tests.support.services import (
     await_state,
     await_true,
     awaited,
+    kill_workers,
     running_service,
     served_client,
     uploaded_capture,
-    worker_pids,
 )
 
 URN = "urn:eigenhead:problem:"
@@ -300,10 +298,8 @@ def test_a_queue_that_nobody_serves_is_said(http: httpx.Client, captures: list[s
     assert (check["ok"], check["detail"]) == (True, "2 jobs wait in queues without a worker: gpu")
     http.post(f"/v1/batches/{batch['id']}/cancel")
     batch_once(http, batch["id"], finished)
-    assert (
-        http.get("/readyz").json()["checks"]["queues"]["detail"]
-        == "there is a worker for every queue with waiting jobs"
-    )
+    served = http.get("/readyz").json()["checks"]["queues"]["detail"]
+    assert served == "there is a worker for every queue with waiting jobs"
 
 
 def test_batches_are_listed_by_pages_newest_first(http: httpx.Client, captures: list[str]) -> None:
@@ -339,8 +335,7 @@ def test_a_capture_that_kills_workers_is_set_aside_and_the_others_are_made(tmp_p
                 break
             if jobs and re.findall(f"{jobs[0]['id']} stage=read", service.log.read_text())[kills:]:
                 kills += 1
-                for pid in worker_pids(service):
-                    os.kill(pid, signal.SIGKILL)
+                kill_workers(service)
             assert time.monotonic() < deadline
             time.sleep(0.2)
         assert (jobs[0]["state"], jobs[0]["error"]["type"]) == ("failed", URN + "worker-died")

@@ -57,19 +57,6 @@ def test_a_damaged_record_is_set_aside(tmp_path: Path, damage: dict[str, object]
     assert len(store.list_quarantined()) == 1
 
 
-def test_a_session_without_its_label_is_set_aside(tmp_path: Path) -> None:
-    store, record = Store(tmp_path), SessionRecord(new_id(), "2026-01-01T00:00:00.000Z", "anna", "")
-    store.add_session(record)
-    assert store.session(record.id) == record
-    path = store.folder("sessions", record.id).with_suffix(".json")
-    document = json.loads(path.read_text())
-    del document["label"]
-    path.write_text(json.dumps(document))
-    with pytest.raises(NotFound):
-        store.session(record.id)
-    assert len(store.list_quarantined()) == 1
-
-
 def test_formats_are_not_mistaken_for_each_other() -> None:
     upload = UploadRecord(new_id(), 3, {"label": "anna"}, "local", 1.5, None)
     assert UPLOAD.read(json.loads(json.dumps(UPLOAD.document(upload)))) == upload
@@ -161,6 +148,17 @@ def test_damaged_checks_say_nothing(tmp_path: Path, damage: str) -> None:
     assert store.checks(record.id) == {"cam00": {"mean": 90.5, "blur_px": None}}
     path.write_text(damage)
     assert store.checks(record.id) == {}
+
+
+def test_a_session_without_its_label_is_set_aside(tmp_path: Path) -> None:
+    store, record = Store(tmp_path), SessionRecord(new_id(), "2026-01-01T00:00:00.000Z", "anna", "")
+    store.add_session(record)
+    assert store.session(record.id) == record
+    path = store.folder("sessions", record.id).with_suffix(".json")
+    path.write_text(path.read_text().replace('"label"', '"table"'))
+    with pytest.raises(NotFound):
+        store.session(record.id)
+    assert len(store.list_quarantined()) == 1
 
 
 @pytest.mark.parametrize("damage", ["", "{}", "[]"])

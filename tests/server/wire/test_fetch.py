@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from tests.support.loopback import Hook, hooked
-from tests.support.services import RunningService, await_state, await_true, packed_capture, running_service
+from tests.support.services import RunningService, await_state, await_true, imported, packed_capture, running_service
 
 
 class Store(BaseHTTPRequestHandler):
@@ -65,10 +65,6 @@ def service(store: Hook, tmp_path_factory: pytest.TempPathFactory) -> Iterator[R
         body_bytes=str(4 << 20),
     ) as service:
         yield service
-
-
-def imported(service: RunningService, url: str) -> httpx.Response:
-    return httpx.post(service.url + "/v1/captures/imports", json={"url": url, "label": "Anna"}, timeout=60)
 
 
 @pytest.mark.parametrize("way", ["{0}/a.tar", "{0}/to//a.tar", "{0}/to/{0}/to/{0}/a.tar"])

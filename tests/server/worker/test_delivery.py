@@ -3,8 +3,6 @@ the store is away, the worker is killed, or the job is removed meanwhile."""
 
 import hashlib
 import json
-import os
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,9 +18,9 @@ from tests.support.services import (
     await_state,
     await_true,
     awaited,
+    kill_workers,
     packed_capture,
     running_service,
-    worker_pids,
 )
 
 NAMES = {"head.glb", "head.ply", "overlays/cam00.png"}
@@ -128,8 +126,7 @@ def test_a_killed_worker_leaves_a_delivery_that_another_ends(
     way.fail("503", 10_000, "PUT", "cam00")
     job = submitted(client, capture, "s3://studio-out/heads/", webhook={"url": hook.url})
     await_true(lambda: any(job in path and "cam00" in path for method, path in way.seen if method == "PUT"))
-    for pid in worker_pids(service):
-        os.kill(pid, signal.SIGKILL)
+    kill_workers(service)
     assert "delivery.json" not in delivered(bucket, job)
     way.heal()
     document = delivery_in(client, job, "delivered")

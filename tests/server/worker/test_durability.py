@@ -29,6 +29,7 @@ from tests.support.services import (
     RunningService,
     await_state,
     await_true,
+    kill_workers,
     packed,
     running_service,
     served_client,
@@ -135,8 +136,7 @@ def test_real_heads_survive_kills_to_the_last_byte(total: int, kills: int, tmp_p
             time.sleep(rng.uniform(0.2, 3.0))
             if number % 2:
                 service.kill()
-            for pid in worker_pids(service):
-                os.kill(pid, signal.SIGKILL)
+            kill_workers(service)
             if number % 2:
                 service.start()
         ended = [await_state(client, job, ("succeeded", "failed", "cancelled"), 240) for job in jobs]
