@@ -224,18 +224,6 @@ def test_a_front_camera_that_nobody_knows_is_a_fault(kind: Callable[[Path], Path
 
 
 @pytest.mark.gl
-def test_a_picture_of_no_camera_is_a_warning_as_a_reconstruction_passes_it_over(masked: Shot, tmp_path: Path) -> None:
-    write_capture(tmp_path / "shot", *masked)
-    for name in ("foo.png", "goo.png"):
-        (tmp_path / "shot" / "images" / name).write_bytes(b"")
-    found = found_in(tmp_path / "shot", front="cam03")
-    assert (found["faults"], found["front"]) == ([], "cam03")
-    assert [(w["code"], w["message"].split(":")[0]) for w in found["warnings"]] == [
-        ("file-unread", "images/foo.png, images/goo.png have no camera")
-    ]
-
-
-@pytest.mark.gl
 def test_a_wrong_variable_is_no_fault_of_the_capture(
     masked: Shot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,13 +12,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from rig.capture import Capture
-from rig.formats.cameras.cameras_file import read_rig_file
 from rig.formats.captures.capture_folder import read_capture, write_capture
 from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
-from rig.rig import Rig
 from server.cli.main import app
 from tests.support.dataset_readers import (
     avatar_pixel,
@@ -110,37 +107,6 @@ def test_avatars_come_before_white_in_divisions_that_share_no_camera(shot, tmp_p
         assert (picture[mask == 255] < 255).any()
 
 
-def test_our_own_reader_finds_the_rig_again(made, shot: Shot) -> None:
-    _, rig = read_capture(shot[0])
-    found = read_rig_file(made[0] / "transforms.json")
-    for camera, original in zip(found, rig, strict=True):
-        np.testing.assert_allclose(camera.centre_world, original.centre_world, atol=1e-6)
-
-
-def with_masks(shot: Path, folder: Path) -> tuple[Capture, Rig]:
-    """The capture with masks in place of plates."""
-    capture, rig = read_capture(shot)
-    rows, columns = np.mgrid[:240, :320]
-    masks = {
-        camera.name: np.hypot(*(np.array([columns, rows]).T - camera.project(rig.centre_world()[None])[0]).T) < 70
-        for camera in rig
-    }
-    straight = Rig(
-        tuple(replace(c, intrinsics=replace(c.intrinsics, distortion=type(c.intrinsics.distortion)())) for c in rig)
-    )
-    masked = replace(capture, backgrounds={}, masks=masks)
-    write_capture(folder, masked, straight)
-    return masked, straight
-
-
-def test_pictures_and_masks_of_a_pinhole_are_kept_as_they_are(shot: Shot, tmp_path: Path) -> None:
-    capture, rig = with_masks(shot[0], tmp_path / "masked")
-    exported(tmp_path / "masked", tmp_path / "out", "nerfstudio")
-    for name in rig.names:
-        assert (read_png(tmp_path / f"out/images/{name}.png") == capture.images[name]).all()
-        assert ((read_png(tmp_path / f"out/masks/{name}.png") > 0) == capture.masks[name]).all()
-
-
 @pytest.mark.parametrize("form", ["nerfstudio", "gaussian-avatars"])
 def test_a_results_head_becomes_the_point_cloud_in_the_same_frame(shot: Shot, tmp_path: Path, form: str) -> None:
     capture, rig = read_capture(shot[0])
@@ -229,7 +195,9 @@ def test_photographs_alone_are_calibrated_once_and_keep_the_frame_of_their_resul
     apart = np.linalg.norm(rig["cam00"].centre_world - rig["cam04"].centre_world)
     scale = {"cameras": ["cam00", "cam04"], "distance_mm": 1.5 * apart}  # makes the ball as large as a head
     (photographs / "scale.json").write_text(json.dumps(scale))
-    exported(photographs, tmp_path / "first", "nerfstudio", "--settings", str(settings_with_front(tmp_path)))
+    settings = tmp_path / "settings.json"  # a front camera that no guess would choose: the world is another without it
+    settings.write_text(json.dumps({"front": "cam04"}))
+    exported(photographs, tmp_path / "first", "nerfstudio", "--settings", str(settings))
     found = tmp_path / "first" / "found"
     kept = {path.name: path.read_bytes() for path in found.glob("c*.json")}
     assert set(kept) == {"cameras.json", "calibration.json"}
@@ -248,10 +216,3 @@ def test_photographs_alone_are_calibrated_once_and_keep_the_frame_of_their_resul
         assert (result / name).read_bytes() == content
     first, second = (frames_of(tmp_path / folder) for folder in ("first", "second"))
     assert first == second
-
-
-def settings_with_front(folder: Path) -> Path:
-    """A front camera that no guess would choose, so that the world is another without it."""
-    path = folder / "settings.json"
-    path.write_text(json.dumps({"front": "cam04"}))
-    return path

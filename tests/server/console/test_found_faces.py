@@ -19,7 +19,7 @@ from server.services.keys import LOCAL, Caller
 from server.storage.records import CameraSize
 from server.storage.store import Store
 from server.tasks.child import ChildProcessPool, WorkerContext
-from tests.support.drawn_studio import LENS, drawn_studio, hidden_from, write_drawn_capture
+from tests.support.drawn_studio import LENS, drawn_studio, write_drawn_capture
 from tests.support.stored_captures import stored_files
 
 
@@ -81,16 +81,3 @@ def test_who_waits_too_long_is_told(
 def endless(context: WorkerContext, report: Progress, *, capture: str, images: dict[str, str]) -> None:
     """Work that does not listen, and takes longer than a test may."""
     time.sleep(600.0)
-
-
-def test_pictures_without_a_face_suggest_nothing(children: ChildProcessPool, tmp_path: Path) -> None:
-    service, capture = service_with(children, tmp_path)
-    from rig.formats.pictures.images import write_image
-
-    names = drawn_studio().names
-    blank = hidden_from(names, {name: np.zeros((LENS.height, LENS.width, 3), np.uint8) for name in names})
-    for name, picture in blank.items():
-        write_image(service.store.folder("captures", capture) / "files" / "images" / f"{name}.png", picture)
-    found = found_faces(service, capture)
-    assert found["suggested"] == {}
-    assert not any(found["faces"].values())

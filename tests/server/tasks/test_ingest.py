@@ -112,6 +112,7 @@ def test_an_upload_is_kept_under_its_cameras_names(tmp_path: Path) -> None:
     for path in sorted((folder / "images").iterdir()):
         write_image(folder / "masks" / f"{path.stem}.png.png", mask)
         write_image(folder / "images" / f"shot.0001.{path.stem}.BMP", read_image(path))
+        write_image(folder / "texture_sets" / "cross" / f"shot_{path.stem}.png", read_image(path))
         for number in (1, 2):
             shutil.copy(folder / "plates" / path.name, folder / "background" / f"{path.stem}_{number}.png")
         path.unlink()
@@ -119,20 +120,13 @@ def test_an_upload_is_kept_under_its_cameras_names(tmp_path: Path) -> None:
     content, kept = kept_of(folder, tmp_path)
     wanted = {"cameras.json"}
     for name in ("cam00", "cam01", "cam02"):
-        wanted |= {f"images/{name}.bmp", f"masks/{name}.png"}
+        wanted |= {f"images/{name}.bmp", f"masks/{name}.png", f"texture_sets/cross/{name}.png"}
         wanted |= {f"background/{name}/{name}_{number}.png" for number in (1, 2)}
     assert {*content.inputs} == wanted
     assert {path.relative_to(kept).as_posix() for path in kept.rglob("*") if path.is_file()} == wanted
-    assert {len(plates) for plates in read_capture(kept)[0].backgrounds.values()} == {2}
-
-
-def test_an_upload_keeps_its_texture_sets_under_the_cameras_names(tmp_path: Path) -> None:
-    folder = small_capture(tmp_path / "capture")
-    for path in sorted((folder / "images").iterdir()):
-        write_image(folder / "texture_sets" / "cross" / f"shot_{path.stem}.png", read_image(path))
-    content, kept = kept_of(folder, tmp_path)
-    assert {f"texture_sets/cross/cam0{number}.png" for number in range(3)} <= {*content.inputs}
-    assert set(read_capture(kept)[0].texture_sets["cross"]) == {"cam00", "cam01", "cam02"}
+    capture, _ = read_capture(kept)
+    assert {len(plates) for plates in capture.backgrounds.values()} == {2}
+    assert set(capture.texture_sets["cross"]) == {"cam00", "cam01", "cam02"}
 
 
 def test_texture_sets_of_an_upload_are_checked_before_they_are_decoded(tmp_path: Path) -> None:
