@@ -240,6 +240,7 @@ def test_nothing_that_is_there_is_overwritten_unasked(run: Run, tmp_path: Path) 
     done = run("simulate", capture)
     assert (done.status, done.err.count("\n")) == (1, 1)
     assert (capture / "cameras.json").is_file()
+    assert "holds no simulated studio" in run("simulate", capture, "--serve").err
 
 
 def test_a_damaged_picture_is_told_in_our_words_alone(tmp_path: Path) -> None:

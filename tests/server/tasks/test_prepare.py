@@ -68,9 +68,7 @@ def test_one_that_is_stopped_does_no_harm(folder: Path) -> None:
     assert prepare_kernels(lambda stage, share: None) == (0, 0, 2)
 
 
-def test_a_folder_that_cannot_be_written_is_said_in_one_line(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_folder_that_cannot_be_written_is_said_in_one_line(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     folder.parent.write_text("a file where the folder should be")
     with caplog.at_level(logging.WARNING):
         assert prepare_kernels(lambda stage, share: pytest.fail("compiles in vain")) == (0, 2, 2)

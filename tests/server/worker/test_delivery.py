@@ -179,9 +179,7 @@ def test_a_batch_delivers_each_of_its_results(client: httpx.Client, capture: str
     assert {*delivered(bucket, job["id"], "heads/batch/")} == NAMES | {"delivery.json"}
 
 
-def test_an_upload_with_its_job_says_where_to(
-    client: httpx.Client, bucket: Any, tmp_path: Path, service: RunningService
-) -> None:
+def test_an_upload_with_its_job_says_where_to(client: httpx.Client, bucket: Any, tmp_path: Path) -> None:
     files = {"file": packed_capture(tmp_path, 3).read_bytes()}
     away = client.post("/v1/reconstructions", files=files, data={"deliver_to": "s3://studio-out/"})
     assert (away.status_code, away.json()["type"]) == (422, "urn:eigenhead:problem:url-refused")

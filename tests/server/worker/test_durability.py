@@ -125,7 +125,9 @@ def test_real_heads_survive_kills_to_the_last_byte(total: int, kills: int, tmp_p
         service,
         client,
     ):
-        capture = client.post("/v1/captures", json={"seed": 1}).json()["id"]
+        shots = [client.post("/v1/captures", json={"seed": 1}).json() for _ in range(2)]
+        assert shots[0]["inputs"] == shots[1]["inputs"], "a seed is one subject"
+        capture = shots[0]["id"]
         settings = {"detail": "span", "outputs": {"surface": "head"}}
         first = submit(service, capture, 0, settings)
         undisturbed = files_of(await_state(client, first, ("succeeded", "failed"), 240))

@@ -131,11 +131,6 @@ def test_work_that_the_system_kills_is_done_again_and_with_less(worker: Worker, 
     assert [warning["code"] for warning in warnings_of(report)[2:]] == ["level-lowered"] * ("below" in mode)
 
 
-def test_a_job_without_a_report_ends_without_a_word(worker: Worker) -> None:
-    worker.outcomes.publish(JOB, "failed")
-    assert events_of(worker) == [{"state": "failed"}]
-
-
 def test_an_end_waits_for_the_database_and_is_written_once(worker: Worker) -> None:
     refused = list[int]()
 
@@ -178,20 +173,6 @@ def test_each_cause_has_its_kind(worker: Worker, error: BaseException, kind: str
 def test_what_is_no_failure_of_the_job_is_left_to_the_engine(worker: Worker) -> None:
     for error in (Cancelled(), OSError(5, "Input/output error"), KeyboardInterrupt()):
         assert worker._failure(error) is error
-
-
-def test_a_worker_is_one_row_however_often_its_heart_beats(worker: Worker) -> None:
-    with worker.engine.begin() as connection:
-        worker._beat()
-        rows = [connection.execute(sa.select(workers)).one()]
-    for _ in range(2):
-        worker._beat()
-    with worker.engine.connect() as connection:
-        rows += connection.execute(sa.select(workers)).all()
-    first, last = rows
-    assert (first.id, last.id, last.stopped) == (worker.id, worker.id, None)
-    assert last.seen >= first.seen
-    assert (last.queue, last.concurrency) == (worker.settings.queue, worker.settings.concurrency)
 
 
 @pytest.fixture
