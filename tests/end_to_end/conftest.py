@@ -1,14 +1,12 @@
 """What the tests in a browser share."""
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser
 
-from tests.support.browser import chromium
-from tests.support.services import ROOT
+from tests.support.browser import SCREENSHOTS, chromium
 
 
 @pytest.fixture(scope="module")
@@ -28,4 +26,4 @@ def browser(opened_browser: Browser) -> Iterator[Browser]:
 @pytest.fixture(scope="session")
 def screenshots() -> Path:
     """``make test-slow`` and CI keep them in out/screenshots."""
-    return Path(os.environ.get("EIGENHEAD_SCREENSHOTS") or ROOT / "out/screenshots")
+    return SCREENSHOTS

@@ -4,12 +4,14 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from tests.support.board_pictures import BoardPictures
 from tests.support.browser import LONG_MS, keep_screenshots, live_rate, visit
+from tests.support.services import RunningService
 from tests.support.shared_data import shared
 from tests.support.studio_pages import StudioPages, studio_pages
 
@@ -55,11 +57,15 @@ def test_a_rig_is_calibrated_and_captures(pages: StudioPages, board: BoardPictur
     describe_board(page)
     for taken, shot in enumerate(SHOTS, start=1):
         board.hold(studio, shot)
+        if taken == 2:
+            studio.inject(DeviceFault("hung", "cam_2"))  # a shot of the board may lack a camera
         page.locator("#shoot").click()
         for shown in (page, other.page):
             expect(shown.get_by_text("1 shot" if taken == 1 else f"{taken} shots", exact=True)).to_be_visible(
                 timeout=LONG_MS
             )
+        studio.clear()
+    check_shots(service)
     expect(other.page.get_by_label("Squares across")).to_have_value("4")
     expect(other.page.get_by_label("Squares across")).to_be_disabled()
     live = "c => c.width / c.height > 1.5"  # the cameras' shape, no longer the empty canvas's
@@ -73,6 +79,9 @@ def test_a_rig_is_calibrated_and_captures(pages: StudioPages, board: BoardPictur
     row = page.locator("[data-calibration]")
     expect(row).to_have_attribute("data-state", ENDED, timeout=LONG_MS)
     expect(row).to_have_attribute("data-state", "succeeded")
+    (made,) = httpx.get(service.url + "/v1/calibrations").json()["calibrations"]
+    assert made["figures"]["rms_px"] <= 1.1
+    assert 5 < made["pictures"]["cam_2"] < len(SHOTS) - 1 >= made["pictures"]["cam_3"]
     row.click()
     page.get_by_role("button", name="Use this").click()
     for shown in (page, other.page):
@@ -94,6 +103,15 @@ def test_a_rig_is_calibrated_and_captures(pages: StudioPages, board: BoardPictur
     keep_screenshots(page, screenshots, "rig-fault")
     v.check_clean()
     other.check_clean()
+
+
+def check_shots(service: RunningService) -> None:
+    """Of the board no head is made and no feature is picked."""
+    shots = httpx.get(service.url + "/v1/captures").json()["captures"]
+    assert [shot["board"] for shot in shots] == [True] * len(SHOTS)
+    assert httpx.post(service.url + "/v1/jobs", json={"capture_id": shots[0]["id"]}).status_code == 409
+    features = f"{service.url}/v1/captures/{shots[0]['id']}/features"
+    assert httpx.put(features, json={"points": {}}).status_code == 409
 
 
 def describe_board(page: Page) -> None:

@@ -4,7 +4,6 @@ import hashlib
 import os
 import re
 import shlex
-import subprocess
 import sys
 import tarfile
 from collections.abc import Iterator
@@ -13,6 +12,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from tests.support import fork_server
+from tests.support.attacks import add_keys
 from tests.support.services import ROOT, RunningService, running_service, small_capture
 
 GUIDE = ROOT / "docs" / "http.md"
@@ -56,8 +57,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService
 
 @pytest.fixture(scope="module")
 def key(service: RunningService) -> str:
-    command = [sys.executable, "-m", "server.cli", "keys", "add", "lab", "--data", str(service.data)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60).stdout.strip()
+    return add_keys(service, "read,capture,submit")[0]
 
 
 @pytest.fixture(scope="module")
@@ -69,9 +69,7 @@ def folder(service: RunningService, tmp_path_factory: pytest.TempPathFactory) ->
         block("sh").replace("$URL", service.url).replace("docs/client.yaml", f"{ROOT}/docs/client.yaml")
     )
     command[0] = str(Path(sys.executable).with_name("openapi-python-client"))
-    generated = subprocess.run(
-        [*command, "--fail-on-warning"], cwd=place, capture_output=True, text=True, timeout=120, check=False
-    )
+    generated = fork_server.run([*command, "--fail-on-warning"], 120.0, cwd=place)
     assert generated.returncode == 0, generated.stdout + generated.stderr
     with tarfile.open(place / "anna.tar", "w") as archive:
         archive.add(small_capture(place / "capture"), ".")
@@ -80,15 +78,7 @@ def folder(service: RunningService, tmp_path_factory: pytest.TempPathFactory) ->
 
 def run(code: str, folder: Path, service: RunningService, key: str) -> str:
     environment = os.environ | {"URL": service.url, "KEY": key, "no_proxy": "127.0.0.1", "PYTHONPATH": str(folder)}
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = fork_server.run([sys.executable, "-c", code], 120.0, cwd=folder, env=environment)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

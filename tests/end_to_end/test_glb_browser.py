@@ -13,6 +13,7 @@ import cv2
 import nicegui
 import numpy as np
 import pytest
+from playwright.sync_api import Browser, ViewportSize
 
 from pipeline.geometry.projection import picture
 from rig.camera import Camera, Intrinsics
@@ -20,17 +21,11 @@ from rig.formats.meshes.mesh_file import read_mesh
 from rig.formats.pictures.images import read_image
 from rig.geometry import look_at
 from rig.mesh import Mesh
+from tests.support.browser import Visit
 from tests.support.loopback import served
 from tests.support.shared_data import shared
 
 pytestmark = pytest.mark.slow
-CHROMIUM = "/usr/bin/chromium"
-FLAGS = [
-    "--no-sandbox",
-    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),  # WebGL without a GPU
-    *("--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync"),
-]
 SIZE, EYE_M = 400, (0.25, 0.05, 0.95)
 FIELDS_DEG = {"bust.glb": 20.0, "head.glb": 6.0}  # the whole head; from the mouth to the brows
 PAGE = """<!doctype html><link rel="icon" href="data:,"><body style="margin:0"><script type="module">
@@ -77,26 +72,14 @@ def site(tmp_path: Path) -> Iterator[tuple[Path, str]]:
         yield tmp_path, f"{url}/"
 
 
-def open_page(url: str, shot: Path, profile: Path) -> tuple[dict[str, Any], list[str]]:
-    """What the page found, and what the browser complained of; the picture goes to ``shot``."""
-    if not Path(CHROMIUM).exists():
-        pytest.skip("no chromium: apt-get install chromium")
-    from playwright.sync_api import sync_playwright
-
-    complaints: list[str] = []
-    with sync_playwright() as play:
-        browser = play.chromium.launch_persistent_context(
-            str(profile), executable_path=CHROMIUM, headless=True, args=FLAGS, viewport={"width": SIZE, "height": SIZE}
-        )
-        page = browser.new_page()
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("console", lambda entry: complaints.append(entry.text) if entry.type == "error" else None)
-        page.goto(url)
-        page.wait_for_function("window.found !== undefined", timeout=60_000)
-        found = page.evaluate("window.found")
-        page.screenshot(path=str(shot))
-        browser.close()
-    return found, complaints
+def open_page(browser: Browser, url: str, query: str, shot: Path) -> dict[str, Any]:
+    """What the page found, without a complaint of the browser; the picture goes to ``shot``."""
+    visited = Visit(browser.new_page(viewport=ViewportSize(width=SIZE, height=SIZE)), url)
+    visited.page.goto(url + query)
+    visited.page.wait_for_function("window.found !== undefined")
+    visited.page.screenshot(path=shot)
+    visited.check_clean()
+    return visited.page.evaluate("window.found")
 
 
 def our_drawing(mesh: Mesh, colours: np.ndarray, field_deg: float) -> np.ndarray:
@@ -111,7 +94,7 @@ def our_drawing(mesh: Mesh, colours: np.ndarray, field_deg: float) -> np.ndarray
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the command line makes of photographs of a real head."""
     out = tmp_path_factory.mktemp("result")
-    options = ["--out", str(out), "--detail", "span", "--formats", "glb,ply,obj"]
+    options = ["--out", str(out), "--detail", "span", "--formats", "glb,ply"]
     command = [sys.executable, "-m", "server.cli", "reconstruct", str(shared("data/captures/scan-a"))]
     subprocess.run([*command, *options], check=True, timeout=600)
     return out
@@ -119,16 +102,13 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("name", ["head.glb", "bust.glb"])
 @pytest.mark.timeout(900)
-def test_three_js_shows_the_head_as_we_do(
-    name: str, result: Path, site: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_three_js_shows_the_head_as_we_do(name: str, result: Path, site: tuple[Path, str], browser: Browser) -> None:
     folder, url = site
     shutil.copy(result / name, folder)
     shot = result / f"{name}.png"
-    found, complaints = open_page(f"{url}?{name}&{FIELDS_DEG[name]}", shot, tmp_path_factory.mktemp("profile"))
+    found = open_page(browser, url, f"?{name}&{FIELDS_DEG[name]}", shot)
     head, written = read_mesh(result / name), read_mesh((result / name).with_suffix(".ply"))
     head = Mesh(1000 * head.vertices, head.faces)
-    assert complaints == []
     assert found["meshes"] == 1
     assert found["triangles"] == len(head.faces)
     assert found["hasNormals"]
@@ -147,9 +127,3 @@ def test_three_js_shows_the_head_as_we_do(
     assert np.median(np.abs(even[0] - even[1])[core]) <= 2
     fine = [np.abs(cv2.Laplacian(image, cv2.CV_32F))[core].mean() for image in (seen, ours)]
     assert fine[0] > (1.1 if name == "head.glb" else 1.0) * fine[1]  # a bust's pixels are 2 mm wide
-
-
-def test_the_obj_on_request_is_the_world_mesh(result: Path) -> None:
-    requested, written = read_mesh(result / "head.obj"), read_mesh(result / "head.ply")
-    assert {"head.mtl", "head.png"} <= {path.name for path in result.iterdir()}
-    np.testing.assert_allclose(requested.vertices[requested.faces], written.vertices[written.faces], atol=1e-3)

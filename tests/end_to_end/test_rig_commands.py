@@ -65,21 +65,6 @@ def test_a_served_studio_is_checked_captured_and_closed(tmp_path: Path) -> None:
     assert set(eyes) == {"right", "left"}
 
 
-def test_a_folder_of_somebody_elses_is_not_overwritten(tmp_path: Path) -> None:
-    (tmp_path / "cameras.json").write_text("{}")
-    with pytest.raises(subprocess.CalledProcessError) as failed:
-        command("simulate", str(tmp_path), "--serve")
-    assert "holds no simulated studio" in failed.value.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["cameras.json"]
-
-
-def test_where_the_capture_goes_must_be_said_or_served(tmp_path: Path) -> None:
-    with pytest.raises(subprocess.CalledProcessError) as failed:
-        command("simulate")
-    assert failed.value.returncode == 2
-    assert "--serve" in failed.value.stderr
-
-
 @contextmanager
 def served_studio(folder: Path, *options: str) -> Iterator[dict[str, Any]]:
     """What ``--json`` prints once the studio is open. At the end it gets the signal of Ctrl-C and must end well."""

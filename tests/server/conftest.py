@@ -5,10 +5,12 @@ import subprocess
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+import httpx
 import pytest
 
 if TYPE_CHECKING:
     from tests.support.object_server import Network
+    from tests.support.services import RunningService
 
 
 @pytest.fixture(autouse=True)
@@ -26,12 +28,28 @@ def real_exec() -> None:
     """For tests of what the start of an interpreter does or costs."""
 
 
+@pytest.fixture
+def http(service: "RunningService") -> Iterator[httpx.Client]:
+    """A client of the file's or the room's service."""
+    with httpx.Client(base_url=service.url, timeout=120) as client:
+        yield client
+
+
 @pytest.fixture(scope="session")
 def object_server() -> Iterator[str]:
     from tests.support.object_server import running_object_server
 
     with running_object_server() as url:
         yield url
+
+
+@pytest.fixture(scope="module")
+def way(bucket: object, object_server: str) -> "Iterator[Network]":
+    """The way of a file's service to the server, on which the file's ``bucket`` is."""
+    from tests.support.object_server import network_before
+
+    with network_before(object_server) as network:
+        yield network
 
 
 @pytest.fixture

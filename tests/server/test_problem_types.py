@@ -22,7 +22,6 @@ KIND_IN = {
     **{kind.__name__: 0 for kind in Refused.__subclasses__() if kind is not NotFound},
 }
 """Where the type stands among the arguments."""
-NOT_RAISED_IN_JOBS = ("server",)
 
 
 def test_every_type_that_the_service_gives_is_in_the_table_and_no_other_is() -> None:
@@ -34,15 +33,10 @@ def test_every_type_that_the_service_gives_is_in_the_table_and_no_other_is() -> 
 def test_every_error_that_may_end_a_job_has_its_type() -> None:
     for package in (calibration, pipeline, rig.formats, rig.render):
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
-            if not module.name.startswith(NOT_RAISED_IN_JOBS):
-                importlib.import_module(module.name)
+            importlib.import_module(module.name)
     classes = {kind for kind in _descendants(EigenheadError) if not issubclass(kind, InputError | Cancelled)}
     rooms = ("calibration.", "pipeline.", "rig.formats.", "rig.render.")
-    found = {
-        kind.__name__
-        for kind in classes
-        if kind.__module__.startswith(rooms) and not kind.__module__.startswith(NOT_RAISED_IN_JOBS)
-    }
+    found = {kind.__name__ for kind in classes if kind.__module__.startswith(rooms)}
     assert found - FAILURE_TYPES.keys() == set()
     assert FAILURE_TYPES.keys() - found == {
         *("EigenheadError", "ShotFailed"),

@@ -13,6 +13,7 @@ from rig.progress import Progress
 from server.processes import process_identity, process_started, python_command, python_environment
 from server.tasks.child import Child, WorkerContext
 from server.tasks.egl import try_egl
+from tests.support import fork_server
 from tests.support.hostile_folder import hostile_folder
 from tests.support.services import ROOT, await_true
 
@@ -35,17 +36,14 @@ def test_a_child_imports_nothing_from_the_working_directory_or_pythonpath(marker
     assert not marker.exists()
 
 
-def test_a_worker_starts_beside_foreign_packages(marker: Path) -> None:
-    command = python_command("cli", "worker", "--help")
-    done = subprocess.run(command, env=python_environment(), capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    assert not marker.exists()
-
-
-def test_the_command_of_the_checkout_runs_beside_foreign_packages(marker: Path) -> None:
-    command = Path(sys.executable).with_name("eigenhead")
-    done = subprocess.run([command, "--help"], capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
+def test_a_worker_and_the_checkouts_command_start_beside_foreign_packages(marker: Path) -> None:
+    commands = (
+        (python_command("cli", "worker"), python_environment()),
+        ([Path(sys.executable).with_name("eigenhead")], None),
+    )
+    for command, environment in commands:
+        done = fork_server.run([*command, "--help"], 120.0, env=environment)
+        assert done.returncode == 0, done.stderr
     assert not marker.exists()
 
 

@@ -86,8 +86,9 @@ def silent_connections(
         yield opened
 
 
-def client(service: RunningService, key: str, timeout_s: float = 60.0) -> httpx.Client:
-    return httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {key}"}, timeout=timeout_s)
+def client(service: RunningService, key: str | None, timeout_s: float = 60.0) -> httpx.Client:
+    headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+    return httpx.Client(base_url=service.url, headers=headers, timeout=timeout_s)
 
 
 def half_body(path: str, key: str | None = None) -> bytes:
@@ -216,24 +217,18 @@ def spoiled_capture(folder: Path, change: Callable[[Path], None]) -> bytes:
 
 def slow_capture(folder: Path) -> bytes:
     """A capture whose check takes one process half a minute and more: a PNG of 4,000,000 chunks."""
-
-    def change(folder: Path) -> None:
-        picture = folder / "images" / "cam00.png"
-        picture.write_bytes(png_of_chunks(picture.read_bytes(), 4_000_000))
-
-    return spoiled_capture(folder, change)
+    picture = small_capture(folder) / "images" / "cam00.png"
+    picture.write_bytes(png_of_chunks(picture.read_bytes(), 4_000_000))
+    return packed(folder)
 
 
 def heavy_capture(folder: Path, segment: int = 65_533) -> bytes:
     """A capture with 60 MB of EXIF in a picture."""
-
-    def change(folder: Path) -> None:
-        picture = folder / "images" / "cam00.png"
-        jpeg = cv2.imencode(".jpg", np.zeros((24, 24, 3), np.uint8))[1].tobytes()
-        picture.with_suffix(".jpg").write_bytes(jpeg_with_metadata(jpeg, 60, segment))
-        picture.unlink()
-
-    return spoiled_capture(folder, change)
+    picture = small_capture(folder) / "images" / "cam00.png"
+    jpeg = cv2.imencode(".jpg", np.zeros((24, 24, 3), np.uint8))[1].tobytes()
+    picture.with_suffix(".jpg").write_bytes(jpeg_with_metadata(jpeg, 60, segment))
+    picture.unlink()
+    return packed(folder)
 
 
 def add_keys(service: RunningService, *scopes: str) -> list[str]:

@@ -29,6 +29,7 @@ SIZES = {"1366x768": (1366, 768), "3840x2160": (3840, 2160)}
 WIDTHS = {"1440": (1440, 900), "1024": (1024, 768), "390": (390, 844)}  # a desk, a tablet, a telephone
 LONG_MS = 600_000  # a reconstruction on a machine that is eight times slower
 WAIT_MS = 60_000  # whatever a page does at once, on a machine that is eight times slower
+SCREENSHOTS = Path(os.environ.get("EIGENHEAD_SCREENSHOTS") or Path(__file__).parents[2] / "out/screenshots")
 PATHS = ("/", "/subjects", "/captures", "/features", "/jobs", "/batches", "/result", "/calibration", "/service")
 
 expect.set_options(timeout=WAIT_MS)
@@ -91,9 +92,8 @@ class Visit:
         assert [address for address in self.addresses if not address.startswith(inside)] == []
 
 
-def visit(browser: Browser, base: str, size: str = "1366x768") -> Visit:
-    width, height = SIZES[size]
-    window = ViewportSize(width=width, height=height)
+def visit(browser: Browser, base: str) -> Visit:
+    window = ViewportSize(width=1366, height=768)
     context = browser.new_context(viewport=window, accept_downloads=True, color_scheme="dark")
     return Visit(context.new_page(), base)
 

@@ -133,15 +133,20 @@ def served_client(data: Path, **settings: Any) -> Iterator[tuple[RunningService,
 
 
 def worker_pids(service: RunningService) -> list[int]:
-    """Worker processes of a service's data folder, told by their environment."""
+    """Worker processes of a service's data folder."""
+    return pids_of(service, lambda words: b"worker" in words)
+
+
+def pids_of(service: RunningService, fits: Callable[[list[bytes]], bool]) -> list[int]:
+    """Processes of a service's data folder, told by their environment, whose command fits."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
-            command = (folder / "cmdline").read_bytes()
-            environment = (folder / "environ").read_bytes()
+            command, environment = ((folder / name).read_bytes() for name in ("cmdline", "environ"))
         except OSError:
             continue
-        if b"\0worker\0" in command and f"EIGENHEAD_DATA={service.data}\0".encode() in environment + b"\0":
+        ours = f"EIGENHEAD_DATA={service.data}\0".encode() in environment + b"\0"
+        if ours and fits(command.rstrip(b"\0").split(b"\0")):
             found.append(int(folder.name))
     return found
 
@@ -217,3 +222,20 @@ def stored(service: RunningService) -> list[str]:
 
 def upload(http: httpx.Client, data: bytes, path: str = "/v1/captures/uploads", **fields: str) -> httpx.Response:
     return http.post(path, files={"file": ("capture.tar", data)}, data=fields)
+
+
+def imported(service: RunningService, url: str) -> httpx.Response:
+    return httpx.post(service.url + "/v1/captures/imports", json={"url": url, "label": "Anna"}, timeout=60)
+
+
+def kill_workers(service: RunningService) -> None:
+    for pid in worker_pids(service):
+        os.kill(pid, signal.SIGKILL)
+
+
+def made_head(http: httpx.Client, folder: Path, seed: int = 0, **fields: str) -> str:
+    """The job that made a head of a small capture."""
+    capture = upload(http, packed_capture(folder, seed).read_bytes(), **fields).json()["id"]
+    job = http.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
+    await_state(http, job, ("succeeded",))
+    return job

@@ -1,7 +1,5 @@
 """What holds on every page: it can be read and used, needs a key where one is set, and outlives its service."""
 
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import httpx
@@ -102,23 +100,6 @@ def narrow_faults(page: Page, picture: Path) -> list[str]:
     hidden = active["x"] < 0 or active["x"] + active["width"] > TELEPHONE["width"] + 1
     found = ["the bar of pages does not show where one is"] * hidden
     return [*found, *page.evaluate(UNREACHABLE), *violations(page)]
-
-
-def test_the_first_page_shows_the_rig_and_may_capture(
-    browser: Browser, service: RunningService, record_property: Callable[[str, object], None]
-) -> None:
-    """The best of three fresh browsers is a figure, whose aim is 2 s; it is not asserted, since the slow tests run two
-    at a time."""
-    took = []
-    for _ in range(3):
-        v = visit(browser, service.url)
-        began = time.monotonic()
-        v.go("/")
-        expect(v.page.locator("article.tile")).to_have_count(11)
-        expect(v.page.locator("#capture")).to_be_enabled()
-        took.append(time.monotonic() - began)
-        v.page.context.close()
-    record_property("seconds to the first page", round(min(took), 2))
 
 
 def test_a_page_comes_back_after_the_service_was_killed(

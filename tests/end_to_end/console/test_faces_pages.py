@@ -1,7 +1,6 @@
 """Faces in a real browser: over the pictures, in the verdict, and as suggestions for the feature points."""
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -17,12 +16,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 SLOW_MS = 240_000  # a machine that does other things, too
 HIDDEN = "cam04"  # 40 degrees beside the front; what it shows is its clean plate
-
-
-@pytest.fixture
-def service(tmp_path: Path) -> Iterator[RunningService]:
-    with running_service(tmp_path / "data", console="true") as running:
-        yield running
 
 
 def uploaded(service: RunningService, folder: Path, name: str, *, hidden: str = "") -> dict:

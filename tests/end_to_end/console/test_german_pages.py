@@ -9,10 +9,9 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from rig.messages.message import compose, documents_of, verbatim
 from tests.end_to_end.console.test_every_page import fill
 from tests.support.browser import Visit, violations, visit
-from tests.support.services import RunningService, await_state, packed_capture, running_service
+from tests.support.services import RunningService, made_head, running_service
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -94,9 +93,7 @@ def test_a_persons_heads_fit_in_german(browser: Browser, screenshots: Path, tmp_
         client = httpx.Client(base_url=running.url, timeout=60)
         session = client.post("/v1/sessions", json={"label": "Anna"}).json()["id"]
         for seed in range(2):
-            file = {"file": packed_capture(tmp_path, seed).read_bytes()}
-            capture = client.post("/v1/captures/uploads", files=file, data={"session": session}).json()["id"]
-            await_state(client, client.post("/v1/jobs", json={"capture_id": capture}).json()["id"], ("succeeded",))
+            made_head(client, tmp_path, seed, session=session)
         v = german(browser, running)
         page = v.go("/result")
         page.wait_for_selector("canvas[data-loaded$=head]")
@@ -144,18 +141,6 @@ def test_pages_and_what_the_service_tells_are_in_the_browsers_language_until_one
     page.locator("#reconstruct").click()
     expect(page.get_by_text("ist eingereiht. Zu verfolgen auf der Seite Aufträge.")).to_be_visible()
     expect(page.get_by_text("GB frei")).to_be_visible()
-    messages = [
-        compose("disk-free", free_gb=12.34, spare_gb=2),
-        verbatim("nobody translates what a camera's maker says"),
-    ]
-    say = "(told) => import('/console/static/language.js').then(({ say }) => told.map((message) => say(message)))"
-    assert page.evaluate(say, documents_of(messages)) == [
-        "12,3 GB frei; Hochladen und Aufträge lassen 2,0 GB übrig",
-        "nobody translates what a camera's maker says",
-    ]
-    shots = "[0, 1, 2].map((count) => say('{count} shot | {count} shots', { count }))"
-    counted = page.evaluate(f"import('/console/static/language.js').then(({{ say }}) => {shots})")
-    assert counted == ["0 Aufnahmen", "1 Aufnahme", "2 Aufnahmen"]
     v.check_clean()
 
 

@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.support.ball_results import RADIUS_MM
 from tests.support.browser import Visit, keep_screenshots, keep_widths, visit
-from tests.support.services import RunningService, await_state, await_true, packed_capture, running_service
+from tests.support.services import RunningService, await_state, await_true, made_head, running_service
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -33,10 +33,7 @@ def heads(tmp_path: Path) -> Iterator[RunningService]:
         client = httpx.Client(base_url=running.url, timeout=60)
         sessions = {n: client.post("/v1/sessions", json={"label": n}).json()["id"] for n in ("Anna", "Bert")}
         for seed, name in enumerate(("Bert", "Anna", "Anna")):
-            file = {"file": packed_capture(tmp_path, seed).read_bytes()}
-            capture = client.post("/v1/captures/uploads", files=file, data={"session": sessions[name]}).json()["id"]
-            job = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
-            await_state(client, job, ("succeeded",))
+            made_head(client, tmp_path, seed, session=sessions[name])
         yield running
 
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import httpx
 
-from tests.server.worker.test_durability import pinned_worker
+from tests.server.worker.test_durability import own_worker
 from tests.support.attacks import (
     ATTACKER,
     Witness,
@@ -198,7 +198,7 @@ def starve_worker(field: Field) -> Seen:
     with served_client(field.folder / "little", worker=False, work=work) as (service, http):
         capture = http.post("/v1/captures", json={"seed": 1}).json()["id"]
         job = http.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
-        with pinned_worker(service) as process:
+        with own_worker(service) as process:
             (group / "cgroup.procs").write_text(str(process.pid))
             ended = await_state(http, job, ("succeeded", "failed"), 600)
     group.rmdir()

@@ -30,20 +30,11 @@ def shots(tmp_path: Path) -> Path:
     small_capture(folder / "packed")
     pack_folder(folder / "packed", folder / "carl.tar.gz")
     (folder / "packed").rename(tmp_path / "elsewhere")
-    (folder / "photos").mkdir()
-    for picture in ("a.jpg", "b.jpg", "c.jpg"):
-        (folder / "photos" / picture).write_bytes(b"")
-    (folder / "notes").mkdir()
-    (folder / "notes" / "lamp.jpg").write_bytes(b"")
-    (folder / "anna.truth").mkdir()
-    (folder / "anna.truth" / "cameras.json").write_text("{}")
-    (folder / "background").mkdir()
-    for picture in ("a.png", "b.png", "c.png"):
-        (folder / "background" / picture).write_bytes(b"")
-    (folder / "old-result" / "overlays").mkdir(parents=True)
-    (folder / "old-result" / "report.json").write_text("{}")
-    (folder / ".hidden").mkdir()
-    (folder / ".hidden" / "cameras.json").write_text("{}")
+    pictures = [f"{place}/{name}.jpg" for place in ("photos", "background") for name in "abc"]
+    documents = ["anna.truth/cameras.json", ".hidden/cameras.json", "old-result/report.json"]
+    for name in (*pictures, *documents, "notes/lamp.jpg", "old-result/overlays/cam00.png"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("{}")
     return folder
 
 

@@ -5,28 +5,21 @@ from pathlib import Path
 
 import pytest
 
-from rig.errors import Cancelled, EigenheadError, InputError
+from rig.errors import Cancelled, EigenheadError
 from rig.messages.message import compose
 from server.batch.folder import Origin
 from server.batch.run import failure_of
 from server.tasks.child import WorkFailed
 
 ORIGIN = Origin("", "", "", "")
-
-
-def crash(how: str, kind: str = "crash", **number: int) -> WorkFailed:
-    return WorkFailed(kind, compose("work-crashed", how=compose(how, **number)))
+STATUS = compose("ended-with-status", status=9)
 
 
 @pytest.mark.parametrize(
     ("error", "origin", "kind", "words"),
     [
-        (InputError("capture", [compose("settings-no-table")]), ORIGIN, "input", "is no table of settings"),
         (Cancelled(), ORIGIN, "refused", "cancelled"),
-        (crash("ended-by-signal", "killed", number=9), ORIGIN, "crash", "fewer --workers"),
-        (crash("ended-by-signal", number=11), ORIGIN, "crash", "signal 11"),
-        (crash("ended-with-status", status=9), ORIGIN, "crash", "status 9"),
-        (WorkFailed("out-of-memory", compose("out-of-memory")), ORIGIN, "out-of-memory", "fewer --workers"),
+        (WorkFailed("crash", compose("work-crashed", how=STATUS)), ORIGIN, "crash", "status 9"),
         (WorkFailed("disk-full", compose("disk-full")), ORIGIN, "disk-full", "make room and run the batch again"),
         (OSError(errno.ENOSPC, "No space left"), ORIGIN, "disk-full", "make room"),
         (OSError(errno.EACCES, "Permission denied", "/x"), ORIGIN, "unwritable", "/x cannot be written (Permission"),
@@ -37,9 +30,3 @@ def test_kind_and_words(error: EigenheadError | OSError, origin: Origin | None, 
     failure = failure_of(error, Path("shots/anna"), origin)
     assert (failure.kind, failure.origin) == (kind, origin)
     assert words in failure.message.text
-
-
-def test_faults_and_traces_are_kept() -> None:
-    fault = compose("settings-no-table")
-    assert failure_of(InputError("x", [fault]), Path(), ORIGIN).faults == (fault,)
-    assert failure_of(WorkFailed("bug", "boom", (), "line 3"), Path(), ORIGIN).trace == "line 3"

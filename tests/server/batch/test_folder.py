@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from rig.messages.message import compose
 from server.batch.captures import WHOLE, Shard
-from server.batch.folder import BatchFolder, FailureRecord, ForeignFiles, Origin, ShareTaken, file_name
+from server.batch.folder import BatchFolder, Origin, file_name
 
 ORIGIN = Origin("11" * 32, "22" * 32, "33" * 32, "0.1.0")
 
@@ -62,39 +61,10 @@ def test_a_new_result_takes_the_place_of_the_old_one_as_a_whole(folder: BatchFol
     assert not (folder.result("anna") / "head.obj").exists()
 
 
-def test_of_two_who_publish_the_second_is_refused(folder: BatchFolder) -> None:
-    """Where both found nothing there; a folder with files is never replaced by a rename."""
-    first, second = folder.new_attempt(Shard(1, 2)), folder.new_attempt(Shard(2, 2))
-    for attempt in (first, second):
-        (attempt / "result" / "report.json").write_text("{}")
-    folder.publish("anna", first, ORIGIN)
-    with pytest.raises(OSError, match="not empty"):
-        (second / "result").rename(folder.result("anna"))
-
-
-def test_files_of_nobody_stop_a_replacement(folder: BatchFolder) -> None:
-    publish(folder, "anna")
-    folder.check_replaceable("anna")
-    folder.check_replaceable("nobody")
-    (folder.result("anna") / "notes.txt").write_text("mine")
-    with pytest.raises(ForeignFiles, match=r"contains files that are no results \(notes.txt\)"):
-        publish(folder, "anna", b"another")
-    assert (folder.result("anna") / "head.ply").read_bytes() == b"mesh"
-
-
 def test_the_version_is_no_reason_to_make_a_head_again() -> None:
     assert ORIGIN.is_of(replace(ORIGIN, version="0.2.0"))
     for other in ("input_sha256", "settings_sha256", "model_sha256"):
         assert not ORIGIN.is_of(replace(ORIGIN, **{other: "44" * 32}))
-
-
-def test_a_failure_is_kept_until_the_capture_is_done(folder: BatchFolder) -> None:
-    failure = FailureRecord("input", compose("batch-list-empty"), (compose("settings-no-table"),), ORIGIN)
-    folder.note_failure("anna", failure)
-    assert folder.failure("anna") == failure
-    assert folder.failure("bert") is None
-    publish(folder, "anna")
-    assert folder.failure("anna") is None
 
 
 def test_attempts_of_ended_shares_and_empty_folders_go(folder: BatchFolder) -> None:
@@ -108,13 +78,6 @@ def test_attempts_of_ended_shares_and_empty_folders_go(folder: BatchFolder) -> N
         (folder.work / "1-of-2.lock").touch()
     assert not dead.exists()
     assert not folder.work.exists()
-
-
-def test_a_share_is_of_one_process(folder: BatchFolder) -> None:
-    with folder.share(WHOLE), pytest.raises(ShareTaken, match="share 1/1"), folder.share(WHOLE):
-        pass
-    with folder.share(WHOLE):
-        pass
 
 
 def test_file_names_are_short_readable_and_apart() -> None:

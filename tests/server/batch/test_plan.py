@@ -10,7 +10,6 @@ from pipeline.applications.templates.header import UnknownTemplate
 from pipeline.head_model.model_names import UnknownModel, model_path, model_sha256
 from pipeline.settings import document_from_settings, settings_from_document
 from rig.errors import InputError
-from rig.messages.message import texts_of
 from server.batch.captures import BatchCapture
 from server.batch.plan import plan_batch
 
@@ -36,15 +35,6 @@ def test_the_hash_is_of_what_the_settings_mean() -> None:
     assert plain.settings_sha256 == written.settings_sha256
     again = document_from_settings(settings_from_document(json.loads(json.dumps(plain.settings))))
     assert again == plain.settings
-
-
-def test_wrong_settings_are_named_with_their_captures() -> None:
-    captures = [capture("anna", detial="photo"), capture("bert"), capture("carl", detail="deep", front=3)]
-    with pytest.raises(InputError) as caught:
-        plan_batch(captures, {}, None)
-    faults = texts_of(caught.value.faults)
-    assert [fault.partition(":")[0] for fault in faults] == ["anna", "carl", "carl"]
-    assert "detail" in faults[0]
 
 
 def test_what_is_wrong_for_all_is_said_once() -> None:

@@ -9,9 +9,8 @@ from pipeline.head_model.landmarks import NAMES
 from pipeline.head_model.model_file import expression_names
 from pipeline.head_model.model_names import model_path
 from rig.digest import document_sha256
-from rig.messages.message import compose
 from server.batch.captures import BatchCapture
-from server.batch.folder import FailureRecord, Origin
+from server.batch.folder import Origin
 from server.batch.table import (
     ORIGIN,
     QUALITY,
@@ -47,16 +46,6 @@ def test_a_head_is_a_row() -> None:
     assert row["expression_jawOpen"] == report["expression"][0]["weight"]
     assert (row["expression_mouthSmileLeft"], row["expression_mouthSmileLeft_std"]) == (0.0, None)
     assert row["seconds"] == 1.5
-
-
-def test_what_failed_and_what_is_missing_have_rows_too() -> None:
-    failure = FailureRecord("crash", compose("batch-worker-killed"), (), FROM)
-    failed = row_of(Outcome(CAPTURE, Path(), "", failure=failure), COLUMNS)
-    assert (failed["state"], failed["failure_kind"]) == ("failed", "crash")
-    assert "fewer --workers" in str(failed["failure"])
-    missing = row_of(Outcome(BatchCapture("bert", Path()), Path(), ""), COLUMNS)
-    assert {name for name, value in missing.items() if value is not None} == {"capture", "state"}
-    assert missing["state"] == "missing"
 
 
 def test_each_value_is_of_its_columns_kind_and_lengths_say_their_unit() -> None:

@@ -9,9 +9,7 @@ from typing import Any
 import pyarrow.parquet
 import pytest
 
-from pipeline.head_model.model_file import expression_names
-from pipeline.head_model.model_names import model_path
-from server.batch.table import Column, Row, columns_of, csv_bytes, has_parquet, parquet_bytes, write_table
+from server.batch.table import Column, Row, csv_bytes, has_parquet, parquet_bytes, write_table
 
 COLUMNS = (
     Column("capture", "text", "", "its name"),
@@ -43,34 +41,6 @@ def test_parquet_has_types_units_and_no_value_where_there_is_none() -> None:
     assert [str(field.type) for field in table.schema] == ["string", "double", "int64", "bool"]
     assert table.schema.field("nose_length_mm").metadata == {b"unit": b"mm", b"description": b"a length"}
     assert parquet_bytes(COLUMNS, ROWS) == data
-
-
-def test_every_column_of_a_heads_table_has_its_unit_and_words_in_the_schema() -> None:
-    """As arrow::read_parquet of R and pandas have them: both read by the schema that is tested here."""
-    columns = columns_of(expression_names(model_path("default")))
-    schema = pyarrow.parquet.read_schema(io.BytesIO(parquet_bytes(columns, [])))
-    assert schema.names == [column.name for column in columns]
-    said = [(field.metadata[b"unit"].decode(), field.metadata[b"description"].decode()) for field in schema]
-    assert said == [(column.unit, column.words) for column in columns]
-    assert {str(field.type) for field in schema} == {"string", "double", "int64", "bool"}
-
-
-def test_pandas_opens_both_files(tmp_path: Path) -> None:
-    pandas = pytest.importorskip("pandas", reason="pandas is not installed: pip install pandas")
-    write_table(tmp_path, COLUMNS, ROWS)
-    parquet = pandas.read_parquet(tmp_path / "heads.parquet")
-    written = pandas.read_csv(tmp_path / "heads.csv")
-    for frame in (parquet, written):
-        assert [*frame.columns] == [column.name for column in COLUMNS]
-        assert frame["nose_length_mm"].dtype == "float64"
-        assert [*frame["nose_length_mm"].dropna()] == [0.1 + 0.2, 1e-9]
-        assert [*frame["warning_count"].dropna()] == [3, 0]
-        assert [*frame["capture"]] == ['anna, "A"\nlate', "bert", "Ä\\udcff"]
-
-
-def test_a_table_of_nothing_has_its_columns() -> None:
-    assert csv_bytes(COLUMNS, []) == b"capture,nose_length_mm,warning_count,pose_doubtful\r\n"
-    assert pyarrow.parquet.read_table(io.BytesIO(parquet_bytes(COLUMNS, []))).num_columns == 4
 
 
 def test_without_pyarrow_there_is_the_csv_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

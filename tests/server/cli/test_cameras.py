@@ -13,9 +13,8 @@ from typer.testing import CliRunner
 
 from calibration.board.board import board_poses, photograph_board, write_board
 from rig.formats.cameras.cameras_file import FOLDER_FORMATS, FORMATS, write_rig_file
-from rig.formats.cameras.cameras_json import read_rig, write_rig
+from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.pictures.images import write_image
-from server.cli.answers import CannotWrite
 from server.cli.main import app
 from server.http.schemas import NewCalibration
 from tests.server.cli.test_main import run
@@ -69,45 +68,6 @@ def test_faults_of_scale_json_end_it_before_the_work(tmp_path: Path) -> None:
     assert not (tmp_path / "cameras.json").exists()
 
 
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ((), "--board"),
-        (("--from", "sky"), "'sky' is not one of 'board', 'scene'"),
-        (("--from", "scene", "--lenses", "two"), "'two' is not one of 'one', 'each'"),
-        (("--from", "scene", "--board", "{file}"), "is for a board"),
-        (("--scale", "{file}"), "is for --from scene"),
-    ],
-)
-def test_options_that_do_not_go_together_are_wrong_usage(tmp_path: Path, options: tuple[str, ...], text: str) -> None:
-    (tmp_path / "file").write_text("")
-    arguments = [option.format(file=tmp_path / "file") for option in options]
-    done = run("calibrate", str(tmp_path), "--out", str(tmp_path / "cameras.json"), *arguments)
-    assert done.returncode == 2
-    assert text in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("kind", "out", "text"),
-    [
-        ("eigenhead", "file/cameras.json", "cannot be written"),
-        ("eigenhead", "folder", "it is a folder"),
-        ("colmap", "file", "it is a file, and a folder is written"),
-        ("colmap", "file/sparse", "cannot be written"),
-    ],
-)
-def test_a_place_where_no_cameras_can_be_written_is_named(tmp_path: Path, kind: str, out: str, text: str) -> None:
-    (tmp_path / "file").write_text("")
-    (tmp_path / "folder").mkdir()
-    write_rig(wedge_rig(), tmp_path / "cameras.json")
-    done = CliRunner().invoke(
-        app, ["convert", str(tmp_path / "cameras.json"), "--to", kind, "--out", str(tmp_path / out)]
-    )
-    assert isinstance(done.exception, CannotWrite)
-    assert str(done.exception).startswith(f"{tmp_path / out} ")
-    assert text in str(done.exception)
-
-
 def test_cameras_that_take_no_part_are_told_where_a_file_is_converted(tmp_path: Path) -> None:
     write_rig_file(wedge_rig(), tmp_path / "rig.xml", "metashape")
     text = (tmp_path / "rig.xml").read_text()
@@ -123,13 +83,6 @@ def test_formats_of_several_files_are_told_from_those_of_one(tmp_path: Path) -> 
     for kind in FORMATS:
         write_rig_file(wedge_rig(), tmp_path / kind, kind)
         assert (tmp_path / kind).is_dir() == (kind in FOLDER_FORMATS), kind
-
-
-def test_a_board_is_written_as_pdf_alone(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["board", "--out", str(tmp_path / "b.xyz")])
-    assert done.exit_code == 2
-    assert "'.xyz': a board is written as .pdf" in " ".join(done.stderr.replace("│", " ").split())
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_one_board_is_the_default_of_command_page_and_documents(tmp_path: Path) -> None:

@@ -30,13 +30,15 @@ from tests.server.tasks.test_ingest import kept_of
 from tests.support.services import small_capture
 from tests.support.silhouette_subjects import dressed_head
 
+Shot = tuple[Capture, Rig]
+
 
 def found_in(capture: Path, **settings: object) -> dict[str, Any]:
     return checked(capture, settings, report=lambda stage, share: None)
 
 
 @pytest.fixture(scope="module")
-def masked(renderer: Renderer) -> tuple[Capture, Rig]:
+def masked(renderer: Renderer) -> Shot:
     """A bare head's masks at half size, and pictures that differ: noise."""
     rig, rng = default_layout().scaled(0.5), np.random.default_rng(2)
     vertices, faces, pose = dressed_head(load_model(), rig, rng, 60, bare=True)
@@ -65,7 +67,7 @@ def test_every_fault_is_told_at_once_and_is_status_2(tmp_path: Path) -> None:
 
 
 @pytest.mark.gl
-def test_a_good_capture_is_nothing_to_speak_of(masked: tuple[Capture, Rig], tmp_path: Path) -> None:
+def test_a_good_capture_is_nothing_to_speak_of(masked: Shot, tmp_path: Path) -> None:
     write_capture(tmp_path / "good", *masked)
     done = run("check", str(tmp_path / "good"), "--json")
     assert done.returncode == 0
@@ -85,7 +87,7 @@ def test_a_good_capture_is_nothing_to_speak_of(masked: tuple[Capture, Rig], tmp_
     ],
 )
 def test_a_camera_whose_pictures_are_turned_is_named(
-    masked: tuple[Capture, Rig], name: str, turn: Callable[[np.ndarray], np.ndarray], word: str, tmp_path: Path
+    masked: Shot, name: str, turn: Callable[[np.ndarray], np.ndarray], word: str, tmp_path: Path
 ) -> None:
     capture, rig = masked
     images, masks = ({**of, name: np.ascontiguousarray(turn(of[name]))} for of in (capture.images, capture.masks))
@@ -95,9 +97,7 @@ def test_a_camera_whose_pictures_are_turned_is_named(
 
 
 @pytest.mark.gl
-def test_outlines_name_exchanged_pictures_as_a_warning_or_as_a_fault(
-    masked: tuple[Capture, Rig], tmp_path: Path
-) -> None:
+def test_outlines_name_exchanged_pictures_as_a_warning_or_as_a_fault(masked: Shot, tmp_path: Path) -> None:
     capture, rig = masked
     write_capture(tmp_path / "shot", reassign_images(capture, pictures={"cam02": "cam07", "cam07": "cam02"}), rig)
     found = found_in(tmp_path / "shot")
@@ -108,9 +108,7 @@ def test_outlines_name_exchanged_pictures_as_a_warning_or_as_a_fault(
 
 
 @pytest.mark.gl
-def test_mirrored_pictures_are_refused_by_an_upload_in_the_same_words(
-    masked: tuple[Capture, Rig], tmp_path: Path
-) -> None:
+def test_mirrored_pictures_are_refused_by_an_upload_in_the_same_words(masked: Shot, tmp_path: Path) -> None:
     capture, rig = masked
     kinds = capture.images, capture.masks
     images, masks = ({name: np.ascontiguousarray(p[:, ::-1]) for name, p in of.items()} for of in kinds)
@@ -132,7 +130,7 @@ HARMS = {
 
 @pytest.mark.gl
 @pytest.mark.parametrize("words", HARMS)
-def test_one_bad_picture_costs_a_view_and_is_named(masked: tuple[Capture, Rig], words: str, tmp_path: Path) -> None:
+def test_one_bad_picture_costs_a_view_and_is_named(masked: Shot, words: str, tmp_path: Path) -> None:
     """By check, upload and job alike; with ``--strict`` it costs the capture."""
     folder = tmp_path / "shot"
     write_capture(folder, *masked)
@@ -166,7 +164,7 @@ def test_a_capture_of_too_few_good_pictures_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.gl
-def test_a_key_that_nobody_reads_is_a_warning(masked: tuple[Capture, Rig], tmp_path: Path) -> None:
+def test_a_key_that_nobody_reads_is_a_warning(masked: Shot, tmp_path: Path) -> None:
     write_capture(tmp_path / "shot", *masked)
     path = tmp_path / "shot" / "cameras.json"
     document = json.loads(path.read_text())
@@ -178,7 +176,7 @@ def test_a_key_that_nobody_reads_is_a_warning(masked: tuple[Capture, Rig], tmp_p
 
 
 @pytest.mark.gl
-def test_unread_cameras_are_warnings_and_a_scale_is_read(masked: tuple[Capture, Rig], tmp_path: Path) -> None:
+def test_unread_cameras_are_warnings_and_a_scale_is_read(masked: Shot, tmp_path: Path) -> None:
     capture, rig = masked
     folder = tmp_path / "shot"
     write_capture(folder, capture, rig)
@@ -197,9 +195,7 @@ def test_unread_cameras_are_warnings_and_a_scale_is_read(masked: tuple[Capture, 
 
 
 @pytest.mark.gl
-def test_a_chart_that_no_plate_shows_is_a_warning_where_one_is_wanted(
-    masked: tuple[Capture, Rig], tmp_path: Path
-) -> None:
+def test_a_chart_that_no_plate_shows_is_a_warning_where_one_is_wanted(masked: Shot, tmp_path: Path) -> None:
     write_capture(tmp_path / "shot", *masked)
     assert not found_in(tmp_path / "shot")["warnings"]
     assert [w["code"] for w in found_in(tmp_path / "shot", texture={"chart": True})["warnings"]] == ["no-chart"]
@@ -228,22 +224,8 @@ def test_a_front_camera_that_nobody_knows_is_a_fault(kind: Callable[[Path], Path
 
 
 @pytest.mark.gl
-def test_a_picture_of_no_camera_is_a_warning_as_a_reconstruction_passes_it_over(
-    masked: tuple[Capture, Rig], tmp_path: Path
-) -> None:
-    write_capture(tmp_path / "shot", *masked)
-    for name in ("foo.png", "goo.png"):
-        (tmp_path / "shot" / "images" / name).write_bytes(b"")
-    found = found_in(tmp_path / "shot", front="cam03")
-    assert (found["faults"], found["front"]) == ([], "cam03")
-    assert [(w["code"], w["message"].split(":")[0]) for w in found["warnings"]] == [
-        ("file-unread", "images/foo.png, images/goo.png have no camera")
-    ]
-
-
-@pytest.mark.gl
 def test_a_wrong_variable_is_no_fault_of_the_capture(
-    masked: tuple[Capture, Rig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    masked: Shot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_capture(tmp_path / "shot", *masked)
     monkeypatch.setenv("EIGENHEAD_THREADS", "-4")

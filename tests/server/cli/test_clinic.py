@@ -9,36 +9,21 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.head_model.model import load_model
-from rig.formats.meshes.ply import write_ply
 from rig.mesh import Mesh
 from server.cli.main import app
+from tests.support.result_folders import mean_head_result
 
 LEFT_MM = (400.0, 30.0, -50.0)  # of the rig from the head: the world frame is the head's, moved
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("heads") / "anna"
     model = load_model()
-    vertices = model.vertices(np.zeros(0)) + LEFT_MM
-    mesh = Mesh(vertices, model.levels["full"].faces)
-    count = len(vertices)
-    write_ply(
-        folder / "head.ply", mesh, normals=mesh.normals(), colours=np.full((count, 3), 150, np.uint8),
-        quality=np.full(count, 0.2), views=np.ones(count, np.uint8),
-    )  # fmt: skip
-    report = {
-        "model": {"name": model.name, "sha256": "0" * 64},
-        "world_from_head": {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": list(LEFT_MM)},
-        "landmarks": {
-            name: {"position": vertices[row].tolist(), "std": [1.0, 2.0, 2.0]} for name, row in model.landmarks.items()
-        },
-        "measurements": {"nose_breadth": {"value": 34.0, "std": 1.0}},
-        "expression": [],
-        "warnings": [],
-    }
-    (folder / "report.json").write_text(json.dumps(report))
-    return folder
+    mesh = Mesh(model.vertices(np.zeros(0)) + LEFT_MM, model.levels["full"].faces)
+    place = {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": list(LEFT_MM)}
+    breadth = {"nose_breadth": {"value": 34.0, "std": 1.0}}
+    folder = tmp_path_factory.mktemp("heads") / "anna"
+    return mean_head_result(folder, mesh, world_from_head=place, measurements=breadth, expression=[])
 
 
 def test_an_export_says_which_plane_and_by_what(result: Path, tmp_path: Path) -> None:
@@ -71,11 +56,12 @@ def test_a_hospital_s_file_has_a_pseudonym_of_letters_and_digits(result: Path, t
 
 
 def test_a_folder_that_is_no_result_is_refused(tmp_path: Path) -> None:
-    for words in (["export", str(tmp_path), "--as", "slicer"], ["compare", str(tmp_path), str(tmp_path)]):
+    exports = [["export", str(tmp_path), "--as", form] for form in ("slicer", "obj")]
+    for words in (*exports, ["compare", str(tmp_path), str(tmp_path)]):
         done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
         assert done.exit_code == 1
         assert "report.json: is not there: name the folder of a result" in str(done.exception)
-        assert not (tmp_path / "out").exists()
+        assert not [*(tmp_path / "out").glob("*")]
 
 
 def test_a_comparison_that_is_there_is_not_written_over(result: Path, tmp_path: Path) -> None:
@@ -94,7 +80,7 @@ def test_a_measure_comes_with_its_deviation_and_size(result: Path, tmp_path: Pat
     assert done.exit_code == 0, done.output
     document = json.loads(done.output)
     girth, bridge = (document["measures"][name] for name in ("head_circumference", "nose_bridge_width"))
-    assert 0.0 < girth["std"] < 2.0 * np.pi * 0.2  # the head states 0.2 mm
+    assert 0.0 < girth["std"] < 2.0 * np.pi * 0.1  # the head states 0.1 mm
     assert 8.0 < bridge["value"] < 25.0
     helmet = document["sizes"]["helmet"]
     limits = {"S": (480, 540), "M": (540, 600), "L": (600, 660)}[helmet["best"]]

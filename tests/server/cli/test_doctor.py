@@ -24,11 +24,18 @@ def examine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict]:
     return lambda **overrides: doctor.examine(ServiceSettings(**overrides))
 
 
-def test_it_makes_nothing(examine: Callable[..., dict], tmp_path: Path) -> None:
-    found = examine(data=tmp_path / "none" / "yet")
+def test_it_shows_where_things_live_and_makes_nothing(
+    examine: Callable[..., dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("EIGENHEAD_MODELS", raising=False)
+    monkeypatch.setenv("EIGENHEAD_DATA", str(tmp_path / "none" / "yet"))
+    monkeypatch.setenv("EIGENHEAD_CACHE", str(tmp_path / "cache"))
+    found = examine()
     assert found["data"]["ok"]
-    assert "will make it" in found["data"]["detail"]
-    assert "will make it" in found["database"]["detail"]
+    for check, place in (("data", "none/yet"), ("models", "none/yet/models"), ("cache", "cache")):
+        assert found[check]["detail"].startswith(str(tmp_path / place))
+    for check in ("data", "database"):
+        assert "will make it" in found[check]["detail"]
     assert list(tmp_path.iterdir()) == []
 
 
@@ -67,20 +74,6 @@ def test_it_judges_the_number_of_threads(
     assert "EIGENHEAD_THREADS: is 'many'; give a whole number from 1 to 512" in found["cores"]["detail"]
 
 
-def test_it_shows_where_data_models_and_keys_live(
-    examine: Callable[..., dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("EIGENHEAD_MODELS", raising=False)
-    monkeypatch.setenv("EIGENHEAD_DATA", str(tmp_path))
-    monkeypatch.setenv("EIGENHEAD_CACHE", str(tmp_path / "cache"))
-    found = examine()
-    assert found["cache"]["detail"].startswith(str(tmp_path / "cache"))
-    assert not (tmp_path / "cache").exists()
-    assert found["data"]["detail"].startswith(str(tmp_path))
-    assert found["models"]["detail"].startswith(str(tmp_path / "models"))
-    assert found["database"]["detail"].startswith(str(tmp_path / "eigenhead.sqlite"))
-
-
 def test_captures_without_their_database_are_told(examine: Callable[..., dict], tmp_path: Path) -> None:
     """A copy of a data folder that lacks the database looks like a new one otherwise."""
     for name in ("captures/a", "captures/b", "jobs/c"):
@@ -106,10 +99,8 @@ def test_a_result_that_is_gone_is_told(examine: Callable[..., dict], tmp_path: P
     engine.dispose()
     for job in (kept, gone):
         (tmp_path / "jobs" / job / "result").mkdir(parents=True)
-    assert examine(data=tmp_path)["results"] == {
-        "ok": True,
-        "detail": "of 2 jobs, all there; the files of 0 were compared",
-    }
+    all_there = {"ok": True, "detail": "of 2 jobs, all there; the files of 0 were compared"}
+    assert examine(data=tmp_path)["results"] == all_there
     shutil.rmtree(tmp_path / "jobs" / gone)
     found = examine(data=tmp_path)["results"]
     assert not found["ok"]

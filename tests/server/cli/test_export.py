@@ -12,14 +12,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from rig.capture import Capture
-from rig.formats.cameras.cameras_file import read_rig_file
 from rig.formats.captures.capture_folder import read_capture, write_capture
-from rig.formats.meshes.ply import write_ply
 from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
-from rig.rig import Rig
 from server.cli.main import app
 from tests.support.dataset_readers import (
     avatar_pixel,
@@ -31,16 +27,18 @@ from tests.support.dataset_readers import (
     with_dots,
 )
 from tests.support.made_up_flame import flame_surface, made_up_flame, some_parameters
+from tests.support.result_folders import write_head
 from tests.support.scenes import ellipsoid
 from tests.support.small_studio import small_studio_captures
 from tests.support.textured_wedge import HEIGHT, WIDTH, wedge_rig, write_photographs
 
 pytestmark = pytest.mark.gl
+Shot = tuple[Path, np.ndarray]
 OFFSETS_MM = np.array([(0, 0, 0), (0, 62, 0), (0, -60, 0)], float)
 
 
 @pytest.fixture(scope="module")
-def shot(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> tuple[Path, np.ndarray]:
+def shot(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> Shot:
     """A capture with plates, and points (mm) inside the head that every picture shows as dots."""
     folder = small_studio_captures(tmp_path_factory.mktemp("shots"), 1, renderer, first=2) / "s2"  # all are usable
     capture, rig = read_capture(folder)
@@ -58,7 +56,7 @@ def exported(shot: Path, out: Path, form: str, *options: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module", params=[("nerfstudio", nerfstudio_pixel), ("gaussian-avatars", avatar_pixel)])
 def made(
-    request: pytest.FixtureRequest, shot: tuple[Path, np.ndarray], tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, shot: Shot, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Callable[[dict[str, Any], np.ndarray], np.ndarray]]:
     form, project = request.param
     out = tmp_path_factory.mktemp(form)
@@ -66,7 +64,7 @@ def made(
     return out, project
 
 
-def test_points_lie_in_the_pictures_where_the_files_say(made, shot: tuple[Path, np.ndarray]) -> None:
+def test_points_lie_in_the_pictures_where_the_files_say(made, shot: Shot) -> None:
     (out, project), (_, points) = made, shot
     errors = []
     for frame in frames_of(out):
@@ -109,56 +107,15 @@ def test_avatars_come_before_white_in_divisions_that_share_no_camera(shot, tmp_p
         assert (picture[mask == 255] < 255).any()
 
 
-def test_our_own_reader_finds_the_rig_again(made, shot: tuple[Path, np.ndarray]) -> None:
-    _, rig = read_capture(shot[0])
-    found = read_rig_file(made[0] / "transforms.json")
-    for camera, original in zip(found, rig, strict=True):
-        np.testing.assert_allclose(camera.centre_world, original.centre_world, atol=1e-6)
-
-
-def with_masks(shot: Path, folder: Path) -> tuple[Capture, Rig]:
-    """The capture with masks in place of plates."""
-    capture, rig = read_capture(shot)
-    rows, columns = np.mgrid[:240, :320]
-    masks = {
-        camera.name: np.hypot(*(np.array([columns, rows]).T - camera.project(rig.centre_world()[None])[0]).T) < 70
-        for camera in rig
-    }
-    straight = Rig(
-        tuple(replace(c, intrinsics=replace(c.intrinsics, distortion=type(c.intrinsics.distortion)())) for c in rig)
-    )
-    masked = replace(capture, backgrounds={}, masks=masks)
-    write_capture(folder, masked, straight)
-    return masked, straight
-
-
-def test_pictures_and_masks_of_a_pinhole_are_kept_as_they_are(shot: tuple[Path, np.ndarray], tmp_path: Path) -> None:
-    capture, rig = with_masks(shot[0], tmp_path / "masked")
-    exported(tmp_path / "masked", tmp_path / "out", "nerfstudio")
-    for name in rig.names:
-        assert (read_png(tmp_path / f"out/images/{name}.png") == capture.images[name]).all()
-        assert ((read_png(tmp_path / f"out/masks/{name}.png") > 0) == capture.masks[name]).all()
-
-
-def write_head(folder: Path, mesh: Mesh) -> np.ndarray:
-    """Writes head.ply and returns its colours."""
-    count = len(mesh.vertices)
-    colours = np.arange(3 * count).reshape(count, 3).astype(np.uint8)
-    quality, views = np.zeros(count, np.float32), np.ones(count, np.uint8)
-    write_ply(folder / "head.ply", mesh, normals=mesh.normals(), colours=colours, quality=quality, views=views)
-    return colours
-
-
 @pytest.mark.parametrize("form", ["nerfstudio", "gaussian-avatars"])
-def test_a_results_head_becomes_the_point_cloud_in_the_same_frame(
-    shot: tuple[Path, np.ndarray], tmp_path: Path, form: str
-) -> None:
+def test_a_results_head_becomes_the_point_cloud_in_the_same_frame(shot: Shot, tmp_path: Path, form: str) -> None:
     capture, rig = read_capture(shot[0])
     head = ellipsoid(2)
     count = len(head.vertices)
     mesh = Mesh(head.vertices + rig.centre_world(), head.faces)
     result = tmp_path / "result"
-    colours = write_head(result, mesh)
+    colours = np.arange(3 * count).reshape(count, 3).astype(np.uint8)
+    write_head(result, mesh, colours=colours)
     (result / "report.json").write_text(json.dumps({"inputs": dict(capture.digests)}))
     answer = exported(shot[0], tmp_path / "out", form, "--result", str(result))
     assert answer["points"] == count
@@ -172,9 +129,7 @@ def test_a_results_head_becomes_the_point_cloud_in_the_same_frame(
     assert (np.stack([points[channel] for channel in "rgb"], 1) == colours).all()
 
 
-def test_flame_parameters_of_a_result_make_its_head_where_the_pictures_show_it(
-    shot: tuple[Path, np.ndarray], tmp_path: Path
-) -> None:
+def test_flame_parameters_of_a_result_make_its_head_where_the_pictures_show_it(shot: Shot, tmp_path: Path) -> None:
     """Read as GaussianAvatars' loader does: a file of parameters a moment, named by frames, and a canonical one."""
     capture, _ = read_capture(shot[0])
     arrays, parameters, result = made_up_flame(), some_parameters(), tmp_path / "result"
@@ -200,7 +155,7 @@ def test_flame_parameters_of_a_result_make_its_head_where_the_pictures_show_it(
     assert "damaged" in str(CliRunner().invoke(app, [*arguments, str(result)]).exception)
 
 
-def test_a_result_of_another_capture_is_refused_by_its_files(shot: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+def test_a_result_of_another_capture_is_refused_by_its_files(shot: Shot, tmp_path: Path) -> None:
     capture, _ = read_capture(shot[0])
     write_head(tmp_path, ellipsoid(2))
     inputs = dict(capture.digests) | {"cameras.json": "ab" * 32}
@@ -214,7 +169,7 @@ def test_a_result_of_another_capture_is_refused_by_its_files(shot: tuple[Path, n
     assert "has no report.json" in str(CliRunner().invoke(app, [*arguments, str(tmp_path)]).exception)
 
 
-def test_a_data_set_is_replaced_only_on_request(shot: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+def test_a_data_set_is_replaced_only_on_request(shot: Shot, tmp_path: Path) -> None:
     out = tmp_path / "out"
     exported(shot[0], out, "gaussian-avatars")
     again = ["export", str(shot[0]), "--as", "nerfstudio", "--out", str(out)]
@@ -240,7 +195,9 @@ def test_photographs_alone_are_calibrated_once_and_keep_the_frame_of_their_resul
     apart = np.linalg.norm(rig["cam00"].centre_world - rig["cam04"].centre_world)
     scale = {"cameras": ["cam00", "cam04"], "distance_mm": 1.5 * apart}  # makes the ball as large as a head
     (photographs / "scale.json").write_text(json.dumps(scale))
-    exported(photographs, tmp_path / "first", "nerfstudio", "--settings", str(settings_with_front(tmp_path)))
+    settings = tmp_path / "settings.json"  # a front camera that no guess would choose: the world is another without it
+    settings.write_text(json.dumps({"front": "cam04"}))
+    exported(photographs, tmp_path / "first", "nerfstudio", "--settings", str(settings))
     found = tmp_path / "first" / "found"
     kept = {path.name: path.read_bytes() for path in found.glob("c*.json")}
     assert set(kept) == {"cameras.json", "calibration.json"}
@@ -259,10 +216,3 @@ def test_photographs_alone_are_calibrated_once_and_keep_the_frame_of_their_resul
         assert (result / name).read_bytes() == content
     first, second = (frames_of(tmp_path / folder) for folder in ("first", "second"))
     assert first == second
-
-
-def settings_with_front(folder: Path) -> Path:
-    """A front camera that no guess would choose, so that the world is another without it."""
-    path = folder / "settings.json"
-    path.write_text(json.dumps({"front": "cam04"}))
-    return path

@@ -63,12 +63,15 @@ def test_data_keys_and_models_follow_one_rule(monkeypatch: pytest.MonkeyPatch, t
 
 
 def test_a_key_is_made_where_data_says_and_says_so(run: Run, tmp_path: Path) -> None:
-    made = run("keys", "add", "console", "--data", tmp_path / "heads", "--json")
+    made = run("keys", "add", "console", "--scope", "read", "--data", tmp_path / "heads", "--json")
     assert json.loads(made.out)["data"] == str(tmp_path / "heads")
     assert made.err == f"eigenhead: a key of the service whose data is {tmp_path / 'heads'}\n"
     assert not (tmp_path / "variable").exists()
-    listed = json.loads(run("keys", "list", "--data", tmp_path / "heads", "--json").out)
-    assert [key["name"] for key in listed["keys"]] == ["console"]
+    (listed,) = json.loads(run("keys", "list", "--data", tmp_path / "heads", "--json").out)["keys"]
+    assert (listed["id"], listed["name"], listed["scopes"]) == (json.loads(made.out)["id"], "console", ["read"])
+    assert json.loads(made.out)["key"].startswith(f"eh_{listed['id']}_")
+    for status in (0, 1):
+        assert run("keys", "remove", listed["id"], "--data", tmp_path / "heads").status == status
 
 
 def test_models_lie_in_the_data_folder_that_is_named(run: Run, tmp_path: Path) -> None:
@@ -105,6 +108,8 @@ def test_help_version_and_a_model_are_told_in_words(run: Run) -> None:
     text = run("model", "info").out
     assert not any(sign in text for sign in "{}[]'\"")
     assert "female: 41; male: 97; total: 138" in text
+    assert json.loads(run("model", "info", "--json").out)["landmarks"] == 26
+    assert run("model", "info", "nobody").status == 1
 
 
 @pytest.mark.parametrize(
@@ -125,7 +130,7 @@ def test_a_shell_completes_commands_options_and_what_they_may_be(line: str, offe
     assert completed.stdout.split() == offered
 
 
-def test_serve_says_in_one_line_that_its_rig_file_is_missing_or_its_port_is_taken(run: Run, tmp_path: Path) -> None:
+def test_serve_says_in_one_line_that_its_rig_file_its_port_or_its_folder_is_no_good(run: Run, tmp_path: Path) -> None:
     done = run("serve", "--rig", tmp_path / "rig.toml")
     assert (done.status, done.err.count("\n")) == (1, 1)
     assert "rig.toml: cannot be read (No such file or directory)" in done.err
@@ -136,6 +141,10 @@ def test_serve_says_in_one_line_that_its_rig_file_is_missing_or_its_port_is_take
         done = run("serve", "--port", port)
     assert (done.status, done.err.count("\n")) == (1, 1)
     assert f"cannot listen on 127.0.0.1:{port}: another program listens there" in done.err
+    (tmp_path / "file").touch()
+    done = run("serve", "--port", "0", "--data", tmp_path / "file" / "x")
+    assert (done.status, done.err.count("\n")) == (1, 1)
+    assert "cannot be used (" in done.err
 
 
 @pytest.mark.parametrize("command", ["serve", "worker"])
@@ -152,44 +161,70 @@ def test_a_database_that_is_down_is_one_line_without_its_password(
     assert "secret" not in done.err
 
 
+NUMBERS = ("--noise", "--light-drift", "--defocus", "--rolling-ms", "--fps")
+
+
 @pytest.mark.parametrize(
-    "arguments",
+    ("line", "words"),
     [
-        ["reconstruct", "CAPTURE", "--out", "OUT", "--method", "magic"],
-        ["reconstruct", "CAPTURE", "--out", "OUT", "--detail", "everything"],
-        ["reconstruct", "CAPTURE", "--out", "OUT", "--surface", "feet"],
-        ["simulate", "OUT", "--fault", "dark:cam00=much"],
-        ["simulate", "OUT", "--expression", "mouthSmile=0.5"],
-        ["board", "--out", "OUT", "--kind", "chess"],
-        ["convert", "CAPTURE", "--out", "OUT", "--to", "paper"],
+        ("--colour", "No such option: --colour"),
+        ("reconstruct", "Missing"),
+        ("reconstruct /nowhere --out {out}", "/nowhere"),
+        ("reconstruct {shots}/a --out {out} --method magic", "'magic' is not one of"),
+        ("reconstruct {shots}/a --out {out} --detail everything", "'everything' is not one of"),
+        ("reconstruct {shots}/a --out {out} --surface feet", "'feet' is not one of"),
+        ("batch {shots} --out {out} --shard 9/8", "is no share such as 2/8"),
+        ("batch {shots} --out {out} --workers 0", "--workers"),
+        ("batch {shots} --out {out} --detail deep", "'deep' is not one of 'span', 'kernel', 'photo', 'fine', 'pores'"),
+        ("batch {shots} --out {out} --formats fbx", "'fbx' is none of"),
+        ("serve --port 99999999", "port: Input should be less than or equal to 65535"),
+        ("keys add x --scope everything", "everything"),
+        ("simulate", "--serve"),
+        *((f"simulate {{out}} {option} {value}", option) for option in NUMBERS for value in ("nan", "inf")),
+        ("simulate {out} --realism oily,shiny", "shiny is not one of smooth, oily, scattering, mosaic, jpeg"),
+        ("simulate {out} --fault dark:cam00=much", "much"),
+        ("simulate {out} --expression mouthSmile=0.5", "mouthSmile"),
+        ("board --out {out} --kind chess", "'chess' is not one of"),
+        ("board --out {out}.pdf --squares seven", "seven"),
+        ("board --out {out}.xyz", "'.xyz': a board is written as .pdf"),
+        ("convert {shots}/a --out {out} --to paper", "'paper' is not one of"),
+        ("calibrate {shots} --out {out}", "--board"),
+        ("calibrate {shots} --out {out} --from sky", "'sky' is not one of 'board', 'scene'"),
+        ("calibrate {shots} --out {out} --from scene --lenses two", "'two' is not one of 'one', 'each'"),
+        ("calibrate {shots} --out {out} --from scene --board {file}", "is for a board"),
+        ("calibrate {shots} --out {out} --scale {file}", "is for --from scene"),
     ],
 )
-def test_a_wrong_value_of_an_option_is_wrong_usage(run: Run, tmp_path: Path, arguments: list[str]) -> None:
-    places = {"CAPTURE": str(small_capture(tmp_path / "capture")), "OUT": str(tmp_path / "out")}
-    done = run(*[places.get(argument, argument) for argument in arguments])
-    assert done.status == 2, done.err
-    assert not (tmp_path / "out").exists()
+def test_wrong_usage_is_status_2_and_is_named(run: Run, tmp_path: Path, line: str, words: str) -> None:
+    file = small_capture(tmp_path / "shots" / "a") / "cameras.json"
+    done = run(*line.format(shots=tmp_path / "shots", file=file, out=tmp_path / "out").split())
+    assert (done.status, done.out) == (2, "")
+    assert words in " ".join(done.err.split())
+    assert [path.name for path in tmp_path.iterdir()] == ["shots"]
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "calibrate", "board", "model build"])
-def test_an_output_that_cannot_be_written_is_found_before_the_work(run: Run, tmp_path: Path, command: str) -> None:
+@pytest.mark.parametrize(
+    ("line", "place", "why"),
+    [
+        ("reconstruct {shot}", "file/inside/out", "cannot be written"),
+        ("calibrate {shot} --board {shot}/cameras.json", "file/inside/out", "cannot be written"),
+        ("board", "file/inside/out", "cannot be written"),
+        ("model build {shot}", "file/inside/out", "cannot be written"),
+        ("convert {shot}", "file/cameras.json", "cannot be written"),
+        ("convert {shot}", "shot", "it is a folder"),
+        ("convert {shot} --to colmap", "file", "it is a file, and a folder is written"),
+        ("convert {shot} --to colmap", "file/sparse", "cannot be written"),
+    ],
+)
+def test_an_output_that_cannot_be_written_is_found_before_the_work(
+    run: Run, tmp_path: Path, line: str, place: str, why: str
+) -> None:
     (tmp_path / "file").touch()
-    capture, out = small_capture(tmp_path / "capture"), tmp_path / "file" / "inside" / "out"
-    arguments = {
-        "reconstruct": [capture],
-        "calibrate": [capture, "--board", capture / "cameras.json"],
-        "model build": [capture],
-    }
-    done = run(*command.split(), *arguments.get(command, []), "--out", out)
+    shot = small_capture(tmp_path / "shot")
+    done = run(*line.format(shot=shot).split(), "--out", tmp_path / place)
     assert done.status == 1
-    assert f"{out} cannot be written" in done.err
-
-
-def test_an_empty_archive_is_refused(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "empty.zip").write_bytes(b"")
-    done = run("reconstruct", tmp_path / "empty.zip", "--out", tmp_path / "out")
-    assert (done.status, done.err.count("\n")) == (1, 1)
-    assert [path.name for path in tmp_path.iterdir()] == ["empty.zip"]
+    assert f"eigenhead: {tmp_path / place} " in done.err
+    assert why in done.err
 
 
 def test_nothing_that_is_there_is_overwritten_unasked(run: Run, tmp_path: Path) -> None:
@@ -206,6 +241,7 @@ def test_nothing_that_is_there_is_overwritten_unasked(run: Run, tmp_path: Path) 
     done = run("simulate", capture)
     assert (done.status, done.err.count("\n")) == (1, 1)
     assert (capture / "cameras.json").is_file()
+    assert "holds no simulated studio" in run("simulate", capture, "--serve").err
 
 
 def test_a_damaged_picture_is_told_in_our_words_alone(tmp_path: Path) -> None:

@@ -68,22 +68,6 @@ def test_a_format_that_does_not_exist_is_wrong_usage_and_the_others_reach_the_se
         assert f"No such option: {option}" in refused.stderr
 
 
-OPTIONS = ("--noise", "--light-drift", "--defocus", "--rolling-ms", "--fps")
-
-
-@pytest.mark.parametrize(
-    ("option", "value", "text"),
-    [
-        *((option, value, option) for option in OPTIONS for value in ("nan", "inf")),
-        ("--realism", "oily,shiny", "shiny is not one of smooth, oily, scattering, mosaic, jpeg"),
-    ],
-)
-def test_a_wrong_value_is_wrong_usage_and_is_named(option: str, value: str, text: str, tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["simulate", str(tmp_path / "shot"), option, value])
-    assert done.exit_code == 2
-    assert text in " ".join(done.stderr.replace("│", " ").split())
-
-
 @pytest.mark.parametrize("enclosed", [False, True])
 @pytest.mark.parametrize("inside", ["", "images", "images/head", "background", "masks/x", "images/../images"])
 def test_a_result_never_lies_among_the_pictures_of_its_capture(inside: str, enclosed: bool, tmp_path: Path) -> None:

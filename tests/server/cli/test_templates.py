@@ -2,9 +2,6 @@
 
 import hashlib
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +13,9 @@ from rig.errors import EigenheadError, InputError
 from rig.formats.meshes.ply import read_head_ply
 from rig.formats.meshes.polygon_obj import read_polygons
 from server.cli.main import app
+from tests.server.cli.test_main import run
 from tests.support.shared_data import shared
 from tests.support.template_headers import header_file
-
-
-def command(*words: str, data: Path) -> subprocess.CompletedProcess[str]:
-    arguments = [sys.executable, "-m", "server.cli", *words]
-    environment = {**os.environ, "EIGENHEAD_DATA": str(data)}
-    return subprocess.run(arguments, capture_output=True, text=True, timeout=600, env=environment)
 
 
 def test_wrong_files_and_names_are_refused_before_anything_is_written(tmp_path: Path) -> None:
@@ -47,8 +39,13 @@ def test_a_template_that_the_job_cannot_have_is_told_before_the_work(tmp_path: P
     data, capture = tmp_path / "data", tmp_path / "capture"
     capture.mkdir()
     header_file(data, "foreign", model_name="other", model_sha256="ee" * 32)
+    header_file(data, "damaged").write_bytes(b"PK")
     arguments = ["reconstruct", str(capture), "--out", str(tmp_path / "out"), "--data", str(data), "--template"]
-    for name, text in (("nobody", "known are foreign"), ("foreign", "registered to the model 'other'")):
+    for name, text in (
+        ("nobody", "known are damaged, foreign"),
+        ("foreign", "registered to the model 'other'"),
+        ("damaged", "Register it again"),
+    ):
         done = CliRunner().invoke(app, [*arguments, name])
         assert isinstance(done.exception, EigenheadError)
         assert text in str(done.exception)
@@ -66,17 +63,16 @@ def test_a_head_is_written_in_a_templates_order(tmp_path: Path) -> None:
     shape, faces = model.vertices(np.zeros(0), "p95")[order] / 10.0, np.argsort(order)[level.faces] + 1
     lines = [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in shape] + [f"f {a} {b} {c}" for a, b, c in faces]
     (tmp_path / "low.obj").write_text("\n".join(lines))
-    added = command("template", "add", str(tmp_path / "low.obj"), "--json", data=data)
+    added = run("template", "add", str(tmp_path / "low.obj"), "--json", timeout_s=600.0, EIGENHEAD_DATA=str(data))
     assert added.returncode == 0, added.stderr
     printed = json.loads(added.stdout)
     assert printed["figures"]["skin_share"] > 0.9
     assert {path.name for path in (data / "templates").iterdir()} == {"low.npz", "low.png"}
-    again = command("template", "add", str(tmp_path / "low.obj"), data=data)
+    again = run("template", "add", str(tmp_path / "low.obj"), EIGENHEAD_DATA=str(data))
     assert (again.returncode, "--overwrite" in again.stderr) == (1, True)
     arguments = ["reconstruct", str(shared("data/captures/scan-a")), "--detail", "span", "--surface", "head"]
-    done = command(
-        *arguments, "--template", "low", "--morphs", "--formats", "ply", "--out", str(tmp_path / "out"), data=data
-    )
+    arguments += ["--template", "low", "--morphs", "--formats", "ply", "--out", str(tmp_path / "out")]
+    done = run(*arguments, timeout_s=600.0, EIGENHEAD_DATA=str(data))
     assert done.returncode == 0, done.stderr
     head = read_head_ply(tmp_path / "out" / "head.ply")[0].vertices[level.rows[order]]
     named = json.loads((tmp_path / "out" / "report.json").read_text())["template"]

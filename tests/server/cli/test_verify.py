@@ -1,9 +1,6 @@
 """`eigenhead verify`: faults before any work, results taken as they are, a missed limit is status 1."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +9,15 @@ import pytest
 from pipeline.applications.verification.judgement import Limits
 from pipeline.head_model.model import load_model
 from rig.errors import InputError
-from rig.formats.meshes.ply import write_ply
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
 from server.cli.heads import read_limits, verify_captures
+from tests.server.cli.test_main import run
 from tests.support.glb import obj_bytes
 from tests.support.landmark_files import write_landmarks
 from tests.support.measured_heads import mannequin
-from tests.support.services import ROOT, small_capture
+from tests.support.result_folders import mean_head_result
+from tests.support.services import small_capture
 
 SCAN_FROM_HEAD = RigidTransform(rotation_from_vector(np.array([0.4, -1.0, 0.2])), np.array([80.0, 900.0, -50.0]))
 
@@ -53,26 +51,7 @@ def test_limits_come_from_a_file(tmp_path: Path) -> None:
 def planted_result(folder: Path, scale: float) -> Path:
     """What a reconstruction of the mean head leaves, ``scale`` times too large."""
     model = load_model()
-    mesh = Mesh(scale * model.vertices(np.zeros(0)), model.levels["full"].faces)
-    count = len(mesh.vertices)
-    write_ply(
-        folder / "head.ply", mesh, normals=mesh.normals(), colours=np.full((count, 3), 90, np.uint8),
-        quality=np.full(count, 0.1, np.float32), views=np.ones(count, np.uint8),
-    )  # fmt: skip
-    marks = {name: {"position": mesh.vertices[row].tolist(), "std": 0.2} for name, row in model.landmarks.items()}
-    place = {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
-    named = {"name": model.name, "sha256": model.sha256}
-    document = {"model": named, "landmarks": marks, "world_from_head": place, "warnings": []}
-    (folder / "report.json").write_text(json.dumps(document))
-    return folder
-
-
-def command(*arguments: str) -> "subprocess.CompletedProcess[str]":
-    line = [sys.executable, "-m", "server.cli", "verify", *arguments]
-    return subprocess.run(
-        line, env=os.environ | {"OPENBLAS_NUM_THREADS": "1"}, cwd=ROOT, capture_output=True, text=True, timeout=280,
-        check=False,
-    )  # fmt: skip
+    return mean_head_result(folder, Mesh(scale * model.vertices(np.zeros(0)), model.levels["full"].faces))
 
 
 @pytest.mark.slow
@@ -83,10 +62,10 @@ def test_results_are_judged_as_they_are_and_a_missed_limit_is_status_1(tmp_path:
     write_landmarks(tmp_path / "scan.json", {name: scan[row] for name, row in model.landmarks.items()})
     right, wrong = planted_result(tmp_path / "right", 1.0), planted_result(tmp_path / "wrong", 1.01)
     options = ("--reference", str(tmp_path / "scan.obj"), "--out", str(tmp_path / "out"), "--json", "--overwrite")
-    good = command(str(right), *options)
+    good = run("verify", str(right), *options, timeout_s=280.0)
     assert (good.returncode, good.stderr) == (0, "")
     assert json.loads(good.stdout) == json.loads((tmp_path / "out" / "report.json").read_text())
-    bad = command(str(right), str(wrong), *options)
+    bad = run("verify", str(right), str(wrong), *options, timeout_s=280.0)
     assert bad.returncode == 1
     assert "size_error_percent is 1, the limit is 0.3" in bad.stderr
     assert bad.stderr.count("\n") == 1

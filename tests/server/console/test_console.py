@@ -13,9 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from starlette.types import Scope
 
+from pipeline.head_model.model import load_model
+from pipeline.settings import settings_from_document
+from pipeline.texturing.paint import find_layout
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.errors import InputError
-from rig.formats.meshes.ply import write_ply
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
 from rig.messages.message import compose, verbatim
@@ -24,7 +26,7 @@ from server.console import coverage, guides, live, media
 from server.console.identity import caller_of, cookie_secret, is_foreign, is_rebound, permit
 from server.console.live import look_bytes
 from server.console.mount import path_below
-from server.console.pages.captures import chosen_work, settings_of
+from server.console.pages.captures import PRESETS, Preset, chosen_work, settings_of
 from server.console.pages.jobs import chosen_settings, log_lines
 from server.console.removal import Removals
 from server.errors import Conflict, Forbidden, NotFound, Unauthenticated, Unavailable
@@ -35,6 +37,7 @@ from server.services.work import ReconstructionRequest
 from server.settings import ServiceSettings
 from server.storage.database import open_database
 from server.storage.events import JobEvent
+from tests.support.result_folders import write_head
 from tests.support.services import await_true
 
 SHOWN = nothing(compose("live-starting"))
@@ -136,28 +139,14 @@ def test_a_removal_that_fails_shows_the_thing_again() -> None:
     await_true(lambda: removals.waiting() == {})
 
 
-def grid(size: int = 12, step: float = 10.0) -> Mesh:
+def grid(size: int = 12) -> Mesh:
     """A flat square of triangles in the plane z = 0."""
-    y, x = np.mgrid[:size, :size] * step
+    y, x = np.mgrid[:size, :size] * 10.0
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(size * size)], axis=1)
     corner = (np.arange(size - 1)[:, None] * size + np.arange(size - 1)).ravel()
     one = np.stack([corner, corner + 1, corner + size], axis=1)
     other = np.stack([corner + 1, corner + size + 1, corner + size], axis=1)
     return Mesh(vertices, np.concatenate([one, other]).astype(np.int32))
-
-
-def write_head(folder: Path, mesh: Mesh, quality: np.ndarray) -> Path:
-    count = len(mesh.vertices)
-    write_ply(
-        folder / "head.ply",
-        mesh,
-        normals=np.tile([0.0, 0.0, 1.0], (count, 1)),
-        colours=np.zeros((count, 3), np.uint8),
-        quality=quality.astype(np.float32),
-        views=np.ones(count, np.uint8),
-        comments=["unit mm"],
-    )
-    return folder
 
 
 def test_quality_and_distance_come_in_the_order_of_the_vertices(tmp_path: Path) -> None:
@@ -181,8 +170,7 @@ def test_heads_of_two_captures_are_compared_after_a_rigid_motion(tmp_path: Path,
     moved = Mesh(motion.apply(bumpy.vertices), bumpy.faces)
     if not shared_vertices:  # two more vertices that no face uses: the meshes are no longer of one model
         moved = Mesh(np.concatenate([moved.vertices, moved.vertices[:2]]), moved.faces)
-    mine = write_head(tmp_path / "mine", bumpy, np.ones(len(bumpy.vertices)))
-    theirs = write_head(tmp_path / "theirs", moved, np.ones(len(moved.vertices)))
+    mine, theirs = write_head(tmp_path / "mine", bumpy), write_head(tmp_path / "theirs", moved)
     distance = media.to_surface(mine, theirs / "head.ply", align=True)
     # the files hold float32: 3e-5 mm at 300 mm; nearest points converge to less than a hundredth of the step
     assert distance.max() < (1e-3 if shared_vertices else 0.1)
@@ -270,6 +258,12 @@ def test_the_captures_form_becomes_work() -> None:
         "ict", {"outputs": {"formats": ["glb", "ply", "obj", "usdz"], "template": "flame"}}
     )
     assert settings_of("texture") == {"outputs": {"formats": ["glb", "ply", "obj", "usdz"]}}  # as it was
+
+
+@pytest.mark.parametrize("preset", PRESETS, ids=lambda preset: preset.id or "standard")
+def test_no_preset_is_warned_of(preset: Preset) -> None:
+    _, warnings = find_layout(load_model(), settings_from_document(preset.settings))
+    assert [warning.text for warning in warnings] == []
 
 
 def test_a_look_on_the_wire_holds_every_picture() -> None:

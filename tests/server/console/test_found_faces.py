@@ -16,10 +16,11 @@ from server.console import media as module
 from server.console.media import found_faces
 from server.errors import Conflict, Unavailable
 from server.services.keys import LOCAL, Caller
-from server.storage.records import CameraSize, CaptureRecord
-from server.storage.store import Store, new_id
+from server.storage.records import CameraSize
+from server.storage.store import Store
 from server.tasks.child import ChildProcessPool, WorkerContext
-from tests.support.drawn_studio import LENS, drawn_studio, hidden_from, write_drawn_capture
+from tests.support.drawn_studio import LENS, drawn_studio, write_drawn_capture
+from tests.support.stored_captures import stored_files
 
 
 @pytest.fixture(scope="module")
@@ -32,15 +33,10 @@ def children() -> Iterator[ChildProcessPool]:
 def service_with(children: ChildProcessPool, data: Path, *, board: bool = False) -> tuple:
     """A service that has one capture, and the capture's id."""
     store = Store(data)
-    files = write_drawn_capture(data / "incoming" / "new" / "files")
-    inputs = {path.relative_to(files).as_posix(): "0" for path in files.rglob("*") if path.is_file()}
     sizes = tuple(CameraSize(name, LENS.width, LENS.height) for name in drawn_studio().names)
-    created = "2026-01-01T00:00:00+00:00"
-    record = CaptureRecord(
-        new_id(), created, "upload", None, "", "", sizes, "cam0", inputs, bytes=0, features=False, board=board
-    )
-    store.add_capture(data / "incoming" / "new", record)
-    return SimpleNamespace(store=store, children=children), record.id
+    files = write_drawn_capture(data / "drawn")
+    capture = stored_files(store, files, cameras=sizes, front="cam0", board=board)
+    return SimpleNamespace(store=store, children=children), capture
 
 
 def test_they_are_found_once_and_kept_with_the_capture(children: ChildProcessPool, tmp_path: Path) -> None:
@@ -54,19 +50,14 @@ def test_they_are_found_once_and_kept_with_the_capture(children: ChildProcessPoo
     assert face["box_px"] == [*points.min(axis=0), *points.max(axis=0)]
     assert np.hypot(*(points.mean(axis=0) - (159.5, 119.5))) < 20.0
     assert found["suggested"].keys() == set(SEVEN_POINTS)
+    answer = media.faces((service, Caller(LOCAL, frozenset({"read"}))), capture)
+    assert json.loads(bytes(answer.body)) == found["faces"]
+    assert "immutable" in answer.headers["Cache-Control"]
     (kept,) = (service.store.cache_of(capture) / "faces").iterdir()
     kept.write_text(json.dumps(found | {"suggested": {}}))
     assert found_faces(service, capture)["suggested"] == {}, "the second time they come from there"
     service.store.remove_capture(capture)
     assert not kept.exists()
-
-
-def test_the_address_gives_what_the_pages_draw(children: ChildProcessPool, tmp_path: Path) -> None:
-    service, capture = service_with(children, tmp_path)
-    who = (service, Caller(LOCAL, frozenset({"read"})))
-    answer = media.faces(who, capture)
-    assert json.loads(bytes(answer.body)) == found_faces(service, capture)["faces"]
-    assert "immutable" in answer.headers["Cache-Control"]
 
 
 def test_a_shot_of_the_board_has_none(children: ChildProcessPool, tmp_path: Path) -> None:
@@ -90,16 +81,3 @@ def test_who_waits_too_long_is_told(
 def endless(context: WorkerContext, report: Progress, *, capture: str, images: dict[str, str]) -> None:
     """Work that does not listen, and takes longer than a test may."""
     time.sleep(600.0)
-
-
-def test_pictures_without_a_face_suggest_nothing(children: ChildProcessPool, tmp_path: Path) -> None:
-    service, capture = service_with(children, tmp_path)
-    from rig.formats.pictures.images import write_image
-
-    names = drawn_studio().names
-    blank = hidden_from(names, {name: np.zeros((LENS.height, LENS.width, 3), np.uint8) for name in names})
-    for name, picture in blank.items():
-        write_image(service.store.folder("captures", capture) / "files" / "images" / f"{name}.png", picture)
-    found = found_faces(service, capture)
-    assert found["suggested"] == {}
-    assert not any(found["faces"].values())

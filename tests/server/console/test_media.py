@@ -13,9 +13,9 @@ from rig.formats.pictures.images import read_image, write_image
 from server.console import media
 from server.console.media import THUMBNAIL_WIDTH, make_thumbnail
 from server.errors import NotFound
-from server.storage.records import CaptureRecord
 from tests.support.at_once import run_at_once
 from tests.support.services import small_capture
+from tests.support.stored_captures import capture_record
 
 ROUTES = [
     route for route in pages.routes if isinstance(route, APIRoute) and route.endpoint.__module__ == media.__name__
@@ -70,15 +70,8 @@ def test_two_that_ask_at_once_get_a_whole_picture(tmp_path: Path) -> None:
 def test_a_camera_is_found_by_its_name_alone(tmp_path: Path) -> None:
     files = small_capture(tmp_path)
     inputs = {path.relative_to(files).as_posix(): "" for path in files.rglob("*") if path.is_file()}
-    created = "2026-01-01T00:00:00+00:00"
-    record = CaptureRecord("c1", created, "upload", None, "", "", (), "cam00", inputs, bytes=0, features=False)
+    record = capture_record(inputs=inputs)
     assert media._image_name(record, "cam01") == "images/cam01.png"
     for other in ("cam1", "../images/cam01", "cam01.png", ""):
         with pytest.raises(NotFound):
             media._image_name(record, other)
-
-
-def test_numbers_go_out_as_little_endian_floats() -> None:
-    answer = media._floats(np.array([0.5, np.pi], np.float64))
-    assert answer.media_type == "application/octet-stream"
-    np.testing.assert_array_equal(np.frombuffer(bytes(answer.body), "<f4"), np.array([0.5, np.pi], np.float32))

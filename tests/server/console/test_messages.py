@@ -72,19 +72,8 @@ def test_the_console_fills_templates_in_as_the_service_does() -> None:
         (compose("view", remark=compose("located", where="cam03", fault=compose("view-unused", remark=LIGHT))),
          "cam03: das Licht weicht um den Faktor 1,50 von dem des Leerbilds ab: neues Leerbild aufnehmen; "
          "die Ansicht wird weggelassen"),
-        (compose("no-bust", reason=compose("depth-contradictory")),
-         "die Fotos widersprechen einander, wo die Oberfläche ist: cameras.json prüfen, und dass sich nichts "
-         "bewegt hat"),
         (compose("print-off", side="width", percent=-0.5), "Breite ist um -0,50 % daneben"),
-        (compose("camera-gain", camera="cam00", factor=1.5),
-         "cam00 ist 1,50 mal so hell wie die anderen: Belichtung prüfen"),
-        (compose("captured-verdict", pictures=11, verdict="good"), "11 Bilder aufgenommen. Urteil: gut."),
         (compose("jobs-queued", count=3), "3 Aufträge eingereiht. Zu verfolgen auf der Seite Aufträge."),
-        (compose("rim-uncovered", cameras=["cam03", "cam04"]),
-         "cam03, cam04: die Tafel war nie nahe am Bildrand: sie dorthin halten"),
-        (compose("held-out", outside_px=0.31, shots=4, inside_px=0.29),
-         "0,31 px in 4 zurückgehaltenen Aufnahmen, 0,29 px in allen"),
-        (compose("captures-erased", count=2), "2 Aufnahmen endgültig gelöscht."),
         (verbatim("nobody translates what a camera's maker says"), "nobody translates what a camera's maker says"),
     ],
 )  # fmt: skip

@@ -6,7 +6,7 @@ import httpx
 import pytest
 
 from server.cli.client import Client
-from tests.support.services import RunningService, packed, running_service, small_capture
+from tests.support.services import RunningService, packed, running_service, small_capture, upload
 
 
 @pytest.fixture(scope="session")
@@ -17,15 +17,15 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService
 
 
 @pytest.fixture
-def http(service: RunningService) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=service.url, timeout=120) as client:
+def client(service: RunningService) -> Iterator[Client]:
+    with Client(service.url) as client:
         yield client
 
 
 @pytest.fixture
-def client(service: RunningService) -> Iterator[Client]:
-    with Client(service.url) as client:
-        yield client
+def capture(http: httpx.Client, archive: bytes) -> str:
+    """The id of a capture that was uploaded for this test."""
+    return upload(http, archive).json()["id"]
 
 
 @pytest.fixture(scope="session")

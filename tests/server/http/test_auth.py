@@ -9,12 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
-from server.services.keys import SCOPES, Keys
-from server.settings import ServiceSettings
-from server.storage.database import open_database
+from server.services.keys import SCOPES
+from tests.support.attacks import add_keys
+from tests.support.attacks import client as client_for
 from tests.support.loopback import hooked
 from tests.support.services import (
     RunningService,
@@ -27,26 +26,17 @@ from tests.support.services import (
     upload,
 )
 
+Guarded = tuple[RunningService, dict[str, str]]
+
 
 @pytest.fixture(scope="module")
-def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RunningService, dict[str, str]]]:
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
     """A service with one key for each scope."""
-    data = tmp_path_factory.mktemp("guarded") / "data"
-    engine = open_database(ServiceSettings(data=data))
-    keys = {scope: Keys(engine).add(scope, (scope,)) for scope in SCOPES}
-    engine.dispose()
-    with running_service(data, jobs_per_key="3") as service:
-        yield service, keys
+    with running_service(tmp_path_factory.mktemp("guarded") / "data", jobs_per_key="3") as service:
+        yield service, dict(zip(SCOPES, add_keys(service, *SCOPES), strict=True))
 
 
-def client_of(service: RunningService, key: str | None) -> httpx.Client:
-    headers = {} if key is None else {"Authorization": f"Bearer {key}"}
-    return httpx.Client(base_url=service.url, headers=headers, timeout=30)
-
-
-def test_each_scope_does_what_it_may_and_no_more(
-    guarded: tuple[RunningService, dict[str, str]], tmp_path: Path
-) -> None:
+def test_each_scope_does_what_it_may_and_no_more(guarded: Guarded, tmp_path: Path) -> None:
     service, keys = guarded
     files = {"file": packed(small_capture(tmp_path / "capture"))}
     calls: dict[str, Any] = {
@@ -57,12 +47,12 @@ def test_each_scope_does_what_it_may_and_no_more(
         "admin": lambda client: client.get("/v1/keys"),
     }
     for holder, key in keys.items():
-        with client_of(service, key) as client:
+        with client_for(service, key) as client:
             for scope, call in calls.items():
                 allowed = scope == holder or holder == "admin"
                 assert (call(client).status_code != 403) == allowed, (holder, scope)
     for key in (None, "eh_000000000000_wrong", keys["read"][:-1] + "x", "nonsense"):
-        with client_of(service, key) as client:
+        with client_for(service, key) as client:
             for call in calls.values():
                 refused = call(client)
                 assert refused.status_code == 401
@@ -70,11 +60,9 @@ def test_each_scope_does_what_it_may_and_no_more(
             assert client.get("/healthz").status_code == 200
 
 
-def test_erasing_captures_with_their_heads_needs_the_scope_erase(
-    guarded: tuple[RunningService, dict[str, str]],
-) -> None:
+def test_erasing_captures_with_their_heads_needs_the_scope_erase(guarded: Guarded) -> None:
     service, keys = guarded
-    with client_of(service, keys["capture"]) as client:
+    with client_for(service, keys["capture"]) as client:
         refused = client.delete("/v1/captures/" + "0" * 28, params={"erase": "true"})
         assert (refused.status_code, refused.json()["type"].rpartition(":")[2]) == (403, "scope-missing")
         assert client.delete("/v1/captures/" + "0" * 28).status_code == 404
@@ -83,20 +71,20 @@ def test_erasing_captures_with_their_heads_needs_the_scope_erase(
 
 
 def test_the_first_key_is_not_made_over_http(service: RunningService) -> None:
-    with client_of(service, None) as client:
+    with client_for(service, None) as client:
         refused = client.post("/v1/keys", json={"name": "mine", "scopes": ["admin"]})
         assert (refused.status_code, refused.json()["type"].rpartition(":")[2]) == (403, "first-key")
         assert client.get("/v1/jobs").status_code == 200  # it is as open as before
 
 
 def test_every_answer_has_the_headers_that_browsers_heed(service: RunningService) -> None:
-    with client_of(service, None) as client:
+    with client_for(service, None) as client:
         for answer in (client.get("/healthz"), client.get("/v1/nowhere"), client.get("/docs")):
             assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
             assert answer.headers["x-content-type-options"] == "nosniff"
 
 
-def test_a_json_body_is_not_awaited_from_nobody(guarded: tuple[RunningService, dict[str, str]]) -> None:
+def test_a_json_body_is_not_awaited_from_nobody(guarded: Guarded) -> None:
     service, _ = guarded
     head = f"POST /v1/sessions HTTP/1.1\r\nHost: 127.0.0.1:{service.port}\r\nContent-Type: application/json\r\n"
     with socket.create_connection(("127.0.0.1", service.port), timeout=10) as client:
@@ -104,31 +92,30 @@ def test_a_json_body_is_not_awaited_from_nobody(guarded: tuple[RunningService, d
         assert client.recv(1 << 16).split()[1] == b"401"
 
 
-def test_a_key_cannot_remove_itself_and_a_removed_one_is_refused(
-    guarded: tuple[RunningService, dict[str, str]],
-) -> None:
+def test_a_key_cannot_remove_itself_and_a_removed_one_is_refused(guarded: Guarded) -> None:
     service, keys = guarded
-    with client_of(service, keys["admin"]) as admin:
+    with client_for(service, keys["admin"]) as admin:
         made = admin.post("/v1/keys", json={"name": "short", "scopes": ["read"]}).json()
-        with client_of(service, made["key"]) as client:
-            assert client.get("/v1/jobs").status_code == 200
+        with client_for(service, made["key"]) as client:
+            foreign = {"host": "heads.example", "origin": "http://evil.example"}  # no cookie to steal
+            assert client.get("/v1/jobs", headers=foreign).status_code == 200
             assert admin.delete(f"/v1/keys/{made['id']}").status_code == 204
             assert client.get("/v1/jobs").status_code == 401
         assert admin.delete(f"/v1/keys/{keys['admin'].split('_')[1]}").status_code == 409
 
 
 @pytest.mark.parametrize("url", ["http://[", "http://", "https://a..b/"])
-def test_a_webhook_at_no_address_is_refused(guarded: tuple[RunningService, dict[str, str]], url: str) -> None:
+def test_a_webhook_at_no_address_is_refused(guarded: Guarded, url: str) -> None:
     service, keys = guarded
-    with client_of(service, keys["admin"]) as admin:
+    with client_for(service, keys["admin"]) as admin:
         refused = admin.post("/v1/webhooks", json={"url": url})
         assert (refused.status_code, refused.json()["type"]) == (422, "urn:eigenhead:problem:url-refused")
         assert admin.get("/v1/webhooks").json() == {"webhooks": []}
 
 
-def test_a_key_has_a_limit_of_jobs(guarded: tuple[RunningService, dict[str, str]], tmp_path: Path) -> None:
+def test_a_key_has_a_limit_of_jobs(guarded: Guarded, tmp_path: Path) -> None:
     service, keys = guarded
-    with client_of(service, keys["admin"]) as client:
+    with client_for(service, keys["admin"]) as client:
         capture = upload(client, packed(small_capture(tmp_path / "capture"))).json()
         job = {"capture_id": capture["id"], "settings": {"front": "long"}}
         jobs = [client.post("/v1/jobs", json=job) for _ in range(4)]

@@ -2,9 +2,7 @@
 
 import csv
 import io
-import os
 import re
-import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,10 +18,10 @@ from tests.support.services import (
     await_state,
     await_true,
     awaited,
+    kill_workers,
     running_service,
     served_client,
     uploaded_capture,
-    worker_pids,
 )
 
 URN = "urn:eigenhead:problem:"
@@ -105,8 +103,6 @@ def test_the_same_request_with_the_same_key_is_one_batch(http: httpx.Client, cap
         ({"session": "0" * 28, "prefix": "x"}, "invalid-request", ["Name the captures in one way"]),
         ({"prefix": "nobody is called so"}, "invalid-captures", ["no capture of a head was selected"]),
         ({"prefix": "%"}, "invalid-captures", ["no capture of a head was selected"]),
-        ({"prefix": ""}, "invalid-request", ["at least 1 character"]),
-        ({"captures": []}, "invalid-request", ["at least 1 item"]),
         ({"captures": ["0" * 28, "0" * 28]}, "invalid-captures", ["named 2 times", "there is no capture 000"]),
         ({"captures": ["../../etc/passwd"]}, "invalid-request", ["pattern"]),
         ({"captures": [f"{n:028x}" for n in range(9)]}, "invalid-captures", ["9 captures are more than the 8"]),
@@ -115,7 +111,6 @@ def test_the_same_request_with_the_same_key_is_one_batch(http: httpx.Client, cap
         ({"prefix": "subject", "settings": {"detail": "finest"}}, "invalid-settings", ["finest"]),
         ({"prefix": "subject", "model": "nobody's"}, "invalid-model", ["not at hand"]),
         ({"prefix": "subject", "queue": "fast"}, "invalid-queue", ["is no queue"]),
-        ({"prefix": "subject", "priority": 0}, "invalid-request", ["greater than or equal to 1"]),
         ({"prefix": "subject", "label": "a\x00b"}, "invalid-request", ["pattern"]),
         ({"prefix": "subject", "shoe": 1}, "invalid-request", ["unknown key shoe"]),
     ],
@@ -242,8 +237,6 @@ def test_the_table_and_the_sheet_are_those_of_the_command_line(tmp_path: Path) -
         parquet = http.get(f"/v1/batches/{batch}/table", params={"format": "parquet"})
         table = pyarrow.parquet.read_table(io.BytesIO(parquet.content))
         assert table.column_names == list(rows[0])
-        assert [repr(value) for value in table["nose_length_mm"].to_pylist()] == [row["nose_length_mm"] for row in rows]
-        assert table.schema.field("nose_length_mm").metadata[b"unit"] == b"mm"
         assert http.get(f"/v1/batches/{batch}/table", params={"format": "xls"}).status_code == 422
         sheet = http.get(f"/v1/batches/{batch}/sheet")
         assert sheet.headers["content-type"].startswith("text/html")
@@ -300,10 +293,8 @@ def test_a_queue_that_nobody_serves_is_said(http: httpx.Client, captures: list[s
     assert (check["ok"], check["detail"]) == (True, "2 jobs wait in queues without a worker: gpu")
     http.post(f"/v1/batches/{batch['id']}/cancel")
     batch_once(http, batch["id"], finished)
-    assert (
-        http.get("/readyz").json()["checks"]["queues"]["detail"]
-        == "there is a worker for every queue with waiting jobs"
-    )
+    served = http.get("/readyz").json()["checks"]["queues"]["detail"]
+    assert served == "there is a worker for every queue with waiting jobs"
 
 
 def test_batches_are_listed_by_pages_newest_first(http: httpx.Client, captures: list[str]) -> None:
@@ -339,8 +330,7 @@ def test_a_capture_that_kills_workers_is_set_aside_and_the_others_are_made(tmp_p
                 break
             if jobs and re.findall(f"{jobs[0]['id']} stage=read", service.log.read_text())[kills:]:
                 kills += 1
-                for pid in worker_pids(service):
-                    os.kill(pid, signal.SIGKILL)
+                kill_workers(service)
             assert time.monotonic() < deadline
             time.sleep(0.2)
         assert (jobs[0]["state"], jobs[0]["error"]["type"]) == ("failed", URN + "worker-died")

@@ -1,17 +1,15 @@
 """Captures and sessions over HTTP, against a running service: uploads, what is refused, features, erasure."""
 
-import io
-import json
 import shutil
-import tarfile
 from pathlib import Path
 
 import httpx
 import pytest
 
 from server.cli.client import Client, ServiceError
-from tests.server.http.test_hostile import SPOILT, removes
+from tests.server.http.test_hostile import SPOILT
 from tests.support.services import RunningService, await_state, packed, small_capture, stored, upload
+from tests.support.small_captures import remove
 
 
 def test_upload_and_job_in_one_call(http: httpx.Client, archive: bytes) -> None:
@@ -40,7 +38,7 @@ def test_a_form_field_that_nobody_knows_is_named(
 
 
 BAD = {case: SPOILT[case] for case in ("missing image", "NaN in a rotation", "image of another size")}
-BAD |= {"cut off": (bool, "damaged or cut off"), "no cameras": (removes("cameras.json"), "contains no cameras.json")}
+BAD |= {"cut off": (bool, "damaged or cut off"), "no cameras": (remove("cameras.json"), "contains no cameras.json")}
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -70,19 +68,7 @@ def test_photographs_too_few_to_do_without_cameras_say_what_is_missing(http: htt
     assert errors[1].startswith("1 photograph; at least 3")
 
 
-def test_every_fault_is_listed(http: httpx.Client, tmp_path: Path) -> None:
-    folder = small_capture(tmp_path / "capture")
-    (folder / "images" / "cam00.png").unlink()
-    (folder / "background" / "cam02.png").write_bytes(b"no picture")
-    points = {"pronasale": {"cam07": [1, 2]}}
-    (folder / "features.json").write_text(json.dumps({"format": "eigenhead-features/1", "points": points}))
-    errors = upload(http, packed(folder)).json()["errors"]
-    for word in ("images/cam00", "background/cam02", "cam07"):
-        assert any(word in error for error in errors)
-
-
-def test_a_capture_in_use_is_not_removed_and_a_finished_job_is(http: httpx.Client, archive: bytes) -> None:
-    capture = upload(http, archive).json()["id"]
+def test_a_capture_in_use_is_not_removed_and_a_finished_job_is(http: httpx.Client, capture: str) -> None:
     job = http.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
     assert http.delete(f"/v1/captures/{capture}").status_code == 409
     assert http.delete(f"/v1/jobs/{job}").status_code in (204, 409)
@@ -95,8 +81,7 @@ def test_a_capture_in_use_is_not_removed_and_a_finished_job_is(http: httpx.Clien
     assert http.get(f"/v1/jobs/{job}").status_code == 404
 
 
-def test_features_are_stored_or_refused_by_name(http: httpx.Client, service: RunningService, archive: bytes) -> None:
-    capture = upload(http, archive).json()["id"]
+def test_features_are_stored_or_refused_by_name(http: httpx.Client, service: RunningService, capture: str) -> None:
     points = {"pronasale": {"cam00": [3.0, 4.0], "cam01": [5.0, 6.0]}}
     assert http.put(f"/v1/captures/{capture}/features", json={"points": points}).json()["features"] is True
     assert http.get(f"/v1/captures/{capture}/features").json()["points"] == points
@@ -171,13 +156,6 @@ def test_the_client_uploads_folders_and_checks_downloads(client: Client, tmp_pat
     assert caught.value.status == 422
 
 
-def test_a_tar_made_elsewhere_with_one_enclosing_folder_works(http: httpx.Client, tmp_path: Path) -> None:
-    folder, buffer = small_capture(tmp_path / "capture"), io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode="w:gz") as archive:
-        archive.add(folder, arcname="Anna")
-    assert upload(http, buffer.getvalue()).status_code == 201
-
-
 def test_a_session_without_captures_is_asked_as_much(http: httpx.Client) -> None:
     session = http.post("/v1/sessions", json={}).json()["id"]
     refused = http.post(f"/v1/sessions/{session}/jobs", json={"settings": {"detial": "fine"}})
@@ -204,16 +182,3 @@ def test_a_change_may_be_meant_for_one_state_alone_and_head_is_get_without_conte
     assert http.delete(path, headers={"If-Match": http.get(path).headers["ETag"]}).status_code == 204
     assert http.delete(path, headers=known).status_code == 404
     assert http.head(path).status_code == 404
-
-
-def test_the_description_names_the_server_and_what_changes_conditionally(http: httpx.Client) -> None:
-    document = http.get("/openapi.json").json()
-    assert document["servers"] == [{"url": "/"}]
-    calls = document["paths"]["/v1/captures/{capture_id}"]
-    assert "ETag" in calls["get"]["responses"]["200"]["headers"]
-    for method in ("patch", "delete"):
-        assert "If-Match" in [parameter["name"] for parameter in calls[method]["parameters"]]
-        assert "412" in calls[method]["responses"]
-    answer = http.patch("/v1/captures/x", content=b'{"label": ', headers={"content-type": "application/json"})
-    assert answer.status_code == 422
-    assert "is no JSON" in answer.json()["errors"][0]

@@ -105,6 +105,7 @@ def test_requests_that_wait_leave_their_key_its_time(service: RunningService, ke
         began = time.monotonic()
         assert [http.get("/v1/captures").status_code for _ in range(5)] == [200] * 5
         assert time.monotonic() - began < 20.0  # one that is not answered ends after 30 s
+    assert "unforeseen" not in service.log.read_text()  # of clients who went
 
 
 def test_a_client_who_goes_in_the_midst_of_a_body_is_no_fault_of_the_service(

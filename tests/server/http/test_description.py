@@ -12,7 +12,6 @@ from server.settings import ServiceSettings
 
 NO_BODY = {"204", "206", "304", "307"}
 TUS_BODILESS = {"tus_create", "tus_head"}  # the protocol's answers are headers alone
-STREAM = "job_events"
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +44,15 @@ def test_every_answer_has_a_type(description: dict[str, Any]) -> None:
                 assert answer.get("content"), where
                 for media, content in answer["content"].items():
                     assert content or media == "application/json", (*where, media)
+
+
+def test_the_description_names_the_server_and_what_changes_conditionally(description: dict[str, Any]) -> None:
+    assert description["servers"] == [{"url": "/"}]
+    calls = description["paths"]["/v1/captures/{capture_id}"]
+    assert "ETag" in calls["get"]["responses"]["200"]["headers"]
+    for method in ("patch", "delete"):
+        assert "If-Match" in [parameter["name"] for parameter in calls[method]["parameters"]]
+        assert "412" in calls[method]["responses"]
 
 
 def test_files_are_bytes_moments_date_times_and_each_name_one_type(description: dict[str, Any]) -> None:

@@ -67,8 +67,7 @@ def test_an_upload_becomes_a_capture_and_a_job_a_result(http: httpx.Client, arch
     assert http.get(f"/v1/captures/{capture['id']}/images/cam99").status_code == 404
 
 
-def test_a_job_says_that_nobody_serves_its_queue(http: httpx.Client, archive: bytes) -> None:
-    capture = upload(http, archive).json()["id"]
+def test_a_job_says_that_nobody_serves_its_queue(http: httpx.Client, capture: str) -> None:
     job = http.post("/v1/jobs", json={"capture_id": capture, "queue": "gpu"}).json()
     assert job["notice"] == "No worker serves the queue 'gpu': start one with `eigenhead worker --queue gpu`."
     assert http.get(f"/v1/jobs/{job['id']}").json()["notice"] == job["notice"]
@@ -101,8 +100,7 @@ def test_an_upload_that_is_sent_again_with_its_key_makes_one_job_and_one_capture
     assert send(key="x" * 201).status_code == 422
 
 
-def test_the_events_of_a_job_name_a_camera_that_has_moved(http: httpx.Client, client: Client, archive: bytes) -> None:
-    capture = upload(http, archive).json()["id"]
+def test_the_events_of_a_job_name_a_camera_that_has_moved(http: httpx.Client, client: Client, capture: str) -> None:
     for front, expected in (("moved", [["cam02 has moved by 5.0 px"]]), ("cam00", [])):
         job = client.submit(capture, settings={"front": front})["id"]
         assert [
@@ -110,8 +108,7 @@ def test_the_events_of_a_job_name_a_camera_that_has_moved(http: httpx.Client, cl
         ] == expected
 
 
-def test_events_tell_progress_and_resume(http: httpx.Client, client: Client, archive: bytes) -> None:
-    capture = upload(http, archive).json()["id"]
+def test_events_tell_progress_and_resume(http: httpx.Client, client: Client, capture: str) -> None:
     job = client.submit(capture)["id"]
     seen = list(client.events(job))
     assert [kind for kind, _ in seen][-1] == "end"
@@ -134,10 +131,9 @@ def test_a_stage_that_reports_nothing_still_moves(http: httpx.Client, client: Cl
 
 @pytest.mark.parametrize("mode", ["long", "deaf"])
 def test_a_cancelled_job_stops_in_the_midst_of_its_work(
-    service: RunningService, http: httpx.Client, archive: bytes, mode: str
+    service: RunningService, http: httpx.Client, capture: str, mode: str
 ) -> None:
     """``deaf`` work never looks whether it should stop; its process is killed."""
-    capture = upload(http, archive).json()["id"]
     job = http.post("/v1/jobs", json={"capture_id": capture, "settings": {"front": mode}}).json()["id"]
     await_state(http, job, ("running", "succeeded"))
     cancelled = http.post(f"/v1/jobs/{job}/cancel").json()
@@ -159,12 +155,12 @@ def test_a_cancelled_job_stops_in_the_midst_of_its_work(
         ("fail", "invalid-capture", "2 faults"),
         ("crash", "work-crashed", "signal 11"),
         ("bug", "internal-error", "planted"),
+        ("killed", "out-of-memory", "memory"),
     ],
 )
-def test_a_failed_job_says_why_and_the_next_one_works(
-    client: Client, http: httpx.Client, archive: bytes, mode: str, kind: str, word: str
+def test_a_failed_job_says_why_leaves_nothing_and_the_next_one_works(
+    client: Client, service: RunningService, capture: str, mode: str, kind: str, word: str
 ) -> None:
-    capture = upload(http, archive).json()["id"]
     with pytest.raises(JobEnded) as caught:
         client.wait(client.submit(capture, settings={"front": mode})["id"])
     error = caught.value.job["error"]
@@ -172,4 +168,5 @@ def test_a_failed_job_says_why_and_the_next_one_works(
     assert error["type"].endswith(kind)
     assert word in error["detail"]
     assert error["detail_message"]["message"] == error["detail"]
+    assert not [*(service.data / "jobs" / caught.value.job["id"]).glob("attempt-*")]
     assert client.wait(client.submit(capture)["id"])["state"] == "succeeded"

@@ -4,12 +4,13 @@ refused before they were read, as a proxy meets them: it writes first and reads 
 import asyncio
 import json
 import socket
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import httpx
 import pytest
 from fastapi import FastAPI, Request
 from fastapi.routing import APIRoute
@@ -53,29 +54,21 @@ class Door:
     async def _ask(
         self, path: str, body: bytes, key: str | None, announced: int | None, kind: str
     ) -> tuple[int, bytes, int]:
-        pieces = [body[start : start + PIECE] for start in range(0, len(body), PIECE)] or [b""]
-        sent: list[Message] = []
         read = 0
 
-        async def receive() -> Message:
+        async def pieces() -> AsyncIterator[bytes]:
             nonlocal read
-            if not pieces:
-                await asyncio.sleep(60)
-            piece = pieces.pop(0)
-            read += len(piece)
-            return {"type": "http.request", "body": piece, "more_body": bool(pieces)}
+            for start in range(0, len(body), PIECE):
+                read += len(body[start : start + PIECE])
+                yield body[start : start + PIECE]
 
-        async def send(message: Message) -> None:
-            sent.append(message)
-
-        headers = [(b"host", b"127.0.0.1"), (b"content-type", kind.encode())]
-        headers += [] if key is None else [(b"authorization", f"Bearer {key}".encode())]
-        headers += [] if announced is None else [(b"content-length", str(announced).encode())]
-        scope: dict[str, Any] = {"type": "http", "http_version": "1.1", "method": "POST", "path": path}
-        scope |= {"raw_path": path.encode(), "root_path": "", "query_string": b"", "headers": headers}
-        scope |= {"scheme": "http", "server": ("127.0.0.1", 80), "client": ("127.0.0.1", 1)}
-        await self.app(scope, receive, send)
-        return sent[0]["status"], b"".join(message.get("body", b"") for message in sent[1:]), read
+        headers = {"content-type": kind}
+        headers |= {} if key is None else {"authorization": f"Bearer {key}"}
+        headers |= {} if announced is None else {"content-length": str(announced)}
+        transport = httpx.ASGITransport(self.app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+            answer = await client.post(path, content=pieces(), headers=headers)
+        return answer.status_code, answer.content, read
 
 
 @pytest.fixture
@@ -140,30 +133,6 @@ def test_a_body_up_to_the_limit_arrives_whole(door: Door, length: int, announces
 @pytest.mark.parametrize(("path", "body"), [("/streams", b"5000"), ("/pages/notes", b"4988")])
 def test_what_streams_and_pages_have_their_own_rules(door: Door, path: str, body: bytes) -> None:
     assert door.ask(path, note_of(5 * MOST)) == (200, body, 5 * MOST)
-
-
-def test_who_goes_away_on_the_way_is_no_fault(door: Door) -> None:
-    """The app hears of it as it would have without."""
-    messages: list[Message] = [
-        {"type": "http.request", "body": b'{"te', "more_body": True},
-        {"type": "http.disconnect"},
-    ]
-    heard: list[Message] = []
-
-    async def app(scope: Any, receive: Any, send: Any) -> None:
-        heard.extend([await receive(), await receive()])
-
-    async def receive() -> Message:
-        return messages.pop(0)
-
-    async def send(message: Message) -> None:
-        raise AssertionError(message)
-
-    routes = [route for route in door.app.routes if isinstance(route, APIRoute)]
-    headers = [(b"host", b"127.0.0.1"), (b"authorization", f"Bearer {door.key}".encode())]
-    scope = {"type": "http", "method": "POST", "path": "/notes", "headers": headers, "app": door.app}
-    asyncio.run(JsonBodies(app, routes)(scope, receive, send))
-    assert [message["type"] for message in heard] == ["http.request", "http.disconnect"]
 
 
 @pytest.mark.parametrize("path", ["/v1/reconstructions", "/v1/captures/uploads", "/v1/nowhere"])

@@ -2,18 +2,17 @@
 503 that says when to ask again."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
-from tests.support.object_server import KEYS, Network, client_of, network_before
-from tests.support.services import RunningService, packed_capture, running_service
+from tests.support.object_server import KEYS, Network, client_of
+from tests.support.services import RunningService, imported, packed_capture, running_service
 
 
 @pytest.fixture(scope="module")
-def studio(object_server: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
+def bucket(object_server: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A client of the studio's own: its bucket holds one capture as an archive, and as a folder."""
     client, folder = client_of(object_server, "studio-in"), tmp_path_factory.mktemp("studio")
     archive = packed_capture(folder)
@@ -23,12 +22,6 @@ def studio(object_server: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
         key = f"in/anna/{file.relative_to(folder / 'capture0').as_posix()}"
         client.put_object(Bucket="studio-in", Key=key, Body=file.read_bytes())
     return client
-
-
-@pytest.fixture(scope="module")
-def way(studio: Any, object_server: str) -> Iterator[Network]:
-    with network_before(object_server) as network:
-        yield network
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +38,6 @@ def service(way: Network, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         body_bytes=str(1 << 20),
     ) as service:
         yield service
-
-
-def imported(service: RunningService, url: str) -> httpx.Response:
-    return httpx.post(service.url + "/v1/captures/imports", json={"url": url, "label": "Anna"}, timeout=60)
 
 
 @pytest.mark.parametrize("url", ["s3://studio-in/in/anna.tar", "s3://studio-in/in/anna/", "file://{0}/capture0.tar"])
@@ -77,8 +66,8 @@ def test_what_is_not_allowed_or_not_there_is_refused(url: str, status: int, kind
     assert not [*(service.data / "incoming").iterdir()]
 
 
-def test_what_is_too_large_is_not_fetched(service: RunningService, studio: Any, way: Network) -> None:
-    studio.put_object(Bucket="studio-in", Key="in/large.tar", Body=bytes(2 << 20))
+def test_what_is_too_large_is_not_fetched(service: RunningService, bucket: Any, way: Network) -> None:
+    bucket.put_object(Bucket="studio-in", Key="in/large.tar", Body=bytes(2 << 20))
     answer = imported(service, "s3://studio-in/in/large.tar")
     assert (answer.status_code, answer.json()["type"]) == (413, "urn:eigenhead:problem:upload-too-large")
 
@@ -97,10 +86,3 @@ def test_a_store_that_is_away_is_a_503_and_the_next_call_goes_through(
     way.fail(fault, 1, "GET")
     assert imported(service, "s3://studio-in/in/anna.tar").status_code == 201
     way.heal()
-
-
-def test_a_service_without_prefixes_takes_nothing(tmp_path: Path) -> None:
-    with running_service(tmp_path / "data", worker=False) as service:
-        answer = imported(service, "s3://studio-in/in/anna.tar")
-        assert (answer.status_code, answer.json()["type"]) == (403, "urn:eigenhead:problem:imports-off")
-        assert "EIGENHEAD_IMPORT_PREFIXES" in answer.json()["detail"]

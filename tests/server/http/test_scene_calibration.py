@@ -45,12 +45,12 @@ def test_photographs_of_a_scene_become_a_calibration(
     (tmp_path / "photos" / "scale.json").write_text(
         json.dumps({"tag": {"dictionary": "DICT_4X4_50", "size_mm": TAG_MM}})
     )
-    made = upload(http, packed(tmp_path / "photos"), "/v1/calibrations", **{"from": "scene", "label": "the wedge"})
+    made = upload(http, packed(tmp_path / "photos"), "/v1/calibrations", **{"from": "scene", "label": 600 * "w"})
     assert made.status_code == 202, made.text
     assert (made.json()["kind"], made.json()["pictures"]) == ("scene", dict.fromkeys(wedge_rig().names, 1))
     found = await_calibration(http, made.json()["id"])
     assert found["state"] == "succeeded", found["error"]
-    assert (found["verdict"], found["warnings"]) == ("usable", [])
+    assert (found["verdict"], found["warnings"], found["label"]) == ("usable", [], 500 * "w")
     assert all(missing.endswith("at the subject: add views near it") for missing in found["missing"])
     assert found["figures"]["rms_px"] < 0.3
     rig = rig_from_document(http.get(f"/v1/calibrations/{found['id']}/cameras.json").json())

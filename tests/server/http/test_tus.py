@@ -21,13 +21,16 @@ from tests.support.services import RunningService
 TUS = {"Tus-Resumable": "1.0.0"}
 
 
+@pytest.fixture
+def uploads(tmp_path: Path) -> ResumableUploads:
+    return ResumableUploads(Store(tmp_path), ServiceSettings(data=tmp_path, free_bytes=0))
+
+
 @pytest.mark.parametrize(("checksum", "kept"), [(None, 30), ("sha256 AAAA", 0)])
 def test_a_client_that_vanished_is_given_up_and_what_it_sent_stays(
-    tmp_path: Path, checksum: str | None, kept: int
+    uploads: ResumableUploads, checksum: str | None, kept: int
 ) -> None:
     """Bytes under a checksum count only all together."""
-    settings = ServiceSettings(data=tmp_path, free_bytes=0)
-    uploads = ResumableUploads(Store(tmp_path), settings)
     record = uploads.create(100, {}, "key")
 
     async def stream() -> AsyncIterator[bytes]:
@@ -41,9 +44,7 @@ def test_a_client_that_vanished_is_given_up_and_what_it_sent_stays(
     assert uploads.offset(record) == kept
 
 
-def test_only_the_pause_counts_and_not_the_whole(tmp_path: Path) -> None:
-    settings = ServiceSettings(data=tmp_path, free_bytes=0)
-    uploads = ResumableUploads(Store(tmp_path), settings)
+def test_only_the_pause_counts_and_not_the_whole(uploads: ResumableUploads) -> None:
     record = uploads.create(100, {}, "key")
 
     async def stream() -> AsyncIterator[bytes]:

@@ -17,8 +17,9 @@ from server.services.calibrations import Calibrations
 from server.settings import ServiceSettings
 from server.storage.database import open_database
 from server.storage.events import EventLog
-from server.storage.records import CameraSize, CaptureRecord, EventDocument
+from server.storage.records import CameraSize, EventDocument
 from server.storage.store import Store, new_id
+from tests.support.stored_captures import stored_files
 
 BOARD = {"kind": "checkerboard", "columns": 9, "rows": 6, "square_mm": 25.0}
 
@@ -59,19 +60,12 @@ def calibrations(store: Store, engine: Engine) -> Calibrations:
 
 def board_shot(store: Store, text: str) -> str:
     """A capture of two pictures in the store."""
-    identity = new_id()
-    with store.incoming() as folder:
-        for camera in ("cam00", "cam01"):
-            path = folder / "capture" / "files" / "images" / f"{camera}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(f"{text} {camera}")
-        inputs = {"cameras.json": "0" * 64} | {f"images/cam{i:02}.png": "0" * 64 for i in range(2)}
-        sizes = tuple(CameraSize(f"cam{i:02}", 4, 3) for i in range(2))
-        record = CaptureRecord(
-            identity, "2026-01-01T00:00:00.000Z", "rig", None, "", "", sizes, "cam00", inputs, 8, False, board=True
-        )
-        store.add_capture(folder / "capture", record)
-    return identity
+    sizes = tuple(CameraSize(name, 4, 3) for name in ("cam00", "cam01"))
+    with store.incoming() as files:
+        (files / "images").mkdir()
+        for size in sizes:
+            (files / "images" / f"{size.name}.png").write_text(f"{text} {size.name}")
+        return stored_files(store, files, source="rig", cameras=sizes, board=True)
 
 
 def finish(store: Store, engine: Engine, identity: str, text: str = "{}") -> str:
@@ -88,12 +82,8 @@ def finish(store: Store, engine: Engine, identity: str, text: str = "{}") -> str
 def test_shots_of_the_board_become_one_folder_a_camera(calibrations: Calibrations, store: Store) -> None:
     shots = [board_shot(store, "first"), board_shot(store, "second")]
     made = calibrations.add_shots(BOARD, shots, "after the move")
-    assert (made.state, made.label, made.source, made.pictures) == (
-        "queued",
-        "after the move",
-        "rig",
-        {"cam00": 2, "cam01": 2},
-    )
+    assert (made.state, made.label, made.source) == ("queued", "after the move", "rig")
+    assert made.pictures == {"cam00": 2, "cam01": 2}
     folder = store.folder("calibrations", made.id)
     pictures = {path.relative_to(folder / "images").as_posix(): path.read_text() for path in folder.glob("images/*/*")}
     assert pictures == {

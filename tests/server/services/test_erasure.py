@@ -29,12 +29,6 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService
         yield running
 
 
-@pytest.fixture
-def client(service: RunningService) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=service.url, timeout=30) as client:
-        yield client
-
-
 HOOK = "http://127.0.0.1:9"  # nobody answers there, so that its messages wait
 
 
@@ -118,44 +112,44 @@ def traces(service: RunningService, settings: dict[str, Any], values: list[str])
     return {value for value, ways in spelt.items() if any(way in each for each in held for way in ways)}
 
 
-def test_consent_comes_before_the_first_picture(client: httpx.Client, tmp_path: Path) -> None:
-    silent = client.post("/v1/sessions", json={"label": "Bert"}).json()["id"]
+def test_consent_comes_before_the_first_picture(http: httpx.Client, tmp_path: Path) -> None:
+    silent = http.post("/v1/sessions", json={"label": "Bert"}).json()["id"]
     archive = packed_capture(tmp_path, 1).read_bytes()
     for fields in ({}, {"session": silent}):
-        refused = upload(client, archive, **fields)
+        refused = upload(http, archive, **fields)
         assert (refused.status_code, refused.json()["type"].endswith("consent-missing")) == (409, True)
-        shot = client.post("/v1/captures", json=fields)
+        shot = http.post("/v1/captures", json=fields)
         assert (shot.status_code, shot.json()["type"]) == (409, refused.json()["type"])
-    client.patch(f"/v1/sessions/{silent}", json={"consent": "signed"})
-    assert upload(client, archive, session=silent).status_code == 201
+    http.patch(f"/v1/sessions/{silent}", json={"consent": "signed"})
+    assert upload(http, archive, session=silent).status_code == 201
 
 
 def test_a_removal_says_what_stays_and_an_erasure_leaves_nothing(
-    client: httpx.Client, service: RunningService, tmp_path: Path
+    http: httpx.Client, service: RunningService, tmp_path: Path
 ) -> None:
     consented = {"label": "Anna", "consent": "signed 2026-11-22"}
-    session = client.post("/v1/sessions", json=consented).json()["id"]
-    removed = upload(client, packed_capture(tmp_path, 2).read_bytes(), session=session).json()["id"]
-    erased = upload(client, packed_capture(tmp_path, 3).read_bytes(), session=session).json()["id"]
-    client.patch(f"/v1/captures/{erased}", json={"session": None})  # with or without a session
+    session = http.post("/v1/sessions", json=consented).json()["id"]
+    removed = upload(http, packed_capture(tmp_path, 2).read_bytes(), session=session).json()["id"]
+    erased = upload(http, packed_capture(tmp_path, 3).read_bytes(), session=session).json()["id"]
+    http.patch(f"/v1/captures/{erased}", json={"session": None})  # with or without a session
     jobs: dict[str, str] = {}
     for capture in (removed, erased):
-        jobs[capture] = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
-        await_state(client, jobs[capture], ("succeeded",))
-        held = client.get(f"/v1/captures/{capture}/holdings").json()
+        jobs[capture] = http.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
+        await_state(http, jobs[capture], ("succeeded",))
+        held = http.get(f"/v1/captures/{capture}/holdings").json()
         assert (held["pictures"], held["heads"], held["jobs"], held["active"]) == (3, [jobs[capture]], [], [])
         assert held["bytes"] > 0
         assert held["head_bytes"] > 0
-    running = client.post("/v1/jobs", json={"capture_id": erased, "settings": {"front": "long"}}).json()["id"]
-    assert client.get(f"/v1/captures/{erased}/holdings").json()["active"] == [running]
+    running = http.post("/v1/jobs", json={"capture_id": erased, "settings": {"front": "long"}}).json()["id"]
+    assert http.get(f"/v1/captures/{erased}/holdings").json()["active"] == [running]
 
-    assert client.delete(f"/v1/captures/{removed}").status_code == 204
-    assert client.get(f"/v1/jobs/{jobs[removed]}/result/head.ply").status_code == 200, "the head stays"
-    assert client.delete(f"/v1/captures/{erased}").status_code == 409, "a job needs it"
-    assert client.delete(f"/v1/captures/{erased}", params={"erase": True}).status_code == 204
+    assert http.delete(f"/v1/captures/{removed}").status_code == 204
+    assert http.get(f"/v1/jobs/{jobs[removed]}/result/head.ply").status_code == 200, "the head stays"
+    assert http.delete(f"/v1/captures/{erased}").status_code == 409, "a job needs it"
+    assert http.delete(f"/v1/captures/{erased}", params={"erase": True}).status_code == 204
     for job in (jobs[erased], running):
-        assert client.get(f"/v1/jobs/{job}").status_code == 404
+        assert http.get(f"/v1/jobs/{job}").status_code == 404
         assert not (service.data / "jobs" / job).exists()
-    assert client.get(f"/v1/captures/{erased}").status_code == 404
+    assert http.get(f"/v1/captures/{erased}").status_code == 404
     assert not list(service.data.rglob(f"*{erased}*"))
-    assert client.delete(f"/v1/captures/{erased}", params={"erase": True}).status_code == 404
+    assert http.delete(f"/v1/captures/{erased}", params={"erase": True}).status_code == 404

@@ -1,6 +1,5 @@
 """Jobs as the service lists them: what a page asks of the database."""
 
-import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,9 +13,9 @@ from server.settings import ServiceSettings
 from server.storage.database import open_database
 from server.storage.job_index import JobQuery
 from server.storage.library import Library
-from server.storage.records import CaptureRecord
-from server.storage.store import Store, new_id
+from server.storage.store import Store
 from tests.support.services import small_capture
+from tests.support.stored_captures import stored_files
 
 
 @pytest.fixture
@@ -37,12 +36,7 @@ def jobs(engine: sa.Engine, tmp_path: Path) -> Iterator[Jobs]:
 
 @pytest.fixture
 def capture(jobs: Jobs, tmp_path: Path) -> str:
-    folder = small_capture(tmp_path / "incoming" / "files").parent
-    inputs = {"cameras.json": hashlib.sha256((folder / "files" / "cameras.json").read_bytes()).hexdigest()}
-    created = "2026-01-01T00:00:00+00:00"
-    record = CaptureRecord(new_id(), created, "upload", None, "", "", (), "cam00", inputs, bytes=500, features=False)
-    jobs._store.add_capture(folder, record)
-    return record.id
+    return stored_files(jobs._store, small_capture(tmp_path / "capture"))
 
 
 def test_a_page_of_queued_jobs_asks_no_more_for_many_than_for_few(jobs: Jobs, engine: sa.Engine, capture: str) -> None:

@@ -16,9 +16,8 @@ from server.metrics import Metrics
 from server.services.retention import sweep
 from server.services.service import open_service
 from server.settings import ServiceSettings
-from server.storage.records import CaptureRecord
-from server.storage.store import new_id
 from tests.support.services import RunningService, await_state, await_true, served_client, uploaded_capture
+from tests.support.stored_captures import capture_record, stored
 
 
 def await_gone(client: httpx.Client, path: str, timeout_s: float = 60.0) -> None:
@@ -53,10 +52,7 @@ def test_after_a_restart_of_the_machine_not_half_of_all_goes_at_once(tmp_path: P
         try:
             for number in range(records):
                 created = datetime.fromtimestamp(time.time() - (60 if number < dues else 1) * 86400, UTC).isoformat()
-                folder = tmp_path / "incoming" / new_id()
-                (folder / "files").mkdir(parents=True)
-                record = CaptureRecord(new_id(), created, "upload", None, "", "", (), "a", {}, bytes=0, features=False)
-                service.store.add_capture(folder, record)
+                stored(service.store, capture_record(created=created))
             note_sweep(tmp_path / "last-sweep.json", days=60, boot="another")
             assert sweep(service).get("captures", 0) == removed
             (tmp_path / "retention-stopped.txt").unlink(missing_ok=True)

@@ -33,19 +33,6 @@ def test_what_can_be_done_is_not_refused() -> None:
     ReconstructionRequest("other", {"outputs": {"template": None}}).check()
 
 
-def test_a_template_that_there_is_not_or_that_another_model_carries_is_refused() -> None:
-    subject, (fault,) = refusal_of(outputs={"template": "ict"})
-    assert (subject, "outputs.template: there is no template 'ict'; known are damaged, flame" in fault.text) == (
-        "settings",
-        True,
-    )
-    subject, (fault,) = refusal_of("other", outputs={"template": "flame"})
-    assert subject == "settings"
-    assert "registered to the model 'makehuman-138', and the job's is 'other'" in fault.text
-    _, (fault,) = refusal_of(outputs={"template": "damaged"})
-    assert "Register it again" in fault.text
-
-
 def test_every_fault_is_named_at_once() -> None:
     subject, faults = refusal_of("nobody", metod="contour", outputs={"template": "ict", "formats": ["xyz"]})
     assert subject == "request"

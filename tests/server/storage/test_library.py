@@ -16,7 +16,7 @@ from server.storage.library import CaptureQuery, Library, subject_of
 from server.storage.pages import Page, page_of
 from server.storage.records import CAPTURE, CaptureRecord, SessionRecord
 from server.storage.store import Store
-from tests.server.storage.test_records import capture_record, stored
+from tests.support.stored_captures import capture_record, stored
 
 
 def identity(number: int) -> str:
@@ -34,7 +34,7 @@ def store(tmp_path: Path, library: Library) -> Store:
 
 
 def capture(number: int, **fields: object) -> CaptureRecord:
-    return replace(capture_record(), id=identity(number), **fields)
+    return capture_record(id=identity(number), **fields)
 
 
 def session(number: int, label: str) -> SessionRecord:

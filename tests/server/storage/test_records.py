@@ -22,36 +22,12 @@ from server.storage.records import (
     CAPTURE,
     UPLOAD,
     CalibrationRecord,
-    CameraSize,
     CaptureRecord,
     SessionRecord,
     UploadRecord,
 )
 from server.storage.store import Store, new_id
-
-
-def capture_record() -> CaptureRecord:
-    return CaptureRecord(
-        id=new_id(),
-        created="2026-01-01T00:00:00.000Z",
-        source="upload",
-        session=None,
-        label="anna",
-        expression="",
-        cameras=(CameraSize("cam00", 64, 48),),
-        front="cam00",
-        inputs={"images/cam00.png": "0" * 64},
-        bytes=10,
-        features=False,
-        shot={"sync": {"cameras": {}}},
-    )
-
-
-def stored(store: Store, record: CaptureRecord) -> Path:
-    with store.incoming() as folder:
-        (folder / "capture" / "files").mkdir(parents=True)
-        store.add_capture(folder / "capture", record)
-    return store.folder("captures", record.id) / "record.json"
+from tests.support.stored_captures import capture_record, stored
 
 
 def test_a_capture_comes_back_as_it_was_stored(tmp_path: Path) -> None:
@@ -78,19 +54,6 @@ def test_a_damaged_record_is_set_aside(tmp_path: Path, damage: dict[str, object]
     path.write_text(json.dumps(json.loads(path.read_text()) | damage))
     with pytest.raises(NotFound):
         store.capture(record.id)
-    assert len(store.list_quarantined()) == 1
-
-
-def test_a_session_without_its_label_is_set_aside(tmp_path: Path) -> None:
-    store, record = Store(tmp_path), SessionRecord(new_id(), "2026-01-01T00:00:00.000Z", "anna", "")
-    store.add_session(record)
-    assert store.session(record.id) == record
-    path = store.folder("sessions", record.id).with_suffix(".json")
-    document = json.loads(path.read_text())
-    del document["label"]
-    path.write_text(json.dumps(document))
-    with pytest.raises(NotFound):
-        store.session(record.id)
     assert len(store.list_quarantined()) == 1
 
 
@@ -185,6 +148,17 @@ def test_damaged_checks_say_nothing(tmp_path: Path, damage: str) -> None:
     assert store.checks(record.id) == {"cam00": {"mean": 90.5, "blur_px": None}}
     path.write_text(damage)
     assert store.checks(record.id) == {}
+
+
+def test_a_session_without_its_label_is_set_aside(tmp_path: Path) -> None:
+    store, record = Store(tmp_path), SessionRecord(new_id(), "2026-01-01T00:00:00.000Z", "anna", "")
+    store.add_session(record)
+    assert store.session(record.id) == record
+    path = store.folder("sessions", record.id).with_suffix(".json")
+    path.write_text(path.read_text().replace('"label"', '"table"'))
+    with pytest.raises(NotFound):
+        store.session(record.id)
+    assert len(store.list_quarantined()) == 1
 
 
 @pytest.mark.parametrize("damage", ["", "{}", "[]"])

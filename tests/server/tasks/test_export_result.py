@@ -100,11 +100,3 @@ def test_an_archive_holds_the_files_of_an_export(folder: Path, tmp_path: Path) -
             name: (tmp_path / "obj" / name).read_bytes() for name in files
         }
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["obj"]  # what was packed is gone
-
-
-def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    called = CliRunner().invoke(app, ["export", str(tmp_path / "empty"), "--as", "obj", "--out", str(tmp_path / "out")])
-    assert called.exit_code == 1
-    assert "report.json" in str(called.exception)
-    assert not list((tmp_path / "out").iterdir())

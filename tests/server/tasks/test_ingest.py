@@ -24,7 +24,6 @@ from server.tasks import ingest
 from server.tasks.child import WorkerContext
 from server.tasks.ingest import check_capture, ingest_archive, ingest_folder
 from tests.rig.acquisition.test_session import flat_rig
-from tests.support.drawn_studio import write_drawn_capture
 from tests.support.services import small_capture
 from tests.support.textured_studio import NAMES, FlatStudio
 
@@ -62,19 +61,6 @@ def test_an_upload_is_judged_as_a_shot_is(tmp_path: Path) -> None:
     measured = check_capture(tmp_path, PIXELS_MOST, lambda stage, share: None, measured=True)
     assert {(fault.code, fault.camera) for fault in measured.faults} <= {("empty", "cam03")}, "the shot has the others"
     assert all(view.keys() == {"subject"} for view in measured.checks.values())
-
-
-def test_the_face_is_looked_for_as_a_capture_is_taken_in(tmp_path: Path) -> None:
-    """Whether it was uploaded or shot; a check of a folder (``eigenhead check``) leaves it to the job."""
-    folder = write_drawn_capture(tmp_path / "capture", left_deg=25.0, hidden=("cam3",))
-    content = ingest_folder(
-        WorkerContext(), lambda stage, share: None, folder=str(folder), image_pixels=PIXELS_MOST, measured=True
-    )
-    assert content.face is not None
-    assert content.face.is_found
-    assert content.face.missing == ("cam3",)
-    assert content.face.left_deg == pytest.approx(25.0, abs=5.0)
-    assert checked(folder).face is None
 
 
 def test_damaged_networks_keep_no_capture_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,6 +112,7 @@ def test_an_upload_is_kept_under_its_cameras_names(tmp_path: Path) -> None:
     for path in sorted((folder / "images").iterdir()):
         write_image(folder / "masks" / f"{path.stem}.png.png", mask)
         write_image(folder / "images" / f"shot.0001.{path.stem}.BMP", read_image(path))
+        write_image(folder / "texture_sets" / "cross" / f"shot_{path.stem}.png", read_image(path))
         for number in (1, 2):
             shutil.copy(folder / "plates" / path.name, folder / "background" / f"{path.stem}_{number}.png")
         path.unlink()
@@ -133,20 +120,13 @@ def test_an_upload_is_kept_under_its_cameras_names(tmp_path: Path) -> None:
     content, kept = kept_of(folder, tmp_path)
     wanted = {"cameras.json"}
     for name in ("cam00", "cam01", "cam02"):
-        wanted |= {f"images/{name}.bmp", f"masks/{name}.png"}
+        wanted |= {f"images/{name}.bmp", f"masks/{name}.png", f"texture_sets/cross/{name}.png"}
         wanted |= {f"background/{name}/{name}_{number}.png" for number in (1, 2)}
     assert {*content.inputs} == wanted
     assert {path.relative_to(kept).as_posix() for path in kept.rglob("*") if path.is_file()} == wanted
-    assert {len(plates) for plates in read_capture(kept)[0].backgrounds.values()} == {2}
-
-
-def test_an_upload_keeps_its_texture_sets_under_the_cameras_names(tmp_path: Path) -> None:
-    folder = small_capture(tmp_path / "capture")
-    for path in sorted((folder / "images").iterdir()):
-        write_image(folder / "texture_sets" / "cross" / f"shot_{path.stem}.png", read_image(path))
-    content, kept = kept_of(folder, tmp_path)
-    assert {f"texture_sets/cross/cam0{number}.png" for number in range(3)} <= {*content.inputs}
-    assert set(read_capture(kept)[0].texture_sets["cross"]) == {"cam00", "cam01", "cam02"}
+    capture, _ = read_capture(kept)
+    assert {len(plates) for plates in capture.backgrounds.values()} == {2}
+    assert set(capture.texture_sets["cross"]) == {"cam00", "cam01", "cam02"}
 
 
 def test_texture_sets_of_an_upload_are_checked_before_they_are_decoded(tmp_path: Path) -> None:
@@ -187,13 +167,6 @@ def test_what_is_missing_everywhere_is_one_fault(tmp_path: Path) -> None:
     (fault,) = refused.value.faults
     assert fault.text.startswith("images/cam00.png is missing")
     assert "the same is true of 11 more (" in fault.text
-
-
-def test_a_byte_order_mark_is_no_fault(tmp_path: Path) -> None:
-    folder = small_capture(tmp_path / "capture")
-    path = folder / "cameras.json"
-    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    assert [camera.name for camera in checked(folder).cameras] == ["cam00", "cam01", "cam02"]
 
 
 def test_an_upload_is_told_what_check_tells(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 from typer.testing import CliRunner
 
 from calibration.adjustment.gauge import image_distance
-from rig.errors import InputError
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.pictures.images import read_image, write_image
 from rig.progress import discard_progress
@@ -50,17 +49,8 @@ def test_lengths_of_an_assumed_scale_hold_what_they_state(tmp_path: Path) -> Non
     calibrated, reports = shared("data/captures/scan-a"), []
     shutil.copytree(calibrated, tmp_path / "photos", ignore=lambda *_: ["cameras.json"])
     for number, folder in enumerate((calibrated, tmp_path / "photos")):
-        words = [
-            "reconstruct",
-            str(folder),
-            "--detail",
-            "span",
-            "--surface",
-            "head",
-            "--out",
-            str(tmp_path / f"{number}"),
-        ]
-        done = CliRunner().invoke(app, words)
+        options = ["--detail", "span", "--surface", "head", "--out", str(tmp_path / f"{number}")]
+        done = CliRunner().invoke(app, ["reconstruct", str(folder), *options])
         assert done.exit_code == 0, done.output
         reports.append(json.loads((tmp_path / f"{number}/report.json").read_text()))
     true, assumed = reports
@@ -79,13 +69,6 @@ def test_a_folder_with_cameras_is_read_as_it_is(tmp_path: Path) -> None:
     assert found.warnings == ()
     assert image_distance(found.rig, wedge_rig(), scale=False).max() < 1e-6
     assert not (tmp_path / "out").exists()
-
-
-def test_too_few_photographs_are_refused_by_name(tmp_path: Path) -> None:
-    rig = wedge_rig()
-    write_photographs(tmp_path, rig.subset(rig.names[:2]))
-    with pytest.raises(InputError, match="2 photographs; at least 3"):
-        read_or_calibrate(tmp_path, tmp_path / "out", front=None, report=discard_progress)
 
 
 @pytest.mark.parametrize(

@@ -43,9 +43,8 @@ def test_a_job_that_goes_as_expected_moves_evenly_and_knows_its_end() -> None:
     assert seen[0][0] == 0.0
     assert max(steps(seen)) < 2 * TICK_S / sum(EXPECTED.values())
     assert min(steps(seen)) >= 0.0
-    assert (
-        max(abs(error) for _, error in seen) < 0.5
-    )  # a stage that is about to end is given a tenth of its time, 0.4 s of "depth"
+    # A stage that is about to end is given a tenth of its time, 0.4 s of "depth".
+    assert max(abs(error) for _, error in seen) < 0.5
 
 
 def test_a_slow_machine_is_noticed_after_the_first_stages() -> None:

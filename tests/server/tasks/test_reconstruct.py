@@ -14,6 +14,7 @@ from pipeline.settings import Settings
 from pipeline.view_checks.usable_views import TooFewViews
 from rig.formats.captures.capture_folder import write_capture
 from rig.formats.meshes.mesh_file import read_mesh
+from rig.progress import Progress, discard_progress
 from rig.render.compute import ComputeDevice, is_software, open_device
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
@@ -34,6 +35,14 @@ def shot(renderer: Renderer) -> SimulatedCapture:
     return simulate(drawn_subject(load_model(), rng), rig, PRESET, rng, renderer=renderer)
 
 
+def reconstruct(renderer: Renderer, folder: Path, report: Progress, **settings: str) -> None:
+    """The job of ``folder``/capture."""
+    context = WorkerContext()
+    context.keep("renderer", lambda: renderer)
+    places = {name: str(folder / name) for name in ("capture", "result", "cache")}
+    reconstruct_capture(context, report, **places, model=None, settings=settings)
+
+
 def test_a_capture_folder_becomes_a_head_and_its_report(
     renderer: Renderer, shot: SimulatedCapture, tmp_path: Path
 ) -> None:
@@ -41,25 +50,10 @@ def test_a_capture_folder_becomes_a_head_and_its_report(
     stored = {"code": "scale-assumed", "message": "as if these cameras had been found from the photographs"}
     digest = hashlib.sha256((tmp_path / "capture" / "cameras.json").read_bytes()).hexdigest()
     (tmp_path / "capture" / "calibration.json").write_text(json.dumps({"cameras_sha256": digest, "told": [stored]}))
-    context, heard = WorkerContext(), []
-    context.keep("renderer", lambda: renderer)
-    reconstruct_capture(
-        context,
-        lambda stage, fraction: heard.append((stage, fraction)),
-        capture=str(tmp_path / "capture"),
-        result=str(tmp_path / "result"),
-        cache=str(tmp_path / "cache"),
-        model=None,
-        settings={"detail": "span"},
-    )
-    order = list(dict.fromkeys(stage for stage, _ in heard))
-    assert [stage for stage in order if stage in ("read", "segmentation", "fit", "texture", "write")] == [
-        "read",
-        "segmentation",
-        "fit",
-        "texture",
-        "write",
-    ]
+    heard: list[str] = []
+    reconstruct(renderer, tmp_path, lambda stage, fraction: heard.append(stage), detail="span")
+    order, known = list(dict.fromkeys(heard)), ["read", "segmentation", "fit", "texture", "write"]
+    assert [stage for stage in order if stage in known] == known
     assert order[-1] == "write"  # nothing is called done before its files are there
     report = json.loads((tmp_path / "result" / "report.json").read_text())
     assert all(camera["used"] for camera in report["cameras"].values())
@@ -78,18 +72,8 @@ def test_an_empty_studio_is_refused_and_leaves_no_result(
 ) -> None:
     nobody = {name: plates[0] for name, plates in shot.capture.backgrounds.items()}
     write_capture(tmp_path / "capture", replace(shot.capture, images=nobody, features={}), shot.rig)
-    context = WorkerContext()
-    context.keep("renderer", lambda: renderer)
     with pytest.raises(TooFewViews, match="cam06"):
-        reconstruct_capture(
-            context,
-            lambda stage, fraction: None,
-            capture=str(tmp_path / "capture"),
-            result=str(tmp_path / "result"),
-            cache=str(tmp_path / "cache"),
-            model=None,
-            settings={},
-        )
+        reconstruct(renderer, tmp_path, discard_progress)
     assert not (tmp_path / "result").exists()
 
 

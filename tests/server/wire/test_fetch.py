@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from tests.support.loopback import Hook, hooked
-from tests.support.services import RunningService, await_state, await_true, packed_capture, running_service
+from tests.support.services import RunningService, await_state, await_true, imported, packed_capture, running_service
 
 
 class Store(BaseHTTPRequestHandler):
@@ -65,10 +65,6 @@ def service(store: Hook, tmp_path_factory: pytest.TempPathFactory) -> Iterator[R
         body_bytes=str(4 << 20),
     ) as service:
         yield service
-
-
-def imported(service: RunningService, url: str) -> httpx.Response:
-    return httpx.post(service.url + "/v1/captures/imports", json={"url": url, "label": "Anna"}, timeout=60)
 
 
 @pytest.mark.parametrize("way", ["{0}/a.tar", "{0}/to//a.tar", "{0}/to/{0}/to/{0}/a.tar"])
@@ -136,7 +132,9 @@ def test_a_jobs_own_webhook_name_and_log(service: RunningService, store: Hook) -
 
 def test_imports_and_webhooks_of_jobs_are_off_by_default(store: Hook, tmp_path: Path) -> None:
     with running_service(tmp_path / "data", worker=False) as service:
-        refused = imported(service, store.url + "/a.tar")
-        assert (refused.status_code, refused.json()["type"].rpartition(":")[2]) == (403, "imports-off")
+        for url, variable in ((store.url + "/a.tar", "ORIGINS"), ("s3://studio-in/in/anna.tar", "PREFIXES")):
+            refused = imported(service, url)
+            assert (refused.status_code, refused.json()["type"].rpartition(":")[2]) == (403, "imports-off")
+            assert f"EIGENHEAD_IMPORT_{variable}" in refused.json()["detail"]
         wanted = {"capture_id": "0" * 28, "webhook": {"url": store.url}}
         assert httpx.post(service.url + "/v1/jobs", json=wanted).status_code in (404, 422)

@@ -76,34 +76,16 @@ FILE, TWICE = part("file", DATA), part("file", DATA) * 2
 LONG = part("label", b"x" * (FIELD_BYTES + 1))
 CUT = "malformed-body: The multipart body breaks off before its end; send it again."
 REFUSED: dict[str, tuple[bytes, str, int, str, str]] = {
-    "JSON": (
-        b"{}",
-        "application/json",
-        415,
-        "unsupported-media-type: Send multipart/form-data with the archive as",
-        "",
-    ),
+    "JSON": (b"{}", "application/json", 415, "unsupported-media-type: Send multipart/form-data with the archive", ""),
     "no boundary": (body(FILE), "multipart/form-data", 415, "unsupported-media-type: Send multipart/form-data", ""),
     "a long one": (body(FILE), TYPE + "x" * 300, 400, "malformed-body: The multipart boundary is no good (", ""),
     "not in the body": (b"nowhere", TYPE, 400, "malformed-body: The body is no multipart/form", ""),
-    "a long header": (
-        body(part("x" * 5000, b"")),
-        TYPE,
-        400,
-        "malformed-body: The body is no multipart/form-data (",
-        "",
-    ),
+    "a long header": (body(part("x" * 5000, b"")), TYPE, 400, "malformed-body: The body is no multipart/form-data", ""),
     "no end": (FILE, TYPE, 400, CUT, ""),
     "cut": (body(FILE)[:500], TYPE, 400, CUT, ""),
     "no file": (body(part("label", b"")), TYPE, 422, "file-missing: The form has no part 'file' that", "file: missing"),
     "two": (body(TWICE), TYPE, 422, "file-repeated: The form has several parts 'file'; send one", "file: repeated"),
-    "a field": (
-        body(FILE, LONG),
-        TYPE,
-        413,
-        "field-too-large: The form field 'label' is longer than 65,536 bytes;",
-        "",
-    ),
+    "a field": (body(FILE, LONG), TYPE, 413, "field-too-large: The form field 'label' is longer than 65,536 bytes", ""),
 }
 
 

@@ -10,6 +10,7 @@ import pytest
 from sqlalchemy.exc import DataError, OperationalError
 
 from rig.errors import EigenheadError, InputError
+from rig.messages.message import texts_of
 from server.errors import Refused
 from server.services.failures import JobFailed
 from server.wire.problems import STATUS_OF, Problem, problem_from
@@ -70,12 +71,16 @@ def made(kind: type[EigenheadError]) -> EigenheadError:
     return error
 
 
-@pytest.mark.parametrize("kind", list(STATUS_OF))
-def test_a_class_below_a_refusal_has_its_status(kind: type[Refused]) -> None:
-    """It was a KeyError in place of an answer."""
-    assert problem_from(made(type("Below", (kind,), {}))).status == STATUS_OF[kind]
-    below_twice = type("BelowTwice", (type("Below", (kind,), {}),), {})
-    assert problem_from(made(below_twice)).status == STATUS_OF[kind]
+def test_every_refusal_has_its_status_and_so_has_a_class_below_it() -> None:
+    assert set(STATUS_OF) == {Refused, *Refused.__subclasses__()}
+    for kind, status in STATUS_OF.items():
+        below_twice = type("BelowTwice", (type("Below", (kind,), {}),), {})
+        for refusal in (kind, below_twice):
+            error = refusal.__new__(refusal)
+            Refused.__init__(error, "kind", "what to do", ["one", "two"], retry_after_s=7)
+            problem = problem_from(error)
+            assert (problem.status, problem.kind, texts_of(problem.errors)) == (status, "kind", ["one", "two"])
+            assert problem.headers == {"Retry-After": "7"}
 
 
 @pytest.mark.slow  # imports half of the product

@@ -1,8 +1,6 @@
 """What SIGKILL at any moment may not do to a batch: lose a capture, make its head twice, or leave anything over."""
 
-import os
 import random
-import signal
 import time
 from pathlib import Path
 
@@ -10,7 +8,7 @@ import httpx
 import pytest
 
 from tests.server.worker.test_durability import database
-from tests.support.services import running_service, uploaded_capture, worker_pids
+from tests.support.services import kill_workers, running_service, uploaded_capture
 
 SPREAD_S = (0.3, 2.5)
 
@@ -37,8 +35,7 @@ def test_a_batch_survives_kills_of_workers_and_service(kind: str, total: int, ki
                 service.kill()
                 service.start()
             else:
-                for pid in worker_pids(service):
-                    os.kill(pid, signal.SIGKILL)
+                kill_workers(service)
         http.post(f"/v1/batches/{batch}/resume")
         deadline = time.monotonic() + 240
         while not (ended := http.get(f"/v1/batches/{batch}").json())["finished"]:

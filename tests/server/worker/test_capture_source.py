@@ -20,6 +20,7 @@ from server.storage.library import Library
 from server.storage.records import CaptureRecord
 from server.storage.store import Store, new_id
 from server.worker.capture_source import CaptureSource
+from tests.support.stored_captures import stored_files
 
 PICTURE = os.urandom(1 << 17)
 
@@ -57,22 +58,20 @@ def source(remote: Store, settings: ServiceSettings, runs: Callable[[str], bool]
     return CaptureSource(remote, settings, runs, threading.Event())
 
 
+@pytest.fixture
+def captures(remote: Store, settings: ServiceSettings) -> CaptureSource:
+    return source(remote, settings)
+
+
 def taken(store: Store) -> CaptureRecord:
-    with store.incoming() as folder:
-        files = folder / "files"
-        files.mkdir()
+    with store.incoming() as files:
         (files / "cameras.json").write_bytes(b"{}")
         (files / "cam00.png").write_bytes(PICTURE)
-        inputs = {path.name: sha256_of(path) for path in files.iterdir()}
-        record = CaptureRecord(new_id(), "2026-01-01T00:00:00Z", "upload", None, "", "", (), "", inputs, 9, False)
-        store.add_capture(folder, record)
-    return record
+        return store.capture(stored_files(store, files))
 
 
-def test_files_come_from_the_store_and_new_feature_points_too(
-    settings: ServiceSettings, served: Store, remote: Store
-) -> None:
-    record, captures = taken(served), source(remote, settings)
+def test_files_come_from_the_store_and_new_feature_points_too(served: Store, captures: CaptureSource) -> None:
+    record = taken(served)
     captures.check(record.id)
     with captures.files("job", record.id) as folder:
         assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
@@ -114,21 +113,20 @@ def test_a_cancelled_job_waits_no_longer(
         pass
 
 
-def test_a_capture_that_is_nowhere_fails_its_job(settings: ServiceSettings, served: Store, remote: Store) -> None:
-    captures, record = source(remote, settings), taken(served)
+def test_a_capture_that_is_nowhere_fails_its_job(served: Store, captures: CaptureSource, tmp_path: Path) -> None:
+    record = taken(served)
     with pytest.raises(JobFailed) as failed:
         captures.check(new_id())
     assert failed.value.kind == "not-found"
-    for path in (settings.data.parent / "nas").glob("*/content"):
+    for path in (tmp_path / "nas").glob("*/content"):
         path.unlink()
     with pytest.raises(JobFailed) as failed, captures.files("job", record.id):
         pass
     assert failed.value.kind == "capture-missing"
 
 
-def test_what_is_erased_goes_from_a_workers_own_folder(settings: ServiceSettings, served: Store, remote: Store) -> None:
+def test_what_is_erased_goes_from_a_workers_own_folder(served: Store, remote: Store, captures: CaptureSource) -> None:
     erased, other = taken(served), taken(served)
-    captures = source(remote, settings)
     for record in (erased, other):
         with captures.files("job", record.id):
             remote.cache_of(record.id).mkdir(parents=True)

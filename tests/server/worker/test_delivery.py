@@ -3,8 +3,6 @@ the store is away, the worker is killed, or the job is removed meanwhile."""
 
 import hashlib
 import json
-import os
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,9 +18,9 @@ from tests.support.services import (
     await_state,
     await_true,
     awaited,
+    kill_workers,
     packed_capture,
     running_service,
-    worker_pids,
 )
 
 NAMES = {"head.glb", "head.ply", "overlays/cam00.png"}
@@ -128,8 +126,7 @@ def test_a_killed_worker_leaves_a_delivery_that_another_ends(
     way.fail("503", 10_000, "PUT", "cam00")
     job = submitted(client, capture, "s3://studio-out/heads/", webhook={"url": hook.url})
     await_true(lambda: any(job in path and "cam00" in path for method, path in way.seen if method == "PUT"))
-    for pid in worker_pids(service):
-        os.kill(pid, signal.SIGKILL)
+    kill_workers(service)
     assert "delivery.json" not in delivered(bucket, job)
     way.heal()
     document = delivery_in(client, job, "delivered")
@@ -182,9 +179,7 @@ def test_a_batch_delivers_each_of_its_results(client: httpx.Client, capture: str
     assert {*delivered(bucket, job["id"], "heads/batch/")} == NAMES | {"delivery.json"}
 
 
-def test_an_upload_with_its_job_says_where_to(
-    client: httpx.Client, bucket: Any, tmp_path: Path, service: RunningService
-) -> None:
+def test_an_upload_with_its_job_says_where_to(client: httpx.Client, bucket: Any, tmp_path: Path) -> None:
     files = {"file": packed_capture(tmp_path, 3).read_bytes()}
     away = client.post("/v1/reconstructions", files=files, data={"deliver_to": "s3://studio-out/"})
     assert (away.status_code, away.json()["type"]) == (422, "urn:eigenhead:problem:url-refused")

@@ -29,6 +29,7 @@ from tests.support.services import (
     RunningService,
     await_state,
     await_true,
+    kill_workers,
     packed,
     running_service,
     served_client,
@@ -124,7 +125,9 @@ def test_real_heads_survive_kills_to_the_last_byte(total: int, kills: int, tmp_p
         service,
         client,
     ):
-        capture = client.post("/v1/captures", json={"seed": 1}).json()["id"]
+        shots = [client.post("/v1/captures", json={"seed": 1}).json() for _ in range(2)]
+        assert shots[0]["inputs"] == shots[1]["inputs"], "a seed is one subject"
+        capture = shots[0]["id"]
         settings = {"detail": "span", "outputs": {"surface": "head"}}
         first = submit(service, capture, 0, settings)
         undisturbed = files_of(await_state(client, first, ("succeeded", "failed"), 240))
@@ -135,8 +138,7 @@ def test_real_heads_survive_kills_to_the_last_byte(total: int, kills: int, tmp_p
             time.sleep(rng.uniform(0.2, 3.0))
             if number % 2:
                 service.kill()
-            for pid in worker_pids(service):
-                os.kill(pid, signal.SIGKILL)
+            kill_workers(service)
             if number % 2:
                 service.start()
         ended = [await_state(client, job, ("succeeded", "failed", "cancelled"), 240) for job in jobs]
@@ -168,14 +170,12 @@ def files_of(job: dict[str, Any]) -> dict[str, str]:
 
 
 @contextmanager
-def pinned_worker(service: RunningService, core: int | None = None) -> Iterator["subprocess.Popen[bytes]"]:
-    """A worker of its own, perhaps bound to one core with everything that it starts."""
+def own_worker(service: RunningService) -> Iterator["subprocess.Popen[bytes]"]:
+    """A worker that no service started."""
     environment = os.environ | service.environment | {"EIGENHEAD_DATA": str(service.data)}
-    pin = (lambda: os.sched_setaffinity(0, {core})) if core is not None else None
     with service.log.open("ab") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "server.cli", "worker"], env=environment, cwd=ROOT, stderr=log, preexec_fn=pin
-        )
+        command = [sys.executable, "-m", "server.cli", "worker"]
+        process = subprocess.Popen(command, env=environment, cwd=ROOT, stderr=log)
     try:
         yield process
     finally:
@@ -235,12 +235,12 @@ def test_the_job_of_a_worker_that_never_returns_is_taken_over_within_30_s(kind: 
         served_client(tmp_path / "data", worker=False, tiny_s="3", **settings) as (service, client),
     ):
         capture = uploaded_capture(service, tmp_path)
-        with pinned_worker(service) as first:
+        with own_worker(service) as first:
             job = submit(service, capture, 0)
             await_state(client, job, ("running",))
             stop_between_writes(first, service.data / "eigenhead.sqlite" if kind == "sqlite" else None)
             stopped = time.monotonic()
-            with open_transaction(settings, job), pinned_worker(service):
+            with open_transaction(settings, job), own_worker(service):
                 await_state(client, job, ("succeeded",), 40)
                 taken_s = time.monotonic() - stopped
             assert taken_s < 30 + 3

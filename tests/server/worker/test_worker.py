@@ -3,7 +3,6 @@ SIGKILL may not do to them is driven in ``test_durability.py``. Jobs of dead wor
 others: on the engine's table as its own release makes it."""
 
 import hashlib
-import json
 import threading
 import time
 from collections.abc import Iterator
@@ -22,11 +21,12 @@ from server.settings import ServiceSettings
 from server.storage.database import now_sql, open_database, workers
 from server.storage.events import failure_counts
 from server.storage.job_index import engine_jobs
-from server.storage.records import CaptureRecord, DeliveryRequest, FileEntry, JobRequest
+from server.storage.records import DeliveryRequest, FileEntry, JobRequest
 from server.storage.store import Store, new_id
 from server.tasks.child import WorkFailed
 from server.worker.worker import Worker, described, take_over, warnings_of
 from tests.support.services import small_capture
+from tests.support.stored_captures import stored_files
 
 JOB = "0123456789ab" + 16 * "c"
 ALIVE = {"machine": "m", "host": "h", "pid": 1, "pid_started": 1, "queue": "cpu", "concurrency": 1, "version": "0"}
@@ -63,16 +63,7 @@ def worker(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> I
 @pytest.fixture
 def capture(worker: Worker, tmp_path: Path) -> str:
     """A stored capture of noise; its id."""
-    folder = small_capture(tmp_path / "incoming" / "files").parent
-    inputs = {
-        path.relative_to(folder / "files").as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in (folder / "files").rglob("*")
-        if path.is_file()
-    }
-    created = "2026-01-01T00:00:00+00:00"
-    record = CaptureRecord(new_id(), created, "upload", None, "", "", (), "cam00", inputs, bytes=500, features=False)
-    worker.store.add_capture(folder, record)
-    return record.id
+    return stored_files(worker.store, small_capture(tmp_path / "capture"), bytes=500)
 
 
 def request(capture: str, mode: str | None = None) -> JobRequest:
@@ -132,43 +123,12 @@ def test_a_fit_is_published_once_whoever_publishes_it(worker: Worker, capture: s
     assert files == described(folder / "result")
 
 
-@pytest.mark.parametrize(
-    ("mode", "kind", "faults"),
-    [
-        ("fail", "invalid-capture", ["cam00 sees nobody", "cam01 sees nobody"]),
-        ("crash", "work-crashed", []),
-        ("bug", "internal-error", []),
-        ("killed", "out-of-memory", []),
-    ],
-)
-def test_work_that_fails_is_told_by_its_kind_and_leaves_nothing(
-    worker: Worker, capture: str, mode: str, kind: str, faults: list[str]
-) -> None:
-    worker.ingest(JOB, request(capture))
-    with pytest.raises(JobFailed) as failed:
-        worker.fit(JOB, request(capture, mode))
-    assert (failed.value.kind, [fault.text for fault in failed.value.errors]) == (kind, faults)
-    assert list(worker.store.folder("jobs", JOB).iterdir()) == []
-
-
 @pytest.mark.parametrize("mode", ["killed once", "killed below photo", "short below photo"])
 def test_work_that_the_system_kills_is_done_again_and_with_less(worker: Worker, capture: str, mode: str) -> None:
     worker.ingest(JOB, request(capture))
     worker.publish(JOB, worker.fit(JOB, request(capture, mode)))
     report = worker.store.folder("jobs", JOB) / "result" / "report.json"
     assert [warning["code"] for warning in warnings_of(report)[2:]] == ["level-lowered"] * ("below" in mode)
-
-
-def test_the_last_event_names_cameras_that_moved(worker: Worker, capture: str) -> None:
-    worker.ingest(JOB, request(capture))
-    worker.publish(JOB, worker.fit(JOB, request(capture, "moved")))
-    worker.outcomes.publish(JOB, "succeeded")
-    assert events_of(worker)[-1] == {"state": "succeeded", "camera_moved": ["cam02 has moved by 5.0 px"]}
-
-
-def test_a_job_without_a_report_ends_without_a_word(worker: Worker) -> None:
-    worker.outcomes.publish(JOB, "failed")
-    assert events_of(worker) == [{"state": "failed"}]
 
 
 def test_an_end_waits_for_the_database_and_is_written_once(worker: Worker) -> None:
@@ -213,30 +173,6 @@ def test_each_cause_has_its_kind(worker: Worker, error: BaseException, kind: str
 def test_what_is_no_failure_of_the_job_is_left_to_the_engine(worker: Worker) -> None:
     for error in (Cancelled(), OSError(5, "Input/output error"), KeyboardInterrupt()):
         assert worker._failure(error) is error
-
-
-def test_a_worker_is_one_row_however_often_its_heart_beats(worker: Worker) -> None:
-    with worker.engine.begin() as connection:
-        worker._beat()
-        rows = [connection.execute(sa.select(workers)).one()]
-    for _ in range(2):
-        worker._beat()
-    with worker.engine.connect() as connection:
-        rows += connection.execute(sa.select(workers)).all()
-    first, last = rows
-    assert (first.id, last.id, last.stopped) == (worker.id, worker.id, None)
-    assert last.seen >= first.seen
-    assert (last.queue, last.concurrency) == (worker.settings.queue, worker.settings.concurrency)
-
-
-def test_a_result_is_described_by_size_and_content(tmp_path: Path) -> None:
-    (tmp_path / "overlays").mkdir()
-    (tmp_path / "overlays" / "cam00.png").write_bytes(b"abc")
-    (tmp_path / "report.json").write_text(json.dumps({}))
-    assert described(tmp_path) == {
-        "overlays/cam00.png": {"bytes": 3, "sha256": hashlib.sha256(b"abc").hexdigest()},
-        "report.json": {"bytes": 2, "sha256": hashlib.sha256(b"{}").hexdigest()},
-    }
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """A served studio of six cameras with a drawn head in it, which turns when it is told to."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -76,8 +75,3 @@ def drawn_rig(folder: Path) -> Iterator[DrawnRig]:
 def rig(tmp_path: Path) -> Iterator[DrawnRig]:
     with drawn_rig(tmp_path / "studio") as opened:
         yield opened
-
-
-@pytest.fixture
-def screenshots() -> Path:
-    return Path(os.environ.get("EIGENHEAD_SCREENSHOTS") or Path(__file__).parents[4] / "out" / "screenshots")

@@ -13,7 +13,7 @@ import pytest
 
 from server.services.live.live import IDLE_S, NICENESS
 from tests.server.services.live.conftest import DrawnRig
-from tests.support.services import RunningService, await_true, awaited, served_client
+from tests.support.services import RunningService, await_true, awaited, pids_of, served_client
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]
 
@@ -27,17 +27,9 @@ def said(answer: dict) -> set[str]:
 
 
 def children(service: RunningService) -> list[int]:
-    """The live head's child processes, told by their niceness and the service's environment."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            command, environment = ((folder / name).read_bytes() for name in ("cmdline", "environ"))
-        except OSError:
-            continue
-        words = command.rstrip(b"\0").split(b"\0")
-        if words[-4:-3] == [b"server.tasks.child"] and words[-2] == str(NICENESS).encode():
-            found += [int(folder.name)] * (f"EIGENHEAD_DATA={service.data}\0".encode() in environment + b"\0")
-    return found
+    """The live head's child processes, told by their niceness."""
+    ours = [b"server.tasks.child"], str(NICENESS).encode()
+    return pids_of(service, lambda words: (words[-4:-3], words[-2]) == ours)
 
 
 def kill_while_it_is_asked(service: RunningService, client: httpx.Client) -> int:
@@ -64,12 +56,8 @@ def test_a_head_is_followed_while_somebody_asks(rig: DrawnRig, tmp_path: Path) -
         rig.devices.seat(True)
         seated = until(client, lambda answer: answer["head"] is not None and answer["steady"])
         assert abs(seated["head"]["left_deg"]) < 10.0
-        assert [seated["cameras"][name]["face"] for name in ("cam0", "cam1", "cam2", "cam5")] == [
-            True,
-            True,
-            True,
-            None,
-        ]
+        faces = [seated["cameras"][name]["face"] for name in ("cam0", "cam1", "cam2", "cam5")]
+        assert faces == [True, True, True, None]
         assert not seated["cameras"]["cam5"]["looking"]
         assert len(seated["head"]["vertices"]) > 100
         assert max(max(corners) for corners in seated["head"]["triangles"]) < len(seated["head"]["vertices"])

@@ -7,14 +7,14 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.server.services.live.conftest import drawn_rig
-from tests.support.browser import chromium, keep_screenshots, keep_widths, visit
+from tests.support.browser import SCREENSHOTS, chromium, keep_screenshots, keep_widths, visit
 from tests.support.services import running_service
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 LONG_MS = 240_000
 
 
-def test_the_page_says_what_to_do_and_captures_when_the_head_is_steady(tmp_path: Path, screenshots: Path) -> None:
+def test_the_page_says_what_to_do_and_captures_when_the_head_is_steady(tmp_path: Path) -> None:
     with (
         drawn_rig(tmp_path / "studio") as rig,
         chromium() as browser,
@@ -36,7 +36,7 @@ def test_the_page_says_what_to_do_and_captures_when_the_head_is_steady(tmp_path:
         rig.turn(30.0)
         expect(page.locator("[data-code=live-turn-right]")).to_contain_text("turn right by")
         page.get_by_label("Capture once when steady").check()
-        keep_screenshots(page, screenshots, "live-turned")
+        keep_screenshots(page, SCREENSHOTS, "live-turned")
         page.wait_for_timeout(2500)
         assert captures(service.url) == 0, "it waits for the subject"
         rig.turn(0.0)
@@ -47,8 +47,8 @@ def test_the_page_says_what_to_do_and_captures_when_the_head_is_steady(tmp_path:
         expect(front.locator("[data-lamp=face].good")).to_be_visible(timeout=LONG_MS)
         page.wait_for_timeout(2500)
         assert captures(service.url) == 1, "it captures once"
-        keep_screenshots(page, screenshots, "live-good")
-        keep_widths(page, screenshots, "live-good")
+        keep_screenshots(page, SCREENSHOTS, "live-good")
+        keep_widths(page, SCREENSHOTS, "live-good")
         v.check_clean()
 
 
