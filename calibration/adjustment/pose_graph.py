@@ -79,7 +79,6 @@ class Graph:
     boards: dict[str, RigidTransform]  # world_from_board
     views: tuple[View, ...]
     strays: tuple[View, ...]
-    edges: tuple[Edge, ...]
 
     def state(self, lenses: dict[str, Lens]) -> BundleState:
         """Returns the graph as a bundle adjustment's start, with the intrinsics of ``lenses`` and no time offsets."""
@@ -107,7 +106,7 @@ def build_graph(detections: Detections, lenses: dict[str, Lens]) -> Graph:
         raise PoseGraphError(_reasons(detections, lenses, names, edges, options))
     boards, views, strays = _place_boards(detections.views, cameras, options, board)
     shots = tuple(shot for shot in detections.shots if shot in boards)
-    return Graph(names, shots, cameras, boards, tuple(views), tuple(strays), edges)
+    return Graph(names, shots, cameras, boards, tuple(views), tuple(strays))
 
 
 def _candidates(view: View, lens: Lens, board: Board) -> Candidates:

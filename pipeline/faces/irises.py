@@ -347,7 +347,6 @@ class Iris:
     radius_mm: float
     covariance: Float[np.ndarray, "7 7"]
     views: tuple[str, ...]
-    rms_px: float
 
     @property
     def centre_std_mm(self) -> Float[np.ndarray, " 3"]:
@@ -513,7 +512,7 @@ def _iris(fit: LimbusFit, seen: Sequence[EyeSight]) -> Iris | UnseenEye:
     spread = np.zeros((7, 7))
     spread[:3, :3], spread[3:6, 3:5], spread[6, 5] = np.eye(3), circle.axes().T, 1.0
     covariance = spread @ np.linalg.inv(fit.information) @ spread.T
-    found = Iris(circle.centre, circle.gaze, circle.radius, covariance, tuple(fit.edges), rms)
+    found = Iris(circle.centre, circle.gaze, circle.radius, covariance, tuple(fit.edges))
     return found if found.gaze_std_deg < MAX_GAZE_STD_DEG else UnseenEye("unclear")
 
 

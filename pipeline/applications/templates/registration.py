@@ -23,7 +23,6 @@ from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import vertex_areas
 from rig.errors import InputError
 from rig.formats.meshes.polygon_obj import PolygonMesh
-from rig.geometry import Similarity
 from rig.mesh import boundary_edges, vertex_normals
 from rig.messages.message import compose
 from rig.progress import Progress
@@ -56,8 +55,7 @@ class Registration:
     """Holds a mesh bound to a model's surface, and figures of how well it fits."""
 
     surface_binding: SurfaceBinding
-    place: Similarity  # head_from_template, from the start
-    placed: Vertices  # the mesh there, in its own shape, mm
+    placed: Vertices  # the mesh at its first place in the head frame, in its own shape, mm
     head: Float[np.ndarray, "v 3"]  # the model as like it as it can be, full level, mm
     off_mm: Float[np.ndarray, " n"]  # skin to that head, after the mesh was drawn to it
     unlike_mm: Float[np.ndarray, " n"]  # and before
@@ -120,7 +118,7 @@ def register(
     )  # fmt: skip
     unlike = SurfaceIndex(head.vertices, faces).closest(placed.vertices[rows], CANDIDATES).distances
     report("drawing", 1.0)
-    return Registration(carried, place, placed.vertices, head.vertices, off[joined[rows]], unlike, covered)
+    return Registration(carried, placed.vertices, head.vertices, off[joined[rows]], unlike, covered)
 
 
 def _check(like: Likeness, name: str, *, marked: bool) -> float:

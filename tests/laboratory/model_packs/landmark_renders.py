@@ -60,7 +60,7 @@ class PhotographedHead:
 def as_detection(points: Float[np.ndarray, "468 2"], score: float) -> FaceDetection:
     """A detection with these points."""
     box = np.concatenate([points.min(axis=0), points.max(axis=0)])
-    return FaceDetection(points, np.zeros(len(points)), score, box, crop_around(points).roll_deg)
+    return FaceDetection(points, score, box, crop_around(points).roll_deg)
 
 
 def photograph_head(model: HeadModel, number: int, networks: FaceNetworks, renderer: Renderer) -> PhotographedHead:

@@ -22,7 +22,7 @@ def looking_at(
         covariance = np.zeros((7, 7))
         covariance[:3, :3] = std_mm**2 * np.eye(3)
         covariance[3:6, 3:6] = np.radians(std_deg) ** 2 * across
-        out[side] = Iris(ball + BEHIND_MM * gaze, gaze, 5.85, covariance, ("cam0", "cam1"), 0.2)
+        out[side] = Iris(ball + BEHIND_MM * gaze, gaze, 5.85, covariance, ("cam0", "cam1"))
     return out
 
 

@@ -39,7 +39,7 @@ def faces_of(model: HeadModel, pose: Similarity, rig: Rig, names: tuple[str, ...
     for name in names:
         pixels = rig[name].project(expected)
         box = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
-        found[name] = (FaceDetection(pixels, np.zeros(468), 40.0, box, 0.0),)
+        found[name] = (FaceDetection(pixels, 40.0, box, 0.0),)
     return SubjectFaces(found, None, names)
 
 

@@ -20,10 +20,11 @@ from rig.studio.scene.simulate import Scene, SimulatedCapture, _rolling, _sway, 
 from rig.studio.scene.subject import Look, Subject, random_look
 from rig.studio.sensor import sensor as sensors
 from rig.studio.sensor.faults import KINDS, Fault, fault_from_text
-from rig.studio.sensor.preset import CLEAN, PRESET
+from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.sensor import Sensor, drift, expose, focus, rolled
 from tests.support import oracles
 from tests.support.layouts import ARRANGEMENTS_DEG, arrangement
+from tests.support.small_studio import CLEAN
 
 pytestmark = pytest.mark.gl
 

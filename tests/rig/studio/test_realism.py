@@ -14,10 +14,11 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.skin_texture import DRY, oily_zones
 from rig.studio.scene.subject import scattered
-from rig.studio.sensor.preset import CLEAN, PRESET, REALISM, made_real, realism_names
+from rig.studio.sensor.preset import PRESET, REALISM, made_real, realism_names
 from rig.studio.sensor.sensor import Sensor, compressed, expose, through_mosaic
 from tests.rig.studio.test_images import egg_head
 from tests.support.scenes import ellipsoid
+from tests.support.small_studio import CLEAN
 
 if TYPE_CHECKING:
     from rig.render.renderer import Renderer
