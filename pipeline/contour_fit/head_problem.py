@@ -21,7 +21,7 @@ from pipeline.contour_fit.problem import (
     State,
     moved_views,
 )
-from pipeline.contour_fit.rim import project_with_slopes
+from pipeline.contour_fit.rim_kernels import projected_with_slopes
 from pipeline.contour_fit.rim_term import LinearisedRimTerm, RimTerm
 from pipeline.contour_fit.surface_term import SurfaceTerm
 from pipeline.estimation.robust import GemanMcClure
@@ -49,7 +49,7 @@ class FeatureTerm:
         observed, views = self.observed, moved_views(self.problem, state)
         moved = np.einsum("m,mnc->nc", state.coefficients, observed.basis[: len(state.coefficients)])
         points = state.world_from_head.apply(observed.mean + moved)
-        pixels, slopes = project_with_slopes(points, observed.view, views)
+        pixels, slopes = projected_with_slopes(points, observed.view, views.packed())
         deviation_px = self._deviation_px(slopes)[:, None]
         return Residuals(
             (pixels - observed.pixel) / deviation_px,

@@ -85,22 +85,6 @@ class Target:
         return Associated(row, triangle[row], blend[row], np.sqrt(square[row]))
 
 
-def associate(
-    points: Float[np.ndarray, "p 3"],
-    normals: Float[np.ndarray, "p 3"],
-    vertices: Float[np.ndarray, "v 3"],
-    vertex_normals: Float[np.ndarray, "v 3"],
-    faces: Faces,
-    *,
-    reach_mm: float,
-    least_agreement: float,
-) -> Associated:
-    """Finds the closest point on a head for every surface point within reach, as ``Target.closest`` does, for a head
-    that is searched only once. Points and head are in one frame, mm."""
-    target = Target.of(vertices, vertex_normals, faces)
-    return target.closest(points, normals, reach_mm=reach_mm, least_agreement=least_agreement)
-
-
 def interpolated(corners: Float[np.ndarray, "n 3 3"], blend: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Returns the values at n points inside triangles: the sum of the values at the three corners, weighted with the
     barycentric coordinates ``blend``."""

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
-from pipeline.detail.association import Associated, associate, interpolated
+from pipeline.detail.association import Associated, Target, interpolated
 from pipeline.detail.blink import blink_shift, estimate_eyelid_closure, plain_shape
 from pipeline.detail.dense_points import CELL_MM, SurfacePoints, thinned
 from pipeline.detail.ears import with_ears_in_place
@@ -275,14 +275,8 @@ def observe(
     function for ICP*), which is exact to second order where both are curved.
     """
     normals = vertex_normals(current, faces)
-    found = associate(
-        surface.points,
-        surface.normals,
-        current,
-        normals,
-        faces,
-        reach_mm=limits.loose_reach_mm,
-        least_agreement=limits.agreement,
+    found = Target.of(current, normals, faces).closest(
+        surface.points, surface.normals, reach_mm=limits.loose_reach_mm, least_agreement=limits.agreement
     )
     corner = faces[found.triangle]
     reach = np.where(loose[corner].any(axis=1), limits.loose_reach_mm, limits.reach_mm)

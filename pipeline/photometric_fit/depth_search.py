@@ -33,7 +33,7 @@ from pipeline.geometry.projection import camera_depths, packed_camera, project_p
 from pipeline.geometry.projection_kernels import rasterise
 from pipeline.geometry.surface_index import facing_cosine
 from pipeline.multiview.triangulation import depth_factor, parallax
-from pipeline.photometric_fit.images import MIN_BLUR_PX, Photographs, blurred, distance_of
+from pipeline.photometric_fit.images import MIN_BLUR_PX, Photographs, blurred
 from pipeline.photometric_fit.patch_kernels import (
     Members,
     Pictures,
@@ -127,7 +127,7 @@ def visibility_of(
     points, outward = patches.points(head_world.vertices), patches.normals(normals)
 
     def one(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        camera, distance = cameras[k], distance_of(views, k)
+        camera, distance = cameras[k], views.distance_map(k)
         facing, ends = np.zeros(len(points), np.float32), np.zeros((2, len(points), 2))
         if not speaks[k]:
             return facing, ends[0], ends[1]

@@ -277,11 +277,6 @@ def locate(url: str, prefixes: Collection[str]) -> tuple[str, str]:
     raise UrlRefused(compose("object-url-not-allowed", prefixes=sorted(prefixes)))
 
 
-def is_object_url(url: str) -> bool:
-    """Returns whether a URL names an object in a store, not a page on the web."""
-    return url.startswith(("s3://", "file://"))
-
-
 def open_objects(prefix: str, settings: ServiceSettings) -> ObjectStore:
     """Opens the store at ``s3://bucket/prefix/`` or ``file:///folder/``, without sending a request. Raises StoreDenied
     if the extra for S3 is not installed."""

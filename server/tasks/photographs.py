@@ -122,7 +122,7 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
     made_of = _made_of(root, front)
     if (told_before := calibration_warnings(kept, made_of)) is not None:
         return told_before
-    from calibration.scene.result import write_scene_report
+    from calibration.scene.result import scene_page
     from calibration.scene.scene import calibrate_scene
 
     scale = entry(root, SCALE)
@@ -136,7 +136,7 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
         rig = rig.subset(spread_views(rig, CAMERAS_MOST))
         warnings.append(compose("views-many", joined=len(found.rig), most=CAMERAS_MOST))
     write_rig(rig, kept / CAMERAS)
-    write_scene_report(found, kept / PAGE)
+    write_atomically(kept / PAGE, scene_page(found).encode())
     document = {
         "made_of": made_of,
         "cameras_sha256": sha256_of(kept / CAMERAS),

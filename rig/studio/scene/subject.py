@@ -16,7 +16,7 @@ from rig.messages.message import compose
 from rig.render.photograph import NOISE_CELLS, Gallery, Grain, Part
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import Anatomy, Landmarks, anatomy
-from rig.studio.scene.eyes import IRIS_TONES, Eye, EyeSurface, eye_centres, look_at_point, opened, surface
+from rig.studio.scene.eyes import IRIS_TONES, Eye, eye_centres, look_at_point, opened, surface
 from rig.studio.scene.hair import STRAND_POINTS, Hair, HairStyle, grow, grow_beard, hang, knot
 from rig.studio.scene.lights import LAMPS, Lamp, irradiance, lamp_directions
 from rig.studio.scene.skin_texture import oily_zones, skin_paint
@@ -224,7 +224,8 @@ def dress(
         grain = CLOTH if appearance.texture else NO_GRAIN
         pieces.append(Piece("clothes", *worn, worn[0], _even(worn[0], appearance.cloth), grain, False))
     pieces += _headwear(head, body, appearance, hairs[0][0] if appearance.hair else None)
-    pieces += [_eye_piece(surface(eye, eye_rng)) for eye in subject.eyes.values()]
+    for eye in (surface(eye, eye_rng) for eye in subject.eyes.values()):
+        pieces.append(Piece("head", eye.vertices, eye.faces, eye.vertices, eye.paint, NO_GRAIN, True, eye.oil))
     if appearance.tight_cap:
         pieces.append(_tight_cap(head, body, appearance.tight_cap, cap_rng))
     placed = [(world_from_head.apply(piece.vertices), piece.faces) for piece in pieces]
@@ -311,10 +312,6 @@ def _hairs(
     if appearance.beard:
         styles.append((grow_beard(head, body, appearance.beard, rng), appearance.beard))
     return styles
-
-
-def _eye_piece(eye: EyeSurface) -> Piece:
-    return Piece("head", eye.vertices, eye.faces, eye.vertices, eye.paint, NO_GRAIN, True, eye.oil)
 
 
 def _hair_piece(hair: Hair, style: HairStyle) -> Piece:

@@ -12,7 +12,6 @@ from calibration.adjustment.gauge import (
     image_distance,
     image_sigma,
     intrinsics_jacobian,
-    moved,
     pose_jacobian,
     subject_points,
     world_motions,
@@ -64,7 +63,7 @@ def test_jacobians_of_pose_and_lens_are_finite_differences() -> None:
     for index in range(6):
         step = np.zeros(6)
         step[index] = 1e-5
-        numeric = (moved(camera, step).project(points) - moved(camera, -step).project(points)) / 2e-5
+        numeric = (camera.moved(step).project(points) - camera.moved(-step).project(points)) / 2e-5
         np.testing.assert_allclose(pose_jacobian(camera, points)[:, :, index], numeric, atol=1e-4, rtol=1e-6)
     values = camera.intrinsics.values()
     for index in range(9):

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.head_model.model_file import expression_names
 from pipeline.head_model.model_names import model_path
-from server.batch.table import Column, Row, columns_of, csv_bytes, has_parquet, parquet_bytes, write_table
+from server.batch.table import Column, Row, columns_of, csv_lines, has_parquet, parquet_bytes, write_table
 
 COLUMNS = (
     Column("capture", "text", "", "its name"),
@@ -27,7 +27,7 @@ ROWS: list[Row] = [
 
 
 def test_csv_gives_every_digit_back() -> None:
-    read = list(csv.DictReader(io.StringIO(csv_bytes(COLUMNS, ROWS).decode("utf-8"), newline="")))
+    read = list(csv.DictReader(io.StringIO(b"".join(csv_lines(COLUMNS, ROWS)).decode("utf-8"), newline="")))
     assert read[0] == {"capture": 'anna, "A"\nlate', "nose_length_mm": repr(0.1 + 0.2), "warning_count": "3",
                        "pose_doubtful": "true"}  # fmt: skip
     assert float(read[0]["nose_length_mm"]) == 0.1 + 0.2
@@ -69,7 +69,7 @@ def test_pandas_opens_both_files(tmp_path: Path) -> None:
 
 
 def test_a_table_of_nothing_has_its_columns() -> None:
-    assert csv_bytes(COLUMNS, []) == b"capture,nose_length_mm,warning_count,pose_doubtful\r\n"
+    assert b"".join(csv_lines(COLUMNS, [])) == b"capture,nose_length_mm,warning_count,pose_doubtful\r\n"
     assert pyarrow.parquet.read_table(io.BytesIO(parquet_bytes(COLUMNS, []))).num_columns == 4
 
 

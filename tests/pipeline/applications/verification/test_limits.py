@@ -2,14 +2,15 @@
 
 import pytest
 
-from pipeline.applications.verification.judgement import Limits, checks, limits_from_document
+from pipeline.applications.verification.judgement import Limits, checks
 from rig.errors import InputError
+from rig.typed_tables import read_table
 
 
 def test_limits_are_read_and_wrong_ones_named() -> None:
-    assert limits_from_document({"face_rms_mm": 1}) == Limits(face_rms_mm=1.0)
+    assert read_table(Limits, {"face_rms_mm": 1}, "limits") == Limits(face_rms_mm=1.0)
     with pytest.raises(InputError) as error:
-        limits_from_document({"face_rms": 1.0, "least_covered": "much"}, "limits.toml")
+        read_table(Limits, {"face_rms": 1.0, "least_covered": "much"}, "limits.toml")
     assert "limits.toml: unknown key 'face_rms'; did you mean 'face_rms_mm'?" in str(error.value)
     assert "least_covered is 'much', expected a finite number" in str(error.value)
 
