@@ -24,8 +24,8 @@ from jaxtyping import Float, UInt8
 from calibration.board.board import SQUARES_LEAST, Board
 from calibration.board.corners import Found, classic_corners, detect, in_board_order, pattern_continues
 from calibration.board.picture_files import filed_by_shot, list_pictures
-from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
+from rig.files import write_atomically
 from rig.messages.message import Message, compose
 from rig.progress import Progress, discard_progress
 

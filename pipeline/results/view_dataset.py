@@ -16,9 +16,9 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from pipeline.compute.threads import task_pool
 from pipeline.imaging.silhouette import Silhouette
-from rig.atomic_write import write_atomically
 from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
+from rig.files import write_atomically
 from rig.formats.cameras.dataset_json import (
     FLAME_CANONICAL,
     FLAME_MOMENT,

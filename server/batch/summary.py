@@ -6,7 +6,7 @@ from typing import Any
 
 from pipeline.head_model.model_file import expression_names
 from pipeline.head_model.model_names import model_path
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.messages.message import MessageDocument, documents_of
 from server.batch.folder import BatchFolder, FailureRecord, Origin
 from server.batch.plan import BatchTask

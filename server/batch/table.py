@@ -16,8 +16,7 @@ from typing import Any, Literal
 from pipeline.evidence.measurements import DISTANCES
 from pipeline.evidence.pose import PUPIL_DISTANCE
 from pipeline.head_model.landmarks import NAMES
-from rig.atomic_write import write_atomically
-from rig.digest import document_sha256
+from rig.files import document_sha256, write_atomically
 from rig.text import printable
 from server.batch.captures import BatchCapture
 from server.batch.folder import FailureRecord, Origin

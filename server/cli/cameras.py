@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.messages.message import compose, texts_of
 from server.cli.answers import (
     Json,
@@ -152,7 +152,7 @@ def _calibrate_board(
     from calibration.calibrate import calibrate as run
     from calibration.report import report_page
     from calibration.result import CalibrationRefused
-    from rig.atomic_write import write_atomically
+    from rig.files import write_atomically
     from rig.formats.cameras.cameras_json import read_rig, write_rig
 
     known = None if previous is None else read_rig(previous)
@@ -182,7 +182,7 @@ def _calibrate_scene(
 ) -> None:
     from calibration.scene.result import scene_page
     from calibration.scene.scene import calibrate_scene
-    from rig.atomic_write import write_atomically
+    from rig.files import write_atomically
     from rig.formats.cameras.cameras_json import write_rig
 
     page = out.with_suffix(".html")
@@ -222,7 +222,7 @@ def refine(
     warn_of_replacement(out, overwrite)
     prepare_file(out)
     from calibration.silhouette_refinement.report import refinement_page
-    from rig.atomic_write import write_atomically
+    from rig.files import write_atomically
     from rig.formats.cameras.cameras_json import write_rig
     from server.tasks.refine import refine_locally
 

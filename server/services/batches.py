@@ -17,8 +17,8 @@ from typing import Literal
 import sqlalchemy as sa
 import structlog
 
-from rig.digest import document_sha256
 from rig.errors import EigenheadError, InputError
+from rig.files import document_sha256
 from rig.messages.message import Message, compose
 from server.errors import Conflict, DiskFull, NotFound, TooMany
 from server.services.deliveries import destination

@@ -20,9 +20,9 @@ from rig.acquisition.judgement import PlatesRefused
 from rig.acquisition.plates import PlatesVersion, link_plates, plates_versions
 from rig.acquisition.session import RigSession
 from rig.acquisition.shot import ShotDocument, ShotFailed
-from rig.atomic_write import write_atomically
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError
+from rig.files import write_atomically
 from rig.formats.cameras.cameras_json import read_rig, write_rig
 from rig.formats.captures.capture_folder import write_capture
 from rig.formats.pictures.images import encode_image, write_image

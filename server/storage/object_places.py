@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import quote
 
-from rig.digest import sha256_of
+from rig.files import sha256_of
 from rig.messages.message import Message, compose
 from server.errors import UrlRefused
 from server.settings import OBJECT_PREFIX, ServiceSettings

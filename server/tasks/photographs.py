@@ -16,11 +16,10 @@ from jaxtyping import Bool, UInt8
 
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.warnings import ReportWarning
-from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
 from rig.capture import Capture, ReadImage
-from rig.digest import sha256_of
 from rig.errors import InputError
+from rig.files import sha256_of, write_atomically
 from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
 from rig.formats.cameras.cameras_json import CAMERAS_MOST, read_rig, write_rig
 from rig.formats.cameras.scale_json import read_scale

@@ -32,8 +32,8 @@ from pipeline.evidence.measurements import Measurement
 from pipeline.head_model.landmarks import stacked
 from pipeline.results.overlays import Resized, clay, contact_sheet
 from pipeline.results.pdf_page import BAD, FAINT, LINE_MM, MARGIN_MM, PdfPage
-from rig.atomic_write import write_atomically
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.ply import ply_bytes
 from rig.formats.meshes.scene import Part, Scene

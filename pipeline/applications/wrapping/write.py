@@ -19,7 +19,7 @@ from pipeline.applications.templates.write.mesh import (
 )
 from pipeline.applications.wrapping.wrap import Wrapped, residual_colours, surface_in_head
 from pipeline.results.overlays import clay, contact_sheet
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.meshes.ply import ply_bytes
 from rig.formats.meshes.polygon_obj import fan, polygon_obj_bytes
 from rig.formats.pictures.images import write_image

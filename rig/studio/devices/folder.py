@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.captures.capture_folder import write_capture
 from rig.formats.meshes.ply import write_ply

@@ -18,8 +18,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rig.atomic_write import write_atomically
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.pictures.images import encode_image
 from rig.image import ImageRgb
