@@ -116,15 +116,10 @@ def _candidates(view: View, lens: Lens, board: Board) -> Candidates:
         refined = poses[0].rotation
         # The lens's own bundle may have settled on either pose; the other of the two is the alternative.
         poses.append(max((pose for pose, _ in fits), key=lambda pose: _angle_deg(pose.rotation, refined)))
-    motions = _turn_motions(board)
+    corners = board.corners()
+    motions = [rigid_fit(corners, corners[turn]) for turn in board.turns()]  # of corner i to corner turn[i]
     pairs = [(pose @ motion.inverse(), turn) for pose in poses for turn, motion in enumerate(motions)]
     return Candidates(tuple(pose for pose, _ in pairs), tuple(turn for _, turn in pairs))
-
-
-def _turn_motions(board: Board) -> list[RigidTransform]:
-    """Returns the motions of the board that move corner i to corner turn[i], one for each turn."""
-    corners = board.corners()
-    return [rigid_fit(corners, corners[turn]) for turn in board.turns()]
 
 
 def _edge(a: str, b: str, options: dict[tuple[str, str], Candidates], board: Board) -> Edge | None:

@@ -26,7 +26,7 @@ from pipeline.detail.ears import with_ears_in_place
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids, with_plain_lids
 from pipeline.detail.outline_points import Outlines, OutlineSearch
 from pipeline.detail.patch_points import PatchPlaces, PatchSearch
-from pipeline.detail.smooth_field import SmoothField, smooth_field
+from pipeline.detail.smooth_field import smooth_field
 from pipeline.detail.solve import (
     NodeMesh,
     Nodes,
@@ -205,7 +205,7 @@ def deform_to_points(
     )
     base = current = unfolded(vertices, current, faces)
     normals = vertex_normals(base, faces)
-    field = _laid_out(nodes.fine, base, LENGTH_MM)
+    field = smooth_field(nodes.fine.shape @ base, nodes.fine.faces, LENGTH_MM)
     directions = normal_directions(nodes.fine, nodes.fine.shape @ amplitude, normals)
     report("fine", len(COARSE) / (len(COARSE) + 1))
     dense = observe(base, current, faces, fine_points, loose, limits=FINE, floor_mm=FLOOR_MM)
@@ -237,7 +237,7 @@ def _coarsely_deformed(
 ) -> Vertices:
     """Returns the vertices after the coarse rounds, which move them freely in space."""
     current = vertices
-    field = _laid_out(nodes, vertices, COARSE_LENGTH_MM)
+    field = smooth_field(nodes.shape @ vertices, nodes.faces, COARSE_LENGTH_MM)
     directions = free_directions(nodes, nodes.shape @ amplitude)
     for i, limits in enumerate(COARSE):
         report("fine", i / (len(COARSE) + 1))
@@ -252,10 +252,6 @@ def with_outlines(
 ) -> Observed:
     """Returns the observations together with those of the outlines, if there are any."""
     return observed if outlines is None else observed.joined(outlines(base, current, robust_mm))
-
-
-def _laid_out(mesh: NodeMesh, vertices: Vertices, length_mm: float) -> SmoothField:
-    return smooth_field(mesh.shape @ vertices, mesh.faces, length_mm)
 
 
 def observe(

@@ -274,20 +274,13 @@ def find_places(
     view, value = choose_views(patches, weights, visibility.facing, MIN_SEEN, MAX_VIEWS)
     peaks = find_peaks(correlate(patches, weights, view, value, seen, grey=grey, noise=noise), steps)
     blur_mm = np.maximum(each.blur_mm, MIN_BLUR_PX / scale).mean()
-    floor_mm = FLOOR_MM * patch_depth_factor(patches, visibility, view, value)
+    centres, at = np.array([camera.centre_world for camera in visibility.cameras]), patches.centre
+    spread = parallax(visibility.vertices[at], visibility.normals[at], centres, view, value)
+    floor_mm = FLOOR_MM * depth_factor(spread)  # larger where the patch's views stand closer together
     variance = floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - peaks.height) / peaks.curvature
     least = MIN_CORRELATION if each.with_shading else MIN_TEXTURE_CORRELATION
     clear = peaks.inside & (peaks.height > least)
     return Places(peaks.place, peaks.height, variance, view[:, 1] >= 0, clear, view, value, weights, samples, pictures)
-
-
-def patch_depth_factor(
-    patches: Patches, visibility: SampleVisibility, view: Int[np.ndarray, "c n"], value: Float[np.ndarray, "c n"]
-) -> Float[np.ndarray, " c"]:
-    """Returns the ratio of each patch's depth error to that with the usual rig, for the same error in the images; at
-    least 1. It exceeds 1 where the patch's views stand closer together."""
-    centres, at = np.array([camera.centre_world for camera in visibility.cameras]), patches.centre
-    return depth_factor(parallax(visibility.vertices[at], visibility.normals[at], centres, view, value))
 
 
 def head_depth_factor(head_world: Mesh, face: Int[np.ndarray, " n"], cameras: Sequence[Camera]) -> float:

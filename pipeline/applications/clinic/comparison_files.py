@@ -317,15 +317,11 @@ def _write_meshes(folder: Path, comparison: Comparison, colours: UInt8[np.ndarra
     packed = io.BytesIO()
     np.savez_compressed(
         packed,
-        distance_mm=_single(comparison.distance_mm),
-        std_mm=_single(comparison.std_mm),
+        distance_mm=comparison.distance_mm.astype(np.float32),
+        std_mm=comparison.std_mm.astype(np.float32),
         changed=changed.astype(np.uint8),
     )
     write_atomically(folder / "difference.npz", packed.getvalue())
-
-
-def _single(values: Float[np.ndarray, " v"]) -> np.ndarray:
-    return values.astype(np.float32)
 
 
 def comparison_pdf(document: Mapping[str, Any], rows: Sequence[tuple[str, Sequence[Resized]]]) -> bytes:

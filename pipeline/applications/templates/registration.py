@@ -113,9 +113,9 @@ def register(
         raise NotRegistered(name, [compose("template-off-skin")])
     rest = _followed(welded.vertices, rest, on_skin)
     rows = np.flatnonzero(on_skin[joined])
-    carried = surface_binding(
-        rest[joined], rows, _rows_of(attachment, joined[rows]), balls(welded, parts, ~skin)[joined]
-    )  # fmt: skip
+    own = joined[rows]
+    own_attachment = Attachment(attachment.triangles[own], attachment.weights[own], attachment.offsets[own])
+    carried = surface_binding(rest[joined], rows, own_attachment, balls(welded, parts, ~skin)[joined])
     unlike = SurfaceIndex(head.vertices, faces).closest(placed.vertices[rows], CANDIDATES).distances
     report("drawing", 1.0)
     return Registration(carried, placed.vertices, head.vertices, off[joined[rows]], unlike, covered)
@@ -255,7 +255,3 @@ def _followed(before: Vertices, after: Vertices, skin: Flags) -> Vertices:
     out = after.copy()
     out[~skin] = landmark_warp(before[rows], after[rows], before[~skin])
     return out
-
-
-def _rows_of(attachment: Attachment, rows: Int[np.ndarray, " n"]) -> Attachment:
-    return Attachment(attachment.triangles[rows], attachment.weights[rows], attachment.offsets[rows])
