@@ -113,9 +113,9 @@ def register(
         raise NotRegistered(name, [compose("template-off-skin")])
     rest = _followed(welded.vertices, rest, on_skin)
     rows = np.flatnonzero(on_skin[joined])
-    own = joined[rows]
-    own_attachment = Attachment(attachment.triangles[own], attachment.weights[own], attachment.offsets[own])
-    carried = surface_binding(rest[joined], rows, own_attachment, balls(welded, parts, ~skin)[joined])
+    at = joined[rows]
+    attached = Attachment(attachment.triangles[at], attachment.weights[at], attachment.offsets[at])
+    carried = surface_binding(rest[joined], rows, attached, balls(welded, parts, ~skin)[joined])
     unlike = SurfaceIndex(head.vertices, faces).closest(placed.vertices[rows], CANDIDATES).distances
     report("drawing", 1.0)
     return Registration(carried, placed.vertices, head.vertices, off[joined[rows]], unlike, covered)
