@@ -2,14 +2,12 @@
 
 from collections.abc import Iterable
 from html import escape
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from calibration.adjustment.state import INTRINSICS
 from calibration.result import Calibration
-from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.messages.message import Message
 
@@ -24,11 +22,6 @@ tr:nth-child(even) td { background: #f4f5f7 } svg { background: #fbfbfc; border:
 .good { color: #176f2c } .bad { color: #b3261e; font-weight: 600 } .none { color: #6b7280 }
 .wide td { text-align: left }
 """
-
-
-def write_report(calibration: Calibration, html: Path) -> None:
-    """Writes the page to ``html``."""
-    write_atomically(html, report_page(calibration).encode())
 
 
 def report_page(calibration: Calibration) -> str:

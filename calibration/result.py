@@ -1,9 +1,7 @@
 """Defines the result of a calibration: the rig with its covariances, and the figures and checks behind it."""
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,6 @@ from calibration.adjustment.timing import TimeOffsets
 from calibration.board.board import Board
 from calibration.quality.checks import CameraEvidence, Check, Verdict, judge
 from calibration.quality.outliers import Dropped
-from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import EigenheadError
 from rig.formats.cameras.cameras_json import document_from_rig
@@ -156,8 +153,3 @@ def _check_document(check: Check) -> dict[str, Any]:
         "detail_message": check.detail.document(),
         "advice_message": None if check.advice is None else check.advice.document(),
     }
-
-
-def write_calibration(calibration: Calibration, path: Path) -> None:
-    """Writes ``cameras.json`` with covariances."""
-    write_atomically(path, json.dumps(document_from_rig(calibration.rig), indent=1).encode())

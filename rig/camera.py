@@ -3,13 +3,13 @@
 ``x = X / Z`` in the camera frame is distorted to ``x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + tangential`` (OpenCV's
 order k1 k2 p1 p2 k3), and ``u = fx x_d + cx``. Pixel (0, 0) is the centre of the top-left pixel."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
 
-from rig.geometry import RigidTransform
+from rig.geometry import RigidTransform, rotation_from_vector
 from rig.recorded_lens import RecordedLens
 
 Pixels = Float[np.ndarray, "n 2"]
@@ -130,6 +130,12 @@ class Camera:
     def axis_world(self) -> Float[np.ndarray, " 3"]:
         """Returns the unit vector of the camera's viewing direction."""
         return self.camera_from_world.rotation[2]
+
+    def moved(self, step: Float[np.ndarray, " 6"]) -> "Camera":
+        """Returns the camera after a left perturbation of its pose by a rotation vector (rad) and a translation (mm),
+        in the camera's frame."""
+        motion = RigidTransform(rotation_from_vector(step[:3]), step[3:])
+        return replace(self, camera_from_world=motion @ self.camera_from_world)
 
     def project(self, points_world: Points) -> Pixels:
         """Projects world points (mm) to pixels. Returns NaN behind the camera and beyond the distortion's valid

@@ -37,8 +37,7 @@ from numba.core.options import TargetOptions
 from numba.core.registry import cpu_target
 from numba.core.runtime.nrt import rtsys
 
-from rig.atomic_write import write_atomically
-from rig.cache_folder import cache_folder
+from rig.files import cache_folder, write_atomically
 
 CARRIED = Path(__file__).with_name("compiled_loops")  # beside the code, where a wheel was built with them
 DIGEST_BYTES = 32

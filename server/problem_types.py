@@ -80,7 +80,7 @@ HTTP_TYPES = {
     500: "internal-server-error",
     503: "service-unavailable",
 }
-"""The type of what the web framework refuses by itself, by its status."""
+"""The type of what the web framework refuses by itself, by its status; of any other it is ``http-error``."""
 
 
 def type_of_input(subject: str) -> str:
@@ -92,9 +92,3 @@ def type_of_failure(kind: str) -> str:
     """Returns the stable name of the problem for failed work. ``kind``: the class of its error, or how its child
     process ended."""
     return FAILURE_TYPES.get(kind, "eigenhead-error")
-
-
-def type_of_status(status: int) -> str:
-    """Returns the stable name of the problem for a request that the web framework itself refuses with this HTTP
-    status."""
-    return HTTP_TYPES.get(status, "http-error")

@@ -35,13 +35,6 @@ def subject_points(rig: Rig, radius_mm: float = SUBJECT_RADIUS_MM, count: int = 
     return rig.centre_world() + radius_mm * np.stack([ring * np.cos(angle), height, ring * np.sin(angle)], axis=1)
 
 
-def moved(camera: Camera, step: Float[np.ndarray, " 6"]) -> Camera:
-    """Returns the camera after a left perturbation of its pose by a rotation (rad) and a translation (mm): x' = R(w) x
-    + v in the camera's frame."""
-    motion = RigidTransform(rotation_from_vector(step[:3]), step[3:])
-    return replace(camera, camera_from_world=motion @ camera.camera_from_world)
-
-
 def pose_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 6"]:
     """Returns the derivative of the points' pixels by a left perturbation of camera_from_world (px per rad and mm)."""
     _, by_world = camera.project_with_jacobian(points_world)

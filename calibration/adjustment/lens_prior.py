@@ -102,8 +102,3 @@ def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
         sigma.append(spread + [LENS_PRIOR[name] for name in INTRINSICS[4:]])
     information = np.stack([np.diag(np.array(row, dtype=float) ** -2) for row in sigma])
     return LensPrior(np.array(mean, dtype=float), information)
-
-
-def fixed_prior(intrinsics: Float[np.ndarray, "c 9"]) -> LensPrior:
-    """Returns a prior with zero information, for lenses that ``Free(intrinsics=False)`` keeps fixed."""
-    return LensPrior(intrinsics, np.zeros((len(intrinsics), 9, 9)))

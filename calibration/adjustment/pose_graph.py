@@ -79,7 +79,6 @@ class Graph:
     boards: dict[str, RigidTransform]  # world_from_board
     views: tuple[View, ...]
     strays: tuple[View, ...]
-    edges: tuple[Edge, ...]
 
     def state(self, lenses: dict[str, Lens]) -> BundleState:
         """Returns the graph as a bundle adjustment's start, with the intrinsics of ``lenses`` and no time offsets."""
@@ -107,7 +106,7 @@ def build_graph(detections: Detections, lenses: dict[str, Lens]) -> Graph:
         raise PoseGraphError(_reasons(detections, lenses, names, edges, options))
     boards, views, strays = _place_boards(detections.views, cameras, options, board)
     shots = tuple(shot for shot in detections.shots if shot in boards)
-    return Graph(names, shots, cameras, boards, tuple(views), tuple(strays), edges)
+    return Graph(names, shots, cameras, boards, tuple(views), tuple(strays))
 
 
 def _candidates(view: View, lens: Lens, board: Board) -> Candidates:
@@ -117,15 +116,10 @@ def _candidates(view: View, lens: Lens, board: Board) -> Candidates:
         refined = poses[0].rotation
         # The lens's own bundle may have settled on either pose; the other of the two is the alternative.
         poses.append(max((pose for pose, _ in fits), key=lambda pose: _angle_deg(pose.rotation, refined)))
-    motions = _turn_motions(board)
+    corners = board.corners()
+    motions = [rigid_fit(corners, corners[turn]) for turn in board.turns()]  # of corner i to corner turn[i]
     pairs = [(pose @ motion.inverse(), turn) for pose in poses for turn, motion in enumerate(motions)]
     return Candidates(tuple(pose for pose, _ in pairs), tuple(turn for _, turn in pairs))
-
-
-def _turn_motions(board: Board) -> list[RigidTransform]:
-    """Returns the motions of the board that move corner i to corner turn[i], one for each turn."""
-    corners = board.corners()
-    return [rigid_fit(corners, corners[turn]) for turn in board.turns()]
 
 
 def _edge(a: str, b: str, options: dict[tuple[str, str], Candidates], board: Board) -> Edge | None:

@@ -19,9 +19,9 @@ import numpy as np
 from fpdf import FPDF
 from jaxtyping import Bool, Float, Int, UInt8
 
-from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.messages.message import Message, compose
 

@@ -9,6 +9,7 @@ CALIB_CB_LARGER would detect a larger board but, on real pictures, adds rows tha
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -97,7 +98,8 @@ def _homography(source: np.ndarray, target: np.ndarray) -> Float[np.ndarray, "3 
 
 
 def _checkerboard(grey: np.ndarray, board: Board) -> Corners | None:
-    for finder in (_sector_based, _sector_based_exhaustive, classic_corners):
+    exhaustive = partial(_sector_based, flags=SB | cv2.CALIB_CB_EXHAUSTIVE)
+    for finder in (_sector_based, exhaustive, classic_corners):
         corners = finder(grey, board)
         if corners is None:
             continue
@@ -164,10 +166,6 @@ def _values(grey: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 def _sector_based(grey: np.ndarray, board: Board, flags: int = SB) -> np.ndarray | None:
     ok, corners = cv2.findChessboardCornersSB(grey, board.grid, flags=flags)
     return corners.reshape(-1, 2) if ok else None
-
-
-def _sector_based_exhaustive(grey: np.ndarray, board: Board) -> np.ndarray | None:
-    return _sector_based(grey, board, SB | cv2.CALIB_CB_EXHAUSTIVE)
 
 
 def classic_corners(grey: np.ndarray, board: Board) -> np.ndarray | None:

@@ -24,8 +24,8 @@ from jaxtyping import Float, UInt8
 from calibration.board.board import SQUARES_LEAST, Board
 from calibration.board.corners import Found, classic_corners, detect, in_board_order, pattern_continues
 from calibration.board.picture_files import filed_by_shot, list_pictures
-from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
+from rig.files import write_atomically
 from rig.messages.message import Message, compose
 from rig.progress import Progress, discard_progress
 
@@ -459,19 +459,18 @@ def _fit(flat: Float[np.ndarray, "m 4 2"], observed: Float[np.ndarray, "m 4 2"])
 def other_dictionary(greys: Iterable[UInt8[np.ndarray, "h w"]], dictionary: str) -> str | None:
     """Finds another of OpenCV's dictionaries that fits a picture's markers, the smallest of these; None if there is
     none."""
-    names = sorted(
-        (name for name in dir(cv2.aruco) if name.startswith("DICT_") and name != dictionary), key=_dictionary_size
-    )
+    sizes = {
+        name: len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
+        for name in dir(cv2.aruco)
+        if name.startswith("DICT_") and name != dictionary
+    }
+    names = sorted(sizes, key=lambda name: sizes[name])
     for grey in greys:
         counts = {name: len(find_markers(grey, name)) for name in names}
         best = max(names, key=lambda name: counts[name])
         if counts[best] >= MARKERS_LEAST:
             return best
     return None
-
-
-def _dictionary_size(name: str) -> int:
-    return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
 
 
 def is_april_grid(markers: Markers) -> bool:

@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from calibration.adjustment.bundle import HUBER, Free, adjust
 from calibration.adjustment.gauge import align_world, image_distance
-from calibration.adjustment.lens_prior import LensPrior, fixed_prior
+from calibration.adjustment.lens_prior import LensPrior
 from calibration.adjustment.state import BundleState, Observations, residuals
 from calibration.board.board import Board
 from rig.geometry import rigid_fit, second_difference, vertex_offset
@@ -76,7 +76,8 @@ def check_held_out(
     trained = adjust(state, observed.subset(~out), prior, sigma, free=free, loss=HUBER, steps=25).state
     boards = replace(free, intrinsics=False, poses=False, offsets=False)
     rest = observed.subset(out)
-    tested = adjust(trained, rest, fixed_prior(trained.intrinsics), sigma, free=boards, loss=HUBER).state
+    none = LensPrior(trained.intrinsics, np.zeros((len(trained.intrinsics), 9, 9)))  # the lenses are fixed
+    tested = adjust(trained, rest, none, sigma, free=boards, loss=HUBER).state
     inside, outside = (
         float(np.sqrt((residuals(s, o) ** 2).sum(axis=1).mean())) for s, o in ((state, observed), (tested, rest))
     )

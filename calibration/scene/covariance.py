@@ -65,7 +65,7 @@ def uncertainty(structure: Structure) -> Uncertainty:
     size = int(places.max()) + 1
     considered, first = np.unique(places[:, structure.estimated : LENS], return_index=True)
     estimated = np.setdiff1d(np.arange(size), considered)
-    system = reduced_camera_system(structure, noise)
+    system, _ = reduced_camera_system(structure, noise)
     motions = np.zeros((size, 7))
     motions[places[:, LENS:]] = world_motions(rig, scale=True).reshape(len(rig), 6, 7)
     inverse = _inverse(system[np.ix_(estimated, estimated)], motions[estimated])
@@ -99,12 +99,6 @@ def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
     return np.hstack([lens, LENS * (lenses.max() + 1) + np.arange(6 * count).reshape(count, 6)])
 
 
-def reduced_camera_system(structure: Structure, noise_px: float) -> Float[np.ndarray, "p p"]:
-    """Returns the matrix ``S`` of the module's docstring, for keypoints with noise ``noise_px`` along each axis.
-    Outliers are left out."""
-    return _reduced(structure, noise_px)[0]
-
-
 def lens_misfit(structure: Structure, noise_px: float) -> float:
     """Tests how much better the points would be explained if each camera had its own lens: about 1 if one lens fits
     all, more if the lenses differ.
@@ -117,7 +111,7 @@ def lens_misfit(structure: Structure, noise_px: float) -> float:
     falls = []
     for one in (True, False):
         variant = replace(structure, one_lens=one)
-        system, gradient = _reduced(variant, noise_px)
+        system, gradient = reduced_camera_system(variant, noise_px)
         places = camera_places(variant)
         free = np.unique(np.hstack([places[:, : structure.estimated], places[:, LENS:]]))
         motions = np.zeros((len(gradient), 7))
@@ -127,8 +121,11 @@ def lens_misfit(structure: Structure, noise_px: float) -> float:
     return (falls[1] - falls[0]) / (structure.estimated * (len(structure.rig) - 1))
 
 
-def _reduced(structure: Structure, noise_px: float) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-    """Returns the reduced system, and half the gradient of chi-squared by the same unknowns."""
+def reduced_camera_system(
+    structure: Structure, noise_px: float
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
+    """Returns the matrix ``S`` of the module's docstring, for keypoints with noise ``noise_px`` along each axis, and
+    half the gradient of chi-squared by the same unknowns. Outliers are left out."""
     places = camera_places(structure)
     size, count = int(places.max()) + 1, len(structure.points)
     u, v = np.zeros((size, size)), np.zeros((count, 3, 3))

@@ -3,7 +3,6 @@ gives the verdict on it, with the same limits as for a board, and writes its rep
 
 from dataclasses import dataclass
 from html import escape
-from pathlib import Path
 from typing import Any
 
 from calibration.adjustment.state import rms
@@ -12,7 +11,6 @@ from calibration.report import STYLE, listed, table
 from calibration.scene.covariance import Uncertainty
 from calibration.scene.scale import Scale
 from calibration.scene.structure import Structure
-from rig.atomic_write import write_atomically
 from rig.formats.cameras.cameras_json import document_from_rig
 from rig.messages.message import Message, compose, documents_of, texts_of
 from rig.rig import Rig
@@ -109,11 +107,6 @@ def judge_scene(calibration: SceneCalibration) -> Verdict:
 
 def _loose(names: list[str], pixels: float) -> Message:
     return compose("scene-pose-loose", cameras=names, px=pixels)
-
-
-def write_scene_report(calibration: SceneCalibration, path: Path) -> None:
-    """Writes the calibration's report as one HTML page."""
-    write_atomically(path, scene_page(calibration).encode())
 
 
 def scene_page(calibration: SceneCalibration) -> str:

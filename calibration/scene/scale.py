@@ -134,13 +134,6 @@ def find_tags(photographs: Photographs, known: TagSize) -> Tags:
     return _tags_of(((camera, shot, grey) for camera, shot, grey in decoded if grey is not None), known)
 
 
-def find_tags_of_shot(images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], known: TagSize) -> Tags:
-    """Finds the tags of a dictionary in the pictures of one shot. Returns their corners (px) by tag, then by camera.
-    The key of a tag is ("", its number), since the shot has no name."""
-    grey = ((camera, "", np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))) for camera, image in images.items())
-    return _tags_of(grey, known)
-
-
 def _tags_of(pictures: Iterable[tuple[str, str, UInt8[np.ndarray, "h w"]]], known: TagSize) -> Tags:
     """Finds tags in grey pictures of (camera, shot)."""
     parameters = cv2.aruco.DetectorParameters()
@@ -286,7 +279,8 @@ def _scale(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> Scale:
             rig,
         )
         return scale_from_points(rig, PointDistance(pixels["first"], pixels["second"], known.distance_mm))
-    return scale_from_tags(rig, known, find_tags_of_shot(capture.images, known))
+    greys = {name: np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for name, image in capture.images.items()}
+    return scale_from_tags(rig, known, _tags_of(((name, "", grey) for name, grey in greys.items()), known))
 
 
 def _undistorted(full: Rig, name: str, pixel: np.ndarray) -> np.ndarray:

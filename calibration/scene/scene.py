@@ -10,13 +10,13 @@ a view's mask, however, is judged by the same mask.
 
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
 
-from calibration.adjustment.gauge import image_distance, in_world_frame
+from calibration.adjustment.gauge import in_world_frame
 from calibration.result import CalibrationRefused
 from calibration.scene.covariance import uncertainty
 from calibration.scene.matching import Matches, match_photographs
@@ -177,7 +177,7 @@ def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.
     masked = Capture({}, masks={name: masks[name] for name in known})
     silhouettes = segment(masked, rig.subset(known), report=discard_progress)
     done = refine_one(silhouettes, rig)
-    return calibration if done is None else replace(calibration, rig=done.rig, refinement=done.reason)
+    return calibration if done is None else replace(calibration, rig=done[0], refinement=done[1])
 
 
 def transformed(structure: Structure, moved: Rig, factor: float) -> Structure:
@@ -192,25 +192,10 @@ def transformed(structure: Structure, moved: Rig, factor: float) -> Structure:
     return replace(structure, rig=Rig(cameras), points=new_from_old.apply(structure.points) * factor)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SingleRefinement:
-    """Holds the result of a refinement by one capture.
-
-    ``rig`` is the refined one if it is ``kept``, otherwise the start; ``reason`` says why. ``change_px`` is the RMS
-    motion (2D) of the image of the subject's region by the refinement, of the median camera."""
-
-    rig: Rig
-    kept: bool
-    change_px: float
-    reason: Message
-
-
-def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement | None:
-    """Refines extrinsics with the silhouettes of one capture.
-
-    The result is accepted if held-out pairs of cameras, a fifth of them at a time, agree better. Returns None if fewer
-    than ``VIEWS_LEAST`` views have a usable silhouette.
-    """
+def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> tuple[Rig, Message] | None:
+    """Refines extrinsics with the silhouettes of one capture. Returns the refined rig if held-out pairs of cameras, a
+    fifth of them at a time, agree better, otherwise ``rig``; and the reason. Returns None if fewer than ``VIEWS_LEAST``
+    views have a usable silhouette."""
     usable = [name for name in rig.names if name in capture and capture[name].quality.usable]
     if len(usable) < VIEWS_LEAST:
         return None
@@ -231,8 +216,7 @@ def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement 
         equations=len(after),
         sigmas=gain / max(deviation, 1e-9),
     )
-    change_px = float(np.median(image_distance(proposed, rig)))
-    return SingleRefinement(proposed if accepted else rig, accepted, change_px, reason)
+    return proposed if accepted else rig, reason
 
 
 def _pairs(names: list[str], fold: int, *, inside: bool) -> Pairs:

@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from calibration.adjustment.gauge import moved
 from pipeline.estimation.robust import GemanMcClure
 from pipeline.estimation.terms import Residuals
 from pipeline.multiview.tangency import Tangency
@@ -85,7 +84,8 @@ def corrected(rig: Rig, correction: Float[np.ndarray, " p"], *, focal: bool) -> 
     correction."""
     cameras = []
     for camera, step in zip(rig, correction.reshape(len(rig), -1), strict=True):
-        cameras.append(zoomed(moved(camera, step[:6]), float(step[6])) if focal else moved(camera, step))
+        moved = camera.moved(step[:6])
+        cameras.append(zoomed(moved, float(step[6])) if focal else moved)
     return Rig(tuple(cameras))
 
 

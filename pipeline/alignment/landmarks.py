@@ -64,14 +64,10 @@ class TooFewFeatures(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureAlignment:
-    """Holds the pose ``world_from_head`` and the points from which it was computed.
-
-    ``used`` tells whether a point counted; outliers do not.
-    """
+    """Holds the pose ``world_from_head`` and the points from which it was computed, outliers among them."""
 
     world_from_head: Similarity
     points: Mapping[str, TriangulatedPoint]
-    used: Mapping[str, bool]
     remarks: tuple[Message, ...]
 
 
@@ -117,7 +113,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig) -> Feature
         for name, distance, keep in zip(names, distances, kept, strict=True)
         if not keep
     )
-    return FeatureAlignment(aligned, points, dict(zip(names, kept.tolist(), strict=True)), remarks)
+    return FeatureAlignment(aligned, points, remarks)
 
 
 def _sides_exchanged(

@@ -24,8 +24,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from rig.atomic_write import write_atomically
-from rig.cache_folder import cache_folder
+from rig.files import cache_folder, write_atomically
 from rig.jit import machine, say_not_kept
 
 ALIGNED = 64  # bytes: where arrays begin in a file, and where NumPy begins its own

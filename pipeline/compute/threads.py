@@ -137,12 +137,6 @@ def task_pool(threads: int | None = None) -> Iterator[ThreadPoolExecutor]:
         yield pool
 
 
-def background_thread(name: str) -> ThreadPoolExecutor:
-    """Returns a pool of one thread, for work in parallel to the caller's. Compiled loops of either still share the
-    common threads."""
-    return ThreadPoolExecutor(1, thread_name_prefix=name)
-
-
 class TracedPool(ThreadPoolExecutor):
     """Runs tasks in threads and records each of them in a trace, as a slice of one loop."""
 

@@ -87,13 +87,12 @@ def find_bare(problem: ContourProblem, state: State, skin: Mapping[str, Plane]) 
     """Marks, in every view, the square cells (``CELL_PX`` pixels wide) near the outline of a hairless head."""
     views, maps = problem.views, []
     for k, camera in enumerate(problem.rig):
-        (width, height), first = views.size[k], views.offset[k]
-        distance = views.distance[first : first + width * height].reshape(height, width)
+        distance = views.distance_map(k)
         depth = camera.camera_from_world.apply(state.world_from_head.translation)[2]
         if camera.name in skin:
             maps.append(bare_cells(distance, skin[camera.name], camera.intrinsics.fx / depth))
         else:
-            maps.append(np.zeros((height // CELL_PX + 1, width // CELL_PX + 1), bool))
+            maps.append(cells_along(np.zeros((0, 2)), np.zeros(0, bool), distance.shape, 0.0))
     return tuple(maps)
 
 

@@ -148,21 +148,14 @@ def run_stage(
 
 
 def coarsened(evidence: StageEvidence, scale_px: float) -> StageEvidence:
-    """Returns the evidence with its noise unit raised to at least ``coarse_unit(scale_px)``, for steps with a coarse
-    robust scale."""
-    noise = evidence.noise
-    unit = max(noise.unit, coarse_unit(scale_px))
-    return replace(evidence, noise=replace(noise, unit=unit))
-
-
-def coarse_unit(scale_px: float) -> float:
-    """Returns the noise unit l sigma^2 (px^3) to use at a coarse robust scale: l is a fixed correlation length, sigma
-    half the scale.
+    """Returns the evidence for steps with a coarse robust scale. Its noise unit l sigma^2 (px^3) is at least that of a
+    fixed correlation length l and a sigma of half the scale.
 
     With so much noise the prior outweighs the outlines and holds the shape. Without it, hair over both ears moved the
     head by 5 mm and the first 15 modes to 8 standard deviations.
     """
-    return FIRST_CORRELATION_PX * (0.5 * scale_px) ** 2
+    unit = max(evidence.noise.unit, FIRST_CORRELATION_PX * (0.5 * scale_px) ** 2)
+    return replace(evidence, noise=replace(evidence.noise, unit=unit))
 
 
 def last_problem(solved: ContourSolution) -> tuple[Problem[State], Linearised]:

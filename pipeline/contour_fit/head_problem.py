@@ -21,7 +21,7 @@ from pipeline.contour_fit.problem import (
     State,
     moved_views,
 )
-from pipeline.contour_fit.rim import project_with_slopes
+from pipeline.contour_fit.rim_kernels import projected_with_slopes
 from pipeline.contour_fit.rim_term import LinearisedRimTerm, RimTerm
 from pipeline.contour_fit.surface_term import SurfaceTerm
 from pipeline.estimation.robust import GemanMcClure
@@ -49,19 +49,14 @@ class FeatureTerm:
         observed, views = self.observed, moved_views(self.problem, state)
         moved = np.einsum("m,mnc->nc", state.coefficients, observed.basis[: len(state.coefficients)])
         points = state.world_from_head.apply(observed.mean + moved)
-        pixels, slopes = project_with_slopes(points, observed.view, views)
-        deviation_px = self._deviation_px(slopes)[:, None]
+        pixels, slopes = projected_with_slopes(points, observed.view, views.packed())
+        pixels_per_mm = np.linalg.norm(slopes, axis=(1, 2)) / np.sqrt(2.0)
+        deviation_px = np.hypot(CLICK_NOISE_PX, self.landmark_noise_mm * pixels_per_mm)[:, None]
         return Residuals(
             (pixels - observed.pixel) / deviation_px,
             lambda: self._rows(state, points, slopes) / deviation_px[:, :, None],
             GemanMcClure(FEATURE_SCALE),
         )
-
-    def _deviation_px(self, slopes: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, " n"]:
-        """Returns the standard deviation (px) of each feature point: a click's noise together with the landmark's
-        variation between heads."""
-        pixels_per_mm = np.linalg.norm(slopes, axis=(1, 2)) / np.sqrt(2.0)
-        return np.hypot(CLICK_NOISE_PX, self.landmark_noise_mm * pixels_per_mm)
 
     def _rows(
         self, state: State, points: Float[np.ndarray, "n 3"], slopes: Float[np.ndarray, "n 2 3"]

@@ -59,8 +59,10 @@ class LandmarkTerm:
         """Returns the differences between the head's landmarks and the triangulated ones as a single residual of many
         components, in standard deviations, with Geman and McClure's loss. One loss for all lets them lose their weight
         together."""
-        points = landmark_points(self.observed, state)
-        residual = self.observed.whiten @ (points - self.observed.position_world).ravel()
+        observed = self.observed
+        moved = np.einsum("m,mnc->nc", state.coefficients, observed.basis[: len(state.coefficients)])
+        points = state.world_from_head.apply(observed.mean + moved)
+        residual = observed.whiten @ (points - observed.position_world).ravel()
         loss = GemanMcClure(FORGIVEN_SIGMAS * np.sqrt(len(residual)))
         return Residuals(residual[None], lambda: self._rows(state, points)[None], loss)
 
@@ -74,9 +76,3 @@ class LandmarkTerm:
         by_pose = [-cross_matrix(arm), np.tile(np.eye(3), (len(arm), 1, 1)), arm[:, :, None]]
         rows[:, :, stage.modes : stage.modes + POSE] = np.concatenate(by_pose, axis=2)
         return observed.whiten @ rows.reshape(3 * len(points), -1)
-
-
-def landmark_points(observed: LandmarkObservations, state: State) -> Float[np.ndarray, "n 3"]:
-    """Returns the positions (world, mm) of the landmarks on the head that ``state`` describes."""
-    moved = np.einsum("m,mnc->nc", state.coefficients, observed.basis[: len(state.coefficients)])
-    return state.world_from_head.apply(observed.mean + moved)

@@ -30,7 +30,6 @@ from pipeline.contour_fit.rim_kernels import (
     X,
     find_rim_samples,
     normals_and_planes,
-    projected_with_slopes,
     sweep_views,
 )
 from pipeline.geometry.projection import packed_lens
@@ -63,6 +62,11 @@ class Views:
     size: Int32[np.ndarray, "k 2"]  # width, height
     distance: Float32[np.ndarray, " pixels"]  # all views, one after the other, row by row
     offset: Int[np.ndarray, " k"]
+
+    def distance_map(self, k: int) -> Float32[np.ndarray, "h w"]:
+        """Returns the signed distances (px) of view k as an image."""
+        width, height = self.size[k]
+        return self.distance[self.offset[k] : self.offset[k] + width * height].reshape(height, width)
 
     def packed(self) -> Float[np.ndarray, "k 22"]:
         """Returns one row for each camera: rotation (9) and translation (3, mm) of ``camera_from_world``, then lens
@@ -182,11 +186,3 @@ def _outlines(
 
     in_threads(len(centres), fill)
     return [(corners[k, :count], samples[k, :count]) for k, count in enumerate(counts.tolist())]
-
-
-def project_with_slopes(
-    points_world: Float[np.ndarray, "n 3"], view: Int[np.ndarray, " n"], views: Views
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
-    """Projects each point into one view, whose index stands in the same row of ``view``. Returns the pixels and the
-    derivatives d(pixel) / d(point), px per mm."""
-    return projected_with_slopes(points_world, view, views.packed())

@@ -30,12 +30,6 @@ class Associated:
     distance_mm: Float[np.ndarray, " n"]
 
 
-def faces_at_vertices(faces: Faces, count: int) -> tuple[Int[np.ndarray, " v1"], Int[np.ndarray, " e"]]:
-    """Returns the faces at each vertex as compressed rows: those of vertex i are ``members[start[i]:start[i + 1]]``."""
-    start, corner = corners_at_vertices(faces, count)
-    return start, corner // 3
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
     """Holds a head's mesh with a search tree for the closest point on it."""
@@ -48,7 +42,8 @@ class Target:
     def of(cls, vertices: Float[np.ndarray, "v 3"], vertex_normals: Float[np.ndarray, "v 3"], faces: Faces) -> "Target":
         """Builds a target from a mesh (mm) with unit vertex normals."""
         sides = [np.linalg.norm(vertices[faces[:, j]] - vertices[faces[:, j - 1]], axis=1) for j in range(3)]
-        head = FannedMesh(vertices, vertex_normals, faces, *faces_at_vertices(faces, len(vertices)))
+        start, corner = corners_at_vertices(faces, len(vertices))
+        head = FannedMesh(vertices, vertex_normals, faces, start, corner // 3)
         return cls(head, PointTree.of(vertices), float(np.max(sides, initial=0.0)))
 
     def closest(
@@ -83,22 +78,6 @@ class Target:
         in_threads(len(points), fill)
         row = np.flatnonzero((triangle >= 0) & (square <= reach_mm**2))
         return Associated(row, triangle[row], blend[row], np.sqrt(square[row]))
-
-
-def associate(
-    points: Float[np.ndarray, "p 3"],
-    normals: Float[np.ndarray, "p 3"],
-    vertices: Float[np.ndarray, "v 3"],
-    vertex_normals: Float[np.ndarray, "v 3"],
-    faces: Faces,
-    *,
-    reach_mm: float,
-    least_agreement: float,
-) -> Associated:
-    """Finds the closest point on a head for every surface point within reach, as ``Target.closest`` does, for a head
-    that is searched only once. Points and head are in one frame, mm."""
-    target = Target.of(vertices, vertex_normals, faces)
-    return target.closest(points, normals, reach_mm=reach_mm, least_agreement=least_agreement)
 
 
 def interpolated(corners: Float[np.ndarray, "n 3 3"], blend: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

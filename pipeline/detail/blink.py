@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.contour_fit.fit import Fit
-from pipeline.detail.association import associate
+from pipeline.detail.association import Target
 from pipeline.detail.dense_points import SurfacePoints
 from pipeline.detail.eyelids import EyeEvidence, Fissure, eye_fissure
 from pipeline.head_model.expressions import BLINKS, plain_name
@@ -143,10 +143,8 @@ def _patch(
 def _misfit(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], points: SurfacePoints) -> float:
     """Returns the mean of Geman and McClure's loss over the points' distances to the mesh, 0 to 1. A point without a
     mesh point within reach counts as 1."""
-    normals = vertex_normals(vertices, faces)
-    found = associate(
-        points.points, points.normals, vertices, normals, faces, reach_mm=REACH_MM, least_agreement=AGREEMENT
-    )
+    target = Target.of(vertices, vertex_normals(vertices, faces), faces)
+    found = target.closest(points.points, points.normals, reach_mm=REACH_MM, least_agreement=AGREEMENT)
     loss = np.ones(len(points.points))
     loss[found.row] = found.distance_mm**2 / (found.distance_mm**2 + ROBUST_MM**2)
     return float(loss.mean())

@@ -47,11 +47,6 @@ class SurfacePoints:
         return SurfacePoints(self.points[rows], self.normals[rows], self.deviation_mm[rows], self.part[rows])
 
 
-def with_scaled_deviation(surface: SurfacePoints, factor: float | Float[np.ndarray, " n"]) -> SurfacePoints:
-    """Returns the points with their standard deviations multiplied by ``factor``."""
-    return replace(surface, deviation_mm=factor * surface.deviation_mm)
-
-
 def thinned(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:
     """Thins out points to one for each cell of a grid, part and main direction of the normal: the mean, weighted by
     information.

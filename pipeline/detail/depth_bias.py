@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.trace import traced
-from pipeline.detail.association import associate, interpolated
+from pipeline.detail.association import Target, interpolated
 from pipeline.detail.dense_points import SurfacePoints
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.robust import Cauchy
@@ -46,7 +46,8 @@ def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarr
     if not len(skin):
         return OnFace(skin, np.zeros((0, 3)), np.zeros(0), np.zeros(0))
     points, facing = surface.points[skin], surface.normals[skin]
-    found = associate(points, facing, vertices, normals, faces, reach_mm=REACH_MM, least_agreement=AGREEMENT)
+    target = Target.of(vertices, normals, faces)
+    found = target.closest(points, facing, reach_mm=REACH_MM, least_agreement=AGREEMENT)
     on_face = face[faces[found.triangle]].all(axis=1)
     row, corner, blend = skin[found.row[on_face]], faces[found.triangle[on_face]], found.blend[on_face]
     normal = interpolated(normals[corner], blend)

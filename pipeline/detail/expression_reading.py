@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from pipeline.compute.array_cache import cached_arrays
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.prior_term import weight_slope
-from pipeline.detail.association import associate, interpolated
+from pipeline.detail.association import Target, interpolated
 from pipeline.estimation.bounded import least_within
 from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit.patches import thinned
@@ -109,7 +109,8 @@ def with_read_expression(
         if strays > STRAYS:
             return fit
         if k < ROUNDS - 1:
-            found = associate(here, normal, head, normals, basis.faces, reach_mm=REACH_MM, least_agreement=AGREEMENT)
+            target = Target.of(head, normals, basis.faces)
+            found = target.closest(here, normal, reach_mm=REACH_MM, least_agreement=AGREEMENT)
             corner, there = basis.faces[found.triangle], np.zeros(len(place))
             place, normal = place.copy(), normal.copy()
             place[found.row] = interpolated(head[corner], found.blend)

@@ -52,7 +52,10 @@ def hair_shell(head: Mesh, bust: Mesh, part: UInt8[np.ndarray, " b"]) -> HairShe
     heights, hit = _traced(head, directions, surface)
     shown = part[bust.faces[hit]].max(axis=1)
     weights = np.vectorize(WEIGHTS.__getitem__, otypes=[float])(shown)
-    heights = np.where(_as_seen(shown, head) == Part.HAIR, heights, 0.0)
+    # What is unseen counts as the nearest seen part: the back of a head gets the hair of its sides, a nape no collar.
+    seen = np.flatnonzero(shown != Part.UNSEEN)
+    nearest_part = shown[seen[KDTree(head.vertices[seen]).query(head.vertices)[1]]]
+    heights = np.where(nearest_part == Part.HAIR, heights, 0.0)
     weights[heights >= REACH_MM] = 0.0
     bending = _bending(topology)
     field = np.maximum(_solved(bending, STIFFNESS, weights, heights[:, None])[:, 0], 0.0)
@@ -98,13 +101,6 @@ def _traced(
         if not len(active):
             break
     return heights, hit
-
-
-def _as_seen(shown: UInt8[np.ndarray, " v"], head: Mesh) -> UInt8[np.ndarray, " v"]:
-    """Returns the parts with unseen ones replaced by the nearest seen one: the back of a head gets the hair of its
-    sides, a nape no collar."""
-    seen = np.flatnonzero(shown != Part.UNSEEN)
-    return shown[seen[KDTree(head.vertices[seen]).query(head.vertices)[1]]]
 
 
 def _pulled(

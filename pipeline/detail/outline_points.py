@@ -19,7 +19,6 @@ from pipeline.detail.solve import Observed
 from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit.patches import HairProbability
 from rig.camera import Camera
-from rig.geometry import RigidTransform, rotation_from_vector
 
 # Variance of an outline's mean over a pixel of its length: 1 px, alike over 8 px. With 2 and 32 the median and the 95th
 # percentile of scan-a are 0.001 and 0.014 mm worse, with 0.5 and 2 the median of scan-a-skin 0.007.
@@ -84,6 +83,4 @@ def outline_search(model: HeadModel, views: Views, cameras: Sequence[Camera], ha
 
 def corrected(camera: Camera, fit: Fit) -> Camera:
     """Returns the camera with the fit's correction of its pose."""
-    shift = fit.camera_shift.get(camera.name, np.zeros(6))
-    motion = RigidTransform(rotation_from_vector(shift[:3]), shift[3:])
-    return replace(camera, camera_from_world=motion @ camera.camera_from_world)
+    return camera.moved(fit.camera_shift.get(camera.name, np.zeros(6)))

@@ -19,14 +19,14 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
-from pipeline.detail.association import Associated, associate, interpolated
+from pipeline.detail.association import Associated, Target, interpolated
 from pipeline.detail.blink import blink_shift, estimate_eyelid_closure, plain_shape
 from pipeline.detail.dense_points import CELL_MM, SurfacePoints, thinned
 from pipeline.detail.ears import with_ears_in_place
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids, with_plain_lids
 from pipeline.detail.outline_points import Outlines, OutlineSearch
 from pipeline.detail.patch_points import PatchPlaces, PatchSearch
-from pipeline.detail.smooth_field import SmoothField, smooth_field
+from pipeline.detail.smooth_field import smooth_field
 from pipeline.detail.solve import (
     NodeMesh,
     Nodes,
@@ -205,7 +205,7 @@ def deform_to_points(
     )
     base = current = unfolded(vertices, current, faces)
     normals = vertex_normals(base, faces)
-    field = _laid_out(nodes.fine, base, LENGTH_MM)
+    field = smooth_field(nodes.fine.shape @ base, nodes.fine.faces, LENGTH_MM)
     directions = normal_directions(nodes.fine, nodes.fine.shape @ amplitude, normals)
     report("fine", len(COARSE) / (len(COARSE) + 1))
     dense = observe(base, current, faces, fine_points, loose, limits=FINE, floor_mm=FLOOR_MM)
@@ -237,7 +237,7 @@ def _coarsely_deformed(
 ) -> Vertices:
     """Returns the vertices after the coarse rounds, which move them freely in space."""
     current = vertices
-    field = _laid_out(nodes, vertices, COARSE_LENGTH_MM)
+    field = smooth_field(nodes.shape @ vertices, nodes.faces, COARSE_LENGTH_MM)
     directions = free_directions(nodes, nodes.shape @ amplitude)
     for i, limits in enumerate(COARSE):
         report("fine", i / (len(COARSE) + 1))
@@ -252,10 +252,6 @@ def with_outlines(
 ) -> Observed:
     """Returns the observations together with those of the outlines, if there are any."""
     return observed if outlines is None else observed.joined(outlines(base, current, robust_mm))
-
-
-def _laid_out(mesh: NodeMesh, vertices: Vertices, length_mm: float) -> SmoothField:
-    return smooth_field(mesh.shape @ vertices, mesh.faces, length_mm)
 
 
 def observe(
@@ -275,14 +271,8 @@ def observe(
     function for ICP*), which is exact to second order where both are curved.
     """
     normals = vertex_normals(current, faces)
-    found = associate(
-        surface.points,
-        surface.normals,
-        current,
-        normals,
-        faces,
-        reach_mm=limits.loose_reach_mm,
-        least_agreement=limits.agreement,
+    found = Target.of(current, normals, faces).closest(
+        surface.points, surface.normals, reach_mm=limits.loose_reach_mm, least_agreement=limits.agreement
     )
     corner = faces[found.triangle]
     reach = np.where(loose[corner].any(axis=1), limits.loose_reach_mm, limits.reach_mm)

@@ -51,7 +51,7 @@ def smooth_field(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
     """Returns the field on a mesh of the given shape (mm). The cotangents of its angles are limited, so that the
     precision matrix stays positive definite."""
     count = len(vertices)
-    stiffness, mass = sparse.csr_array((count, count)), np.zeros(count)
+    mass = np.zeros(count)
     corners = vertices[faces]
     double_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     double_area = np.maximum(double_area, MIN_AREA * double_area.mean())

@@ -75,7 +75,8 @@ def judge_pose(
         off = landmark_offsets(subject, places, head_world, world_from_head, rig)
         elsewhere = [name for name, share in off.items() if share > ELSEWHERE]
         if elsewhere and 2 * len(elsewhere) > len(off):
-            warnings.append(_elsewhere(elsewhere, off))
+            worst = max(min(off[name], 10.0) for name in elsewhere)
+            warnings.append(compose("face-elsewhere", cameras=some_of(elsewhere), sizes=worst))
         facing = cameras_in_front(world_from_head, rig)
         if not off and len(facing) >= MIN_VIEWS:
             warnings.append(compose("no-face", views=len(facing)))
@@ -132,11 +133,6 @@ def _offset(pixels: Float[np.ndarray, "n 2"], found: Float[np.ndarray, "n 2"], s
     if not np.isfinite(pixels).all():
         return np.inf
     return float(np.sqrt(((pixels - found) ** 2).sum(axis=1).mean()) / size_px)
-
-
-def _elsewhere(names: list[str], off: Mapping[str, float]) -> ReportWarning:
-    worst = max(min(off[name], 10.0) for name in names)
-    return compose("face-elsewhere", cameras=some_of(names), sizes=worst)
 
 
 def pupils(eyes: Mapping[str, Iris | UnseenEye]) -> dict[str, Measurement]:

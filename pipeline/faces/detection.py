@@ -106,7 +106,6 @@ class FaceDetection:
     """
 
     landmarks_px: Float[np.ndarray, "468 2"]
-    depth_px: Float[np.ndarray, " 468"]  # away from the camera, from the face's middle; a guess
     score: float  # of the landmark network: 15 to 55 on faces, below 0 elsewhere
     box_px: Float[np.ndarray, " 4"]  # left, top, right, bottom of the points
     roll_deg: float
@@ -143,7 +142,7 @@ def find_face_at(
     """Places the 468 points on the face in a crop. The crop follows the points until they no longer change; the
     result's score tells whether it shows a face."""
     for count in range(MAX_ROUNDS):
-        points, _, _ = _place(pyramid, crop, networks)
+        points, _ = _place(pyramid, crop, networks)
         before, crop = crop, crop_around(points)
         if count + 1 >= min_rounds and _is_settled(before, crop):
             break
@@ -151,8 +150,7 @@ def find_face_at(
     turned = _place(pyramid, Crop(crop.centre_px, crop.side_px, crop.roll_deg, mirrored=True), networks)
     points = (straight[0] + turned[0]) / 2
     box = np.concatenate([points.min(axis=0), points.max(axis=0)])
-    score = max(straight[2], turned[2])
-    return FaceDetection(points, (straight[1] + turned[1]) / 2, score, box, crop_around(points).roll_deg)
+    return FaceDetection(points, max(straight[1], turned[1]), box, crop_around(points).roll_deg)
 
 
 def crop_around(points_px: Float[np.ndarray, "468 2"]) -> Crop:
@@ -167,15 +165,12 @@ def crop_around(points_px: Float[np.ndarray, "468 2"]) -> Crop:
     return Crop((low + high) / 2 @ level, CROP_OF_FACE * float((high - low).max()), float(np.rad2deg(roll)))
 
 
-def _place(
-    pyramid: Pyramid, crop: Crop, networks: FaceNetworks
-) -> tuple[Float[np.ndarray, "468 2"], Float[np.ndarray, " 468"], float]:
-    """Returns pixels, depths and score of the points in a crop."""
+def _place(pyramid: Pyramid, crop: Crop, networks: FaceNetworks) -> tuple[Float[np.ndarray, "468 2"], float]:
+    """Returns pixels and score of the points in a crop."""
     points, score = networks.place_landmarks(pyramid.sample(crop, LANDMARK_SIZE))
     if crop.mirrored:
         points = points[point_table().mirror_images]
-    pixels = in_picture(points[:, :2], crop.picture_from_crop(LANDMARK_SIZE))
-    return pixels, points[:, 2] * crop.side_px / LANDMARK_SIZE, score
+    return in_picture(points[:, :2], crop.picture_from_crop(LANDMARK_SIZE)), score
 
 
 def _whole(pyramid: Pyramid) -> list[Crop]:
@@ -242,7 +237,7 @@ def _verified(pyramid: Pyramid, proposals: Sequence[Crop], networks: FaceNetwork
     """Returns the proposals that are faces, best first and without duplicates; it tests the most likely first."""
     candidates = [_place(pyramid, crop, networks) for crop in proposals]
     chosen: list[FaceDetection] = []
-    for points, _, _ in sorted(candidates, key=lambda candidate: -candidate[2]):
+    for points, _ in sorted(candidates, key=lambda candidate: -candidate[1]):
         crop = crop_around(points)
         if any(_is_same(crop, crop_around(face.landmarks_px)) for face in chosen):
             continue

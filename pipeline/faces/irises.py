@@ -347,7 +347,6 @@ class Iris:
     radius_mm: float
     covariance: Float[np.ndarray, "7 7"]
     views: tuple[str, ...]
-    rms_px: float
 
     @property
     def centre_std_mm(self) -> Float[np.ndarray, " 3"]:
@@ -468,7 +467,8 @@ def _first_fit(eye: _Eye, ahead: Float[np.ndarray, " 3"]) -> LimbusFit | UnseenE
     if len(eye.seen) < MIN_VIEWS:
         return UnseenEye("few-views")
     centre = _nearest_to_rays(eye.seen, eye.eyeball + BEHIND_MM * ahead)
-    start = LimbusCircle(centre, _towards(centre - eye.eyeball, ahead), eye.up)
+    gaze = (centre - eye.eyeball) / BEHIND_MM + ahead  # moved towards ahead, as eyeballs are known only roughly
+    start = LimbusCircle(centre, gaze / np.linalg.norm(gaze), eye.up)
     facing = [sight for sight in eye.seen if start.faces(sight)]
     if len(facing) < MIN_VIEWS:
         return UnseenEye("few-views")
@@ -513,14 +513,8 @@ def _iris(fit: LimbusFit, seen: Sequence[EyeSight]) -> Iris | UnseenEye:
     spread = np.zeros((7, 7))
     spread[:3, :3], spread[3:6, 3:5], spread[6, 5] = np.eye(3), circle.axes().T, 1.0
     covariance = spread @ np.linalg.inv(fit.information) @ spread.T
-    found = Iris(circle.centre, circle.gaze, circle.radius, covariance, tuple(fit.edges), rms)
+    found = Iris(circle.centre, circle.gaze, circle.radius, covariance, tuple(fit.edges))
     return found if found.gaze_std_deg < MAX_GAZE_STD_DEG else UnseenEye("unclear")
-
-
-def _towards(gaze: Float[np.ndarray, " 3"], ahead: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-    """Returns the direction from eyeball to iris, moved towards straight ahead, as eyeballs are known only roughly."""
-    mixed = gaze / BEHIND_MM + ahead
-    return mixed / np.linalg.norm(mixed)
 
 
 def _nearest_to_rays(seen: Sequence[EyeSight], start: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:

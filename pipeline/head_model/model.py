@@ -115,6 +115,7 @@ def assemble(parts: ModelParts, sha256: str) -> HeadModel:
     """Builds the model in memory from the parts of a model file: operators, borders and landmarks of every level.
     Arrays become read-only."""
     count = len(parts.mean)
+    expressions = parts.expressions or no_expressions(count)
     full, full_faces = refine(parts.faces, count, parts.subdivisions)
     region = full @ parts.face_region.astype(float) > 0.5
     index = {
@@ -142,7 +143,7 @@ def assemble(parts: ModelParts, sha256: str) -> HeadModel:
         levels=levels,
         figures=dict(parts.figures),
         scores=_frozen(np.asarray(parts.scores, np.float32)),
-        expressions=_readable(parts.expressions or no_expressions(count)),
+        expressions=Expressions(expressions.names, _frozen(np.asarray(expressions.shapes, np.float32))),
     )
 
 
@@ -158,10 +159,6 @@ def _level(
         landmarks={name: place[v] for name, v in landmarks.items() if v in place},
         rows=_frozen(np.asarray(rows, np.int32)),
     )
-
-
-def _readable(expressions: Expressions) -> Expressions:
-    return Expressions(expressions.names, _frozen(np.asarray(expressions.shapes, np.float32)))
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from pipeline.head_model.expressions import Expressions, no_expressions, packed, unpacked
-from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError
+from rig.files import write_atomically
 from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz
 
 FORMAT = "eigenhead-model/2"  # 2: with expressions

@@ -9,8 +9,8 @@ import os
 from functools import lru_cache
 from pathlib import Path
 
-from rig.digest import sha256_of
 from rig.errors import EigenheadError
+from rig.files import sha256_of
 
 DATA, MODELS = "EIGENHEAD_DATA", "EIGENHEAD_MODELS"
 PACKS = Path(__file__).parent / "packs"

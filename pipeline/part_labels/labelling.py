@@ -109,7 +109,9 @@ def classify_parts(
         return np.concatenate([each[mask] for each, mask in zip(maps, inside, strict=True)])
 
     appearance = gathered([bins(view) for view in cells])
-    start, lower = gathered([starts(view) for view in cells]), gathered([lower_face(view) for view in cells])
+    start = gathered([starts(view) for view in cells])
+    # Evenly lit skin of a face without a beard: no lips, and no underside of jaw and chin, which is always dark.
+    lower = gathered([beard_zone(view) & (np.maximum(view.feature, view.underside) < PLAIN) for view in cells])
     by_colour, by_both = unlike_cheeks(appearance, start[:, SKIN_CHANNEL])
     bearded = beard_evidence(by_both, lower)
     unlikeness = by_colour + bearded * lower * (by_both - by_colour)
@@ -163,12 +165,6 @@ def sideburn_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
     """Marks the cells above the beard zone, between cheeks and ears, where hair other than a beard does not occur."""
     above = (view.above_chin_mm >= 50.0) & (view.above_chin_mm < 80.0)
     return view.on_head & above & (view.into_face_mm > -15.0) & (view.cheek < 0.5)
-
-
-def lower_face(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Marks the cells of the beard zone that show evenly lit skin on a face without a beard. Lips are excluded, and so
-    is the underside of jaw and chin, which is always dark."""
-    return beard_zone(view) & (np.maximum(view.feature, view.underside) < PLAIN)
 
 
 def beard_evidence(unlikeness: Float[np.ndarray, " n"], lower: Bool[np.ndarray, " n"]) -> float:

@@ -33,7 +33,7 @@ from pipeline.geometry.projection import camera_depths, packed_camera, project_p
 from pipeline.geometry.projection_kernels import rasterise
 from pipeline.geometry.surface_index import facing_cosine
 from pipeline.multiview.triangulation import depth_factor, parallax
-from pipeline.photometric_fit.images import MIN_BLUR_PX, Photographs, blurred, distance_of
+from pipeline.photometric_fit.images import MIN_BLUR_PX, Photographs, blurred
 from pipeline.photometric_fit.patch_kernels import (
     Members,
     Pictures,
@@ -127,7 +127,7 @@ def visibility_of(
     points, outward = patches.points(head_world.vertices), patches.normals(normals)
 
     def one(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        camera, distance = cameras[k], distance_of(views, k)
+        camera, distance = cameras[k], views.distance_map(k)
         facing, ends = np.zeros(len(points), np.float32), np.zeros((2, len(points), 2))
         if not speaks[k]:
             return facing, ends[0], ends[1]
@@ -274,20 +274,13 @@ def find_places(
     view, value = choose_views(patches, weights, visibility.facing, MIN_SEEN, MAX_VIEWS)
     peaks = find_peaks(correlate(patches, weights, view, value, seen, grey=grey, noise=noise), steps)
     blur_mm = np.maximum(each.blur_mm, MIN_BLUR_PX / scale).mean()
-    floor_mm = FLOOR_MM * patch_depth_factor(patches, visibility, view, value)
+    centres, at = np.array([camera.centre_world for camera in visibility.cameras]), patches.centre
+    spread = parallax(visibility.vertices[at], visibility.normals[at], centres, view, value)
+    floor_mm = FLOOR_MM * depth_factor(spread)  # larger where the patch's views stand closer together
     variance = floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - peaks.height) / peaks.curvature
     least = MIN_CORRELATION if each.with_shading else MIN_TEXTURE_CORRELATION
     clear = peaks.inside & (peaks.height > least)
     return Places(peaks.place, peaks.height, variance, view[:, 1] >= 0, clear, view, value, weights, samples, pictures)
-
-
-def patch_depth_factor(
-    patches: Patches, visibility: SampleVisibility, view: Int[np.ndarray, "c n"], value: Float[np.ndarray, "c n"]
-) -> Float[np.ndarray, " c"]:
-    """Returns the ratio of each patch's depth error to that with the usual rig, for the same error in the images; at
-    least 1. It exceeds 1 where the patch's views stand closer together."""
-    centres, at = np.array([camera.centre_world for camera in visibility.cameras]), patches.centre
-    return depth_factor(parallax(visibility.vertices[at], visibility.normals[at], centres, view, value))
 
 
 def head_depth_factor(head_world: Mesh, face: Int[np.ndarray, " n"], cameras: Sequence[Camera]) -> float:

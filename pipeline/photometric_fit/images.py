@@ -41,7 +41,7 @@ def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Vi
         image = images.get(views.names[k], np.zeros((height, width, 3), np.uint8))
         grey = image.astype(np.float32) @ LUMINANCE
         noise = noise_level(grey)
-        return grey, noise, shows_texture(grey, distance_of(views, k) < -INSIDE_PX, noise)
+        return grey, noise, shows_texture(grey, views.distance_map(k) < -INSIDE_PX, noise)
 
     grey, noise, speaks = zip(*map_in_threads(load, len(views.names)), strict=True)
     return Photographs(grey, np.array(noise), np.array(speaks))
@@ -52,7 +52,7 @@ def fine_texture(photographs: Photographs, views: Views, px_per_mm: Float[np.nda
     covers in each view."""
 
     def fine(k: int) -> Float32[np.ndarray, "h w"]:
-        return without_shading(photographs.grey[k], distance_of(views, k) < 0.0, SHADING_MM * float(px_per_mm[k]))
+        return without_shading(photographs.grey[k], views.distance_map(k) < 0.0, SHADING_MM * float(px_per_mm[k]))
 
     return replace(photographs, grey=tuple(map_in_threads(fine, len(photographs.grey))))
 
@@ -72,12 +72,6 @@ def without_shading(
     mean /= np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma_px), MIN_COVERAGE)
     out[box] = np.where(inside[box], grey[box] - mean, np.float32(0.0))
     return out
-
-
-def distance_of(views: Views, k: int) -> Float32[np.ndarray, "h w"]:
-    """Returns the signed distances (px) of view k as an image."""
-    width, height = views.size[k]
-    return views.distance[views.offset[k] : views.offset[k] + width * height].reshape(height, width)
 
 
 def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"], noise: float) -> bool:

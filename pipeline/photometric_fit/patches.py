@@ -153,13 +153,7 @@ def under_hair(
             column, row = np.rint(pixel[k, seen[k]]).astype(int).T
             total[seen[k]] += hair[name][row, column]
             views[seen[k]] += 1
-    sure = patch_mean(patches, total / np.maximum(views, 1.0), views > 0) > HAIR_SHARE
+    known = (views > 0).astype(float)
+    shown = patches.sums(patches.agreement, np.stack([total / np.maximum(views, 1.0) * known, known], axis=1))
+    sure = shown[:, 0] / np.maximum(shown[:, 1], 1e-9) > HAIR_SHARE
     return KDTree(centres[sure]).query(centres)[0] < REACH_MM if sure.any() else sure
-
-
-def patch_mean(
-    patches: Patches, values: Float[np.ndarray, " s"], known: Bool[np.ndarray, " s"]
-) -> Float[np.ndarray, " c"]:
-    """Returns, for each patch, the mean of ``values`` over its samples that are ``known``; 0 if none is."""
-    total = patches.sums(patches.agreement, np.stack([values * known, known], axis=1).astype(float))
-    return total[:, 0] / np.maximum(total[:, 1], 1e-9)

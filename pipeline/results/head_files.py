@@ -24,7 +24,7 @@ from pipeline.texturing.pores.skin_maps import SkinMaps
 from pipeline.texturing.sets.specular import Specular
 from pipeline.texturing.sets.texture_sets import SetTextures
 from pipeline.texturing.visibility import LINEAR
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.markups import MarkupPoint, markups_document
 from rig.formats.meshes.ply import write_ply

@@ -25,7 +25,7 @@ from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.texturing import Texturing
 from pipeline.stages.views import Views
 from pipeline.warnings import ReportWarning
-from rig.digest import document_sha256
+from rig.files import document_sha256
 from rig.mesh import Mesh
 
 

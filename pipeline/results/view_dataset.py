@@ -16,9 +16,9 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from pipeline.compute.threads import task_pool
 from pipeline.imaging.silhouette import Silhouette
-from rig.atomic_write import write_atomically
 from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
+from rig.files import write_atomically
 from rig.formats.cameras.dataset_json import (
     FLAME_CANONICAL,
     FLAME_MOMENT,
@@ -88,7 +88,8 @@ def _write_view(folder: Path, dataset: ViewDataset, camera: Camera, pinholes: Ri
     picture = undistorted_picture(np.asarray(dataset.capture.images[camera.name]), lens, pinhole)
     share = undistorted_share(_subject_share(dataset, camera.name), lens, pinhole)
     if form == "gaussian-avatars":
-        picture = _before_white(picture, share)
+        weight = share[:, :, None]
+        picture = np.rint(picture * weight + 255.0 * (1.0 - weight)).astype(np.uint8)
         mask = np.rint(share * 255.0).astype(np.uint8)
     else:
         mask = (share >= 0.5).astype(np.uint8) * np.uint8(255)  # nerfstudio takes all but black for the subject
@@ -105,11 +106,6 @@ def _subject_share(dataset: ViewDataset, name: str) -> Plane:
     if name in capture.masks:
         return capture.masks[name].astype(np.float32)
     return np.clip(np.float32(0.5) - dataset.silhouettes[name].distance, 0.0, 1.0)
-
-
-def _before_white(picture: Photograph, share: Float[np.ndarray, "h w"] | Plane) -> Photograph:
-    weight = share[:, :, None]
-    return np.rint(picture * weight + 255.0 * (1.0 - weight)).astype(np.uint8)
 
 
 SPLINE_ORDER = 3

@@ -38,8 +38,8 @@ from pipeline.results.reconstruction import QUALITY, Reconstruction, asset_extra
 from pipeline.results.report import report_document
 from pipeline.results.report_types import AddedReport
 from pipeline.stages.bust import Bust, HairyHead
-from rig.atomic_write import write_atomically
 from rig.capture import Capture, reassign_images
+from rig.files import write_atomically
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.ply import write_ply
 from rig.formats.meshes.scene import Part, Scene, Skin

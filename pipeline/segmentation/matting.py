@@ -83,7 +83,9 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision) -> Matte:
     alpha = _smooth(alpha, trust, ALPHA_BLUR_PX)
     unsolved = dilated(contrast < 0, 1) if decision.reduction >= FULL_REDUCTION else contrast < 0
     little = (contrast < WEAK_CONTRAST) | unsolved
-    return Matte(alpha, box, _along_contour(contrast, alpha), _share_of_edge(little, alpha))
+    edge = np.abs(alpha - 0.5) < 0.25
+    unsure = float(little[edge].mean()) if edge.any() else 0.0
+    return Matte(alpha, box, _along_contour(contrast, alpha), unsure)
 
 
 def _pixels(cells: tuple[slice, slice], coarse: tuple[int, ...], fine: tuple[int, ...]) -> tuple[slice, slice]:
@@ -133,12 +135,6 @@ def _subject_inside(
     total = cv2.GaussianBlur(known.astype(np.float32), (0, 0), WINDOW_PX * share / step)
     found = cv2.cvtColor(total, cv2.COLOR_RGBA2RGB) + 0.02 * cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
     return found / cv2.cvtColor(total[:, :, 3] / 255 + np.float32(0.02), cv2.COLOR_GRAY2RGB)
-
-
-def _share_of_edge(there: Bool[np.ndarray, "h w"], alpha: Plane) -> float:
-    """Returns the fraction of contour pixels at which ``there`` is set; 0 without a contour."""
-    edge = np.abs(alpha - 0.5) < 0.25
-    return float(there[edge].mean()) if edge.any() else 0.0
 
 
 def _along_contour(contrast: Plane, alpha: Plane) -> Float32[np.ndarray, " c"]:

@@ -81,7 +81,7 @@ def fit_simplex(
                 objective, coefficients, np.full(len(coefficients), MU), tolerance=TOLERANCE, limit=LIMIT, watch=watch
             )
         coefficients = solution.value
-        evaluations += solution.stats.evaluations
+        evaluations += solution.evaluations
         reasons.append(f"{level.mesh}: {solution.result}")
     return Fit(
         method="simplex",

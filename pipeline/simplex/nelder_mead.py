@@ -18,22 +18,15 @@ Watcher = Callable[[int, float], None]
 SPREAD_TINY = 1e-30  # keeps the relative spread defined at a minimum of exactly zero
 
 
-@dataclass(frozen=True, slots=True)
-class Stats:
-    """Holds how often the function was called, its smallest value, and the relative spread of the values at the end."""
-
-    evaluations: int
-    cost: float
-    spread: float
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Holds the best point (``value``), why the search ended (``result``), and its statistics."""
+    """Holds the best point (``value``) with the function's value there (``cost``), why the search ended (``result``),
+    and how often the function was called."""
 
     value: Float[np.ndarray, " n"]
     result: Literal["converged", "evaluation limit"]
-    stats: Stats
+    evaluations: int
+    cost: float
 
 
 def minimise(
@@ -58,12 +51,12 @@ def minimise(
         order = np.argsort(values, kind="stable")
         points, values = points[order], values[order]
         spread = 2.0 * (values[-1] - values[0]) / (abs(values[-1]) + abs(values[0]) + SPREAD_TINY)
-        stats = Stats(evaluations, float(values[0]), float(spread))
-        watch(evaluations, float(values[0]))
+        cost = float(values[0])
+        watch(evaluations, cost)
         if spread < tolerance:
-            return Solution(points[0], "converged", stats)
+            return Solution(points[0], "converged", evaluations, cost)
         if evaluations >= limit:
-            return Solution(points[0], "evaluation limit", stats)
+            return Solution(points[0], "evaluation limit", evaluations, cost)
         evaluations += _move(function, points, values)
 
 

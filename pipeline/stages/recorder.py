@@ -3,12 +3,12 @@
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
-from pipeline.compute.threads import background_thread, thread_count
+from pipeline.compute.threads import thread_count
 from pipeline.compute.trace import span
 from pipeline.stages.context import ReconstructionContext
 from pipeline.warnings import ReportWarning
@@ -90,7 +90,7 @@ class Recorder:
             with span("foreground", name):
                 yield pending
             return
-        with background_thread(name) as pool:
+        with ThreadPoolExecutor(1, thread_name_prefix=name) as pool:
             future: Future[Staged[T]] = pool.submit(run_quietly)
             try:
                 with span("foreground", name):

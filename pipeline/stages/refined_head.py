@@ -1,12 +1,11 @@
 """Deforms the fitted head to the surface that dense matching measured."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.contour_fit.posterior import vertex_deviation_mm
-from pipeline.detail.dense_points import with_scaled_deviation
 from pipeline.detail.depth_bias import without_window_bias
 from pipeline.detail.eyelids import measure_eye_appearance
 from pipeline.detail.outline_points import outline_search
@@ -54,11 +53,12 @@ def refine_head(
     cameras, face = [context.rig[name] for name in distances], np.flatnonzero(model.levels["full"].face_region)
     factor = head_depth_factor(mesh, face, cameras)
     hair = labels.hiding_probability()
+    points = without_window_bias(depth.points, depth.on_face, depth.window_bias)
     patches = patch_search(model, fit, depth.images, distances, hair, context.rig)
     displaced = refine_to_surface(
         fit,
         model,
-        with_scaled_deviation(without_window_bias(depth.points, depth.on_face, depth.window_bias), factor),
+        replace(points, deviation_mm=factor * points.deviation_mm),
         eigenheads=min(settings.fitting.modes, len(fit.coefficients)),
         deviation_mm=deviation_mm,
         eyes=measure_eye_appearance(model, mesh.vertices, views.capture.images, context.rig, faces.eye_openings),

@@ -20,7 +20,7 @@ from pipeline.texturing.chart_colours import ChartColours, chart_colours, with_t
 from pipeline.texturing.layout.normal_map import ReducedLayout, reduced_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.paint import find_layout, paint_head
-from pipeline.texturing.pores.skin_maps import CloseViews, SkinMaps, read_close_views, skin_maps, skin_share
+from pipeline.texturing.pores.skin_maps import COARSER, CloseViews, SkinMaps, read_close_views, skin_maps, skin_share
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
 from pipeline.texturing.vertex_colours import Shown, Texture, texture
 from pipeline.warnings import ReportWarning
@@ -73,7 +73,7 @@ def texture_head(
         ),
     )
     close, pores_warnings = _read_pores(context, views, mesh, vertices, face, chart)
-    atlas = paint_head(layout, mesh, vertices, face, settings, None if close is None else close.for_texels())
+    atlas = paint_head(layout, mesh, vertices, face, settings, None if close is None else close.views.scaled(COARSER))
     skin = None
     if close is not None and layout is not None and atlas is not None:
         skin, atlas = skin_maps(

@@ -20,10 +20,10 @@ from jaxtyping import UInt8
 from rig.acquisition.plates import Plates, link_plates
 from rig.acquisition.session import MakeDriver, RigSession
 from rig.acquisition.shot import Fault, Shot, ShotFailed
-from rig.atomic_write import write_atomically
 from rig.capture import Capture
 from rig.drivers.base import driver_for
 from rig.errors import EigenheadError, InputError
+from rig.files import write_atomically
 from rig.formats.captures.capture_folder import write_capture
 from rig.formats.pictures.images import write_image
 from rig.formats.rig_toml import RigConfig

@@ -19,8 +19,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from rig.acquisition.image_checks import noise_of
-from rig.atomic_write import write_atomically
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.formats.pictures.images import IMAGE_SUFFIXES, read_image, write_image
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose, documents_of, read_message

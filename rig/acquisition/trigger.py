@@ -55,16 +55,6 @@ class TriggerRefused(TriggerError):
 
 
 @dataclass(frozen=True, slots=True)
-class BoxIdentity:
-    """Holds the box's answer to IDENTIFY."""
-
-    firmware: str
-    serial: str
-    channels: int
-    lights: int
-
-
-@dataclass(frozen=True, slots=True)
 class BoxStatus:
     """Holds the box's answer to STATUS. ``bad_lines``: number of lines that it ignored as noise."""
 
@@ -125,7 +115,7 @@ class TriggerBox:
         except (serial.SerialException, OSError, ValueError) as error:
             raise TriggerUnplugged(port, _first_line(error)) from error
         try:
-            self.identity = self._identify(boot_s)
+            self._identify(boot_s)
         except BaseException:
             self.close()
             raise
@@ -190,16 +180,11 @@ class TriggerBox:
         self._clock = best
         return best
 
-    def _identify(self, boot_s: float) -> BoxIdentity:
+    def _identify(self, boot_s: float) -> None:
         attempts = max(1, round(boot_s / self._reply_timeout_s))
         words = self._command("IDENTIFY", attempts=attempts)
-        fields = _fields(words)
-        if not words or words[0] != PROTOCOL:
+        if words[:1] != [PROTOCOL] or not _fields(words).keys() >= {"FW", "ID", "CH", "LI"}:
             raise WrongDevice(self.port, " ".join(words))
-        try:
-            return BoxIdentity(fields["FW"], fields["ID"], int(fields["CH"]), int(fields["LI"]))
-        except (KeyError, ValueError) as error:
-            raise WrongDevice(self.port, " ".join(words)) from error
 
     def _command(self, body: str, attempts: int | None = None) -> list[str]:
         """Sends ``body`` until the box answers, also while the box is busy with a release. Returns the words after

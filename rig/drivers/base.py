@@ -151,7 +151,15 @@ class Pace:
         return True
 
 
-class PacedDriver:
+class FreeDriver:
+    """Sends frames at its own rate, whatever is asked of it."""
+
+    def trigger(self) -> None:
+        """Does nothing: there is no software trigger."""
+        return
+
+
+class PacedDriver(FreeDriver):
     """Delivers frames at the camera's rate without a device."""
 
     def __init__(self, camera: CameraConfig) -> None:
@@ -165,7 +173,3 @@ class PacedDriver:
         if not self._pace.wait(timeout_s):
             raise GrabTimeout(self._camera, timeout_s)
         return Arrival(time.monotonic(), self._pace.beat)
-
-    def trigger(self) -> None:
-        """Does nothing: frames come at their own rate."""
-        return

@@ -28,7 +28,6 @@ class FeedState:
     that the camera refused."""
 
     opened: bool
-    frames: int  # since it was opened
     last_seen_s: float | None
     period_s: float | None  # between frames of a camera that runs by itself
     error: Message | None
@@ -78,7 +77,6 @@ class CameraFeed:
             gaps = [b - a for a, b in zip(list(self._arrivals_s)[:-1], list(self._arrivals_s)[1:], strict=True)]
             return FeedState(
                 self._opened,
-                self._count,
                 self._arrivals_s[-1] if self._arrivals_s else None,
                 median(gaps) if gaps and median(gaps) <= _SLOWEST_S else None,
                 None if self._error is None else self._error.message,

@@ -21,7 +21,7 @@ from urllib.parse import unquote, urlsplit
 import cv2
 import numpy as np
 
-from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverError, GrabTimeout
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverError, FreeDriver, GrabTimeout
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose
@@ -190,7 +190,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
     return MjpegDriver(camera) if camera.identity.startswith(_ADDRESSES) else VideoCaptureDriver(camera)
 
 
-class MjpegDriver:
+class MjpegDriver(FreeDriver):
     """Reads a motion-JPEG stream over HTTP."""
 
     live = True
@@ -221,10 +221,7 @@ class MjpegDriver:
     def configure(self) -> tuple[Message, ...]:
         """Returns one message for each setting of exposure, gain or white balance in rig.toml, because none can be set
         over HTTP."""
-        requested = [
-            key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None
-        ]
-        return tuple(compose("not-set-over-http", setting=key) for key in requested)
+        return tuple(compose("not-set-over-http", setting=key) for key in self._camera.exposure_settings())
 
     def grab(self, timeout_s: float) -> Arrival:
         """Waits for the next JPEG file of the stream, without decoding it. Raises GrabTimeout, CameraLost."""
@@ -243,10 +240,6 @@ class MjpegDriver:
         """Decodes the JPEG file of the last ``grab``. Raises DriverError if it is damaged."""
         return decode_jpeg(self._camera, self._jpeg)
 
-    def trigger(self) -> None:
-        """Does nothing: such a stream has no software trigger."""
-        return
-
     def close(self) -> None:
         """Ends the connection."""
         if self._stream is not None:
@@ -254,7 +247,7 @@ class MjpegDriver:
             self._stream = None
 
 
-class VideoCaptureDriver:
+class VideoCaptureDriver(FreeDriver):
     """Reads the sources that cv2.VideoCapture opens: /dev/v4l/by-id/..., /dev/v4l/by-path/..., rtsp://..."""
 
     live = True
@@ -311,10 +304,6 @@ class VideoCaptureDriver:
         if not done or image is None:
             raise DriverError(self._camera.name, compose("frame-not-decoded"))
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.ndim == 3 else cv2.COLOR_GRAY2RGB)
-
-    def trigger(self) -> None:
-        """Does nothing: these sources have no software trigger."""
-        return
 
     def close(self) -> None:
         """Releases the device or connection."""

@@ -47,10 +47,7 @@ class SimulatedDriver(PacedDriver):
     def configure(self) -> tuple[Message, ...]:
         """Returns one message for each setting of exposure, gain or white balance in rig.toml, which a simulated camera
         lacks."""
-        requested = [
-            key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None
-        ]
-        return tuple(compose("no-setting-of-simulated", setting=key) for key in requested)
+        return tuple(compose("no-setting-of-simulated", setting=key) for key in self._camera.exposure_settings())
 
     def retrieve(self) -> ImageRgb:
         """Renders and returns the camera's current view. Raises CameraLost if it is not open."""

@@ -73,6 +73,10 @@ class CameraConfig:
     white_balance_k: int | None = None
     rotation_deg: Literal[0, 90, 180, 270] = 0  # clockwise, of the picture, to stand upright
 
+    def exposure_settings(self) -> list[str]:
+        """Returns the names of the settings of exposure, gain and white balance that have a value."""
+        return [key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self, key) is not None]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TriggerConfig:

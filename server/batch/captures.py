@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
-from rig.digest import sha256_of
 from rig.errors import InputError
+from rig.files import sha256_of
 from rig.formats.cameras.cameras_file import find_rig_file
 from rig.formats.captures.shot_files import ASIDE, listed_pictures
 from rig.formats.pictures.picture_names import entry, is_junk

@@ -19,8 +19,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
-from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError
+from rig.files import write_atomically
 from rig.messages.message import Message, compose, documents_of, read_message
 from server.batch.captures import Shard
 from server.storage.result_folder import RESULT_FILE

@@ -7,8 +7,8 @@ from importlib.metadata import version
 from pipeline.applications.templates.header import check_template
 from pipeline.head_model.model_names import model_path, model_sha256
 from pipeline.settings import document_from_settings, settings_from_document
-from rig.digest import document_sha256
 from rig.errors import EigenheadError, InputError
+from rig.files import document_sha256
 from rig.messages.message import Message, compose
 from server.batch.captures import BatchCapture
 from server.tasks.settings_file import merged_settings

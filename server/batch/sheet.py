@@ -101,13 +101,9 @@ def message_class(card: Card, message: MessageDocument) -> str:
     return "failed" if card.state == "failed" else severity(message["code"])
 
 
-def sheet_html(title: str, cards: Sequence[Card]) -> str:
-    """Returns the sheet as HTML. Captures that need attention come first."""
-    return "\n".join(sheet_lines(title, cards))
-
-
 def sheet_lines(title: str, cards: Sequence[Card]) -> Iterator[str]:
-    """Yields the parts of ``sheet_html`` one by one, so memory never holds the pictures of a thousand heads."""
+    """Yields the sheet as parts of HTML, so that memory need not hold the pictures of a thousand heads. Captures that
+    need attention come first."""
     yield '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
     yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
     yield f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>"

@@ -5,7 +5,6 @@ The PDF's own fonts have Latin-1. A name in other letters is drawn as a picture;
 question marks. The sheet contains no times, so that equal results give equal bytes.
 """
 
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -16,6 +15,8 @@ import cv2
 import numpy as np
 from fpdf import FPDF
 
+from pipeline.results.pdf_page import latin
+from rig.formats.pictures.images import encode_image
 from server.batch.sheet import (
     PANEL_PX,
     Card,
@@ -93,13 +94,13 @@ class _Page(FPDF):
     def wrapped(self, text: str, size_pt: float, width_mm: float) -> list[str]:
         """Returns the text's lines, of ``width_mm`` at most, in Latin-1."""
         self.set_font("Helvetica", style="B", size=size_pt)  # the wider one
-        lines = self.multi_cell(width_mm, text=_latin(text), align="L", dry_run=True, output="LINES")
+        lines = self.multi_cell(width_mm, text=latin(text), align="L", dry_run=True, output="LINES")
         return cast(list[str], lines)
 
     def write_line(self, line: _Line, x: float, width_mm: float) -> None:
         """Writes one line at the height of the cursor, and moves that below it."""
         y = self.get_y()
-        if _latin(line.text) == line.text:
+        if latin(line.text) == line.text:
             self.set_xy(x, y)
             for part, style, ink in (
                 (line.text[: line.lead], "B", line.ink),
@@ -112,7 +113,7 @@ class _Page(FPDF):
         else:
             picture, scale = _drawn(line.text, line.ink, bold=line.lead > 0)
             width = min(picture.shape[1] * scale * line.height_mm, width_mm)
-            self.image(_png(picture), x, y, w=width, h=width * picture.shape[0] / picture.shape[1])
+            self.image(encode_image(".png", picture), x, y, w=width, h=width * picture.shape[0] / picture.shape[1])
         self.set_xy(x, y + line.height_mm)
 
     def write_cards(self, cards: Sequence[Card]) -> None:
@@ -136,7 +137,7 @@ class _Page(FPDF):
             x += BAR_MM + PAD_MM
             self.set_xy(x, top + PAD_MM)
             if picture is not None:
-                self.image(io.BytesIO(picture), x, top + PAD_MM, w=TEXT_MM, h=view_mm)
+                self.image(picture, x, top + PAD_MM, w=TEXT_MM, h=view_mm)
                 self.set_y(top + PAD_MM + view_mm + 1)
             for line in lines:
                 self.write_line(line, x, TEXT_MM)
@@ -144,12 +145,12 @@ class _Page(FPDF):
 
 
 def _lines(pdf: _Page, card: Card) -> Iterator[_Line]:
-    latin = _latin(card.name) == card.name
-    for name in pdf.wrapped(card.name, 10, TEXT_MM)[:2] if latin else [card.name]:
+    printable = latin(card.name) == card.name
+    for name in pdf.wrapped(card.name, 10, TEXT_MM)[:2] if printable else [card.name]:
         yield _Line(name, 10, lead=len(name))
     state = "" if card.state == "done" else card.state
     if of := ", ".join(text for text in (card.of, state, card.figures) if text):
-        for text in pdf.wrapped(of, 7.5, TEXT_MM)[:2] if _latin(of) == of else [of]:
+        for text in pdf.wrapped(of, 7.5, TEXT_MM)[:2] if latin(of) == of else [of]:
             yield _Line(text, 7.5, FAINT)
     messages = ranked_messages(card)
     for message in messages[:MAX_MESSAGES]:
@@ -163,11 +164,6 @@ def _lines(pdf: _Page, card: Card) -> Iterator[_Line]:
         yield _Line(f"and {len(messages) - MAX_MESSAGES} more, in sheet.html", 8, FAINT)
 
 
-def _latin(text: str) -> str:
-    """Returns the text with a question mark for each character that is not in Latin-1."""
-    return text.encode("latin-1", "replace").decode("latin-1")
-
-
 @cache
 def _font() -> cv2.FontFace:
     return cv2.FontFace("uni")  # OpenCV's own, with most of the world's letters
@@ -178,12 +174,6 @@ def _drawn(text: str, ink: Ink, *, bold: bool) -> tuple[np.ndarray, float]:
     size_px, weight = 48, 700 if bold else 400
     printable = "".join(letter if letter.isprintable() else "?" for letter in text)
     _, _, width, _ = cv2.getTextSize((10, 10), printable, (0, 0), _font(), size_px, weight)
-    picture = np.full((int(1.5 * size_px), max(width, 1) + 4, 3), CARD, np.uint8)
-    cv2.putText(picture, printable, (0, int(1.1 * size_px)), ink[::-1], _font(), size_px, weight)
+    picture = np.full((int(1.5 * size_px), max(width, 1) + 4, 3), CARD[::-1], np.uint8)
+    cv2.putText(picture, printable, (0, int(1.1 * size_px)), ink, _font(), size_px, weight)
     return picture, 1 / picture.shape[0]
-
-
-def _png(picture: np.ndarray) -> io.BytesIO:
-    encoded, data = cv2.imencode(".png", picture)
-    assert encoded
-    return io.BytesIO(data.tobytes())

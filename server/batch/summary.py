@@ -6,11 +6,11 @@ from typing import Any
 
 from pipeline.head_model.model_file import expression_names
 from pipeline.head_model.model_names import model_path
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.messages.message import MessageDocument, documents_of
 from server.batch.folder import BatchFolder, FailureRecord, Origin
 from server.batch.plan import BatchTask
-from server.batch.sheet import Card, figures_of, sheet_html
+from server.batch.sheet import Card, figures_of, sheet_lines
 from server.batch.table import Outcome, Row, columns_of, row_of, write_table
 
 SHEET, SHEET_PDF = "sheet.html", "sheet.pdf"
@@ -28,7 +28,7 @@ def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]
     from server.batch.sheet_pdf import sheet_pdf  # its library takes a while to load; the service's table does without
 
     title = folder.out.resolve().name
-    write_atomically(folder.out / SHEET, sheet_html(title, cards).encode("utf-8", "replace"))
+    write_atomically(folder.out / SHEET, "\n".join(sheet_lines(title, cards)).encode("utf-8", "replace"))
     write_atomically(folder.out / SHEET_PDF, sheet_pdf(title, cards))
     return [*files, folder.out / SHEET, folder.out / SHEET_PDF]
 

@@ -16,8 +16,7 @@ from typing import Any, Literal
 from pipeline.evidence.measurements import DISTANCES
 from pipeline.evidence.pose import PUPIL_DISTANCE
 from pipeline.head_model.landmarks import NAMES
-from rig.atomic_write import write_atomically
-from rig.digest import document_sha256
+from rig.files import document_sha256, write_atomically
 from rig.text import printable
 from server.batch.captures import BatchCapture
 from server.batch.folder import FailureRecord, Origin
@@ -197,7 +196,7 @@ def _rms(values: Sequence[float | None]) -> float | None:
 def write_table(folder: Path, columns: Sequence[Column], rows: Sequence[Row]) -> list[Path]:
     """Writes the table as CSV and, if pyarrow is installed, as Parquet. Returns the files. Raises OSError."""
     files = [folder / CSV]
-    write_atomically(files[0], csv_bytes(columns, rows))
+    write_atomically(files[0], b"".join(csv_lines(columns, rows)))
     if has_parquet():
         files.append(folder / PARQUET)
         write_atomically(files[1], parquet_bytes(columns, rows))
@@ -215,13 +214,9 @@ def has_parquet() -> bool:
     return True
 
 
-def csv_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
-    """Returns the table as CSV (RFC 4180, UTF-8), with all digits of every number. A missing value is an empty cell."""
-    return b"".join(csv_lines(columns, rows))
-
-
 def csv_lines(columns: Sequence[Column], rows: Iterable[Row]) -> Iterator[bytes]:
-    """Yields the lines of ``csv_bytes`` one by one, the names of the columns first."""
+    """Yields the lines of the table as CSV (RFC 4180, UTF-8), the names of the columns first, with all digits of every
+    number. A missing value is an empty cell."""
     cells = ([_cell(row[column.name]) for column in columns] for row in rows)
     for line in itertools.chain([[column.name for column in columns]], cells):
         stream = io.StringIO(newline="")

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.messages.message import compose, texts_of
 from server.cli.answers import (
     Json,
@@ -150,9 +150,10 @@ def _calibrate_board(
 ) -> None:
     from calibration.board.board import read_board
     from calibration.calibrate import calibrate as run
-    from calibration.report import write_report
-    from calibration.result import CalibrationRefused, write_calibration
-    from rig.formats.cameras.cameras_json import read_rig
+    from calibration.report import report_page
+    from calibration.result import CalibrationRefused
+    from rig.files import write_atomically
+    from rig.formats.cameras.cameras_json import read_rig, write_rig
 
     known = None if previous is None else read_rig(previous)
     page = out.with_suffix(".html")
@@ -162,14 +163,14 @@ def _calibrate_board(
     except CalibrationRefused as refusal:
         if refusal.calibration is None:
             raise
-        write_report(refusal.calibration, page)
+        write_atomically(page, report_page(refusal.calibration).encode())
         if not anyway:
             reasons = (*refusal.reasons, "its report is written, and --anyway writes cameras.json, too, for a look")
             raise CalibrationRefused(reasons, refusal.calibration) from refusal
         warn(str(refusal))
         calibration = refusal.calibration
-    write_calibration(calibration, out)
-    write_report(calibration, page)
+    write_rig(calibration.rig, out)
+    write_atomically(page, report_page(calibration).encode())
     figures = calibration.figures()
     cameras = [f"{name}  {figure['rms_px']:.3f} px" for name, figure in figures["cameras"].items()]
     total = f"{figures['rms_px']:.3f} px over {figures['used_share']:.1%} of the corners: {calibration.verdict().word}"
@@ -179,8 +180,9 @@ def _calibrate_board(
 def _calibrate_scene(
     photographs: Path, out: Path, scale: Path | None, front: str | None, lenses: str | None, json_out: bool
 ) -> None:
-    from calibration.scene.result import write_scene_report
+    from calibration.scene.result import scene_page
     from calibration.scene.scene import calibrate_scene
+    from rig.files import write_atomically
     from rig.formats.cameras.cameras_json import write_rig
 
     page = out.with_suffix(".html")
@@ -188,7 +190,7 @@ def _calibrate_scene(
     with progress_bar() as report:
         calibration = calibrate_scene(photographs, scale=scale, front=front, one_lens=one_lens, report=report)
     write_rig(calibration.rig, out)
-    write_scene_report(calibration, page)
+    write_atomically(page, scene_page(calibration).encode())
     figures = calibration.figures()
     cameras = [
         f"{name}  {figure['rms_px']:.3f} px, {figure['points']} points, known to {figure['pose_sigma_px']:.2f} px"
@@ -220,7 +222,7 @@ def refine(
     warn_of_replacement(out, overwrite)
     prepare_file(out)
     from calibration.silhouette_refinement.report import refinement_page
-    from rig.atomic_write import write_atomically
+    from rig.files import write_atomically
     from rig.formats.cameras.cameras_json import write_rig
     from server.tasks.refine import refine_locally
 

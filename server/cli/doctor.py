@@ -14,9 +14,8 @@ from urllib.parse import quote
 
 from pipeline.compute.threads import THREADS, thread_count
 from pipeline.head_model.model_names import MODELS, model_path, models_folder
-from rig.cache_folder import CACHE, cache_folder
-from rig.digest import sha256_of
 from rig.errors import EigenheadError
+from rig.files import CACHE, cache_folder, sha256_of
 from rig.text import suggest
 from server.address import is_loopback
 from server.settings import PREFIX, ServiceSettings

@@ -316,10 +316,11 @@ def verify_captures(
 def read_limits(path: Path | None) -> "Limits":
     """Reads limits from a TOML or JSON file. Limits that the file omits, or all without a file, have their defaults.
     Raises InputError."""
-    from pipeline.applications.verification.judgement import limits_from_document
+    from pipeline.applications.verification.judgement import Limits
+    from rig.typed_tables import read_table
     from server.tasks.settings_file import settings_document
 
-    return limits_from_document(settings_document(path), path.name if path else "limits")
+    return read_table(Limits, settings_document(path), path.name if path else "limits")
 
 
 def verification_lines(document: "VerificationReport", out: Path) -> list[str]:

@@ -156,7 +156,7 @@ def clock(
     cameras run in step with the screen."""
     from calibration.board.picture_files import list_pictures
     from pipeline.applications.moments.screen_clock import clock_page, measure_shots
-    from rig.atomic_write import write_atomically
+    from rig.files import write_atomically
 
     if (shots is None) == (page is None):
         raise typer.BadParameter("either a folder of shots, or --page", param_hint="SHOTS")

@@ -6,8 +6,8 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rig.atomic_write import write_atomically
 from rig.capture import TEXTURE_SETS
+from rig.files import write_atomically
 from rig.formats.captures.capture_folder import capture_root
 from rig.formats.captures.shot_files import BESIDE_PICTURES, picture_folder
 from rig.progress import Progress

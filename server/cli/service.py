@@ -80,7 +80,7 @@ def prepare(json_out: Json = False) -> None:
     """Compile the loops of a job ahead.
 
     They are kept for every later process; the first job does it otherwise."""
-    from rig.cache_folder import cache_folder
+    from rig.files import cache_folder
     from server.tasks.prepare import prepare_kernels
 
     began = monotonic()

@@ -13,7 +13,7 @@ from nicegui import app as pages
 from starlette.datastructures import Headers
 from starlette.types import Scope
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.messages.message import compose
 from server.address import is_loopback
 from server.errors import Unauthenticated

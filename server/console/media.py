@@ -27,9 +27,9 @@ from scipy.spatial import KDTree
 
 from pipeline.geometry.registration.rigid import rigid_procrustes
 from pipeline.results.report_types import Report
-from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import Cancelled, EigenheadError, InputError
+from rig.files import write_atomically
 from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.formats.meshes.ply import read_vertex_numbers

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from pipeline.head_model.model import load_model
+from rig.formats.pictures.images import encode_image
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import Scene, build_scene, view_light
@@ -56,7 +57,6 @@ def _frame(
 ) -> JsonObject:
     sensor, light, small = lit
     picture = expose(small, sensor, rng)
-    done, data = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    assert done
+    data = encode_image(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))
     large = expose(light.astype(np.float32), sensor, rng) if sharp else None
-    return measured_frame(name, picture, data.tobytes(), large)
+    return measured_frame(name, picture, data, large)

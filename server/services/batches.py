@@ -17,8 +17,8 @@ from typing import Literal
 import sqlalchemy as sa
 import structlog
 
-from rig.digest import document_sha256
 from rig.errors import EigenheadError, InputError
+from rig.files import document_sha256
 from rig.messages.message import Message, compose
 from server.errors import Conflict, DiskFull, NotFound, TooMany
 from server.services.deliveries import destination
@@ -106,7 +106,7 @@ class Batches:
                 raise TooMany("too-many-batches", compose("too-many-batches", count=most), retry_after_s=60)
             row = BatchRow(
                 id=identity,
-                created=_now_ms(),
+                created=time.time_ns() // 1_000_000,
                 label=wanted.label,
                 key=key,
                 digest=digest,
@@ -198,7 +198,7 @@ class Batches:
                 room[row.queue] -= self._feed(row, room[row.queue])
             if not jobs and (row.wish == "cancelled" or row.id not in waiting):
                 self._webhooks.announce_batch(row.id, row.rounds, self._jobs.client.enqueue)
-                self._index.finish(row, _now_ms())
+                self._index.finish(row, time.time_ns() // 1_000_000)
 
     def captures(self, identity: str) -> Iterator[tuple[str | None, JobOut | None]]:
         """Yields the captures of a batch in their order: the id (None if the capture was erased) and its latest job
@@ -326,7 +326,3 @@ class Batches:
             eta_s=eta_s,
             notice=self._jobs.queue_notice(row.queue) if state == "running" and undone else None,
         )
-
-
-def _now_ms() -> int:
-    return time.time_ns() // 1_000_000

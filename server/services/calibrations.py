@@ -16,9 +16,8 @@ from pathlib import Path
 
 from dbos import DBOSClient, WorkflowStatus
 
-from rig.atomic_write import write_atomically
-from rig.digest import sha256_of
 from rig.errors import InputError
+from rig.files import sha256_of, write_atomically
 from rig.messages.message import Message, compose, read_message
 from server.errors import Conflict, NotFound
 from server.services.failures import failure

@@ -14,8 +14,8 @@ from pydantic import TypeAdapter
 from rig.acquisition.face_sighting import face_remarks
 from rig.acquisition.shot import ShotDocument, read_fault
 from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
-from rig.atomic_write import write_atomically
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.formats.captures.archive import ArchiveLimits
 from rig.messages.message import compose
 from server.errors import Conflict, NotFound

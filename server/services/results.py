@@ -14,8 +14,8 @@ from pathlib import Path
 
 import structlog
 
-from rig.digest import sha256_of
 from rig.errors import Cancelled, EigenheadError
+from rig.files import sha256_of
 from rig.messages.message import compose
 from server.errors import Conflict, Refused
 from server.settings import ServiceSettings

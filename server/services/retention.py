@@ -22,9 +22,8 @@ from typing import Literal
 import structlog
 from pydantic import Field
 
-from rig.atomic_write import write_atomically
-from rig.digest import sha256_of
 from rig.errors import EigenheadError
+from rig.files import sha256_of, write_atomically
 from rig.messages.message import compose
 from server.errors import NotFound, Refused
 from server.services.answer import Answer, Moment

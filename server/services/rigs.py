@@ -20,12 +20,12 @@ from rig.acquisition.judgement import PlatesRefused
 from rig.acquisition.plates import PlatesVersion, link_plates, plates_versions
 from rig.acquisition.session import RigSession
 from rig.acquisition.shot import ShotDocument, ShotFailed
-from rig.atomic_write import write_atomically
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError
+from rig.files import write_atomically
 from rig.formats.cameras.cameras_json import read_rig, write_rig
 from rig.formats.captures.capture_folder import write_capture
-from rig.formats.pictures.images import write_image
+from rig.formats.pictures.images import encode_image, write_image
 from rig.formats.rig_toml import RigConfig, adjusted, read_rig_config
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose, message_of
@@ -364,10 +364,7 @@ def rig_state(
 
 def jpeg(image: ImageRgb) -> bytes:
     """Encodes an RGB image as a JPEG file. One wider than ``PREVIEW_WIDTH`` pixels is reduced to that width."""
-    small = reduced(image, PREVIEW_WIDTH)
-    done, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])
-    assert done
-    return data.tobytes()
+    return encode_image(".jpg", reduced(image, PREVIEW_WIDTH), (cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY))
 
 
 def reduced(image: ImageRgb, width: int) -> ImageRgb:

@@ -9,15 +9,17 @@ import numpy as np
 from jaxtyping import Float
 
 from rig.formats.meshes.mesh_file import read_mesh
-from rig.mesh import Mesh, face_normals
+from rig.mesh import Mesh
 
 
 def error_mm(truth: Path, result: Path) -> dict[str, float]:
     """Computes the distance (mm) from the true face region to the surface of ``result`` as delivered, without aligning
     both. Returns mean, median and maximum, weighted by area."""
+    from pipeline.head_model.subdivision import vertex_areas
+
     head, face = read_mesh(truth / "head.ply"), np.load(truth / "face_mask.npy")
     distances = surface_distance(head.vertices[face], read_mesh(result))
-    weights = _vertex_areas(head)[face]
+    weights = vertex_areas(head.vertices, head.faces)[face]
     order = np.argsort(distances)
     share = np.cumsum(weights[order]) / weights.sum()
     return {
@@ -32,8 +34,3 @@ def surface_distance(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> Float[np.n
     from pipeline.geometry.surface_index import SurfaceIndex  # its compiled loops take a second to load
 
     return SurfaceIndex(mesh.vertices, mesh.faces).closest(points).distances
-
-
-def _vertex_areas(mesh: Mesh) -> Float[np.ndarray, " v"]:
-    areas = np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1) / 2
-    return np.bincount(mesh.faces.ravel(), np.repeat(areas / 3, 3), minlength=len(mesh.vertices))

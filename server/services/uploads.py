@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.messages.message import compose
 from server.errors import Conflict, NotFound, TooLarge, TooMany
 from server.settings import ServiceSettings

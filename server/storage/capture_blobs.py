@@ -18,7 +18,7 @@ from pathlib import Path
 import sqlalchemy as sa
 import structlog
 
-from rig.digest import sha256_of
+from rig.files import sha256_of
 from rig.messages.message import compose
 from server.errors import Conflict
 from server.settings import ServiceSettings

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import cv2
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from server.storage.records import JsonObject
 
 PIPELINE = Path(__file__).resolve().parents[2] / "pipeline"

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import quote
 
-from rig.digest import sha256_of
+from rig.files import sha256_of
 from rig.messages.message import Message, compose
 from server.errors import UrlRefused
 from server.settings import OBJECT_PREFIX, ServiceSettings
@@ -275,11 +275,6 @@ def locate(url: str, prefixes: Collection[str]) -> tuple[str, str]:
                 raise UrlRefused(faults[0])
             return prefix, key
     raise UrlRefused(compose("object-url-not-allowed", prefixes=sorted(prefixes)))
-
-
-def is_object_url(url: str) -> bool:
-    """Returns whether a URL names an object in a store, not a page on the web."""
-    return url.startswith(("s3://", "file://"))
 
 
 def open_objects(prefix: str, settings: ServiceSettings) -> ObjectStore:

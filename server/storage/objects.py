@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from rig.digest import sha256_of
+from rig.files import sha256_of
 from rig.messages.message import Message, compose
 from server.errors import InvalidInput, Unavailable
 from server.storage.folders import sync_folder

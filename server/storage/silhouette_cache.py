@@ -22,8 +22,8 @@ from jaxtyping import Float32
 
 from pipeline.imaging.silhouette import Silhouette, ViewQuality
 from pipeline.segmentation.segment import segment
-from rig.atomic_write import write_atomically
 from rig.capture import Capture
+from rig.files import write_atomically
 from rig.messages.message import documents_of, read_message
 from rig.progress import Progress
 from rig.rig import Rig

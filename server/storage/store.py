@@ -34,8 +34,7 @@ from typing import TypeVar
 import structlog
 
 from rig.acquisition.verdict import ViewDocument
-from rig.atomic_write import unfinished, write_atomically
-from rig.digest import sha256_of
+from rig.files import sha256_of, unfinished, write_atomically
 from rig.messages.message import compose
 from server.errors import DiskFull, NotFound
 from server.storage.capture_blobs import CaptureBlobs

@@ -10,9 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rig.atomic_write import write_atomically
-from rig.digest import sha256_of
 from rig.errors import InputError
+from rig.files import sha256_of, write_atomically
 from rig.formats.captures.archive import ArchiveLimits, extract_archive
 from rig.formats.captures.capture_folder import capture_root
 from rig.messages.message import compose, documents_of, texts_of
@@ -127,9 +126,9 @@ def calibrate_folder(
         return _calibrate_scene(report, Path(folder), Path(result), front)
     from calibration.board.board import read_board
     from calibration.calibrate import calibrate
-    from calibration.report import write_report
-    from calibration.result import CalibrationRefused, write_calibration
-    from rig.formats.cameras.cameras_json import read_rig
+    from calibration.report import report_page
+    from calibration.result import CalibrationRefused
+    from rig.formats.cameras.cameras_json import read_rig, write_rig
 
     known = None if previous is None else read_rig(Path(previous))
     try:
@@ -143,14 +142,14 @@ def calibrate_folder(
         )
     except CalibrationRefused as error:
         raise InputError("calibration", error.reasons) from error
-    write_report(found, Path(result) / "report.html")
-    write_calibration(found, Path(result) / "cameras.json")
+    write_atomically(Path(result) / "report.html", report_page(found).encode())
+    write_rig(found.rig, Path(result) / "cameras.json")
     return _outcome(found.document(), Path(result))
 
 
 def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | None) -> JsonObject:
     from calibration.result import CalibrationRefused
-    from calibration.scene.result import judge_scene, write_scene_report
+    from calibration.scene.result import judge_scene, scene_page
     from calibration.scene.scene import calibrate_scene
     from rig.formats.cameras.cameras_json import write_rig
 
@@ -160,7 +159,7 @@ def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | 
     except CalibrationRefused as error:
         raise InputError("calibration", error.reasons) from error
     verdict = judge_scene(found)
-    write_scene_report(found, result / "report.html")
+    write_atomically(result / "report.html", scene_page(found).encode())
     write_rig(found.rig, result / "cameras.json")
     missing = {"missing": texts_of(verdict.missing), "missing_messages": documents_of(verdict.missing)}
     return _outcome({"verdict": verdict.word, **missing, **found.document()}, result)

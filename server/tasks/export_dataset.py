@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from rig.errors import InputError
 from rig.formats.cameras.dataset_json import DatasetFormat
-from rig.formats.meshes.flame_param import FILE, FlameParam, read_flame_param
+from rig.formats.meshes.flame_param import FILE, read_flame_param
 from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import Mesh
 from rig.messages.message import Message, compose, say_once
@@ -51,7 +51,8 @@ def export_folder(
     inputs: Mapping[str, str] = {}
     if result is not None:
         inputs, head = _read_result(result)
-        flame = _read_flame(result, form)
+        if form == "gaussian-avatars" and (result / FILE).is_file():
+            flame = read_flame_param(result / FILE)
         if photographs_alone(folder):
             front = _take_over_found(result, kept) or front
     prepared = read_or_calibrate(folder, kept, front=front, report=report)
@@ -82,12 +83,6 @@ def _read_result(result: Path) -> tuple[Mapping[str, str], Mesh]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(str(result), [compose("no-result-folder")]) from error
     return inputs, read_head_ply(result / "head.ply")[0]
-
-
-def _read_flame(result: Path, form: DatasetFormat) -> FlameParam | None:
-    """Returns the FLAME parameters of a result, for a data set whose program reads them. Raises InputError."""
-    path = result / FILE
-    return read_flame_param(path) if form == "gaussian-avatars" and path.is_file() else None
 
 
 def _take_over_found(result: Path, kept: Path) -> str | None:

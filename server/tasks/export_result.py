@@ -114,7 +114,7 @@ def _eye(eye: EyeReport) -> Iris | UnseenEye:
     if iris is None or radius is None or gaze is None:
         return UnseenEye("closed" if eye["cause"] == "closed" else "unclear")
     place, views = np.array(iris["position"]), tuple(eye["views"])
-    return Iris(place, np.array(gaze), radius["value"], np.zeros((7, 7)), views, 0.0)
+    return Iris(place, np.array(gaze), radius["value"], np.zeros((7, 7)), views)
 
 
 def _read_textures(folder: Path, bare: Texturing, model: HeadModel, mesh: Mesh, outputs: OutputSettings) -> Texturing:

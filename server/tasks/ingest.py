@@ -25,8 +25,8 @@ from rig.acquisition.face_sighting import FaceSighting
 from rig.acquisition.verdict import ViewCheck, check_view, view_faults
 from rig.camera import Camera
 from rig.capture import TEXTURE_SETS, Capture
-from rig.digest import sha256_of
 from rig.errors import EigenheadError, InputError
+from rig.files import sha256_of
 from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, read_cameras, rig_file_parts
 from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.cameras.scale_json import read_scale

@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from pipeline.head_model.expressions import arkit_parts, closed_lids
 from pipeline.head_model.model import HeadModel
-from rig.atomic_write import write_atomically
 from rig.capture import ImageRgb
+from rig.files import write_atomically
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.pictures.images import write_image
 from rig.geometry import Similarity, rotation_from_vector

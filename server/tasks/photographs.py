@@ -16,11 +16,10 @@ from jaxtyping import Bool, UInt8
 
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.warnings import ReportWarning
-from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
 from rig.capture import Capture, ReadImage
-from rig.digest import sha256_of
 from rig.errors import InputError
+from rig.files import sha256_of, write_atomically
 from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
 from rig.formats.cameras.cameras_json import CAMERAS_MOST, read_rig, write_rig
 from rig.formats.cameras.scale_json import read_scale
@@ -122,7 +121,7 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
     made_of = _made_of(root, front)
     if (told_before := calibration_warnings(kept, made_of)) is not None:
         return told_before
-    from calibration.scene.result import write_scene_report
+    from calibration.scene.result import scene_page
     from calibration.scene.scene import calibrate_scene
 
     scale = entry(root, SCALE)
@@ -136,7 +135,7 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
         rig = rig.subset(spread_views(rig, CAMERAS_MOST))
         warnings.append(compose("views-many", joined=len(found.rig), most=CAMERAS_MOST))
     write_rig(rig, kept / CAMERAS)
-    write_scene_report(found, kept / PAGE)
+    write_atomically(kept / PAGE, scene_page(found).encode())
     document = {
         "made_of": made_of,
         "cameras_sha256": sha256_of(kept / CAMERAS),

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from typing import TYPE_CHECKING, NamedTuple
 
-from rig.cache_folder import cache_folder
+from rig.files import cache_folder
 from rig.progress import Progress
 from server.tasks.child import Child, WorkerContext
 

@@ -16,7 +16,7 @@ from pipeline.stages.views import Views
 from pipeline.view_checks.usable_views import without_moved_cameras
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import read_rig
-from rig.geometry import RigidTransform, Similarity
+from rig.geometry import Similarity
 from rig.messages.message import compose
 from rig.progress import Progress, discard_progress
 from rig.rig import Rig
@@ -79,16 +79,13 @@ def _differences(recorded: Rig, rig: Rig, *, same_poses: bool) -> list[str]:
         return [f"{name}: only in one of the two calibrations" for name in sorted(set(recorded.names) ^ set(rig.names))]
     faults = []
     for camera in recorded:
-        here, there = camera, rig[camera.name]
-        size, wanted = ((c.intrinsics.width, c.intrinsics.height) for c in (here, there))
+        there = rig[camera.name]
+        size, wanted = ((c.intrinsics.width, c.intrinsics.height) for c in (camera, there))
+        pose, first = camera.camera_from_world, there.camera_from_world
+        turned = not np.allclose(pose.rotation, first.rotation, rtol=0, atol=1e-9)
+        shifted = not np.allclose(pose.translation, first.translation, rtol=0, atol=1e-6)
         if size != wanted:
             faults.append(f"{camera.name}: pictures of {size[0]} x {size[1]}, calibrated for {wanted[0]} x {wanted[1]}")
-        elif same_poses and not _same_place(here.camera_from_world, there.camera_from_world):
+        elif same_poses and (turned or shifted):
             faults.append(f"{camera.name}: stands elsewhere in its cameras.json than in the first capture's")
     return faults
-
-
-def _same_place(one: RigidTransform, other: RigidTransform) -> bool:
-    return np.allclose(one.rotation, other.rotation, rtol=0, atol=1e-9) and np.allclose(
-        one.translation, other.translation, rtol=0, atol=1e-6
-    )

@@ -12,9 +12,8 @@ from pathlib import Path
 from statistics import median
 
 from pipeline.settings import FINE_LEVELS, PHOTO_LEVELS, Settings
-from rig.atomic_write import write_atomically
-from rig.cache_folder import cache_folder
 from rig.errors import InputError
+from rig.files import cache_folder, write_atomically
 from rig.formats.captures.capture_folder import capture_root
 from rig.formats.captures.shot_files import listed_pictures, picture_folder
 from rig.formats.pictures.images import picture_size

@@ -34,7 +34,7 @@ from server.errors import (
     Unavailable,
     unusable_input,
 )
-from server.problem_types import PROBLEM_TYPES, URN, type_of_status
+from server.problem_types import HTTP_TYPES, PROBLEM_TYPES, URN
 
 MEDIA_TYPE = "application/problem+json"
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -138,7 +138,8 @@ def problem_from(error: Exception) -> Problem:
     if isinstance(error, HTTPException):
         phrase = HTTPStatus(error.status_code).phrase
         detail = str(error.detail) if error.detail != phrase else compose("http-refused", phrase=phrase)
-        return Problem(error.status_code, type_of_status(error.status_code), detail, headers=error.headers)
+        kind = HTTP_TYPES.get(error.status_code, "http-error")
+        return Problem(error.status_code, kind, detail, headers=error.headers)
     if (isinstance(error, OSError) and error.errno in DISK_FULL) or "database or disk is full" in str(error):
         return problem_from(DiskFull())
     if isinstance(error, OSError) and error.errno in UNWRITABLE:

@@ -10,7 +10,7 @@ from typing import Literal, cast
 import structlog
 from dbos import DBOS, PortableWorkflowError
 
-from rig.digest import sha256_of
+from rig.files import sha256_of
 from rig.messages.message import compose
 from server.errors import Refused
 from server.services.deliveries import DELIVER, MANIFEST, MANIFEST_FORMAT, delivery_id, place_of

@@ -37,9 +37,8 @@ from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import PHOTO_LEVELS, settings_from_document
-from rig.atomic_write import write_atomically
-from rig.digest import sha256_of
 from rig.errors import Cancelled, InputError
+from rig.files import sha256_of, write_atomically
 from rig.messages.message import Message, MessageDocument, compose
 from rig.progress import Progress
 from server.errors import UNWRITABLE, unusable_input

@@ -14,11 +14,11 @@ from calibration.board.board import read_board
 from calibration.board.detection import Detections, View
 from calibration.calibrate import calibrate, calibrate_detections
 from calibration.quality.checks import check_against_previous, failed
-from calibration.result import Calibration, CalibrationRefused, write_calibration
+from calibration.result import Calibration, CalibrationRefused
 from rig.camera import Camera
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import read_rig_file
-from rig.formats.cameras.cameras_json import read_rig
+from rig.formats.cameras.cameras_json import read_rig, write_rig
 from rig.geometry import RigidTransform
 from rig.rig import Rig
 from tests.support.board_sessions import CHECKERBOARD, Session, session
@@ -215,7 +215,7 @@ def test_the_world_frame_is_the_projects(calibrated: Calibration, good: Session)
 
 
 def test_what_is_written_is_a_rig_with_covariances(calibrated: Calibration, tmp_path: Path) -> None:
-    write_calibration(calibrated, tmp_path / "cameras.json")
+    write_rig(calibrated.rig, tmp_path / "cameras.json")
     rig = read_rig(tmp_path / "cameras.json")
     assert rig.names == calibrated.rig.names
     for camera, other in zip(rig, calibrated.rig, strict=True):

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.pictures.images import write_image
 from tests.laboratory.experiments import markdown
 from tests.laboratory.inputs import INPUTS

@@ -39,7 +39,7 @@ def test_a_child_imports_nothing_from_the_working_directory_or_pythonpath(marker
 def test_a_worker_and_the_checkouts_command_start_beside_foreign_packages(marker: Path) -> None:
     commands = (
         (python_command("cli", "worker"), python_environment()),
-        ([Path(sys.executable).with_name("eigenhead")], None),
+        ([str(Path(sys.executable).with_name("eigenhead"))], None),
     )
     for command, environment in commands:
         done = fork_server.run([*command, "--help"], 120.0, env=environment)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.meshes.ply import write_ply
 from rig.mesh import Mesh
 from rig.progress import Progress

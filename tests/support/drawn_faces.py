@@ -89,7 +89,7 @@ def seen_face(
         crop = crop_around(points)
         points = projected + turned_about(bias, crop.roll_deg) * crop.side_px / CROP_OF_FACE
     box = np.concatenate([points.min(axis=0), points.max(axis=0)])
-    return FaceDetection(points, np.zeros(len(points)), score, box, crop_around(points).roll_deg)
+    return FaceDetection(points, score, box, crop_around(points).roll_deg)
 
 
 PAINT_PX_PER_MM = 2.0  # of the drawing that is laid on a head or a poster

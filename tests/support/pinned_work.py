@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.head_model.landmarks import NAMES
-from rig.atomic_write import write_atomically
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.messages.message import compose
 from rig.progress import Progress
 from server.processes import end_with_parent

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from calibration.adjustment.gauge import align_world, image_distance, moved
+from calibration.adjustment.gauge import align_world, image_distance
 from pipeline.contour_fit.problem import camera_information
 from pipeline.head_model.model import HeadModel, load_model
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
@@ -65,7 +65,7 @@ def disturbed(rig: Rig, error_px: float, rng: np.random.Generator) -> Rig:
         draws.append(np.sqrt(1.0 / np.diag(camera_information(camera, depth, 1.0))) * rng.standard_normal(6))
     off, scale = rig, error_px
     for _ in range(3):
-        off = Rig(tuple(moved(camera, scale * draw) for camera, draw in zip(rig, draws, strict=True)))
+        off = Rig(tuple(camera.moved(scale * draw) for camera, draw in zip(rig, draws, strict=True)))
         scale *= error_px / rms(image_distance(off, rig))
     return align_world(off, rig)
 

@@ -11,11 +11,28 @@ from rig.formats.pictures.work_size import work_rig
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import simulate
-from rig.studio.sensor.preset import CLEAN
+from rig.studio.sensor.preset import Preset
 from server.tasks.subjects import drawn_subject
 
 CAMERAS = ("cam00", "cam03", "cam04", "cam07", "cam08", "cam01")
 PIXELS = 320 * 240
+
+CLEAN = Preset(
+    noise=0.0,
+    light_drift=0.0,
+    defocus_px=0.0,
+    hair=False,
+    clothes=False,
+    backdrop_unevenness=0.0,
+    plates=1,
+    exposure_spread=0.0,
+    white_balance_spread=0.0,
+    vignetting=0.0,
+    pose_spread_deg=0.0,
+    pose_spread_mm=0.0,
+    feature_noise_px=0.0,
+)
+"""No imperfection at all: for telling what an imperfection costs."""
 
 
 def small_studio_captures(folder: Path, count: int, renderer: Renderer, *, first: int = 0) -> Path:

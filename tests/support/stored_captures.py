@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rig.digest import sha256_of
+from rig.files import sha256_of
 from server.storage.records import CameraSize, CaptureRecord
 from server.storage.store import Store, new_id
 

@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rig.atomic_write import write_atomically
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.formats.captures.capture_folder import read_capture
 from rig.progress import Progress
 from server.tasks.child import WorkerContext

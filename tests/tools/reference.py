@@ -23,7 +23,7 @@ from typer.core import TyperGroup
 
 from pipeline import settings
 from pipeline.settings import Settings
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats import rig_toml
 from server.cli.main import ROOMS, app
 from server.settings import PREFIX, ServiceSettings

@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
 KEPT = ROOT / "docs" / "results"

@@ -32,8 +32,8 @@ from pipeline.evidence.measurements import Measurement
 from pipeline.head_model.landmarks import stacked
 from pipeline.results.overlays import Resized, clay, contact_sheet
 from pipeline.results.pdf_page import BAD, FAINT, LINE_MM, MARGIN_MM, PdfPage
-from rig.atomic_write import write_atomically
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.ply import ply_bytes
 from rig.formats.meshes.scene import Part, Scene
@@ -317,15 +317,11 @@ def _write_meshes(folder: Path, comparison: Comparison, colours: UInt8[np.ndarra
     packed = io.BytesIO()
     np.savez_compressed(
         packed,
-        distance_mm=_single(comparison.distance_mm),
-        std_mm=_single(comparison.std_mm),
+        distance_mm=comparison.distance_mm.astype(np.float32),
+        std_mm=comparison.std_mm.astype(np.float32),
         changed=changed.astype(np.uint8),
     )
     write_atomically(folder / "difference.npz", packed.getvalue())
-
-
-def _single(values: Float[np.ndarray, " v"]) -> np.ndarray:
-    return values.astype(np.float32)
 
 
 def comparison_pdf(document: Mapping[str, Any], rows: Sequence[tuple[str, Sequence[Resized]]]) -> bytes:

@@ -20,8 +20,8 @@ from pipeline.applications.clinic.anatomical_frame import AnatomicalFrame
 from pipeline.applications.clinic.patient_files import FRAME_FILE, frame_document, write_json
 from pipeline.applications.clinic.visit import Visit
 from pipeline.results.head_files import close_borders
-from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, how_to_install
+from rig.files import write_atomically
 from rig.formats.meshes.markups import Axes
 from rig.formats.meshes.printing import stl_bytes
 from rig.mesh import Mesh

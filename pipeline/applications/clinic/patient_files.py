@@ -18,7 +18,7 @@ from pipeline.applications.clinic.visit import Visit
 from pipeline.applications.model_building.correspondence.scans import plain_name
 from pipeline.applications.verification.write import heat_colours
 from pipeline.results.head_files import uncertainty
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.meshes.markups import Axes, MarkupPoint, markups_document, read_markups
 from rig.formats.meshes.ply import write_ply
 from rig.geometry import RigidTransform

@@ -205,16 +205,10 @@ def read_surface(path: Path, axes: Axes | None = None) -> PatientSurface:
     """Reads a .ply, .obj, .glb or .stl. Axes are ``axes``, else those that the file's header states (``SPACE=RAS``, as
     3D Slicer writes it), else LPS. Raises InputError naming every fault."""
     mesh, _ = welded(read_mesh(path, SURFACE_ENDINGS))
-    found = _stated_axes(path)
     data = path.read_bytes()
+    found: Axes | None = next((stated for stated in AXES if f"SPACE={stated}".encode() in data[:HEADER_BYTES]), None)
     reference = Reference.of(mesh, {}, path.name, hashlib.sha256(data).hexdigest())
     return PatientSurface(reference, axes or found or "LPS", axes is None and found is not None)
-
-
-def _stated_axes(path: Path) -> Axes | None:
-    with path.open("rb") as file:
-        header = file.read(HEADER_BYTES)
-    return next((axes for axes in AXES if f"SPACE={axes}".encode() in header), None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -93,7 +93,7 @@ def sight(
         if eyes is not None and len(pixels) > eyes:
             continue
         box = np.concatenate([pixels[name].min(axis=0), pixels[name].max(axis=0)])
-        face = find_eyes(pyramid, FaceDetection(pixels[name], found[:, 2], score, box, crop.roll_deg), networks)
+        face = find_eyes(pyramid, FaceDetection(pixels[name], score, box, crop.roll_deg), networks)
         assert face.lids_px is not None
         direction = direction_from_face(placed, camera)
         for side, rows in LIDS.items():

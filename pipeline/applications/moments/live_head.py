@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from pipeline.alignment.face_alignment import align_to_face
 from pipeline.applications.moments.face_evidence import FaceReference, Sighting, refer, sight, terms_of
@@ -91,11 +91,6 @@ class LiveHead:
     def landmarks_world(self) -> Float[np.ndarray, "468 3"]:
         """Returns the 468 landmarks on the head (mm)."""
         return self.points_world[-LANDMARKS:]
-
-
-def mesh_faces(model: HeadModel) -> Int[np.ndarray, "f 3"]:
-    """Returns the triangles of the small mesh."""
-    return model.levels[MESH].faces
 
 
 def meet(

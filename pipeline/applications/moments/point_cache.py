@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int32
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.meshes.scene import Part, Scene
 from rig.formats.meshes.usdz import ROOT, check_usd, openusd_module, vectors, write_layer
 from rig.mesh import Mesh, vertex_normals

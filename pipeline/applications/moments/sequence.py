@@ -30,7 +30,7 @@ from pipeline.faces.networks import FaceNetworks, load_networks
 from pipeline.faces.subject import find_subject
 from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings, document_from_settings
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.geometry import RigidTransform, rigid_fit, rotation_from_vector, vector_from_rotation
 from rig.messages.message import documents_of, read_message
 from rig.progress import Progress

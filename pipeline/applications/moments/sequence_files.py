@@ -34,9 +34,9 @@ from pipeline.geometry.projection import picture
 from pipeline.head_model.expressions import plain_name
 from pipeline.head_model.model import load_model
 from pipeline.settings import Settings
-from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import EigenheadError
+from rig.files import write_atomically
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.scene import Part, Scene
 from rig.formats.meshes.usdz import check_usd

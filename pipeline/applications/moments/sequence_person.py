@@ -22,7 +22,7 @@ from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.recorder import Recorder
 from rig.errors import Cancelled, EigenheadError
-from rig.geometry import RigidTransform, rotation_from_vector
+from rig.geometry import RigidTransform
 from rig.messages.message import Message
 from rig.render.renderer import Renderer
 from rig.rig import Rig
@@ -147,7 +147,5 @@ def _corrected(rig: Rig, joint: tuple[ContourSolution, ...]) -> Rig:
             shifts[name].append(shift)
     cameras = []
     for camera in rig:
-        mean = np.mean(shifts[camera.name] or [np.zeros(6)], axis=0)
-        moved = RigidTransform(rotation_from_vector(mean[:3]), mean[3:])
-        cameras.append(replace(camera, camera_from_world=moved @ camera.camera_from_world))
+        cameras.append(camera.moved(np.mean(shifts[camera.name] or [np.zeros(6)], axis=0)))
     return replace(rig, cameras=tuple(cameras))

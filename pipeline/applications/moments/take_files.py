@@ -26,9 +26,8 @@ from pipeline.results.reconstruction import QUALITY, Reconstruction
 from pipeline.results.write import write_result
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext, Segment
-from rig.atomic_write import write_atomically
 from rig.capture import Capture
-from rig.digest import document_sha256
+from rig.files import document_sha256, write_atomically
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.ply import ply_bytes
 from rig.formats.meshes.scene import Part, Scene

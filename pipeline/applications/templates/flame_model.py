@@ -136,7 +136,8 @@ def fit_flame(
     for _ in range(ROUNDS):
         terms = (_Vertices(model, target, np.sqrt(counted) / deviation), _Prior.of(model))
         value = minimise(Problem(terms, len(_vector(value)), _moved), value, LIMITS).value
-        before, deviation = deviation, _deviation(_distances(model, value, target), counted)
+        variance = counted @ _distances(model, value, target) ** 2 / (3.0 * counted.sum())  # of a coordinate
+        before, deviation = deviation, max(FLOOR_M, float(np.sqrt(variance)))
         if abs(deviation - before) < 0.01 * before:
             break
     turns = np.stack([vector_from_rotation(turn) for turn in rotation_from_vector(value.pose)])
@@ -155,11 +156,6 @@ def _start(model: FlameModel, target: Float[np.ndarray, "v 3"], weights: Float[n
 
 def _distances(model: FlameModel, value: FlameParameters, target: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
     return np.linalg.norm(model.surface(value) - target, axis=1)
-
-
-def _deviation(distances: Float[np.ndarray, " v"], weights: Float[np.ndarray, " v"]) -> float:
-    """Returns the standard deviation of a coordinate of the distances, m, at least ``FLOOR_M``."""
-    return max(FLOOR_M, float(np.sqrt(weights @ distances**2 / (3.0 * weights.sum()))))
 
 
 def _vector(value: FlameParameters) -> Float[np.ndarray, " p"]:

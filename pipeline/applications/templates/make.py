@@ -11,8 +11,8 @@ from pipeline.applications.templates.registration import Registration, register
 from pipeline.applications.templates.template_file import Template
 from pipeline.head_model.model import HeadModel
 from pipeline.results.overlays import SKIN, clay, contact_sheet
-from rig.digest import sha256_of
 from rig.errors import InputError
+from rig.files import sha256_of
 from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz, read_pickled_arrays
 from rig.formats.meshes.polygon_obj import PolygonMesh, read_polygons
 from rig.image import ImageRgb

@@ -23,7 +23,6 @@ from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import vertex_areas
 from rig.errors import InputError
 from rig.formats.meshes.polygon_obj import PolygonMesh
-from rig.geometry import Similarity
 from rig.mesh import boundary_edges, vertex_normals
 from rig.messages.message import compose
 from rig.progress import Progress
@@ -56,8 +55,7 @@ class Registration:
     """Holds a mesh bound to a model's surface, and figures of how well it fits."""
 
     surface_binding: SurfaceBinding
-    place: Similarity  # head_from_template, from the start
-    placed: Vertices  # the mesh there, in its own shape, mm
+    placed: Vertices  # the mesh at its first place in the head frame, in its own shape, mm
     head: Float[np.ndarray, "v 3"]  # the model as like it as it can be, full level, mm
     off_mm: Float[np.ndarray, " n"]  # skin to that head, after the mesh was drawn to it
     unlike_mm: Float[np.ndarray, " n"]  # and before
@@ -115,12 +113,12 @@ def register(
         raise NotRegistered(name, [compose("template-off-skin")])
     rest = _followed(welded.vertices, rest, on_skin)
     rows = np.flatnonzero(on_skin[joined])
-    carried = surface_binding(
-        rest[joined], rows, _rows_of(attachment, joined[rows]), balls(welded, parts, ~skin)[joined]
-    )  # fmt: skip
+    at = joined[rows]
+    attached = Attachment(attachment.triangles[at], attachment.weights[at], attachment.offsets[at])
+    carried = surface_binding(rest[joined], rows, attached, balls(welded, parts, ~skin)[joined])
     unlike = SurfaceIndex(head.vertices, faces).closest(placed.vertices[rows], CANDIDATES).distances
     report("drawing", 1.0)
-    return Registration(carried, place, placed.vertices, head.vertices, off[joined[rows]], unlike, covered)
+    return Registration(carried, placed.vertices, head.vertices, off[joined[rows]], unlike, covered)
 
 
 def _check(like: Likeness, name: str, *, marked: bool) -> float:
@@ -257,7 +255,3 @@ def _followed(before: Vertices, after: Vertices, skin: Flags) -> Vertices:
     out = after.copy()
     out[~skin] = landmark_warp(before[rows], after[rows], before[~skin])
     return out
-
-
-def _rows_of(attachment: Attachment, rows: Int[np.ndarray, " n"]) -> Attachment:
-    return Attachment(attachment.triangles[rows], attachment.weights[rows], attachment.offsets[rows])

@@ -21,7 +21,7 @@ from pipeline.applications.templates.header import (
     template_path,
 )
 from pipeline.head_model.model import HeadModel
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz
 from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.messages.message import compose

@@ -23,7 +23,6 @@ not.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -37,7 +36,6 @@ from pipeline.head_model.regions import REGIONS
 from rig.errors import InputError
 from rig.geometry import rigid_fit
 from rig.mesh import vertex_normals
-from rig.typed_tables import read_table
 
 ROUNDS = 20  # of laying on and averaging; three are usual
 STILL_MM = 1e-7  # a mean that moves by less is the mean
@@ -71,11 +69,6 @@ class Check:
     value: float | None
     limit: float
     passed: bool | None  # None: not judged
-
-
-def limits_from_document(document: Mapping[str, Any], subject: str = "limits") -> Limits:
-    """Returns the limits from decoded JSON or TOML. Raises InputError that names every unknown key and wrong value."""
-    return read_table(Limits, document, subject)
 
 
 def checks(limits: Limits, values: Mapping[str, float | None]) -> tuple[Check, ...]:

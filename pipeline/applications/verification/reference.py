@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.applications.model_building.correspondence.scans import landmark_file, read_landmarks, welded
 from pipeline.geometry.surface_index import Hits, SurfaceIndex
-from rig.digest import sha256_of
 from rig.errors import InputError
+from rig.files import sha256_of
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh, boundary_edges
 

@@ -15,7 +15,7 @@ from pipeline.applications.verification.reference import Reference
 from pipeline.applications.verification.report import Occasion, VerificationReport, report_document
 from pipeline.results.overlays import Resized, clay
 from pipeline.results.pdf_page import BAD, FAINT, GOOD, LINE_MM, MARGIN_MM, WIDTH_MM, PdfPage
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 

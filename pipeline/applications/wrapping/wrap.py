@@ -157,13 +157,11 @@ def _round_rigs() -> Iterator[Rig]:
 
 
 def _pictures(rig: Rig, mesh: Mesh, light: Light, renderer: Renderer) -> dict[str, ImageRgb]:
-    drawn = renderer.colour(rig, mesh, light=light)
-    return {name: _before_grey(image) for name, image in drawn.items()}
-
-
-def _before_grey(image: np.ndarray) -> ImageRgb:
-    share = image[..., 3:].astype(float) / 255.0
-    return np.rint(share * image[..., :3] + (1.0 - share) * np.array(BACKGROUND)).astype(np.uint8)
+    pictures = {}
+    for name, image in renderer.colour(rig, mesh, light=light).items():
+        share = image[..., 3:].astype(float) / 255.0
+        pictures[name] = np.rint(share * image[..., :3] + (1.0 - share) * np.array(BACKGROUND)).astype(np.uint8)
+    return pictures
 
 
 def _lifted(
@@ -485,9 +483,3 @@ def _check(like: Likeness, name: str) -> None:
     off_mm = float(np.median(like.distances[met & like.in_face]))
     if off_mm > LIKE_MM:
         raise InputError(name, [compose("scan-no-head", off_mm=off_mm)])
-
-
-def surface_in_head(wrapped: Wrapped) -> tuple[Surface, Surface]:
-    """Returns scan and template in the frame and scale of the mean head, for drawing."""
-    vertices = wrapped.placed.head_from_scan.apply(wrapped.vertices)
-    return wrapped.placed.surface(), Surface.of(vertices, wrapped.template.mesh.triangles())

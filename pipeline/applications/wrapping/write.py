@@ -17,9 +17,9 @@ from pipeline.applications.templates.write.mesh import (
     template_materials,
     tile_suffix,
 )
-from pipeline.applications.wrapping.wrap import Wrapped, residual_colours, surface_in_head
+from pipeline.applications.wrapping.wrap import Wrapped, residual_colours
 from pipeline.results.overlays import clay, contact_sheet
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.meshes.ply import ply_bytes
 from rig.formats.meshes.polygon_obj import fan, polygon_obj_bytes
 from rig.formats.pictures.images import write_image
@@ -110,15 +110,16 @@ def _write_residuals(folder: Path, wrapped: Wrapped) -> None:
 
 def wrap_picture(wrapped: Wrapped) -> ImageRgb:
     """Draws, from front and side, the scan in clay, the template on it, and the residuals, with the face below."""
-    scan, template = surface_in_head(wrapped)
+    scan = wrapped.placed.surface()  # both in the frame and scale of the mean head
+    template = Mesh(wrapped.placed.head_from_scan.apply(wrapped.vertices), wrapped.template.mesh.triangles())
     colours = residual_colours(wrapped.distance_mm, wrapped.covered)
     box = (template.vertices.min(axis=0), template.vertices.max(axis=0))
     middle = wrapped.placed.marks.points.mean(axis=0)
     close = (middle - CLOSE_MM, middle + CLOSE_MM)
     meshes = (
         ("the scan", Mesh(scan.vertices, scan.faces), None),
-        ("in the template's order", Mesh(template.vertices, template.faces), None),
-        ("its distance: yellow 0.5 mm, red 1 mm", Mesh(template.vertices, template.faces), colours),
+        ("in the template's order", template, None),
+        ("its distance: yellow 0.5 mm, red 1 mm", template, colours),
     )
     rows = []
     for turn in AZIMUTHS_DEG:

@@ -31,7 +31,7 @@ from rig.rig import Rig
 
 MAX_VIEWS = 12  # read: of 24 Mpx they take 0.4 GB, of 45 Mpx 0.8 GB, as much again while they are packed
 MARGIN_PX = 8
-COARSER = 0.8
+COARSER = 0.8  # texels are that much coarser than pictures: of 0.1 mm a pixel most would need four times as many
 HALF_VIEWS = 2  # in the mean of each of two sets: more blur, for errors of the geometry
 GREY = 128.0  # code of what no view shows: the same in both pictures, so that it adds nothing
 MM_PER_CODE = 1.0 / 65536  # from -0.5 to 0.5 mm: deeper than any pore
@@ -54,11 +54,6 @@ class CloseViews:
     rows: tuple[int, ...]
     pictures: Pictures
     decision: Decision
-
-    def for_texels(self) -> Rig:
-        """Returns cameras with as many pixels as the texels need, a quarter coarser than the pictures: at 0.1 mm a
-        pixel, most pictures would otherwise need four times as many texels."""
-        return self.views.scaled(COARSER)
 
 
 def read_close_views(

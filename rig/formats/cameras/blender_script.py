@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rig.atomic_write import write_atomically
 from rig.camera import Camera
+from rig.files import write_atomically
 from rig.formats.cameras.transforms_json import opengl_pose
 from rig.rig import Rig
 

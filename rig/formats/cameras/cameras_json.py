@@ -6,9 +6,9 @@ from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
-from rig.atomic_write import write_atomically
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.formats.pictures.picture_names import safe_name
 from rig.geometry import RigidTransform, nearest_rotation
 from rig.messages.message import Message, compose, say_once

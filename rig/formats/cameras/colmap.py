@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from rig.atomic_write import write_atomically
 from rig.camera import Camera
+from rig.files import write_atomically
 from rig.formats.cameras.cameras_json import CAMERAS_READ_MOST
 from rig.formats.cameras.foreign import (
     CamerasRead,

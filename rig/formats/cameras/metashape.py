@@ -12,9 +12,9 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float
 
-from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.formats.cameras.foreign import (
     LENS_LOSS_PX,
     CamerasRead,

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.formats.cameras.foreign import (
     CamerasRead,
     Malformed,

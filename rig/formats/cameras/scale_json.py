@@ -98,7 +98,8 @@ def _pixels(views: Any, where: str, cameras: Collection[str], faults: list[Messa
     for name, pixel in views.items():
         if name not in cameras:
             faults.append(compose("no-photograph-of", key=where, camera=f"{name!r:.80}"))
-        if not (isinstance(pixel, list) and len(pixel) == 2 and all(map(_is_place, pixel))):
+        listed = isinstance(pixel, list) and len(pixel) == 2
+        if not listed or not all(is_number(at) and -1.0 < at < PIXELS_MOST for at in pixel):
             key = f"{where}.{printable(name):.80}"
             faults.append(compose("no-pixel-pair", key=key, value=f"{pixel!r:.80}", most=PIXELS_MOST))
     return {} if faults else {name: np.array(pixel, float) for name, pixel in views.items()}
@@ -141,7 +142,3 @@ def _length(document: dict[str, Any], key: str, faults: list[Message], where: st
         faults.append(compose("no-length", key=f"{where}{key}", value=f"{value!r:.80}"))
         return 1.0
     return float(value)
-
-
-def _is_place(value: Any) -> bool:
-    return is_number(value) and -1.0 < value < PIXELS_MOST  # a pixel's area reaches half of one beyond its centre

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.formats.cameras.cameras_json import is_number
 from rig.formats.cameras.foreign import (
     CamerasRead,

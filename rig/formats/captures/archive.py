@@ -370,7 +370,8 @@ def _judge(
             faults.add(fault)
         return None
     parts = [part for part in PurePosixPath(member.name).parts if part != "."]
-    if member.kind == "folder" or not parts or any(is_dropped(part) for part in parts):
+    dropped = any(part.startswith("._") or part.casefold() in DROPPED for part in parts)  # file managers add them
+    if member.kind == "folder" or not parts or dropped:
         return None
     for depth, part in enumerate(parts, 1):
         here = tuple(parts[:depth])
@@ -424,11 +425,6 @@ def unicode_path(extra: bytes, raw: bytes) -> bytes | None:
             return data[5:]
         at += 4 + size
     return None
-
-
-def is_dropped(part: str) -> bool:
-    """Tells whether a file or folder of this name is never written, because file managers add it."""
-    return part.startswith("._") or part.casefold() in DROPPED
 
 
 def name_clash(parts: list[str], shown: str, kind: str, seen: dict[str, tuple[str, str]]) -> Message | None:

@@ -23,11 +23,10 @@ from pathlib import Path
 
 import numpy as np
 
-from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
 from rig.capture import TEXTURE_SETS, Capture, Features, ReadImage
-from rig.digest import sha256_of
 from rig.errors import InputError
+from rig.files import sha256_of, write_atomically
 from rig.formats.cameras.cameras_file import find_rig_file, no_rig_fault, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras.cameras_json import CAMERAS_LEAST, write_rig
 from rig.formats.cameras.foreign import CamerasRead, program_of, unread_programs

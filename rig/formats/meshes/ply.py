@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from rig.atomic_write import write_atomically
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.mesh import Mesh
 from rig.messages.message import compose
 

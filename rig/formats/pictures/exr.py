@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 
 MAGIC, VERSION = 20000630, 2
 HALF, ZIP = 1, 3  # of a channel's samples; the compression

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
-from rig.atomic_write import write_atomically
 from rig.errors import InputError, how_to_install
+from rig.files import write_atomically
 from rig.formats.pictures.mask_values import Plane, mask_plane, subject_convention
 from rig.formats.pictures.picture_names import HEIC_SUFFIXES, IMAGE_SUFFIXES, RAW_SUFFIXES
 from rig.formats.pictures.picture_samples import TIFF, WHOLE_BITS

@@ -18,7 +18,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Num, UInt8
+from jaxtyping import Bool, Float, Num, UInt8
 
 from rig.messages.message import Message, compose
 
@@ -188,7 +188,10 @@ def _read_trimap(plane: Plane, levels: list[float]) -> MaskReading:
         return MaskReading(_nothing(plane), fault=labels)
     share = _share_between(plane, levels[0], levels[2])
     black, white = share < 64, share > 191
-    away_black, away_white = (_distance_to(area) for area in (black, white))
+    away_black, away_white = (
+        np.asarray(cv2.distanceTransform((~area).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+        for area in (black, white)
+    )
     width = float(np.minimum(away_black, away_white)[~black & ~white].max(initial=0.0))
     touching = cv2.dilate(white.astype(np.uint8), np.ones((3, 3), np.uint8)).view(bool) & black
     if width > BAND_MOST_PX or touching.mean() > 1e-4:
@@ -196,10 +199,6 @@ def _read_trimap(plane: Plane, levels: list[float]) -> MaskReading:
     middle = away_black / np.maximum(away_black + away_white, np.float32(1e-3))
     remark = compose("mask-band", width_px=2 * width)
     return MaskReading((255.0 * middle + 0.5).astype(np.uint8), soft=True, remark=remark)
-
-
-def _distance_to(area: np.ndarray) -> Float32[np.ndarray, "h w"]:
-    return np.asarray(cv2.distanceTransform((~area).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
 
 
 def subject_convention(

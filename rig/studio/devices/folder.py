@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.captures.capture_folder import write_capture
 from rig.formats.meshes.ply import write_ply
@@ -18,9 +18,7 @@ from rig.studio.scene.simulate import SimulatedCapture
 from rig.studio.sensor.preset import REALISM, made_real
 
 
-def simulate_to_folder(
-    out: Path, simulated: SimulatedCapture, *, seed: int | None = None, features: bool = True
-) -> Path:
+def simulate_to_folder(out: Path, simulated: SimulatedCapture, *, seed: int | None = None) -> Path:
     """Writes a simulated capture as the folder ``out`` and its ground truth as the folder ``<out>.truth``. Returns the
     latter.
 
@@ -29,10 +27,7 @@ def simulate_to_folder(
     coverage/ (0 to 255), parts/ (0 background, 1 skin, 2 hair or beard, 3 clothes, cap or glasses), visible.npz (points
     of head, hair and clothes in two or more views), cameras.json (the true cameras) and meta.json.
     """
-    capture = simulated.capture
-    if not features:
-        capture = type(capture)(capture.images, capture.backgrounds, capture.masks)
-    write_capture(out, capture, simulated.rig)
+    write_capture(out, simulated.capture, simulated.rig)
     truth = out.with_name(out.name + ".truth")
     write_truth(truth, simulated, seed=seed)
     return truth

@@ -18,8 +18,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rig.atomic_write import write_atomically
 from rig.errors import InputError
+from rig.files import write_atomically
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.pictures.images import encode_image
 from rig.image import ImageRgb
@@ -207,12 +207,11 @@ class StudioDevices:
                 views[camera], views[other] = views[other], views[camera]
         self.streams.connect(views)
         for name in self.names:
-            self.streams.freeze(name, ("frozen", name) in kinds)
-            self.streams.hang(name, ("hung", name) in kinds)
-            self.streams.drop_next(name, ("dropped", name) in kinds)
+            frozen, hung, dropped = ((kind, name) in kinds for kind in ("frozen", "hung", "dropped"))
+            self.streams.disturb(name, frozen=frozen, hung=hung, drop_next=dropped)
         unplugged = any(kind == "unplugged" for kind, _ in kinds)
         if unplugged and self.box is not None:
-            self.box.unplug()
+            self.box.close()
             self.box = None
             self._lamps = 0  # the box has its power from the same cable, and the lamps are switched by it
         elif not unplugged and self.box is None:

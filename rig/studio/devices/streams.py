@@ -125,17 +125,15 @@ class StreamServer:
 
         self._do(plan)
 
-    def freeze(self, name: str, frozen: bool = True) -> None:
-        """Makes a camera repeat its last picture, or stops that."""
-        self._do(lambda: setattr(self._cameras[name], "frozen", frozen))
+    def disturb(self, name: str, *, frozen: bool = False, hung: bool = False, drop_next: bool = False) -> None:
+        """Sets a camera's faults: it repeats its last picture, keeps its connections but sends nothing, or loses its
+        next triggered frame."""
 
-    def hang(self, name: str, hung: bool = True) -> None:
-        """Makes a camera keep its connections but send nothing, or stops that."""
-        self._do(lambda: setattr(self._cameras[name], "hung", hung))
+        def change() -> None:
+            camera = self._cameras[name]
+            camera.frozen, camera.hung, camera.drop_next = frozen, hung, drop_next
 
-    def drop_next(self, name: str, drop: bool = True) -> None:
-        """Makes a camera lose its next triggered frame, or stops that."""
-        self._do(lambda: setattr(self._cameras[name], "drop_next", drop))
+        self._do(change)
 
     def connect(self, views: Mapping[str, str]) -> None:
         """Sets which camera's pictures each address shows, to simulate exchanged cables."""

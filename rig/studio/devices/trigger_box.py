@@ -151,7 +151,7 @@ _COMMANDS: dict[str, Callable[[BoxLogic, list[str], float], str]] = {
 
 class SimulatedTriggerBox:
     """Runs a simulated trigger box on a pseudo-terminal. ``port`` is the path of a link to it, removed when the box is
-    closed or unplugged."""
+    closed."""
 
     def __init__(self, port: Path, logic: BoxLogic) -> None:
         self.port = port
@@ -173,12 +173,8 @@ class SimulatedTriggerBox:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def unplug(self) -> None:
-        """Pulls the box's cable: the client's next read or write fails, and the port is gone."""
-        self.close()
-
     def close(self) -> None:
-        """Ends the box's thread and removes its port. Safe to call twice."""
+        """Ends the box's thread and removes its port: a client's next read or write fails. Safe to call twice."""
         if self._stopped:
             return
         self._stopped = True

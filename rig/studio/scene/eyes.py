@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from trimesh.remesh import subdivide
 
 from rig.geometry import Similarity
@@ -146,7 +146,8 @@ def _cut(mesh: Mesh, landmarks: Landmarks, side: str) -> tuple[Mesh, Int[np.ndar
         if not patch.any() or np.median(edges) < EDGE_MM:
             break
         vertices, faces, *_ = subdivide(vertices, faces, face_index=np.flatnonzero(patch))
-    inside = _between_lids(vertices, inner, outer)[faces].all(axis=1)
+    gap = eye_gap(vertices, inner, outer, 0.0)
+    inside = (gap.here & (np.abs(gap.off) < gap.height))[faces].all(axis=1)
     edges = boundary_edges(faces[~inside])
     edges = edges[np.isin(edges, np.unique(faces[inside])).all(axis=1)]
     return Mesh(vertices, faces[~inside]), edges
@@ -159,11 +160,6 @@ def _with_margins(mesh: Mesh, edges: Int[np.ndarray, "e 2"]) -> Mesh:
     behind = mesh.vertices[rim] - (0.0, 0.0, MARGIN_MM)
     walls = [np.stack([edges[:, 1], edges[:, 0], start], axis=1), np.stack([edges[:, 1], start, end], axis=1)]
     return Mesh(np.concatenate([mesh.vertices, behind]), np.concatenate([mesh.faces, *walls]))
-
-
-def _between_lids(vertices: Float[np.ndarray, "v 3"], inner: Vector, outer: Vector) -> Bool[np.ndarray, " v"]:
-    gap = eye_gap(vertices, inner, outer, 0.0)
-    return gap.here & (np.abs(gap.off) < gap.height)
 
 
 def eye_centres(mesh: Mesh, landmarks: Landmarks, gaze: Vector) -> dict[str, Vector]:

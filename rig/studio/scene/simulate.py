@@ -16,7 +16,7 @@ from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
 from rig.errors import InputError
-from rig.geometry import RigidTransform, Similarity, rotation_from_vector
+from rig.geometry import Similarity
 from rig.mesh import Mesh
 from rig.messages.message import compose
 from rig.render.photograph import Gallery, Part
@@ -315,8 +315,8 @@ def _knocked(camera: Camera, faults: Sequence[Fault], rng: np.random.Generator) 
     for fault in faults:
         if fault.kind == "bumped" and fault.camera == camera.name:
             axis = rng.normal(0, 1, 3)
-            turn = rotation_from_vector(np.radians(fault.strength) * axis / np.linalg.norm(axis))
-            camera = replace(camera, camera_from_world=RigidTransform(turn, np.zeros(3)) @ camera.camera_from_world)
+            turn = np.radians(fault.strength) * axis / np.linalg.norm(axis)
+            camera = camera.moved(np.concatenate([turn, np.zeros(3)]))
     return camera
 
 
@@ -351,15 +351,7 @@ def view_cameras(
             camera_rng.normal(0, preset.exposure_spread) + camera_rng.normal(0, preset.white_balance_spread, 3)
         )
         red, green, blue = gains.tolist()
-        sensor = Sensor(
-            (red, green, blue),
-            preset.vignetting,
-            blur[0] if blur else preset.defocus_px,
-            preset.noise,
-            preset.read_noise,
-            preset.mosaic,
-            preset.jpeg_quality,
-        )
+        sensor = Sensor((red, green, blue), replace(preset, defocus_px=blur[0]) if blur else preset)
         behind = backdrop(camera.intrinsics, camera_rng, preset.backdrop_unevenness, colour)
         return View(light[camera.name], behind, sensor)
 

@@ -1,99 +1,19 @@
-"""Computes skin colour at each vertex: an even tone, blotches, and features placed by landmarks. If cameras are near
-enough, it also adds a known relief as true geometry.
-
-Real skin is crossed by furrows 20 to 100 um deep and 0.5 to 3 mm apart. Here the relief is a sum of plane waves in head
-coordinates, so its height is known at every point. The skin's triangles are finely divided there, moved along the
-normals, and lit with the normals of the relief.
-"""
+"""Computes skin colour at each vertex: an even tone, blotches, and features placed by landmarks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from trimesh.remesh import subdivide
+from jaxtyping import Bool, Float
 
-from rig.mesh import Mesh, vertex_normals
 from rig.studio.scene.anatomy import Anatomy, Landmarks
 
-WAVES = 160
-SHORTEST_MM, LONGEST_MM = 0.5, 3.0
-EDGE_MM = 0.16  # of the divided triangles: three to the shortest wave
-FADE = 0.75  # share of the radius within which the relief has its full height
-CHUNK = 20_000
 Vertices = Float[np.ndarray, "v 3"]
 Vector = Float[np.ndarray, " 3"]
 
 BROW = np.array([0.035, 0.022, 0.015])
 LIP = np.array([0.40, 0.13, 0.12])
 DRY = 0.25  # oil of skin beside the oily zones
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SkinRelief:
-    """Holds a relief: plane waves (rad/mm, rad, mm) in the head frame, within ``radius_mm`` of the ``centres``."""
-
-    vectors: Float[np.ndarray, "w 3"]
-    phases: Float[np.ndarray, " w"]
-    amplitudes_mm: Float[np.ndarray, " w"]
-    centres: Float[np.ndarray, "c 3"]
-    radius_mm: float
-
-    def share(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Returns the strength of the relief at points of the head (mm): 1 inside, 0 beyond the radius."""
-        off = np.linalg.norm(places[:, None] - self.centres[None], axis=2).min(axis=1) / self.radius_mm
-        inside = np.clip((1.0 - off) / (1.0 - FADE), 0.0, 1.0)
-        return inside * inside * (3.0 - 2.0 * inside)
-
-    def heights_mm(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Returns the height at points of the head (mm), along its normals."""
-        parts = [np.sin(chunk @ self.vectors.T + self.phases) @ self.amplitudes_mm for chunk in _chunks(places)]
-        return np.concatenate([np.zeros(0), *parts]) * self.share(places)
-
-    def slopes(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Returns the gradient of the height at points of the head. The slow fading towards the radius is left out."""
-        scaled = self.amplitudes_mm[:, None] * self.vectors
-        parts = [np.cos(chunk @ self.vectors.T + self.phases) @ scaled for chunk in _chunks(places)]
-        return np.concatenate([np.zeros((0, 3)), *parts]) * self.share(places)[:, None]
-
-
-def _chunks(places: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "_ 3"]]:
-    return [places[start : start + CHUNK] for start in range(0, len(places), CHUNK)]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RelievedSkin:
-    """Holds skin with its relief (head frame, mm). ``places`` are its points before the relief moved them; ``values``
-    are interpolated from the values at the vertices."""
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    normals: Float[np.ndarray, "v 3"]
-    places: Float[np.ndarray, "v 3"]
-    values: Mapping[str, Float[np.ndarray, "v _"]]
-
-
-def relieved(head: Mesh, relief: SkinRelief, values: Mapping[str, Float[np.ndarray, "v _"]]) -> RelievedSkin:
-    """Divides the triangles of a head where it has a relief, and moves their corners to it. ``values`` are those of the
-    head's vertices."""
-    places, attributes = head.vertices, {"normals": vertex_normals(head.vertices, head.faces), **values}
-    near = (relief.share(places) > 0)[head.faces].any(axis=1)
-    inner, outer = head.faces[near], head.faces[~near]
-    while len(inner) and np.median(np.linalg.norm(places[inner[:, 0]] - places[inner[:, 1]], axis=1)) > EDGE_MM:
-        places, inner, attributes = cast(Any, subdivide)(places, inner, vertex_attributes=attributes)
-    normals = attributes.pop("normals")
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    slopes = relief.slopes(places)
-    slopes -= (slopes * normals).sum(axis=1, keepdims=True) * normals
-    tilted = normals - slopes
-    return RelievedSkin(
-        places + relief.heights_mm(places)[:, None] * normals,
-        np.concatenate([outer, inner]),
-        tilted / np.linalg.norm(tilted, axis=1, keepdims=True),
-        places,
-        attributes,
-    )
 
 
 def skin_paint(

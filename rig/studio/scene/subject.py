@@ -16,10 +16,10 @@ from rig.messages.message import compose
 from rig.render.photograph import NOISE_CELLS, Gallery, Grain, Part
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import Anatomy, Landmarks, anatomy
-from rig.studio.scene.eyes import IRIS_TONES, Eye, EyeSurface, eye_centres, look_at_point, opened, surface
+from rig.studio.scene.eyes import IRIS_TONES, Eye, eye_centres, look_at_point, opened, surface
 from rig.studio.scene.hair import STRAND_POINTS, Hair, HairStyle, grow, grow_beard, hang, knot
 from rig.studio.scene.lights import LAMPS, Lamp, irradiance, lamp_directions
-from rig.studio.scene.skin_texture import SkinRelief, oily_zones, relieved, skin_paint
+from rig.studio.scene.skin_texture import oily_zones, skin_paint
 from rig.studio.scene.worn import TightCap, cap, glasses, joined, lay_cap, shirt
 from rig.studio.sensor.sensor import volume
 
@@ -102,15 +102,14 @@ NO_GRAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
     """Holds a head (head frame, mm). Without landmarks, its skin has neither brows nor lips. ``closed`` is how far the
-    lids of each side are closed, 0 to 1. ``relief`` is fine relief of its skin that the mesh does not have. ``eyes``
-    are eyeballs by side (head frame); without them eyes are painted on the skin."""
+    lids of each side are closed, 0 to 1. ``eyes`` are eyeballs by side (head frame); without them eyes are painted
+    on the skin."""
 
     mesh: Mesh
     landmarks: Landmarks = field(default_factory=dict)
     face_region: Bool[np.ndarray, " v"] | None = None
     name: str = "subject"
     closed: Mapping[str, float] = field(default_factory=dict)  # eyes by side, 0 open to 1
-    relief: SkinRelief | None = None
     eyes: Mapping[str, Eye] = field(default_factory=dict)
 
 
@@ -153,7 +152,7 @@ class Dressed:
     most of the rest.
 
     ``solid`` are vertices and triangles of everything except strands of hair; they decide what is hidden. ``surfaces``
-    are the same by name: head, hair, clothes. ``skin`` is the visible head, with its relief.
+    are the same by name: head, hair, clothes. ``skin`` is the visible head.
     """
 
     head: Part
@@ -225,25 +224,20 @@ def dress(
         grain = CLOTH if appearance.texture else NO_GRAIN
         pieces.append(Piece("clothes", *worn, worn[0], _even(worn[0], appearance.cloth), grain, False))
     pieces += _headwear(head, body, appearance, hairs[0][0] if appearance.hair else None)
-    pieces += [_eye_piece(surface(eye, eye_rng)) for eye in subject.eyes.values()]
+    for eye in (surface(eye, eye_rng) for eye in subject.eyes.values()):
+        pieces.append(Piece("head", eye.vertices, eye.faces, eye.vertices, eye.paint, NO_GRAIN, True, eye.oil))
     if appearance.tight_cap:
         pieces.append(_tight_cap(head, body, appearance.tight_cap, cap_rng))
     placed = [(world_from_head.apply(piece.vertices), piece.faces) for piece in pieces]
     normals = [vertex_normals(*piece) for piece in placed]
     solid = joined(placed)
-    close_up = None if subject.relief is None else _relieved(pieces[0], pierced.mesh, subject.relief, world_from_head)
-    lit = [(v, n) for (v, _), n in zip(placed, normals, strict=True)]
-    lit += [] if close_up is None else [(close_up.vertices, close_up.normals)]
-    light = irradiance(renderer, lit, solid, lamps)
+    light = irradiance(renderer, [(v, n) for (v, _), n in zip(placed, normals, strict=True)], solid, lamps)
     if max(appearance.scattering_mm) > 0.0:
         light[0] = scattered(*placed[0], light[0], appearance.scattering_mm)
-        if close_up is not None:
-            light[-1] = scattered(close_up.vertices, close_up.faces, light[-1], appearance.scattering_mm)
     parts = [
         Part(vertices, faces, normal, piece.places, piece.paint, lit, piece.grain, piece.one_sided, piece.oil)
-        for piece, (vertices, faces), normal, lit in zip(pieces, placed, normals, light[: len(pieces)], strict=True)
+        for piece, (vertices, faces), normal, lit in zip(pieces, placed, normals, light, strict=True)
     ]
-    skin = parts[0] if close_up is None else replace(close_up, irradiance=light[-1])
     strands = [
         _strand_part(hair, part, world_from_head, strand_rng)
         for (hair, _), part in zip(hairs, parts[1:], strict=False)
@@ -258,7 +252,7 @@ def dress(
         for name in dict.fromkeys(("head", *shown))
     }
     bare = parts[0] if pierced is subject else _uncut(parts[0], head)
-    return Dressed(bare, skin, tuple(parts[1:] + strands), gallery, solid, surfaces)
+    return Dressed(bare, parts[0], tuple(parts[1:] + strands), gallery, solid, surfaces)
 
 
 def _uncut(skin: Part, head: Mesh) -> Part:
@@ -298,23 +292,6 @@ def _skin(subject: Subject, body: Anatomy, appearance: Look, one_sided: bool, rn
     return Piece("head", head.vertices, head.faces, head.vertices, paint, grain, one_sided, oil)
 
 
-def _relieved(piece: Piece, head: Mesh, relief: SkinRelief, world_from_head: Similarity) -> Part:
-    """Returns the skin with its relief in the world frame, not lit yet."""
-    oil = np.zeros((len(piece.vertices), 1)) if piece.oil is None else piece.oil[:, None]
-    fine = relieved(head, relief, {"paint": piece.paint, "oil": oil})
-    return Part(
-        world_from_head.apply(fine.vertices),
-        fine.faces,
-        fine.normals @ world_from_head.rotation.T,
-        fine.places,
-        fine.values["paint"],
-        np.zeros_like(fine.vertices),
-        piece.grain,
-        piece.one_sided,
-        None if piece.oil is None else fine.values["oil"][:, 0],
-    )
-
-
 def _hairs(
     head: Mesh,
     body: Anatomy,
@@ -335,10 +312,6 @@ def _hairs(
     if appearance.beard:
         styles.append((grow_beard(head, body, appearance.beard, rng), appearance.beard))
     return styles
-
-
-def _eye_piece(eye: EyeSurface) -> Piece:
-    return Piece("head", eye.vertices, eye.faces, eye.vertices, eye.paint, NO_GRAIN, True, eye.oil)
 
 
 def _hair_piece(hair: Hair, style: HairStyle) -> Piece:

@@ -49,23 +49,6 @@ class Preset:
 PRESET = Preset()
 """Noise 1.5 %, light drift 2 %, defocus 0.7 px, hair, uneven backdrop (issue 2, item 6)."""
 
-CLEAN = Preset(
-    noise=0.0,
-    light_drift=0.0,
-    defocus_px=0.0,
-    hair=False,
-    clothes=False,
-    backdrop_unevenness=0.0,
-    plates=1,
-    exposure_spread=0.0,
-    white_balance_spread=0.0,
-    vignetting=0.0,
-    pose_spread_deg=0.0,
-    pose_spread_mm=0.0,
-    feature_noise_px=0.0,
-)
-"""No imperfection at all: for telling what an imperfection costs."""
-
 Change = Callable[[Preset], Preset]
 
 

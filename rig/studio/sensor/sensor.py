@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from rig.colour_space import srgb_from_linear
+from rig.studio.sensor.preset import Preset
 
 CURVE_STEPS = 1 << 12
 MID_GREY = 0.214  # linear light that sRGB writes as 50 %
@@ -16,15 +17,11 @@ READ_SHARE = 0.1  # of mid grey's noise variance: what is there without light
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Holds the imperfections of one camera, which are the same in every picture."""
+    """Holds what is the same in every picture of one camera: its gains (exposure times white balance, by channel), and
+    imperfections."""
 
-    gains: tuple[float, float, float]  # exposure times white balance, per channel
-    vignetting: float
-    defocus_px: float
-    noise: float
-    read_noise: float = 0.0
-    mosaic: bool = False
-    jpeg_quality: int | None = None
+    gains: tuple[float, float, float]
+    preset: Preset
 
 
 def _curve() -> UInt8[np.ndarray, " n"]:
@@ -39,10 +36,10 @@ _CURVE = _curve()
 def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarray, "h w 3"]:
     """Returns the light on the sensor (linear, float32): blurred by the lens, darker in the corners, times the camera's
     gains."""
-    light = cv2.GaussianBlur(linear, (0, 0), sensor.defocus_px) if sensor.defocus_px > 0 else linear
+    light = cv2.GaussianBlur(linear, (0, 0), sensor.preset.defocus_px) if sensor.preset.defocus_px > 0 else linear
     height, width = light.shape[:2]
     y, x = np.ogrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
-    fall_off = (1.0 - sensor.vignetting * (x**2 + y**2) / 2.0).astype(np.float32)
+    fall_off = (1.0 - sensor.preset.vignetting * (x**2 + y**2) / 2.0).astype(np.float32)
     return light * fall_off[:, :, None] * np.array(sensor.gains, np.float32)
 
 
@@ -58,17 +55,17 @@ def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"
 
 def expose(light: Float[np.ndarray, "h w 3"], sensor: Sensor, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
     """Takes one picture (sRGB codes) of the linear light on the sensor, with fresh noise."""
-    if sensor.noise > 0:
+    if sensor.preset.noise > 0:
         # The curve's slope at mid grey is 1.07, so that the noise there is ``noise`` of full scale in the picture.
-        variance = (sensor.noise / 1.07) ** 2 * (READ_SHARE + (1 - READ_SHARE) / MID_GREY * np.maximum(light, 0))
+        variance = (sensor.preset.noise / 1.07) ** 2 * (READ_SHARE + (1 - READ_SHARE) / MID_GREY * np.maximum(light, 0))
         light = light + np.sqrt(variance) * rng.standard_normal(light.shape, np.float32)
-    if sensor.read_noise > 0:
-        light = light + np.float32(sensor.read_noise) * rng.standard_normal(light.shape, np.float32)
-    if sensor.mosaic:
+    if sensor.preset.read_noise > 0:
+        light = light + np.float32(sensor.preset.read_noise) * rng.standard_normal(light.shape, np.float32)
+    if sensor.preset.mosaic:
         light = through_mosaic(light)
     step = np.sqrt(np.clip(light, 0.0, 1.0)) * np.float32(CURVE_STEPS - 1) + np.float32(0.5)
     picture = _CURVE[step.astype(np.uint16)]
-    return picture if sensor.jpeg_quality is None else compressed(picture, sensor.jpeg_quality)
+    return picture if sensor.preset.jpeg_quality is None else compressed(picture, sensor.preset.jpeg_quality)
 
 
 def through_mosaic(light: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:

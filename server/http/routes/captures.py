@@ -35,7 +35,6 @@ from server.services.records import JobOut
 from server.services.texts import PLAIN, TEXT_MOST, checked_tags
 from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureOrder, CaptureQuery
-from server.storage.object_places import is_object_url
 from server.storage.records import CaptureRecord
 from server.wire.fetch import fetch_archive, fetch_stored_capture
 from server.wire.multipart import ABOUT, ARCHIVE, described_form, receive_capture
@@ -77,7 +76,7 @@ async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, r
     """Downloads a capture folder as an archive from a server that the operator allowed (``EIGENHEAD_IMPORT_ORIGINS``;
     403 if none is), or takes it from an object store (``EIGENHEAD_IMPORT_PREFIXES``): an archive, or with a slash
     at the end of ``url`` all files below it. 422 names every fault in it."""
-    stored = is_object_url(wanted.url)
+    stored = wanted.url.startswith(("s3://", "file://"))
     if not (service.settings.import_prefixes if stored else service.settings.import_origins):
         raise Forbidden("imports-off", compose("stored-imports-not-allowed" if stored else "imports-not-allowed"))
     about = CaptureMetadata(wanted.session, wanted.label, wanted.expression, checked_tags(wanted.tags))

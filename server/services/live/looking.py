@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.applications.moments.live_head import LiveHead, follow, meet, mesh_faces
+from pipeline.applications.moments.live_head import MESH, LiveHead, follow, meet
 from pipeline.faces.detection import find_large_faces, make_pyramid
 from pipeline.faces.eyes import closed_by_openings
 from pipeline.faces.networks import LANDMARKS, FaceNetworks, load_networks
@@ -257,7 +257,7 @@ def _head(head: LiveHead, rig: Rig, scaled: Rig, front: str | None) -> HeadOut:
         openings={side: round(opening, 3) for side, opening in openings.items()},
         eyes_open=not closed_by_openings(openings) if openings else None,
         vertices=tuple(_rounded(vertex, 1) for vertex in vertices),
-        triangles=tuple(tuple(face) for face in mesh_faces(head.who.person.model).tolist()),
+        triangles=tuple(tuple(face) for face in head.who.person.model.levels[MESH].faces.tolist()),
     )
 
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.adjustment.gauge import moved
 from calibration.scene.covariance import LENS, camera_places, lens_misfit, reduced_camera_system, uncertainty
 from calibration.scene.structure import Structure
 from rig.camera import Camera, Distortion
@@ -33,7 +32,7 @@ def stepped(camera: Camera, lens: np.ndarray, pose: np.ndarray) -> Camera:
     f, k1, k2, cx, cy = lens
     bent = Distortion(k.distortion.k1 + k1, k.distortion.k2 + k2)
     changed = replace(k, fx=k.fx + f, fy=k.fy + f, cx=k.cx + cx, cy=k.cy + cy, distortion=bent)
-    return moved(replace(camera, intrinsics=changed), pose)
+    return replace(camera, intrinsics=changed).moved(pose)
 
 
 @pytest.mark.parametrize("one_lens", [True, False])
@@ -52,14 +51,14 @@ def test_it_is_the_schur_complement_of_dense_normal_equations(one_lens: bool) ->
     jacobian = np.stack(columns, axis=1)
     normal = jacobian.T @ jacobian / 10.0**2
     dense = normal[:size, :size] - normal[:size, size:] @ np.linalg.solve(normal[size:, size:], normal[size:, :size])
-    ours = reduced_camera_system(observed, 10.0)
+    ours, _ = reduced_camera_system(observed, 10.0)
     scale = np.sqrt(np.diag(normal)[:size])
     np.testing.assert_allclose(ours / np.outer(scale, scale), dense / np.outer(scale, scale), atol=1e-6)
 
 
 def test_a_motion_of_the_world_costs_nothing_and_blocks_are_covariances_in_the_subjects_gauge() -> None:
     observed = structure(one_lens=True)
-    system = reduced_camera_system(observed, NOISE_PX)
+    system, _ = reduced_camera_system(observed, NOISE_PX)
     scaled = system / np.sqrt(np.outer(np.diag(system), np.diag(system)))
     assert (np.linalg.eigvalsh(scaled)[:7] < 1e-9).all()
     assert np.linalg.eigvalsh(scaled)[7] > 1e-9

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.adjustment.gauge import align_world, gauge_projection, image_distance, moved, world_motions
+from calibration.adjustment.gauge import align_world, gauge_projection, image_distance, world_motions
 from calibration.silhouette_refinement.refine import (
     Heads,
     TooFewCaptures,
@@ -121,7 +121,7 @@ def test_rim_equations_are_the_slope_of_the_cameras_errors(one_capture_of_a_head
     values, vectors = np.linalg.eigh(matrix)
     for value, direction in zip(values[-3:], vectors.T[-3:], strict=True):
         step = 5.0 / np.sqrt(value) * direction
-        off = Rig(tuple(moved(camera, part) for camera, part in zip(rig, step.reshape(-1, 6), strict=True)))
+        off = Rig(tuple(camera.moved(part) for camera, part in zip(rig, step.reshape(-1, 6), strict=True)))
         _, gradient = rim_equations(subject.seen, off, heads, subject.start)
         assert direction @ (gradient - still) == pytest.approx(value * 5.0 / np.sqrt(value), rel=0.3)
 

@@ -26,7 +26,7 @@ from pipeline.contour_fit import (
 from pipeline.estimation import levenberg_marquardt, terms
 from pipeline.geometry import projection_kernels
 from pipeline.imaging import sampling_kernels
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.progress import Progress, discard_progress
 
 # What rows of the contour solver depend on, for keys.

@@ -22,7 +22,7 @@ from pipeline.applications.templates.inner_mouth import ANCHORS, PACK, InnerPart
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.head_model.model import load_model
 from pipeline.head_model.subdivision import refine
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.geometry import rigid_fit
 from rig.mesh import Mesh
 from tests.laboratory.model_packs import makehuman

@@ -26,6 +26,7 @@ from rig.studio.scene.layout import rig_from_directions
 from rig.studio.scene.lights import LAMPS, Lamp
 from rig.studio.scene.simulate import backdrop
 from rig.studio.scene.subject import Subject, dress, random_look
+from rig.studio.sensor.preset import Preset
 from rig.studio.sensor.sensor import Sensor, expose, focus
 from tests.support.drawn_expressions import drawn_weights
 
@@ -60,7 +61,7 @@ class PhotographedHead:
 def as_detection(points: Float[np.ndarray, "468 2"], score: float) -> FaceDetection:
     """A detection with these points."""
     box = np.concatenate([points.min(axis=0), points.max(axis=0)])
-    return FaceDetection(points, np.zeros(len(points)), score, box, crop_around(points).roll_deg)
+    return FaceDetection(points, score, box, crop_around(points).roll_deg)
 
 
 def photograph_head(model: HeadModel, number: int, networks: FaceNetworks, renderer: Renderer) -> PhotographedHead:
@@ -151,7 +152,7 @@ def _halved(
 def _picture(light: Float[np.ndarray, "h w 4"], intrinsics: object, rng: np.random.Generator) -> ImageRgb:
     """A camera's picture of the lit subject before a backdrop."""
     red, green, blue = (np.exp(rng.normal(0, 0.1)) * np.exp(rng.normal(0, 0.05, 3))).tolist()
-    sensor = Sensor((red, green, blue), 0.12, 0.6, 0.012)
+    sensor = Sensor((red, green, blue), Preset(vignetting=0.12, defocus_px=0.6, noise=0.012))
     behind = backdrop(intrinsics, rng, 1.0, None)  # type: ignore[arg-type]
     whole = (light[:, :, :3] + (1 - light[:, :, 3:]) * behind).astype(np.float32)
     return expose(focus(whole, sensor), sensor, rng)

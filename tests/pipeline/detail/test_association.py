@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.detail.association import associate
+from pipeline.detail.association import Target
 from rig.mesh import vertex_normals
 from tests.support.closest_points import closest_on_triangles_naive
 from tests.support.subdivided_spheres import subdivided_sphere
@@ -15,9 +15,8 @@ def test_the_place_is_the_closest_of_all_triangles() -> None:
     normals = rng.standard_normal((60, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = normals * rng.uniform(74.0, 86.0, (60, 1))
-    found = associate(
-        points, normals, vertices, vertex_normals(vertices, faces), faces, reach_mm=20.0, least_agreement=0.5
-    )
+    target = Target.of(vertices, vertex_normals(vertices, faces), faces)
+    found = target.closest(points, normals, reach_mm=20.0, least_agreement=0.5)
     assert (found.row == np.arange(60)).all()
     for i in range(60):
         foot, _ = closest_on_triangles_naive(np.repeat(points[i : i + 1], len(faces), 0), vertices[faces])
@@ -31,7 +30,6 @@ def test_points_that_look_the_other_way_or_lie_too_far_have_no_place() -> None:
     vertices, faces, _ = subdivided_sphere()
     points = vertices[[0, 100, 200]] * [[1.02], [1.02], [1.5]]
     normals = points / np.linalg.norm(points, axis=1, keepdims=True) * [[1.0], [-1.0], [1.0]]
-    found = associate(
-        points, normals, vertices, vertex_normals(vertices, faces), faces, reach_mm=5.0, least_agreement=0.5
-    )
+    target = Target.of(vertices, vertex_normals(vertices, faces), faces)
+    found = target.closest(points, normals, reach_mm=5.0, least_agreement=0.5)
     assert found.row.tolist() == [0]

@@ -1,11 +1,13 @@
 """A surface drawn to points: analytic shapes, planted faults, and the default head."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import vertex_deviation_mm
-from pipeline.detail.dense_points import SurfacePoints, with_scaled_deviation
+from pipeline.detail.dense_points import SurfacePoints
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids
 from pipeline.detail.refine import SHARED_ERROR, DeformedSurface, deform_to_points, folded, refine_to_surface, unfolded
 from pipeline.fusion.untangling import head_topology, spoilt_faces
@@ -48,7 +50,8 @@ def test_a_sphere_becomes_the_ellipsoid_that_the_points_show() -> None:
 
 def test_a_share_of_the_points_deviation_stays_however_many_they_are() -> None:
     surface = ellipsoid_points(np.random.default_rng(0), AXES_MM, NOISE_MM)
-    unsure = with_scaled_deviation(surface, np.where(surface.points[:, 0] > 0.0, 2.0, 6.0))
+    factor = np.where(surface.points[:, 0] > 0.0, 2.0, 6.0)
+    unsure = replace(surface, deviation_mm=factor * surface.deviation_mm)
     vertices, _, stated = drawn(unsure)
     alone = drawn(unsure, shared_error=0.0)[2]
     added = np.sqrt(stated.deviation_mm**2 - alone.deviation_mm**2)

@@ -30,7 +30,7 @@ from pipeline.contour_fit.problem import (
     make_problem,
     moved_views,
 )
-from pipeline.contour_fit.rim import project_with_slopes
+from pipeline.contour_fit.rim_kernels import projected_with_slopes
 from pipeline.contour_fit.rim_term import observed_rim, rim_rows
 from pipeline.contour_fit.surface_term import SurfaceTerm, surface_rows
 from pipeline.estimation.terms import NormalEquations, Residuals
@@ -153,7 +153,7 @@ def rim_of_a_head() -> Case:
     def residuals(step: np.ndarray) -> np.ndarray:
         moved = apply_step(state, step, stage)
         points = moved.world_from_head.apply(on_mesh(moved) + lift)
-        pixels, _ = project_with_slopes(points, rim.view, moved_views(problem, moved))
+        pixels, _ = projected_with_slopes(points, rim.view, moved_views(problem, moved).packed())
         return (rim.normal * pixels).sum(axis=1)
 
     return Case(residuals, jacobian, steps, 1e-3)  # the modes are summed in single precision

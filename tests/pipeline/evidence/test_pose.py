@@ -42,7 +42,7 @@ def faces_of(model: HeadModel, pose: Similarity, rig: Rig, names: tuple[str, ...
     for name in names:
         pixels = rig[name].project(expected)
         box = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
-        found[name] = (FaceDetection(pixels, np.zeros(468), 40.0, box, 0.0),)
+        found[name] = (FaceDetection(pixels, 40.0, box, 0.0),)
     return SubjectFaces(found, None, names)
 
 
@@ -112,7 +112,7 @@ def looking_at(
         covariance = np.zeros((7, 7))
         covariance[:3, :3] = std_mm**2 * np.eye(3)
         covariance[3:6, 3:6] = np.radians(std_deg) ** 2 * across
-        out[side] = Iris(ball + BEHIND_MM * gaze, gaze, 5.85, covariance, ("cam0", "cam1"), 0.2)
+        out[side] = Iris(ball + BEHIND_MM * gaze, gaze, 5.85, covariance, ("cam0", "cam1"))
     return out
 
 

@@ -67,7 +67,7 @@ def planted(openings: tuple[float, float], direction: np.ndarray) -> MatchedFace
         upper = np.column_stack([along[1:-1], np.full(7, -half)])
         lids.append(np.concatenate([lower, upper]) * (across, up) + middle)
     points = point_table().shape_mm
-    face = FaceDetection(np.zeros((468, 2)), np.zeros(468), 30.0, np.zeros(4), 0.0, lids_px=np.concatenate(lids))
+    face = FaceDetection(np.zeros((468, 2)), 30.0, np.zeros(4), 0.0, lids_px=np.concatenate(lids))
     other = replace(face, lids_px=None)
     faces = {"cam00": face, "cam01": other}
     empty = np.zeros((468, 3, 3))

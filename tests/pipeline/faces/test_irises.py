@@ -94,7 +94,7 @@ def scene(
         found = camera.project(np.array(marks)) + rng.normal(0.0, 1.0, (10, 2))
         lids = camera.project(np.concatenate([lid_edges(side) for side in CENTRES])) + rng.normal(0.0, 0.8, (32, 2))
         empty = np.zeros((468, 2))
-        faces[camera.name] = FaceDetection(empty, np.zeros(468), 30.0, np.zeros(4), 0.0, found, lids)
+        faces[camera.name] = FaceDetection(empty, 30.0, np.zeros(4), 0.0, found, lids)
     none = np.zeros((468, 3, 3))
     face = MatchedFaces(faces, {}, {}, {}, {}, points, none, np.zeros((0, 468, 3)), {}, Similarity.identity(), 1.0)
     return face, {camera.name: picture(camera, rng, gazes, irises=irises) for camera in rig}
@@ -140,7 +140,7 @@ def iris(azimuth_deg: float, elevation_deg: float) -> Iris:
     covariance = np.diag([0.1] * 3 + [np.radians(2.0)] * 3 + [0.1]) ** 2
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     gaze = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
-    return Iris(np.zeros(3), gaze, 5.85, covariance, ("cam0", "cam1"), 0.2)
+    return Iris(np.zeros(3), gaze, 5.85, covariance, ("cam0", "cam1"))
 
 
 def test_gazes_that_nobody_has_are_not_told() -> None:

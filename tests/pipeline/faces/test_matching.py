@@ -155,5 +155,5 @@ def test_a_mask_seen_from_behind_is_no_face() -> None:
     for each in RIG:
         face = seen_face(hollow, each, rng)
         inside_out = each.project(hollow.apply(point_table().shape_mm * (1.0, 1.0, -1.0)))
-        candidates[each.name] = (FaceDetection(inside_out, face.depth_px, face.score, face.box_px, face.roll_deg),)
+        candidates[each.name] = (FaceDetection(inside_out, face.score, face.box_px, face.roll_deg),)
     assert match_faces(candidates, RIG) is None

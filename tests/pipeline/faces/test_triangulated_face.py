@@ -71,7 +71,7 @@ def test_covariances_hold_for_the_noise_they_state() -> None:
     noisy = {}
     for (name, face), noise in zip(clean.detections.items(), clean.noise_px, strict=True):
         points = face.landmarks_px + SHARE * noise[:, None] * rng.standard_normal((468, 2))
-        noisy[name] = FaceDetection(points, face.depth_px, face.score, face.box_px, face.roll_deg)
+        noisy[name] = FaceDetection(points, face.score, face.box_px, face.roll_deg)
     found = triangulated(noisy)
     miss = found.points.positions_world - clean.points.positions_world
     squares = np.einsum("ni,nij,nj->n", miss, np.linalg.inv(found.points.covariances), miss)
@@ -90,9 +90,7 @@ def test_a_view_that_is_off_moves_all_points_as_its_modes_say() -> None:
             moved = dict(clean.detections)
             face = moved[name]
             shift = np.eye(2)[axis] * clean.view_noise_px[view]
-            moved[name] = FaceDetection(
-                face.landmarks_px + shift, face.depth_px, face.score, face.box_px, face.roll_deg
-            )
+            moved[name] = FaceDetection(face.landmarks_px + shift, face.score, face.box_px, face.roll_deg)
             step = triangulated(moved).points.positions_world - clean.points.positions_world
             mode = modes[2 * view + axis]
             assert np.linalg.norm(step - mode, axis=1).mean() < 0.2 * np.linalg.norm(mode, axis=1).mean()

@@ -1,23 +1,14 @@
 """What patches say of cameras: image motions against differences, sums against dense matrices, slopes of pictures."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from pipeline.photometric_fit.depth_search import camera_sensitivity
 from pipeline.photometric_fit.patch_kernels import read, read_with_slopes
 from rig.camera import Camera
-from rig.geometry import RigidTransform, rotation_from_vector
 from rig.studio.scene.layout import default_layout
 
 STEP = 1e-5
-
-
-def moved(camera: Camera, by: np.ndarray) -> Camera:
-    pose = camera.camera_from_world
-    turn = rotation_from_vector(by[:3])
-    return replace(camera, camera_from_world=RigidTransform(turn @ pose.rotation, turn @ pose.translation + by[3:]))
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +37,7 @@ def test_a_patch_moves_in_its_images_as_differences_say(planted: dict) -> None:
         camera = cameras[view[n, j]]
         for c in range(6):
             by = STEP * np.eye(6)[c]
-            ends = [moved(camera, sign * by).project(places[n][None])[0] for sign in (1.0, -1.0)]
+            ends = [camera.moved(sign * by).project(places[n][None])[0] for sign in (1.0, -1.0)]
             expected = (ends[0] - ends[1]) / (2.0 * STEP)
             np.testing.assert_allclose(found.slides[n, 2 * j : 2 * j + 2, c], expected, rtol=1e-5, atol=1e-4)
 

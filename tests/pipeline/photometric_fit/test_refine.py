@@ -124,11 +124,7 @@ def test_a_moved_camera_moves_nothing(model: HeadModel, bump: Scene, refined: tu
     assert rms[1] < 1.3 * rms[0] + 0.02
     points = scene.truth[model.levels["full"].face_region]
     for k, camera in enumerate(rig):
-        shift = solved.state.camera_shift[k]
-        found = replace(
-            camera,
-            camera_from_world=RigidTransform(rotation_from_vector(shift[:3]), shift[3:]) @ camera.camera_from_world,
-        )
+        found = camera.moved(solved.state.camera_shift[k])
         assert np.linalg.norm((found.project(points) - moved[camera.name].project(points)).mean(axis=0)) < 0.15
 
 

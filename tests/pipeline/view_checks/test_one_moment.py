@@ -30,7 +30,7 @@ def test_a_view_of_another_moment_is_named(moved_mm, rows, named) -> None:
         size_px = float(np.ptp(pixels[:, 1]))
         pixels += size_px * view_bias(direction_from_face(AT_ORIGIN, camera))
         box = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
-        found[camera.name] = (FaceDetection(pixels, np.zeros(468), 40.0, box, 0.0),)
+        found[camera.name] = (FaceDetection(pixels, 40.0, box, 0.0),)
     best = find_subject_face(found, FIVE, None)
     warnings = judge_moments(SubjectFaces(found, best and complete_match(best, found, FIVE), FIVE.names), FIVE)
     assert [warning.parameters["camera"] for warning in warnings] == named

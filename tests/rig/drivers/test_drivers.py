@@ -110,13 +110,13 @@ def test_a_stream_that_hangs_is_let_go(make: Make, studio: StudioDevices) -> Non
     driver.open(5.0)
     try:
         grab_frame(driver, 2.0)
-        studio.streams.hang("cam00")
+        studio.streams.disturb("cam00", hung=True)
         started_s = time.monotonic()
         with pytest.raises((GrabTimeout, CameraLost)):
             drain(driver, 0.3)
         assert time.monotonic() - started_s < 20.0, "FFmpeg itself waits for half a minute"
     finally:
-        studio.streams.hang("cam00", False)
+        studio.streams.disturb("cam00")
         driver.close()
 
 

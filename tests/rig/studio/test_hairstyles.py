@@ -14,8 +14,8 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.subject import HAIRSTYLES, Look, Subject, dress, restyled
 from rig.studio.scene.worn import cap, glasses
-from rig.studio.sensor.preset import CLEAN
 from tests.rig.studio.test_images import egg_head
+from tests.support.small_studio import CLEAN
 
 CALM = HairStyle(thickness_mm=10.0, over_ears=True, lumps=0.0, strands=0)
 

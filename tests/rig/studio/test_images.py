@@ -20,10 +20,11 @@ from rig.studio.scene.simulate import Scene, SimulatedCapture, _rolling, _sway, 
 from rig.studio.scene.subject import Look, Subject, random_look
 from rig.studio.sensor import sensor as sensors
 from rig.studio.sensor.faults import KINDS, Fault, fault_from_text
-from rig.studio.sensor.preset import CLEAN, PRESET
+from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.sensor import Sensor, drift, expose, focus, rolled
 from tests.support import oracles
 from tests.support.layouts import ARRANGEMENTS_DEG, arrangement
+from tests.support.small_studio import CLEAN
 
 pytestmark = pytest.mark.gl
 
@@ -160,7 +161,7 @@ def test_features_are_clicked_near_their_landmarks(renderer):
 
 
 def test_sensor_noise_is_what_the_preset_says():
-    sensor = Sensor((1.0, 1.0, 1.0), 0.0, 0.0, PRESET.noise)
+    sensor = Sensor((1.0, 1.0, 1.0), replace(CLEAN, noise=PRESET.noise))
     light = np.full((200, 300, 3), sensors.MID_GREY, np.float32)
     picture = expose(light, sensor, np.random.default_rng(0)).astype(float) / 255
     # 180,000 draws: the estimate is good to 0.17 %; quantisation adds 1 / (255 sqrt 12) in quadrature (0.3 %), and the
@@ -200,7 +201,7 @@ def test_crossed_filters_take_the_highlights_away_and_nothing_else(renderer, rig
 
 
 def test_lens_and_gains():
-    sensor = Sensor((1.2, 1.0, 0.8), 0.2, 1.5, 0.0)
+    sensor = Sensor((1.2, 1.0, 0.8), replace(CLEAN, vignetting=0.2, defocus_px=1.5))
     light = focus(np.full((90, 120, 3), 0.2, np.float32), sensor)
     np.testing.assert_allclose(light[45, 60], (0.24, 0.2, 0.16), rtol=1e-2)
     np.testing.assert_allclose(light[0, 0], 0.8 * np.array((0.24, 0.2, 0.16)), rtol=1e-2)

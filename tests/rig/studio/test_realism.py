@@ -14,10 +14,11 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.skin_texture import DRY, oily_zones
 from rig.studio.scene.subject import scattered
-from rig.studio.sensor.preset import CLEAN, PRESET, REALISM, made_real, realism_names
+from rig.studio.sensor.preset import PRESET, REALISM, made_real, realism_names
 from rig.studio.sensor.sensor import Sensor, compressed, expose, through_mosaic
 from tests.rig.studio.test_images import egg_head
 from tests.support.scenes import ellipsoid
+from tests.support.small_studio import CLEAN
 
 if TYPE_CHECKING:
     from rig.render.renderer import Renderer
@@ -129,7 +130,7 @@ def test_a_mosaic_keeps_flat_colours_and_blurs_what_is_finer_than_it() -> None:
 def test_read_out_noise_is_there_without_light() -> None:
     dark = np.full((64, 64, 3), 0.02, np.float32)
     quiet, noisy = (
-        expose(dark, Sensor((1.0, 1.0, 1.0), 0.0, 0.0, 0.0, read_noise=share), np.random.default_rng(1)).astype(float)
+        expose(dark, Sensor((1.0, 1.0, 1.0), replace(CLEAN, read_noise=share)), np.random.default_rng(1)).astype(float)
         for share in (0.0, 0.004)
     )
     assert quiet.std(axis=(0, 1)).max() == 0.0

@@ -12,7 +12,7 @@ import pytest
 from pipeline.results.overlays import AZIMUTHS_DEG
 from pipeline.warnings import WARNING_CODES
 from rig.messages.message import MessageDocument
-from server.batch.sheet import PANEL_PX, REMARKS, SEVERE, Card, card_class, figures_of, severity, sheet_html, views_of
+from server.batch.sheet import PANEL_PX, REMARKS, SEVERE, Card, card_class, figures_of, severity, sheet_lines, views_of
 from tests.support.pinned_work import picture_bytes
 from tests.support.services import ROOT
 
@@ -38,7 +38,7 @@ def test_the_sheet_needs_nothing_beside_it(tmp_path: Path) -> None:
     found, turntable = Found(), tmp_path / "turntable.png"
     turntable.write_bytes(picture_bytes(bytes(range(9))))
     cards = [card("a", turntable=turntable), card("b", "failed", "input-refused"), card("c", turntable=tmp_path / "no")]
-    found.feed(sheet_html("study", cards))
+    found.feed("\n".join(sheet_lines("study", cards)))
     (picture,) = [attributes for tag, attributes in found.tags if tag == "img"]
     assert picture["src"] == "data:image/jpeg;base64," + base64.b64encode(views_of(turntable) or b"").decode()
     assert {tag for tag, _ in found.tags} & {"script", "link", "iframe"} == set()
@@ -48,7 +48,7 @@ def test_the_sheet_needs_nothing_beside_it(tmp_path: Path) -> None:
 def test_names_and_messages_are_text() -> None:
     hostile = Card("<script>x</script>&", "<b>", "failed", "", messages("<i>"), None, "x")
     found = Found()
-    page = sheet_html("<script>", [hostile])
+    page = "\n".join(sheet_lines("<script>", [hostile]))
     found.feed(page)
     assert {tag for tag, _ in found.tags} & {"script", "b", "i"} == set()
     assert "&lt;script&gt;x&lt;/script&gt;&amp;" in page
@@ -64,7 +64,7 @@ def test_what_needs_a_look_comes_first_and_is_counted() -> None:
         card("failed", "failed", "input-refused"),
     ]
     assert [card_class(each) for each in cards] == ["missing", "good", "good", "warning", "severe", "failed"]
-    page = sheet_html("study", cards)
+    page = "\n".join(sheet_lines("study", cards))
     assert re.findall(r"<h2>(?:<a[^>]*>)?(\w+)", page) == ["failed", "wrong", "warned", "good", "remark", "missing"]
     assert "6 captures: 2 without a warning that matters, 1 with warnings, 1 that may be wrong, 1 failed" in page
     assert page.index("pose-doubtful") < page.index("words of view")  # the worst first, within a card too

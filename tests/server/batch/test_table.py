@@ -8,7 +8,7 @@ import pytest
 from pipeline.head_model.landmarks import NAMES
 from pipeline.head_model.model_file import expression_names
 from pipeline.head_model.model_names import model_path
-from rig.digest import document_sha256
+from rig.files import document_sha256
 from server.batch.captures import BatchCapture
 from server.batch.folder import Origin
 from server.batch.table import (

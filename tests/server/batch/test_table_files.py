@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow.parquet
 import pytest
 
-from server.batch.table import Column, Row, csv_bytes, has_parquet, parquet_bytes, write_table
+from server.batch.table import Column, Row, csv_lines, has_parquet, parquet_bytes, write_table
 
 COLUMNS = (
     Column("capture", "text", "", "its name"),
@@ -25,7 +25,7 @@ ROWS: list[Row] = [
 
 
 def test_csv_gives_every_digit_back() -> None:
-    read = list(csv.DictReader(io.StringIO(csv_bytes(COLUMNS, ROWS).decode("utf-8"), newline="")))
+    read = list(csv.DictReader(io.StringIO(b"".join(csv_lines(COLUMNS, ROWS)).decode("utf-8"), newline="")))
     assert read[0] == {"capture": 'anna, "A"\nlate', "nose_length_mm": repr(0.1 + 0.2), "warning_count": "3",
                        "pose_doubtful": "true"}  # fmt: skip
     assert float(read[0]["nose_length_mm"]) == 0.1 + 0.2

@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from server.cli.doctor import examine
 from server.metrics import Metrics
 from server.services.retention import sweep

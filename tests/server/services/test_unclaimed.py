@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rig.digest import sha256_of
+from rig.files import sha256_of
 from server.services.retention import OWNER, collect
 from server.settings import ServiceSettings
 from server.storage.database import database_identity, open_database

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
-from rig.digest import sha256_of
+from rig.files import sha256_of
 from server.errors import Conflict
 from server.services.retention import collect
 from server.settings import ServiceSettings

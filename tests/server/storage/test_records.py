@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from server.errors import NotFound
 from server.storage.records import (
     CALIBRATION,

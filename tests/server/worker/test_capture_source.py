@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from rig.digest import sha256_of
 from rig.errors import Cancelled
+from rig.files import sha256_of
 from server.services.failures import JobFailed
 from server.services.stored_captures import bound_captures, forget_erased
 from server.settings import ServiceSettings

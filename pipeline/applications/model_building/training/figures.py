@@ -20,16 +20,11 @@ from pipeline.applications.model_building.correspondence.correspondence import (
     warp_and_resample,
 )
 from pipeline.applications.model_building.correspondence.scans import Scan
-from pipeline.applications.model_building.training.training import (
-    USED_MODES,
-    compactness,
-    components_of,
-    generalisation,
-    specificity,
-)
+from pipeline.applications.model_building.training.training import USED_MODES, compactness, generalisation, specificity
 from pipeline.geometry.projection import picture
 from pipeline.head_model.landmarks import NAMES
 from pipeline.head_model.model import HeadModel
+from pipeline.head_model.pca import Components
 from rig.camera import Camera, Intrinsics
 from rig.formats.pictures.images import encode_image
 from rig.geometry import look_at, rotation_from_vector
@@ -221,7 +216,8 @@ def curves_figure(model: HeadModel, report: Progress) -> Image:
         c for c in (1, 2, 5, 10, 20, 40, USED_MODES, 100, 137) if c <= min(len(model.modes), len(model.scores) - 1)
     ]
     region = model.levels["cage"].face_region
-    components = components_of(model.mean, model.modes, model.scores)
+    mean, modes, scores = (array.astype(float) for array in (model.mean, model.modes, model.scores))
+    components = Components(mean, modes, np.linalg.norm(modes.reshape(len(modes), -1), axis=1), scores)
     compact = compactness(model.sigma)
     apart = generalisation(components, region, counts, report=report)
     heads = (model.mean + np.tensordot(model.scores, model.modes, 1)).astype(float)

@@ -41,7 +41,8 @@ def train(training: Training, *, report: Progress) -> ModelParts:
     Raises NotAManifold."""
     check_manifold(training.faces)
     report("aligning", 0.0)
-    heads = in_head_frame(training.heads, training.landmarks)
+    ears = training.heads[:, [training.landmarks["tragion_right"], training.landmarks["tragion_left"]]].mean(1)
+    heads = training.heads - ears[:, None]  # the origin inside each head, between its ears
     heads = align(heads, above_neck(heads[0], training.landmarks))
     heads = centred(heads, training.landmarks)
     report("principal components", 0.0)
@@ -112,13 +113,6 @@ def levels_of(
     places = (full[np.arange(count)]) @ mean
     p95, p99 = decimate(places, rough_faces, targets, importance=importance, fixed=fixed)
     return {"p95": p95, "p99": p99}
-
-
-def in_head_frame(heads: Float[np.ndarray, "N V 3"], landmarks: Mapping[str, int]) -> Float[np.ndarray, "N V 3"]:
-    """Returns every head shifted (not rotated) so that its mean tragion is the origin, inside the head between the
-    ears."""
-    ears = heads[:, [landmarks["tragion_right"], landmarks["tragion_left"]]].mean(1)
-    return heads - ears[:, None]
 
 
 def centred(heads: Float[np.ndarray, "N V 3"], landmarks: Mapping[str, int]) -> Float[np.ndarray, "N V 3"]:
@@ -198,9 +192,3 @@ def specificity(
         drawn = (mean + np.tensordot(rng.standard_normal(len(modes)), modes, 1))[region].astype(np.float32)
         total += np.linalg.norm(known - drawn, axis=2).mean(1).min() / draws
     return float(total)
-
-
-def components_of(mean: np.ndarray, modes: np.ndarray, scores: np.ndarray) -> Components:
-    """Returns a model's components in double precision."""
-    sigma = np.linalg.norm(modes.reshape(len(modes), -1).astype(float), axis=1)
-    return Components(mean.astype(float), modes.astype(float), sigma, scores.astype(float))

@@ -20,7 +20,7 @@ from pipeline.geometry.projection_kernels import interpolate, rasterise
 from pipeline.results.head_files import ENCODINGS, encoded
 from pipeline.results.reconstruction import Reconstruction, ply_comments
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.meshes.polygon_obj import MATERIAL, PolygonMesh, fan, polygon_obj_bytes
 from rig.mesh import vertex_normals
 

@@ -39,7 +39,7 @@ from pipeline.results.reconstruction import Reconstruction, asset_extras
 from pipeline.results.report_types import AddedReport, TemplateReport
 from pipeline.results.write import ResultWriter
 from pipeline.texturing.layout.uv_unwrap import Atlas
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.meshes.flame_param import FILE, encode_flame_param, flame_param
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.polygon_obj import scene_obj_bytes

@@ -24,7 +24,6 @@ from rig.camera import Camera
 from rig.capture import Capture, ImageRgb
 from rig.errors import EigenheadError
 from rig.formats.pictures.images import write_image
-from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh, boundary_edges
 from rig.render.renderer import Renderer
 from rig.rig import Rig
@@ -156,8 +155,7 @@ def wrong_mask(known: Known, rng: np.random.Generator) -> Known:
 def half_a_pixel_off(known: Known, rng: np.random.Generator) -> Known:
     """Turns one camera after calibration by an angle too small to notice."""
     camera = known.rig[HIT]
-    turn = RigidTransform(rotation_from_vector(np.array([0.0, OFF_PX / camera.intrinsics.fx, 0.0])), np.zeros(3))
-    turned = replace(camera, camera_from_world=turn @ camera.camera_from_world)
+    turned = camera.moved(np.array([0.0, OFF_PX / camera.intrinsics.fx, 0.0, 0.0, 0.0, 0.0]))
     return replace(known, rig=Rig(tuple(turned if c.name == HIT else c for c in known.rig)))
 
 

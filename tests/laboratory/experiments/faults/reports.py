@@ -22,7 +22,7 @@ from unittest import mock
 
 import numpy as np
 
-from rig.atomic_write import write_atomically
+from rig.files import write_atomically
 from rig.formats.meshes.mesh_file import read_mesh
 from tests.laboratory.experiments.markdown import table
 from tests.support.services import free_port

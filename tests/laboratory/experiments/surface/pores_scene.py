@@ -21,12 +21,11 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import DEFAULT_DIRECTIONS_DEG, rig_from_directions
 from rig.studio.scene.simulate import Scene, build_scene, shoot, view_light
-from rig.studio.scene.skin_texture import SkinRelief
 from rig.studio.scene.subject import Subject, random_look, random_pose
 from rig.studio.sensor.preset import PRESET, made_real
 from rig.studio.sensor.sensor import expose
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD
-from tests.support.drawn_relief import draw_relief
+from tests.support.drawn_relief import SkinRelief, draw_relief, relieved
 
 FULL_PX = (5640, 4230)  # 24 Mpx, 0.1 mm a pixel at the face
 SHARE = 0.4  # at which they are read: 3.8 Mpx
@@ -84,6 +83,7 @@ def photograph_close_up(
     marks = {name: head.vertices[row] for name, row in model.landmarks.items()}
     relief = draw_relief(rng, _bare_places(head, marks), RADIUS_MM, slope)
     subject = Subject(head, marks, level.face_region, f"pores-{seed}")
+    fine = Subject(relieved(head, relief), marks)
     plain = rig_from_directions((*DEFAULT_DIRECTIONS_DEG, KEPT_BACK_DEG))
     full = Rig(tuple(replace(camera, intrinsics=camera.intrinsics.at_size(*FULL_PX)) for camera in plain))
     work = full.scaled(SHARE)
@@ -98,7 +98,7 @@ def photograph_close_up(
         build_scene(
             sitter, rig, quality, np.random.default_rng((37, seed)), renderer=renderer, look=look, world_from_head=pose
         )
-        for sitter, rig, quality in ((subject, work, reduced), (replace(subject, relief=relief), close, preset))
+        for sitter, rig, quality in ((subject, work, reduced), (fine, close, preset))
     )
     capture = shoot(scene, np.random.default_rng((35, seed)))
     images, parts = dict(capture.images), {}

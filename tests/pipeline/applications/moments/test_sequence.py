@@ -25,12 +25,12 @@ from rig.formats.pictures.work_size import work_rig
 from rig.geometry import vector_from_rotation
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
-from rig.studio.sensor.preset import CLEAN
 from server.cli.heads import head_alone
 from server.cli.main import app
 from server.tasks.moving_subject import FPS, Person, simulate_sequence
 from server.tasks.settings_file import settings_document
 from tests.support.services import small_capture
+from tests.support.small_studio import CLEAN
 
 FRAMES, LOST, PIXELS = 7, 4, 320 * 240
 CAMERAS = ["cam00", "cam01", "cam03", "cam04", "cam07"]

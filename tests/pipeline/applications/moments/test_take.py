@@ -18,8 +18,8 @@ from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import simulate
 from rig.studio.scene.subject import Subject, random_look
-from rig.studio.sensor.preset import CLEAN
 from server.cli.main import app
+from tests.support.small_studio import CLEAN
 
 PIXELS = 240 * 180
 EXPRESSIONS = {"calm": {}, "smile": {"mouthSmileLeft": 0.8, "mouthSmileRight": 0.8}}

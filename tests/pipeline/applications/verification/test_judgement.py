@@ -5,20 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.applications.verification.judgement import (
-    Limits,
-    checks,
-    judge,
-    judge_one,
-    limits_from_document,
-    scatter,
-    weighted_range,
-)
+from pipeline.applications.verification.judgement import Limits, checks, judge, judge_one, scatter, weighted_range
 from pipeline.applications.verification.reference import Reference
 from pipeline.head_model.subdivision import vertex_areas
 from rig.errors import InputError
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
+from rig.typed_tables import read_table
 from tests.support.measured_heads import mannequin, marks, measured_head
 from tests.support.scenes import ellipsoid
 from tests.support.visits import bumped
@@ -104,9 +97,9 @@ def test_the_range_leaves_out_the_tails_weight() -> None:
 
 
 def test_limits_are_read_and_wrong_ones_named() -> None:
-    assert limits_from_document({"face_rms_mm": 1}) == Limits(face_rms_mm=1.0)
+    assert read_table(Limits, {"face_rms_mm": 1}, "limits") == Limits(face_rms_mm=1.0)
     with pytest.raises(InputError) as error:
-        limits_from_document({"face_rms": 1.0, "least_covered": "much"}, "limits.toml")
+        read_table(Limits, {"face_rms": 1.0, "least_covered": "much"}, "limits.toml")
     assert "limits.toml: unknown key 'face_rms'; did you mean 'face_rms_mm'?" in str(error.value)
     assert "least_covered is 'much', expected a finite number" in str(error.value)
 

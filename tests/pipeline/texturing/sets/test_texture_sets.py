@@ -22,9 +22,9 @@ from rig.image import ImageRgb
 from rig.mesh import Mesh
 from rig.studio.scene.simulate import Scene, simulate
 from rig.studio.scene.subject import SKIN_TONES, Look, Subject
-from rig.studio.sensor.preset import CLEAN
 from tests.pipeline.texturing.test_paint import without_neck
 from tests.support.scenes import ellipsoid, fan
+from tests.support.small_studio import CLEAN
 
 pytestmark = pytest.mark.gl
 

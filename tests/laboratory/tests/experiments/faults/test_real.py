@@ -17,10 +17,10 @@ from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import rig_from_directions
 from rig.studio.scene.simulate import simulate
-from rig.studio.sensor.preset import CLEAN
 from server.tasks.subjects import drawn_subject
 from tests.laboratory.experiments.faults.real import RealCapture, choose, judge, outline_px, psnr_db, views_in_front
 from tests.support.scenes import ellipsoid
+from tests.support.small_studio import CLEAN
 
 AWAY = RigidTransform(np.eye(3), np.array([0.0, 0.0, 600.0]))
 CAMERA = Camera("cam00", Intrinsics(320, 240, 400.0, 400.0, 159.5, 119.5), AWAY)

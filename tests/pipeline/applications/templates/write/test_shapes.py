@@ -41,7 +41,7 @@ def result() -> Reconstruction:
     morphs = {name: whole.morphs[name] for name in NAMES}
     shapes = BlendshapeRig(world, morphs, {"jawOpen": 0.25, "browInnerUp": 0.0}, whole.missing)
     made = made_up_result(world, Fit("contour", np.zeros(1), PLACE, 42, "the cost no longer falls"))
-    iris = Iris(np.zeros(3), PLACE.rotation @ GAZE, 5.85, np.eye(7), ("cam00", "cam01"), 0.2)
+    iris = Iris(np.zeros(3), PLACE.rotation @ GAZE, 5.85, np.eye(7), ("cam00", "cam01"))
     eyes = {"left": iris, "right": UnseenEye("closed")}
     return replace(made, evidence=replace(made.evidence, blendshape_rig=shapes), faces=Faces(None, {}, eyes))
 

@@ -1,9 +1,15 @@
-"""Writes files so that neither a reader nor a crash leaves or sees a half-written one."""
+"""Writes files so that neither a reader nor a crash leaves or sees a half-written one; computes digests of files and
+documents; names this machine's folder for data that can be recomputed (compiled loops, arrays of models, durations)."""
 
+import hashlib
+import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
+
+CACHE = "EIGENHEAD_CACHE"
 
 
 def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, parents: bool = True) -> None:
@@ -31,3 +37,23 @@ def unfinished(folder: Path, name: str = "*") -> Iterator[Path]:
     """Yields the temporary files in ``folder`` from writes to ``name``: writes in progress, and writes interrupted by a
     kill or a power failure. ``*`` stands for any text, as in ``Path.glob``."""
     return folder.glob(f".{name}.*.part")
+
+
+def document_sha256(document: Mapping[str, Any]) -> str:
+    """Computes the sha256 of a document's canonical JSON. Results refer to their settings and inputs by it."""
+    return hashlib.sha256(json.dumps(document, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def sha256_of(path: Path) -> str:
+    """Computes the SHA-256 of a file's content."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def cache_folder() -> Path:
+    """Returns EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead. The folder may not exist
+    yet."""
+    configured = os.environ.get(CACHE)
+    if configured:
+        return Path(configured)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eigenhead"

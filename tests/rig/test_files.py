@@ -1,6 +1,6 @@
 """A document's digest is of what it says, whatever its order."""
 
-from rig.digest import document_sha256
+from rig.files import document_sha256
 
 
 def test_order_and_kind_of_list_do_not_count_and_values_do() -> None:
