@@ -45,6 +45,7 @@ def model_import(
     source: Annotated[Path, typer.Argument(help="ICT-FaceKit, statismo or Basel HDF5, or npz.", exists=True)],
     name: Annotated[str | None, typer.Option(help="What to call it.")] = None,
     data: Data = None,
+    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
     """Convert a head model of another program.
@@ -57,8 +58,9 @@ def model_import(
 
     with progress_bar() as report:
         parts = import_model(source, name=name, report=report)
-        path = models_folder() / f"{parts.name}.npz"
-        save_model(path, parts)
+    path = models_folder() / f"{parts.name}.npz"
+    prepare_file(path, overwrite=overwrite, option="--name")
+    save_model(path, parts)
     document = {"name": parts.name, "file": str(path), "draws_mm": parts.figures.get("draws_mm")}
     answer(document, json_out, [f"{parts.name}  {path}"])
 

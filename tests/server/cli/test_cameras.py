@@ -28,9 +28,7 @@ from tests.support.textured_wedge import wedge_rig, write_photographs
 def test_the_studio_shows_an_own_board_that_gives_its_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("server.cli.simulate.BOARD_SHOTS", 8)
     shots, out = tmp_path / "shots", tmp_path / "cameras.json"
-    printed = CliRunner().invoke(
-        app, ["board", "--squares", "10x7", "--square-mm", "40", "--out", f"{tmp_path}/own.pdf"]
-    )
+    printed = CliRunner().invoke(app, ["board", "--squares=10x7", "--square-mm=40", f"--out={tmp_path}/own.pdf"])
     assert "paper of 420 x 594 mm" in printed.stdout
     assert CliRunner().invoke(app, ["simulate", str(shots), f"--board-file={tmp_path}/board.toml"]).exit_code == 0
     for folder in sorted(shots.glob("cam*"))[6:]:  # six cameras show it as well as eleven
@@ -100,9 +98,7 @@ def test_a_place_where_no_cameras_can_be_written_is_named(tmp_path: Path, kind: 
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
     write_rig(wedge_rig(), tmp_path / "cameras.json")
-    done = CliRunner().invoke(
-        app, ["convert", str(tmp_path / "cameras.json"), "--to", kind, "--out", str(tmp_path / out)]
-    )
+    done = CliRunner().invoke(app, ["convert", f"{tmp_path}/cameras.json", "--to", kind, "--out", f"{tmp_path}/{out}"])
     assert isinstance(done.exception, CannotWrite)
     assert str(done.exception).startswith(f"{tmp_path / out} ")
     assert text in str(done.exception)
@@ -135,12 +131,9 @@ def test_a_board_is_written_as_pdf_alone(tmp_path: Path) -> None:
 def test_one_board_is_the_default_of_command_page_and_documents(tmp_path: Path) -> None:
     assert CliRunner().invoke(app, ["board", "--out", str(tmp_path / "board.pdf")]).exit_code == 0
     written = tomllib.loads((tmp_path / "board.toml").read_text())
-    document = tomllib.loads(
-        "\n".join(re.findall(r"^    (\w+ = .*)$", (ROOT / "docs/calibration.md").read_text(), re.MULTILINE)[:6])
-    )
-    page = dict(
-        re.findall(r"^      (\w+): (.*),$", (ROOT / "server/console/pages/calibration.js").read_text(), re.MULTILINE)
-    )
+    text, script = (ROOT / name for name in ("docs/calibration.md", "server/console/pages/calibration.js"))
+    document = tomllib.loads("\n".join(re.findall(r"^    (\w+ = .*)$", text.read_text(), re.MULTILINE)[:6]))
+    page = dict(re.findall(r"^      (\w+): (.*),$", script.read_text(), re.MULTILINE))
     schema = NewCalibration.model_json_schema()
     assert schema["examples"][0]["board"].items() <= written.items()
     assert document.items() <= written.items()
