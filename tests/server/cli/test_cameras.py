@@ -59,12 +59,11 @@ def test_faults_of_scale_json_end_it_before_the_work(tmp_path: Path) -> None:
     for name in "abc":
         (tmp_path / f"{name}.png").write_bytes(b"")
     (tmp_path / "scale.json").write_text(json.dumps({"cameras": ["a", "d"], "distance_mm": -1}))
-    scale = str(tmp_path / "scale.json")
-    done = run("calibrate", str(tmp_path), "--from", "scene", "--scale", scale, "--out", str(tmp_path / "cameras.json"))
+    done = run("calibrate", f"{tmp_path}", "--from=scene", f"--scale={tmp_path}/scale.json", f"--out={tmp_path}/c.json")
     assert done.returncode == 1
     assert "distance_mm is -1" in done.stderr
     assert "cameras names 'd'" in done.stderr
-    assert not (tmp_path / "cameras.json").exists()
+    assert not (tmp_path / "c.json").exists()
 
 
 @pytest.mark.parametrize(

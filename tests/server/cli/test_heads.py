@@ -28,11 +28,7 @@ def test_warnings_of_a_result_reach_the_terminal_and_the_status_stays_0(
         {"code": "cameras-exchanged", "message": "cam04 and cam06 hold each other's pictures"},
         {"code": "scale-implausible", "message": "too large"},
     ]
-
-    def reconstructed(*positional: Any, **named: Any) -> dict[str, Any]:
-        return {"warnings": warnings}
-
-    monkeypatch.setattr(reconstruct_local, "reconstruct_locally", reconstructed)
+    monkeypatch.setattr(reconstruct_local, "reconstruct_locally", lambda *_, **__: {"warnings": warnings})
     capture = small_capture(tmp_path / "capture")
     arguments = ["reconstruct", str(capture), "--out", str(tmp_path / "out"), *(["--json"] if as_json else [])]
     done = CliRunner().invoke(app, arguments)

@@ -215,6 +215,9 @@ def test_files_of_another_kind_and_folders_of_pictures_that_nobody_reads_are_tol
     strays, unread = (remark.text for remark in read_capture(folder)[0].remarks)
     assert strays.startswith("images/cam00.exr has no camera")
     assert unread == "depth/ is not read: pictures lie in images/, masks/ and background/"
+    (folder / "images").rename(folder / "Bilder")
+    with pytest.raises(InputError, match="Bilder/ is not read: pictures lie in images/"):
+        read_capture(folder)
 
 
 @pytest.mark.parametrize("around", ["anna", "anna/anna", "anna/2024/shot"])
@@ -233,10 +236,8 @@ def test_colmap_models_that_are_not_read_are_told(folder: Path) -> None:
     write_rig_file(rig_of(), folder / "sparse/0", "colmap-text")
     write_rig_file(rig_of(3), folder / "sparse/1", "colmap-text")
     remarks = [remark.text for remark in read_capture(folder)[0].remarks]
-    assert remarks == [
-        "sparse/0/cameras.txt is not read: the cameras come from sparse/0/cameras.bin",
-        "sparse/1/cameras.txt is not read: the cameras come from sparse/0/cameras.bin",
-    ]
+    unread = "cameras.txt is not read: the cameras come from sparse/0/cameras.bin"
+    assert remarks == [f"sparse/0/{unread}", f"sparse/1/{unread}"]
 
 
 def test_one_size_that_is_wrong_everywhere_is_one_sentence(folder: Path) -> None:
