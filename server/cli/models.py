@@ -54,8 +54,10 @@ def model_import(
     """
     from pipeline.applications.model_building.sources.imports import import_model
     from pipeline.head_model.model_file import save_model
-    from pipeline.head_model.model_names import models_folder
+    from pipeline.head_model.model_names import PACK_FILES, models_folder
 
+    if name is not None and (Path(name).name != name or name in PACK_FILES):
+        raise typer.BadParameter(f"{name!r}: a name without folders that no shipped model has", param_hint="--name")
     with progress_bar() as report:
         parts = import_model(source, name=name, report=report)
     path = models_folder() / f"{parts.name}.npz"

@@ -193,7 +193,7 @@ def test_nothing_that_is_there_is_overwritten_unasked(run: Run, tmp_path: Path) 
     convert = ("convert", small_capture(tmp_path / "shot"), "--to", "blender", "--out", tmp_path / "cameras.py")
     for more, said in [((), False), ((), True), (("--overwrite",), False)]:
         assert ("result-replaced" in run(*convert, *more).err) is said
-    for more, status in [((), 0), ((), 1), (("--overwrite",), 0)]:
+    for more, status in [((), 0), ((), 1), (("--overwrite",), 0), (("--name=../evil",), 2), (("--name=default",), 2)]:
         assert run("model", "import", model_path("default"), "--name", "mine", *more).status == status
     capture = small_capture(tmp_path / "capture")
     done = run("simulate", capture)
