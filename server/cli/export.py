@@ -83,8 +83,6 @@ def export(
         files = export_result(source, out, outputs)
         answer({"out": str(out), "files": files}, json_out, [f"{out}  {', '.join(files)}"])
     elif form in ("slicer", "dicom", "nifti"):
-        if not (patient.isascii() and patient.isalnum() and len(patient) <= LONGEST_PSEUDONYM):
-            raise typer.BadParameter(f"at most {LONGEST_PSEUDONYM} letters and digits", param_hint="--patient")
         _export_patient(source, out, form, axes, plane, marked=marked, patient=patient, json_out=json_out)
     else:
         _export_dataset(source, out, form, result=result, settings=settings, json_out=json_out)
@@ -126,6 +124,8 @@ def _export_patient(
     json_out: bool,
 ) -> None:
     """Writes a result's head in a patient's axes."""
+    if not (patient.isascii() and patient.isalnum() and len(patient) <= LONGEST_PSEUDONYM):
+        raise typer.BadParameter(f"at most {LONGEST_PSEUDONYM} letters and digits", param_hint="--patient")
     from pipeline.applications.clinic.anatomical_frame import frankfurt_axes, head_axes
     from pipeline.applications.clinic.hospital_files import HOSPITAL_AXES, write_hospital_files
     from pipeline.applications.clinic.patient_files import marked_points, write_patient_files
