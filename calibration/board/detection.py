@@ -355,26 +355,26 @@ def explain_markers(pictures: Sequence[Markers], board: Board) -> Message | None
             return compose("board-april-grid")
         return compose("board-markers-disordered")
     if layout.columns != board.columns:
-        last = max(max(markers) for markers in pictures if markers) - layout.first_marker + 1
-        rows = -(-2 * last // layout.columns)
+        rows = -(-2 * layout.markers // layout.columns)
         return compose("board-of-other-columns", columns=layout.columns, rows=rows, said=_size(board))
     if abs(layout.ratio - board.marker_ratio) > RATIO_OFF:
         return compose("board-marker-ratio", ratio=layout.ratio, said=board.marker_ratio)
-    beyond = max(max(markers) for markers in pictures if markers) - layout.first_marker
-    if beyond >= board.marker_count:
-        return compose("board-marker-beyond", marker=beyond, size=_size(board), held=board.marker_count)
+    if layout.markers > board.marker_count:
+        return compose("board-marker-beyond", marker=layout.markers - 1, size=_size(board), held=board.marker_count)
     return None
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
     """Describes how markers are laid out: squares in a row, number of the first marker, and whether the first square is
-    white (``legacy``). ``ratio`` is the measured side of a marker divided by that of a square."""
+    white (``legacy``). ``ratio`` is the measured side of a marker divided by that of a square, ``markers`` the count
+    up to the last that fits: a picture's background may pass for any."""
 
     columns: int
     first_marker: int
     legacy: bool
     ratio: float
+    markers: int
 
 
 def find_markers(grey: UInt8[np.ndarray, "h w"], dictionary: str) -> dict[int, Float[np.ndarray, "4 2"]]:
@@ -420,7 +420,7 @@ def _first_markers(shown: Sequence[Markers], board: Board | None) -> list[int]:
 
 def _explaining(shown: Sequence[Markers], columns: int, first: int, *, legacy: bool) -> Layout | None:
     corners = _layout_corners(columns, legacy=legacy)
-    ratios = []
+    ratios, last = [], first
     for markers in shown:
         numbers = np.array([number for number in markers if 0 <= number - first < len(corners)])
         if len(numbers) < max(MARKERS_LEAST, 0.8 * len(markers)):
@@ -429,9 +429,10 @@ def _explaining(shown: Sequence[Markers], columns: int, first: int, *, legacy: b
         miss, ratio = _fit(flat, observed)
         if miss < LAYOUT_MISS:
             ratios.append(ratio)
+            last = max(last, int(numbers.max()))
     if len(ratios) <= 0.5 * len(shown):
         return None
-    return Layout(columns, first, legacy, float(np.median(ratios)))
+    return Layout(columns, first, legacy, float(np.median(ratios)), last - first + 1)
 
 
 def _layout_corners(columns: int, *, legacy: bool) -> Float[np.ndarray, "m 4 2"]:

@@ -15,7 +15,7 @@ from rig.files import sha256_of
 DATA, MODELS = "EIGENHEAD_DATA", "EIGENHEAD_MODELS"
 PACKS = Path(__file__).parent / "packs"
 DEFAULT = "makehuman-138"
-_PACK_FILES = {"default": "makehuman.npz", DEFAULT: "makehuman.npz", "makehuman": "makehuman.npz"}
+PACK_FILES = {"default": "makehuman.npz", DEFAULT: "makehuman.npz", "makehuman": "makehuman.npz"}
 
 
 class UnknownModel(EigenheadError):
@@ -38,7 +38,7 @@ class ShippedModel(EigenheadError):
 
 def list_models() -> dict[str, Path]:
     """Returns the files of the available head models by name: the shipped default and those in the user's folder."""
-    found = {DEFAULT: PACKS / _PACK_FILES[DEFAULT]}
+    found = {DEFAULT: PACKS / PACK_FILES[DEFAULT]}
     folder = models_folder()
     if folder.is_dir():
         found |= {path.stem: path for path in sorted(folder.glob("*.npz"))}
@@ -48,8 +48,8 @@ def list_models() -> dict[str, Path]:
 def model_path(name_or_path: str | Path) -> Path:
     """Returns the file of a head model, from its name or its path. Raises UnknownModel."""
     name = str(name_or_path)
-    if name in _PACK_FILES:
-        return PACKS / _PACK_FILES[name]
+    if name in PACK_FILES:
+        return PACKS / PACK_FILES[name]
     named = list_models().get(name)
     if named is not None:
         return named
@@ -75,7 +75,7 @@ def remove_model(name: str) -> Path:
     ShippedModel for a model that comes with the program."""
     path = models_folder() / f"{name}.npz"
     if path.parent != models_folder() or not path.is_file():
-        raise ShippedModel(name) if name in _PACK_FILES else UnknownModel(name)
+        raise ShippedModel(name) if name in PACK_FILES else UnknownModel(name)
     path.unlink()
     return path
 

@@ -1,5 +1,6 @@
 """Provides for all commands: types of options, the service's settings, a progress bar, and the answer on stdout."""
 
+import atexit
 import errno
 import json
 import math
@@ -8,7 +9,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Event
 from time import monotonic
@@ -159,27 +160,42 @@ def prepare_file(path: Path, *, overwrite: bool = True, option: str = "--out") -
 
     Raises CannotWrite, and Overwrites if the file exists and ``overwrite`` is false."""
     if path.exists() and not overwrite:
-        raise Overwrites(path)
+        raise Overwrites(path, "place" if option == "--out" else option)
     try:
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, "it is a folder")
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _make_folder(path.parent)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
         raise CannotWrite(path, error, option) from error
 
 
-def prepare_folder(path: Path) -> None:
-    """Makes an output folder and checks that it can be written. Raises CannotWrite."""
+def prepare_folder(path: Path, sign: str = "", *, overwrite: bool = True) -> None:
+    """Makes an output folder and checks that it can be written. Raises CannotWrite, and Overwrites if the folder has
+    the file ``sign`` and ``overwrite`` is false."""
+    if sign and (path / sign).exists() and not overwrite:
+        raise Overwrites(path / sign)
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        _make_folder(path)
         with tempfile.TemporaryFile(dir=path):
             pass
     except FileExistsError as error:
         raise CannotWrite(path, FileExistsError(errno.ENOTDIR, "it is a file, and a folder is written")) from error
     except OSError as error:
         raise CannotWrite(path, error) from error
+
+
+def _make_folder(path: Path) -> None:
+    """Makes a folder. What is still empty at the end goes again: the command was refused."""
+    atexit.register(_remove_empty, [folder for folder in (path, *path.parents) if not folder.exists()])
+    path.mkdir(parents=True, exist_ok=True)
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    with suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
 
 
 @contextmanager

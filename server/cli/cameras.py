@@ -92,22 +92,17 @@ def calibrate(
 ) -> None:
     """Calibrate a rig from pictures of a board or scene."""
     warn_of_replacement(out, overwrite)
-    if source == "scene":
-        board_options = {"--board": board, "--previous": previous}
-        board_options |= {"--anyway": anyway or None, "--intrinsics-only": intrinsics_only or None}
-        for option, value in board_options.items():
-            if value is not None:
-                raise typer.BadParameter("is for a board; a scene takes none", param_hint=option)
-        prepare_file(out)
-        _calibrate_scene(images, out, scale, front, lenses, json_out)
-        return
-    for option, value in (("--scale", scale), ("--lenses", lenses)):
-        if value is not None:
-            raise typer.BadParameter("is for --from scene", param_hint=option)
-    if board is None:
-        raise typer.BadParameter("say which board, or --from scene", param_hint="--board")
+    of_board = {"--board": board, "--previous": previous, "--anyway": anyway, "--intrinsics-only": intrinsics_only}
+    why = "is for a board; a scene takes none" if source == "scene" else "is for --from scene"
+    for option, value in (of_board if source == "scene" else {"--scale": scale, "--lenses": lenses}).items():
+        if value:
+            raise typer.BadParameter(why, param_hint=option)
     prepare_file(out)
-    if intrinsics_only:
+    if source == "scene":
+        _calibrate_scene(images, out, scale, front, lenses, json_out)
+    elif board is None:
+        raise typer.BadParameter("say which board, or --from scene", param_hint="--board")
+    elif intrinsics_only:
         _calibrate_lenses(images, board, out, json_out)
     else:
         _calibrate_board(images, board, out, front, previous, json_out, anyway=anyway)

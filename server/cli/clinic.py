@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, file_in, prepare_folder, warn
+from server.cli.answers import Data, Json, Overwrite, answer, file_in, prepare_folder, warn
 
 if TYPE_CHECKING:
     from pipeline.applications.clinic.comparison_files import Comparison
@@ -36,14 +36,12 @@ def compare(
 
     Both are aligned on the forehead and the bridge of the nose. Writes the signed distances as PLY, GLB, picture and
     tables, and a PDF; what is below two combined standard deviations is grey."""
-    if (out / "compare.json").exists() and not overwrite:
-        raise Overwrites(out / "compare.json")
+    prepare_folder(out, "compare.json", overwrite=overwrite)
     from pipeline.applications.clinic.comparison_files import compare as compare_visits
     from pipeline.applications.clinic.comparison_files import write_comparison
     from pipeline.applications.clinic.visit import read_visit
 
     comparison = compare_visits(read_visit(earlier, model), read_visit(later, model))
-    prepare_folder(out)
     document = write_comparison(out, comparison, date.today().isoformat())
     for warning in comparison.warnings:
         warn(str(warning))
@@ -96,8 +94,7 @@ def register(
 
     A rigid fit of the face; what contradicts the rest (swelling, a chin rest, the surfaces of skull and airways) has no
     part in it. Writes the head and its landmarks in the surface's frame, and what is left between the two."""
-    if (out / "registration.json").exists() and not overwrite:
-        raise Overwrites(out / "registration.json")
+    prepare_folder(out, "registration.json", overwrite=overwrite)
     from pipeline.applications.clinic.patient_files import write_registration
     from pipeline.applications.clinic.registration import read_surface, read_surface_landmarks
     from pipeline.applications.clinic.registration import register as register_head
@@ -109,7 +106,6 @@ def register(
     for warning in visit.warnings:
         warn(str(warning))
     registered = register_head(visit, patient, marks)
-    prepare_folder(out)
     document = write_registration(out, registered)
     answer(document | {"out": str(out)}, json_out, _registration_lines(document, out))
 

@@ -9,7 +9,6 @@ from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, file_i
 from server.cli.heads import Albedo, Morphs, TemplateName
 
 if TYPE_CHECKING:
-    from pipeline.settings import OutputSettings
     from rig.formats.cameras.dataset_json import DatasetFormat
     from rig.formats.meshes.markups import Axes
 
@@ -73,27 +72,20 @@ def export(
     }  # fmt: skip
     for option in filter(unused.get, unused):
         raise typer.BadParameter(f"changes nothing in {form}; leave it out", param_hint=option)
-    sign = out / (f"head.{form}" if head else "frame.json" if patients else "transforms.json")
-    if (head and out.resolve() == source.resolve()) or (sign.exists() and not overwrite):
-        raise Overwrites(sign)
+    sign = f"head.{form}" if head else "frame.json" if patients else "transforms.json"
+    if head and out.resolve() == source.resolve():
+        raise Overwrites(out / sign)
+    prepare_folder(out, sign, overwrite=overwrite)
     if form in FORMATS:
+        from server.tasks.export_result import export_result
+
         outputs = OutputSettings(formats=(form,), template=template, morphs=morphs, albedo="file" if albedo else "none")
-        _export_head(source, out, outputs, json_out=json_out)
+        files = export_result(source, out, outputs)
+        answer({"out": str(out), "files": files}, json_out, [f"{out}  {', '.join(files)}"])
     elif form in ("slicer", "dicom", "nifti"):
-        if not (patient.isascii() and patient.isalnum() and len(patient) <= LONGEST_PSEUDONYM):
-            raise typer.BadParameter(f"at most {LONGEST_PSEUDONYM} letters and digits", param_hint="--patient")
         _export_patient(source, out, form, axes, plane, marked=marked, patient=patient, json_out=json_out)
     else:
         _export_dataset(source, out, form, result=result, settings=settings, json_out=json_out)
-
-
-def _export_head(result: Path, out: Path, outputs: "OutputSettings", *, json_out: bool) -> None:
-    """Writes a result's head in another format."""
-    from server.tasks.export_result import export_result
-
-    prepare_folder(out)
-    files = export_result(result, out, outputs)
-    answer({"out": str(out), "files": files}, json_out, [f"{out}  {', '.join(files)}"])
 
 
 def _export_dataset(
@@ -108,7 +100,6 @@ def _export_dataset(
 
     wanted = settings_from_document(settings_document(settings))
     check_apart(out, capture)
-    prepare_folder(out)
     with progress_bar() as report, folder_of(capture) as folder:
         figures, warnings = export_folder(folder, out, form, result=result, chosen=wanted, report=report)
     for warning in warnings:
@@ -133,6 +124,8 @@ def _export_patient(
     json_out: bool,
 ) -> None:
     """Writes a result's head in a patient's axes."""
+    if not (patient.isascii() and patient.isalnum() and len(patient) <= LONGEST_PSEUDONYM):
+        raise typer.BadParameter(f"at most {LONGEST_PSEUDONYM} letters and digits", param_hint="--patient")
     from pipeline.applications.clinic.anatomical_frame import frankfurt_axes, head_axes
     from pipeline.applications.clinic.hospital_files import HOSPITAL_AXES, write_hospital_files
     from pipeline.applications.clinic.patient_files import marked_points, write_patient_files
@@ -143,7 +136,6 @@ def _export_patient(
     axes = axes if form == "slicer" else HOSPITAL_AXES[form]
     in_plane = plane == "frankfurt" or marked is not None
     frame = frankfurt_axes(visit.measured, axes, points) if in_plane else head_axes(visit.measured, axes)
-    prepare_folder(out)
     if form == "slicer":
         document = write_patient_files(out, visit, frame)
     else:

@@ -45,6 +45,7 @@ def model_import(
     source: Annotated[Path, typer.Argument(help="ICT-FaceKit, statismo or Basel HDF5, or npz.", exists=True)],
     name: Annotated[str | None, typer.Option(help="What to call it.")] = None,
     data: Data = None,
+    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
     """Convert a head model of another program.
@@ -53,12 +54,15 @@ def model_import(
     """
     from pipeline.applications.model_building.sources.imports import import_model
     from pipeline.head_model.model_file import save_model
-    from pipeline.head_model.model_names import models_folder
+    from pipeline.head_model.model_names import PACK_FILES, models_folder
 
+    if name is not None and (Path(name).name != name or name in PACK_FILES):
+        raise typer.BadParameter(f"{name!r}: a name without folders that no shipped model has", param_hint="--name")
     with progress_bar() as report:
         parts = import_model(source, name=name, report=report)
-        path = models_folder() / f"{parts.name}.npz"
-        save_model(path, parts)
+    path = models_folder() / f"{parts.name}.npz"
+    prepare_file(path, overwrite=overwrite, option="--name")
+    save_model(path, parts)
     document = {"name": parts.name, "file": str(path), "draws_mm": parts.figures.get("draws_mm")}
     answer(document, json_out, [f"{parts.name}  {path}"])
 

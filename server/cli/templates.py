@@ -7,18 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from server.cli.answers import (
-    Data,
-    Json,
-    Overwrite,
-    Overwrites,
-    answer,
-    file_in,
-    prepare_file,
-    prepare_folder,
-    progress_bar,
-    warn,
-)
+from server.cli.answers import Data, Json, Overwrite, answer, file_in, prepare_file, prepare_folder, progress_bar, warn
 
 if TYPE_CHECKING:
     from pipeline.applications.wrapping.wrap import Wrapped
@@ -55,9 +44,7 @@ def template_add(
     from pipeline.applications.templates.header import new_path
 
     path = new_path(name or file.stem)
-    if path.exists() and not overwrite:
-        raise Overwrites(path, "--name")
-    prepare_file(path)
+    prepare_file(path, overwrite=overwrite, option="--name")
     from pipeline.applications.model_building.correspondence.scans import landmark_file, read_landmarks
     from pipeline.applications.templates.make import make_template, template_picture
     from pipeline.applications.templates.template_file import save_template
@@ -135,8 +122,7 @@ def wrap(
 
     The scan's unit and axes are found by its face. Writes wrapped.obj with its texture, in the scan's own frame and
     unit, the distance of every vertex from the scan, and a picture to look at."""
-    if (out / "wrapped.obj").exists() and not overwrite:
-        raise Overwrites(out / "wrapped.obj")
+    prepare_folder(out, "wrapped.obj", overwrite=overwrite)
     from pipeline.applications.model_building.correspondence.scans import read_landmarks
     from pipeline.applications.templates.template_file import load_template
     from pipeline.applications.wrapping.scan import read_raw_scan
@@ -149,7 +135,6 @@ def wrap(
     assert known is not None
     marks = read_landmarks(landmarks) if landmarks else None
     raw = read_raw_scan(scan)
-    prepare_folder(out)
     with progress_bar() as report:
         wrapped = wrap_scan(raw, known, head_model, landmarks=marks, report=report)
         document = write_wrapped(out, wrapped)

@@ -48,6 +48,8 @@ def export_result(folder: Path, out: Path, outputs: OutputSettings) -> list[str]
     Raises InputError for a folder that is no result or whose model is not at hand, and what the writers raise.
     """
     head_model = load_model(identity_of(folder).model)
+    if outputs.morphs and not head_model.expressions.names:
+        raise InputError("morphs", [compose("model-without-shapes", model=head_model.name)])
     writers = load_template_writers(outputs.template, head_model)
     result = _read_reconstruction(folder, head_model, outputs)
     out.mkdir(parents=True, exist_ok=True)

@@ -48,6 +48,7 @@ from rig.errors import InputError
 from rig.messages.message import Message, compose
 
 FORMAT = "eigenhead-sizes/1"
+EXAMPLE = f'format = "{FORMAT}", [[table]], name = "cap", measure = "head_length", sizes = {{ S = [180, 190] }}'
 KEYS = frozenset({"name", "measure", "sizes", "allowance"})
 MIN_STD = 1e-6
 ISO_NAMES: Mapping[str, str] = {
@@ -100,12 +101,12 @@ class SizeChoice:
 def read_size_tables(path: Path, measures: Set[str]) -> list[SizeTable]:
     """Reads a file of size tables for these measures. Raises InputError naming every fault."""
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:
-        raise InputError(path.name, [compose("sizes-unread", reason=str(error))]) from error
+        raise InputError(path.name, [compose("sizes-unread", reason=str(error), example=EXAMPLE)]) from error
     entries = document.get("table")
     if document.get("format") != FORMAT or not isinstance(entries, list) or not entries:
-        raise InputError(path.name, [compose("sizes-no-table", format=FORMAT)])
+        raise InputError(path.name, [compose("sizes-no-table", format=FORMAT, example=EXAMPLE)])
     faults = [fault for number, entry in enumerate(entries, 1) for fault in _faults(number, entry)] or [
         compose(
             "size-measure-unknown", table=entry["name"], measure=entry["measure"], known=", ".join(sorted(measures))

@@ -12,6 +12,7 @@ expectation: a step of expectation maximisation for a Gaussian with known noise.
 sees nothing would count as variation of people.
 """
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -170,9 +171,13 @@ def build_from_results(folder: Path, out: Path, *, name: str, report: Progress =
 
 
 def find_results(folder: Path) -> tuple[Path, ...]:
-    """Returns the folders of all results in or below ``folder``, in order. Raises InputError if there is none."""
-    reports = sorted(folder.rglob("report.json"))
-    found = tuple(path.parent for path in reports if is_result(path.parent))
+    """Returns the folders of all results in or below ``folder``, in order; links are followed, each counts once.
+    Raises InputError if there is none."""
+    places: dict[str, Path] = {}
+    for place, below, _ in os.walk(folder, followlinks=True):
+        if places.setdefault(os.path.realpath(place), Path(place)) != Path(place):
+            below.clear()
+    found = tuple(sorted(filter(is_result, places.values())))
     if not found:
         raise InputError(str(folder), [compose("results-none")])
     return found

@@ -209,12 +209,11 @@ def _thinned(read: CamerasRead, file: str) -> CamerasRead:
 
 def rig_file_parts(path: Path) -> tuple[Path, ...]:
     """Returns all files that ``read_rig_file`` reads for ``path``; most formats have one."""
-    suffix = path.suffix.lower()
-    if suffix in (".bin", ".txt") and path.stem.lower() == "cameras":
-        return path, entry(path.parent, f"images{suffix}")
-    if suffix == ".xmp":
+    if path.suffix.lower() == ".xmp":
         return tuple(other for other in sorted(path.parent.iterdir()) if other.suffix.lower() == ".xmp")
-    return (path, entry(path.parent, "extri.yml")) if path.name.lower() == "intri.yml" else (path,)
+    pairs = {"cameras.bin": "images.bin", "cameras.txt": "images.txt", "intri.yml": "extri.yml"}
+    other = pairs.get(path.name.lower())  # a cameras.txt that holds JSON has none
+    return (path, entry(path.parent, other)) if other and entry(path.parent, other).is_file() else (path,)
 
 
 def write_rig_file(rig: Rig, path: Path, kind: str) -> None:

@@ -153,7 +153,7 @@ def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFile
     if places["images"] != folder:
         strays["beside"] = [path for path in listed_pictures(folder) if path not in used]
     stray_names = [path.relative_to(folder).as_posix() for paths in strays.values() for path in paths]
-    if stray_names or missing or faults:  # one of the others may be what is missing
+    if stray_names or missing or faults or len(absent) == len(rig):  # one of the others may be what is missing
         missing, absent = [*absent.values(), *missing], {}
     faults += missing + ([stray_sentence(stray_names, rig)] if missing and stray_names and not cause else [])
     sets = _texture_sets(folder, rig, names, faults)

@@ -14,6 +14,7 @@ from calibration.board.detection import (
     board_of,
     detect_folder,
     explain,
+    explain_markers,
     find_layout,
     find_markers,
     is_april_grid,
@@ -66,6 +67,12 @@ def test_the_pattern_that_was_printed_is_found(printed: Board) -> None:
 ])  # fmt: skip
 def test_the_cause_is_named(printed: Board, words: str) -> None:
     assert words in str(explain(picture(printed), TOLD))
+
+
+def test_what_passes_for_a_marker_beside_the_board_adds_no_rows() -> None:
+    shown = markers(replace(TOLD, columns=7))
+    shown[0][617] = shown[0][0] + 300.0
+    assert "7 squares in a row and 6 rows or more" in str(explain_markers(shown, TOLD))
 
 
 def test_mirrored_and_inverted_pictures_are_named_whatever_the_pattern() -> None:

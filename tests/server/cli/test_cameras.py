@@ -27,9 +27,7 @@ from tests.support.textured_wedge import wedge_rig, write_photographs
 def test_the_studio_shows_an_own_board_that_gives_its_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("server.cli.simulate.BOARD_SHOTS", 8)
     shots, out = tmp_path / "shots", tmp_path / "cameras.json"
-    printed = CliRunner().invoke(
-        app, ["board", "--squares", "10x7", "--square-mm", "40", "--out", f"{tmp_path}/own.pdf"]
-    )
+    printed = CliRunner().invoke(app, ["board", "--squares=10x7", "--square-mm=40", f"--out={tmp_path}/own.pdf"])
     assert "paper of 420 x 594 mm" in printed.stdout
     assert CliRunner().invoke(app, ["simulate", str(shots), f"--board-file={tmp_path}/board.toml"]).exit_code == 0
     for folder in sorted(shots.glob("cam*"))[6:]:  # six cameras show it as well as eleven
@@ -60,12 +58,11 @@ def test_faults_of_scale_json_end_it_before_the_work(tmp_path: Path) -> None:
     for name in "abc":
         (tmp_path / f"{name}.png").write_bytes(b"")
     (tmp_path / "scale.json").write_text(json.dumps({"cameras": ["a", "d"], "distance_mm": -1}))
-    scale = str(tmp_path / "scale.json")
-    done = run("calibrate", str(tmp_path), "--from", "scene", "--scale", scale, "--out", str(tmp_path / "cameras.json"))
+    done = run("calibrate", f"{tmp_path}", "--from=scene", f"--scale={tmp_path}/scale.json", f"--out={tmp_path}/c.json")
     assert done.returncode == 1
     assert "distance_mm is -1" in done.stderr
     assert "cameras names 'd'" in done.stderr
-    assert not (tmp_path / "cameras.json").exists()
+    assert not (tmp_path / "c.json").exists()
 
 
 def test_cameras_that_take_no_part_are_told_where_a_file_is_converted(tmp_path: Path) -> None:
@@ -88,12 +85,9 @@ def test_formats_of_several_files_are_told_from_those_of_one(tmp_path: Path) -> 
 def test_one_board_is_the_default_of_command_page_and_documents(tmp_path: Path) -> None:
     assert CliRunner().invoke(app, ["board", "--out", str(tmp_path / "board.pdf")]).exit_code == 0
     written = tomllib.loads((tmp_path / "board.toml").read_text())
-    document = tomllib.loads(
-        "\n".join(re.findall(r"^    (\w+ = .*)$", (ROOT / "docs/calibration.md").read_text(), re.MULTILINE)[:6])
-    )
-    page = dict(
-        re.findall(r"^      (\w+): (.*),$", (ROOT / "server/console/pages/calibration.js").read_text(), re.MULTILINE)
-    )
+    text, script = (ROOT / name for name in ("docs/calibration.md", "server/console/pages/calibration.js"))
+    document = tomllib.loads("\n".join(re.findall(r"^    (\w+ = .*)$", text.read_text(), re.MULTILINE)[:6]))
+    page = dict(re.findall(r"^      (\w+): (.*),$", script.read_text(), re.MULTILINE))
     schema = NewCalibration.model_json_schema()
     assert schema["examples"][0]["board"].items() <= written.items()
     assert document.items() <= written.items()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.head_model.model_names import data_folder, models_folder
+from pipeline.head_model.model_names import data_folder, model_path, models_folder
 from rig.studio.sensor.faults import KINDS
 from server.cli.main import main
 from tests.server.cli.test_main import run as run_apart
@@ -74,18 +74,13 @@ def test_a_key_is_made_where_data_says_and_says_so(run: Run, tmp_path: Path) -> 
         assert run("keys", "remove", listed["id"], "--data", tmp_path / "heads").status == status
 
 
-def test_models_lie_in_the_data_folder_that_is_named(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "heads" / "models").mkdir(parents=True)
-    (tmp_path / "heads" / "models" / "mine.npz").touch()
-    found = json.loads(run("model", "list", "--data", tmp_path / "heads", "--json").out)["models"]
-    assert found["mine"] == str(tmp_path / "heads" / "models" / "mine.npz")
-    assert "mine" not in json.loads(run("model", "list", "--data", tmp_path / "others", "--json").out)["models"]
-
-
-def test_a_model_of_the_users_own_is_removed_and_no_other_file(run: Run, tmp_path: Path) -> None:
+def test_models_lie_in_the_named_data_folder_and_the_users_own_is_removed(run: Run, tmp_path: Path) -> None:
     models = tmp_path / "heads" / "models"
     models.mkdir(parents=True)
     (models / "mine.npz").touch()
+    found = json.loads(run("model", "list", "--data", tmp_path / "heads", "--json").out)["models"]
+    assert found["mine"] == str(models / "mine.npz")
+    assert "mine" not in json.loads(run("model", "list", "--data", tmp_path / "others", "--json").out)["models"]
     (tmp_path / "heads" / "other.npz").touch()
     for name, word in (("default", "comes with the program"), ("nobody", "no head model"), ("../other", "no head")):
         refused = run("model", "remove", name, "--data", tmp_path / "heads")
@@ -237,6 +232,8 @@ def test_nothing_that_is_there_is_overwritten_unasked(run: Run, tmp_path: Path) 
     convert = ("convert", small_capture(tmp_path / "shot"), "--to", "blender", "--out", tmp_path / "cameras.py")
     for more, said in [((), False), ((), True), (("--overwrite",), False)]:
         assert ("result-replaced" in run(*convert, *more).err) is said
+    for more, status in [((), 0), ((), 1), (("--overwrite",), 0), (("--name=../evil",), 2), (("--name=default",), 2)]:
+        assert run("model", "import", model_path("default"), "--name", "mine", *more).status == status
     capture = small_capture(tmp_path / "capture")
     done = run("simulate", capture)
     assert (done.status, done.err.count("\n")) == (1, 1)
@@ -254,3 +251,4 @@ def test_a_damaged_picture_is_told_in_our_words_alone(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "images/cam01.png" in done.stderr
     assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()

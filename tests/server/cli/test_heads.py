@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from pipeline.compute.trace import active_trace, span
 from rig.errors import EigenheadError
+from rig.progress import discard_progress
 from server.cli import reconstruct_local
 from server.cli.answers import SpoilsCapture
 from server.cli.main import app
@@ -27,11 +28,7 @@ def test_warnings_of_a_result_reach_the_terminal_and_the_status_stays_0(
         {"code": "cameras-exchanged", "message": "cam04 and cam06 hold each other's pictures"},
         {"code": "scale-implausible", "message": "too large"},
     ]
-
-    def reconstructed(*positional: Any, **named: Any) -> dict[str, Any]:
-        return {"warnings": warnings}
-
-    monkeypatch.setattr(reconstruct_local, "reconstruct_locally", reconstructed)
+    monkeypatch.setattr(reconstruct_local, "reconstruct_locally", lambda *_, **__: {"warnings": warnings})
     capture = small_capture(tmp_path / "capture")
     arguments = ["reconstruct", str(capture), "--out", str(tmp_path / "out"), *(["--json"] if as_json else [])]
     done = CliRunner().invoke(app, arguments)
@@ -55,10 +52,8 @@ def test_a_format_that_does_not_exist_is_wrong_usage_and_the_others_reach_the_se
     wrong = CliRunner().invoke(app, [*arguments, "--formats", "glb,fbx"])
     assert (wrong.exit_code, requested) == (2, [])
     assert "'fbx' is none of glb, ply, obj, usdz, stl, 3mf" in " ".join(wrong.stderr.replace("│", " ").split())
-    assert CliRunner().invoke(app, [*arguments, "--formats", "glb, usdz"]).exit_code == 0
-    assert CliRunner().invoke(app, [*arguments, "--albedo"]).exit_code == 0
-    assert CliRunner().invoke(app, [*arguments, "--cap", "blue"]).exit_code == 0
-    assert CliRunner().invoke(app, [*arguments, "--cap", "#2458ac", "--cap-thickness", "0.6"]).exit_code == 0
+    for more in (["--formats=glb, usdz"], ["--albedo"], ["--cap=blue"], ["--cap=#2458ac", "--cap-thickness=0.6"]):
+        assert CliRunner().invoke(app, [*arguments, *more]).exit_code == 0
     wanted = [("outputs", {"formats": ["glb", "usdz"]}), ("outputs", {"albedo": "file"}), ("cap", {"colour": "blue"})]
     wanted.append(("cap", {"colour": "#2458ac", "thickness_mm": 0.6}))
     assert [settings[key] for settings, (key, _) in zip(requested, wanted, strict=True)] == [one for _, one in wanted]
@@ -76,14 +71,11 @@ def test_a_result_never_lies_among_the_pictures_of_its_capture(inside: str, encl
     before = sorted(tmp_path.rglob("*"))
     for out in [folder / inside, *([capture / "head"] if enclosed else [])]:
         with pytest.raises(SpoilsCapture, match="name another place with --out"):
-            reconstruct_local.reconstruct_locally(
-                capture, out, model=None, settings={}, report=lambda stage, share: None
-            )
+            reconstruct_local.reconstruct_locally(capture, out, model=None, settings={}, report=discard_progress)
     photographs = folder / "images"  # of one camera, as a capture without names of cameras has them
+    within = photographs / "out"
     with pytest.raises(SpoilsCapture):
-        reconstruct_local.reconstruct_locally(
-            photographs, photographs / "out", model=None, settings={}, report=lambda stage, share: None
-        )
+        reconstruct_local.reconstruct_locally(photographs, within, model=None, settings={}, report=discard_progress)
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -101,7 +93,7 @@ def test_a_trace_is_written_of_every_job_and_may_lie_in_the_result(
     capture, out = small_capture(tmp_path / "capture"), tmp_path / "out"
     with pytest.raises(OSError, match="no head") if fails else nullcontext():
         reconstruct_local.reconstruct_locally(
-            capture, out, model=None, settings={}, report=lambda stage, share: None, trace=out / "trace.json"
+            capture, out, model=None, settings={}, report=discard_progress, trace=out / "trace.json"
         )
     events = json.loads((out / "trace.json").read_text())["traceEvents"]
     assert [event["name"] for event in events if event["ph"] == "X"] == ["job", "fit"]

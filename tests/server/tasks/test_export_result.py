@@ -13,16 +13,19 @@ from typer.testing import CliRunner
 
 from pipeline.applications.templates.write.writers import load_template_writers
 from pipeline.evidence.expression import Found, build_blendshape_rig
+from pipeline.head_model.expressions import Expressions
 from pipeline.head_model.model import load_model
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
 from pipeline.texturing.layout.uv_unwrap import Atlas, model_layout
 from rig.capture import Capture
+from rig.errors import InputError
 from rig.mesh import Mesh
 from rig.progress import discard_progress
 from server.cli.main import app
 from server.tasks.child import WorkerContext
 from server.tasks.export_archive import export_archive
+from server.tasks.export_result import export_result
 from tests.support.glb import opened_glb
 from tests.support.made_up_results import textured_result
 
@@ -100,3 +103,11 @@ def test_an_archive_holds_the_files_of_an_export(folder: Path, tmp_path: Path) -
             name: (tmp_path / "obj" / name).read_bytes() for name in files
         }
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["obj"]  # what was packed is gone
+
+
+def test_shapes_of_a_model_without_expressions_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    rigid = replace(load_model(), expressions=Expressions((), np.zeros((0, 1, 3), np.float32)))
+    monkeypatch.setattr("server.tasks.export_result.load_model", lambda _: rigid)
+    (tmp_path / "report.json").write_text(json.dumps({"model": {"name": rigid.name, "sha256": rigid.sha256}}))
+    with pytest.raises(InputError, match="morphs: cannot be written: the model makehuman-138 has no expressions"):
+        export_result(tmp_path, tmp_path / "out", OutputSettings(formats=("glb",), morphs=True))

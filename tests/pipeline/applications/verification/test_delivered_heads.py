@@ -60,8 +60,10 @@ def test_heads_come_back_without_smile_and_place(tmp_path: Path) -> None:
 
 
 def test_a_model_of_results_knows_them_better_and_is_used_like_the_old_one(tmp_path: Path) -> None:
-    for seed in range(3):
-        deliver(tmp_path / "results" / f"s{seed}", seed)
+    for seed, place in enumerate(("results/s0", "results/s1", "elsewhere")):
+        deliver(tmp_path / place, seed)
+    for link, place in (("s2", "elsewhere"), ("z", "elsewhere"), ("loop", "results")):
+        (tmp_path / "results" / link).symlink_to(tmp_path / place)
     built = build_from_results(tmp_path / "results", tmp_path / "ours.npz", name="ours")
     model, old = load_model(tmp_path / "ours.npz"), load_model()
     assert (model.name, dict(model.subjects)["total"], built.used) == ("ours", 3, ("s0", "s1", "s2"))

@@ -112,7 +112,7 @@ def wrong_crc_zip() -> bytes:
     return data.replace(b"some pixels", b"same pixels", 1)
 
 
-KINDS = "; only files and folders are unpacked"
+KINDS = "; only files and folders are unpacked: replace it by a file, or leave it out"
 HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "nothing": (lambda: b"", "no .zip"),
     "noise": (lambda: bytes(range(256)) * 40, "no .zip"),
