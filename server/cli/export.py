@@ -61,12 +61,12 @@ def export(
     hospital's programs without name and date. A capture as a data set: undistorted pictures, masks and cameras in
     metres."""
     from pipeline.settings import FORMATS, OutputSettings
+    from server.tasks.export_result import export_result
 
-    hospital, patients = form in ("dicom", "nifti"), form in ("slicer", "dicom", "nifti")
-    head = form in FORMATS
+    head, patients = form in FORMATS, form in ("slicer", "dicom", "nifti")
     unused: dict[str, object] = {
         "--axes": axes != "LPS" and form != "slicer", "--plane": plane != "head" and not patients,
-        "--marked": marked and not patients, "--patient": patient != "anonymous" and not hospital,
+        "--marked": marked and not patients, "--patient": patient != "anonymous" and form not in ("dicom", "nifti"),
         "--template": template and not head, "--morphs": morphs and not head, "--albedo": albedo and not head,
         "--result": result and (head or patients), "--settings": settings and (head or patients),
     }  # fmt: skip
@@ -77,8 +77,6 @@ def export(
         raise Overwrites(out / sign)
     prepare_folder(out, sign, overwrite=overwrite)
     if form in FORMATS:
-        from server.tasks.export_result import export_result
-
         outputs = OutputSettings(formats=(form,), template=template, morphs=morphs, albedo="file" if albedo else "none")
         files = export_result(source, out, outputs)
         answer({"out": str(out), "files": files}, json_out, [f"{out}  {', '.join(files)}"])
