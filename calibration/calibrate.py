@@ -244,9 +244,10 @@ def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped:
 def _prior(
     weak: LensPrior, names: Sequence[str], lenses: dict[str, Lens], noise: Float[np.ndarray, " c"], sigma: np.ndarray
 ) -> LensPrior:
-    """Returns a prior of each lens from its own calibration. If views have errors as a whole (their moments differ),
-    the joint fit overestimates the noise of corners, and would bend the lenses to explain the rest. The prior's weight
-    is the fraction of the noise that the corners of one view share."""
+    """Returns the prior on each camera's lens: ``weak`` combined with the estimate from that camera's own views. If
+    views have errors as a whole (their moments differ), the joint fit overestimates the noise of corners, and would
+    bend the lenses to explain the rest. The prior's weight is the fraction of the noise that the corners of one
+    view share."""
     share = 1.0 - noise**2 / sigma**2
     mean = np.stack([lenses[name].intrinsics.values() for name in names])
     information = np.stack([np.linalg.inv(lenses[name].covariance) for name in names])

@@ -59,8 +59,8 @@ def target(url: str, origins: Collection[str]) -> Target:
 
 
 def parsed(url: str) -> httpx.URL:
-    """Parses a web address, without looking up its host. Raises InvalidInput ("url-refused") for one whose host could
-    not be looked up."""
+    """Parses a web address, without looking up its host. Raises InvalidInput ("url-refused") if it is none, is not
+    http(s), or names a host that cannot exist."""
     try:
         wanted = httpx.URL(url)
         shown, host = wanted.host, wanted.raw_host.decode("ascii")  # httpx decodes a host no sooner than it is asked

@@ -32,6 +32,11 @@ def test_every_command_has_its_page() -> None:
     assert {path.name for path in (DOCS / "commands").iterdir()} == {f"{name}.md" for name in ROOMS}
 
 
+@pytest.mark.parametrize("page", ["settings.md", "rig-toml.md"])
+def test_every_setting_has_its_sentence(page: str) -> None:
+    assert re.findall(r"^- `.*\)$", PAGES[page], re.MULTILINE) == []
+
+
 def test_a_page_says_what_the_command_line_says() -> None:
     """Asked of the command itself, at the same width."""
     command = [str(Path(sys.executable).with_name("eigenhead")), "convert", "--help"]

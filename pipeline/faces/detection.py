@@ -3,8 +3,8 @@
 In: a picture as it was taken, in any orientation. Leaves: ``FaceDetection``. The detector proposes faces in the picture
 rotated by 0, 90, 180 and 270 degrees (it tolerates 45 degrees either way). A proposal is a face if the landmark network
 confirms it, in a crop that follows the points. The network sees the face and its mirror image; the points are the means
-of both results. Crops are squares, rotated so that the face is upright in them. A picture is stored at full size and
-repeatedly halved, so that a small sample of a large face averages over its pixels."""
+of both results. Crops are squares, rotated so that the face is upright in them. They are sampled from an image
+pyramid, at the level near their resolution, so that a large face is averaged and not skipped over."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

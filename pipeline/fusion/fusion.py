@@ -1,4 +1,4 @@
-"""Fuses all that the cameras see to one closed surface.
+"""Fuses all that the cameras see into one closed surface.
 
 A signed distance is computed on a grid (``signed_distance``); its zero becomes a mesh (``surface_nets``); the vertices
 are moved to the depth maps (``refinement``), to the fitted head (``skin``) and, of hair, to its outlines (``hair``);

@@ -50,7 +50,7 @@ class SeenVertices:
 
     @classmethod
     def of(cls, vertices: Float[np.ndarray, "v 3"], seen: Bool[np.ndarray, " v"]) -> "SeenVertices":
-        """Finds the nearest seen vertices. Where there is none at all, the distance is infinite."""
+        """Finds, for each vertex, the nearest seen one and the distance to it, infinite where none is seen."""
         far_mm, row, those = np.where(seen, 0.0, np.inf), np.arange(len(seen)), np.flatnonzero(seen)
         if len(those):
             far_mm[~seen], at = nearest(PointTree.of(vertices[those]), vertices[~seen])

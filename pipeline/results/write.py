@@ -140,7 +140,7 @@ def write_neutral(folder: Path, result: Reconstruction) -> None:
 def _write_glb(
     path: Path, result: Reconstruction, mesh_world: Mesh, normals: Float[np.ndarray, "v 3"], skin: Skin | None = None
 ) -> None:
-    """Writes a coloured mesh of the world frame as a GLB in the head frame."""
+    """Writes a coloured mesh in world coordinates as a GLB in the head frame."""
     from_world = head_from_world(result)
     mesh = Mesh(from_world.apply(mesh_world.vertices), mesh_world.faces, mesh_world.colours)
     part = Part("head", mesh, normals @ from_world.rotation.T, skin)

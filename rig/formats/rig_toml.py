@@ -57,20 +57,20 @@ _SHOT_BOUNDS = {
 class CameraConfig:
     """Holds one table [[cameras]] of rig.toml. Omitted settings stay as they are in the camera."""
 
-    name: str
+    name: str  # as in cameras.json
     driver: DriverName
-    identity: str
+    identity: str  # its serial number, device path or address
     trigger: TriggerMode = "external"  # external: the box's output; software: a command; free: not synchronised
     channel: int | None = None  # output of the trigger box
     delay_us: int = 0  # of that output
     latency_ms: float = 0.0  # from exposure to arrival: readout and transport, by `rig check`
-    pixel_format: str | None = None
-    width: int | None = None
-    height: int | None = None
-    fps: float | None = None
-    exposure_ms: float | None = None
-    gain_db: float | None = None
-    white_balance_k: int | None = None
+    pixel_format: str | None = None  # by the camera's own name, such as BayerRG8
+    width: int | None = None  # of the picture, px
+    height: int | None = None  # of the picture, px
+    fps: float | None = None  # frames a second of the live view, or of a camera that runs free
+    exposure_ms: float | None = None  # open shutter
+    gain_db: float | None = None  # of the sensor's amplifier
+    white_balance_k: int | None = None  # colour temperature of the light
     rotation_deg: Literal[0, 90, 180, 270] = 0  # clockwise, of the picture, to stand upright
 
     def exposure_settings(self) -> list[str]:
@@ -83,9 +83,9 @@ class TriggerConfig:
     """Holds the table [trigger] of rig.toml, the trigger box. ``port`` is a path under /dev/serial/by-id, or a link
     made by a udev rule."""
 
-    port: str
-    baud: int = 115200
-    pulse_us: int = 1000
+    port: str  # serial port of the box
+    baud: int = 115200  # bits a second on the port
+    pulse_us: int = 1000  # length of the trigger pulse
     window_s: float = 5.0  # the box disarms itself after it
 
 
@@ -93,7 +93,7 @@ class TriggerConfig:
 class LightsConfig:
     """Holds the table [lights] of rig.toml: which light outputs of the trigger box are on during a shot."""
 
-    outputs: tuple[int, ...] = ()
+    outputs: tuple[int, ...] = ()  # numbers on the box
     settle_s: float = 0.3  # halogen and LED drivers reach their level well within it
     keep_on: bool = False  # after the session
 
@@ -102,10 +102,10 @@ class LightsConfig:
 class ShotConfig:
     """Holds the table [shot] of rig.toml: waiting times, and limits beyond which a shot has a fault."""
 
-    timeout_s: float = 2.0
-    open_timeout_s: float = 10.0
-    warm_up_frames: int = 3
-    plates: int = 5
+    timeout_s: float = 2.0  # from the trigger until a camera's frame must be there
+    open_timeout_s: float = 10.0  # until a camera must be open
+    warm_up_frames: int = 3  # frames dropped after a camera is opened
+    plates: int = 5  # clean plates taken of each camera
     plates_over_s: float = 3.0  # from the first clean plate to the last: in that time a person who sits still moves
     skew_most_ms: float = 40.0  # in which a head that drifts at 25 mm/s moves 1 mm
     clipped_most: float = 0.05  # share of pixels at 255 in every channel
@@ -120,10 +120,10 @@ class RigConfig:
 
     format: Literal["eigenhead-rig/1"]
     cameras: tuple[CameraConfig, ...]
-    name: str = "rig"
+    name: str = "rig"  # shown in pages and reports
     calibration: str | None = None  # cameras.json
     plates: str = "plates"  # folder of the clean plates
-    front: str | None = None
+    front: str | None = None  # the camera that the subject faces
     trigger: TriggerConfig | None = None
     lights: LightsConfig = LightsConfig()
     shot: ShotConfig = ShotConfig()

@@ -48,7 +48,7 @@ def model_import(
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Convert a head model of another program.
+    """Import a head model from another program.
 
     It is kept among the models under its name.
     """

@@ -50,8 +50,8 @@ def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: 
 
 
 def _await_workers(store: Store, jobs: Collection[str]) -> None:
-    """Waits until no worker writes to the jobs, that is until none has the folder of an attempt. Otherwise a worker
-    could restore erased files. A killed worker does not write any more, but leaves its folder."""
+    """Waits until no job has a folder ``attempt-*``, which exists while a worker writes, or until ``CANCEL_S`` seconds
+    have passed: a killed worker leaves its folder. Otherwise a worker could restore erased files."""
     deadline = time.monotonic() + CANCEL_S
     folders = [store.folder("jobs", job) for job in jobs]
     while any([*folder.glob("attempt-*")] for folder in folders) and time.monotonic() < deadline:

@@ -204,8 +204,8 @@ class BatchIndex:
             return {*connection.scalars(sa.select(batches.c.id).where(batches.c.finished.is_(None), _has_waiting()))}
 
     def change(self, identity: str, wish: Wish) -> bool:
-        """Stores whether a batch is to run, to pause or to be cancelled. Returns False, without any change, if it has
-        finished or was cancelled before."""
+        """Stores whether a batch is to run, to pause or to be cancelled. Returns False, without any change, if the
+        batch has finished or was cancelled before."""
         change = sa.update(batches).where(batches.c.id == identity, batches.c.finished.is_(None))
         with self._engine.begin() as connection:
             return bool(connection.execute(change.where(batches.c.wish != "cancelled").values(wish=wish)).rowcount)

@@ -66,7 +66,7 @@ def _together(squares: Courses, groups: Sequence[Int[np.ndarray, " g"]]) -> Cour
 
 
 def _factor(information: Courses, held: Float[np.ndarray, "t-2 p"]) -> tuple[Courses, Courses, Courses]:
-    """Returns the factor L D L^T of the five-diagonal matrices: D, and the two diagonals below L's unit diagonal."""
+    """Returns the factorization L D L^T of the pentadiagonal matrices: D, and the two subdiagonals of L."""
     count = len(information)
     main, first, second = information.copy(), np.zeros_like(information), np.zeros_like(information)
     main[:-2] += held

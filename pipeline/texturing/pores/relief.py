@@ -3,7 +3,7 @@
 A furrow turns the skin towards or away from the light. A relief h changes the logarithm of the diffuse light by ``-g .
 grad h``; g is the light's tangential gradient by the normal, divided by the light (Pentland, *Linear shape from
 shading*, IJCV 1990). In a patch of skin, a few millimetres wide, this multiplies each wave by a factor, so it can be
-inverted. Waves along whose direction the light does not change stay unknown, and tend to zero.
+inverted. Waves at right angles to g do not change the shading: they cannot be recovered, and are estimated near zero.
 
 Pictures have noise and highlights, and the geometry and the cameras are off by a pixel. So the views are split into two
 disjoint sets, and the shift between the two is removed. For each patch and octave of wavelength, only the fraction of

@@ -90,7 +90,7 @@ class _Writer:
         return header + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
 
     def append_mesh(self, part: Part, vertices: Float[np.ndarray, "v 3"]) -> int:
-        """Appends a part whose vertices (mm) are relative to its node, and returns the number of its mesh.
+        """Appends a part as a mesh, whose vertices (mm) are relative to its node. Returns the mesh's index.
 
         glTF's ``COLOR_0`` is linear, while colours here are sRGB. They are converted to 16 bits, so that dark tones
         stay distinct. https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes

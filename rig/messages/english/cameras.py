@@ -77,7 +77,7 @@ TEMPLATES = {
     "yaml-fisheye": "this format cannot mark a fisheye lens, but {cameras} have fisheye lenses",
     "no-opencv-yaml": "is no YAML of OpenCV's: {reason}",
     "rotations-differ": "{one} and {other} are different rotations: keep only the correct one",
-    "coefficients-many": "{key} has more than the {most} coefficients {names}",
+    "coefficients-many": "{key} has coefficients other than 0 beyond the {most} that are used: {names}",
     "coefficients-at-most": "{key} must be at most {most} coefficients ({names})",
     "no-frame-list": "is no object with a list 'frames' of objects",
     "format-without-skew": "cannot hold the skew of {cameras}: write eigenhead",

@@ -223,6 +223,6 @@ TEMPLATES = {
     "landmarks-lacking": "lacks the landmarks {names}",
     "no-frankfurt-plane": "has no Frankfurt plane: its porions are {width_mm:.0f} mm apart, and the orbitalia {reach_mm:.0f} mm in front of them: are the marked points named correctly, and in the same axes?",
     "not-same-person": "differs by {off_mm:.1f} mm from {earlier} on forehead and bridge of the nose: are both heads of one person, and in mm?",
-    "maybe-other-person": "forehead and bridge of the nose differ for sure on {share:.0%} of their area: is the later head another person's, or is hair over the forehead in one of them?",
+    "maybe-other-person": "forehead and bridge of the nose differ significantly between the two visits, on {share:.0%} of their area: is the later head another person's, or does hair cover the forehead in one of the captures?",
     "surface-not-this-head": "does not have the face of {head} (scatter after the best fit: {off_mm:.1f} mm): is it this person's surface, in mm, facing outwards, and are its axes right (--axes)? Else give its landmarks (--landmarks)",
 }

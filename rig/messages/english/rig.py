@@ -137,7 +137,7 @@ TEMPLATES = {
     "stream-frame": "a frame of {bytes} bytes",
     "stream-no-jpeg": "it sends no motion JPEG",
     "stream-ended": "the stream ended",
-    "stream-no-http": "the address answers something else than HTTP",
+    "stream-no-http": "the address answers something other than HTTP",
     "stream-http-status": "the address answers with HTTP status {status}",
     "stream-other-kind": "the address serves no motion JPEG (multipart/x-mixed-replace)",
 }

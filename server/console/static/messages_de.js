@@ -998,7 +998,7 @@ export default {
   "yaml-fisheye": "unterscheidet ein Fischauge nicht von anderen Objektiven: {cameras} haben eines",
   "no-opencv-yaml": "ist kein YAML von OpenCV: {reason}",
   "rotations-differ": "{one} und {other} sind nicht dieselbe Drehung: die richtige lassen",
-  "coefficients-many": "{key} hat mehr als die {most} Koeffizienten {names}",
+  "coefficients-many": "{key} hat von 0 verschiedene Koeffizienten nach den {most} benutzten: {names}",
   "coefficients-at-most": "{key} darf höchstens {most} Koeffizienten haben ({names})",
   "no-frame-list": "ist kein Objekt mit einer Liste 'frames' von Objekten",
   "format-without-skew": "kennt keine Scherung, wie {cameras} sie haben: eigenhead schreiben",

@@ -115,7 +115,7 @@ def test_arrival_is_when_the_frame_came_not_when_it_was_read() -> None:
     [
         (b"HTTP/1.0 404 Not Found\r\n\r\n", "HTTP status 404"),
         (b"HTTP/1.0 200 OK\r\nContent-Type: text/html\r\n\r\n<html>", "no motion JPEG"),
-        (b"SSH-2.0-OpenSSH_9.2\r\n\r\n", "something else than HTTP"),
+        (b"SSH-2.0-OpenSSH_9.2\r\n\r\n", "something other than HTTP"),
     ],
 )
 def test_addresses_that_serve_no_stream(answer: bytes, why: str) -> None:
