@@ -76,9 +76,7 @@ def misfits(page: Page, folder: Path, name: str) -> list[str]:
     return found
 
 
-def test_every_page_fits_in_german(
-    browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
-) -> None:
+def test_pages_fit_in_german(browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path) -> None:
     v, found = german(browser, service), []
     for name, page in v.walk(lambda: fill(service, tmp_path)):
         assert page.evaluate("document.documentElement.lang") == "de"

@@ -59,9 +59,7 @@ def test_points_that_contradict_are_told_before_they_are_saved(
     assert len(httpx.get(stored).json()["points"]["exocanthion_right"]) == 2
 
 
-def test_a_job_is_cancelled_and_restarted_with_other_settings(
-    v: Visit, service: RunningService, tmp_path: Path
-) -> None:
+def test_a_job_is_cancelled_and_begun_with_other_settings(v: Visit, service: RunningService, tmp_path: Path) -> None:
     capture = uploaded_capture(service, tmp_path)
     httpx.post(service.url + "/v1/jobs", json={"capture_id": capture, "settings": {"front": "long"}})
     page = v.go("/jobs")

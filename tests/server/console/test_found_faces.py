@@ -66,9 +66,7 @@ def test_a_shot_of_the_board_has_none(children: ChildProcessPool, tmp_path: Path
         found_faces(service, capture)
 
 
-def test_who_waits_too_long_is_told(
-    children: ChildProcessPool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_waits_long_is_told(children: ChildProcessPool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     service, capture = service_with(children, tmp_path)
     monkeypatch.setattr(module, "PATIENCE_S", 0.5)
     monkeypatch.setattr(module, "find_capture_faces", endless)

@@ -96,9 +96,7 @@ def test_shots_of_the_board_become_one_folder_a_camera(calibrations: Calibration
     assert list((store.data / "incoming").iterdir()) == []
 
 
-def test_a_board_or_a_shot_that_is_none_queues_nothing(
-    calibrations: Calibrations, store: Store, engine: Engine
-) -> None:
+def test_a_board_or_shot_that_is_none_queues_nothing(calibrations: Calibrations, store: Store, engine: Engine) -> None:
     with pytest.raises(NotFound):
         calibrations.add_shots(BOARD, [board_shot(store, "one"), new_id()], "")
     with pytest.raises(InputError, match="square_mm"):

@@ -63,9 +63,7 @@ def test_pages_go_on_where_they_ended_whatever_comes_and_goes(store: Store, libr
 
 
 @pytest.mark.parametrize("order", ["-created", "created", "label", "-label", "verdict", "-bytes"])
-def test_every_order_shows_each_capture_once_though_values_are_equal(
-    store: Store, library: Library, order: str
-) -> None:
+def test_every_order_shows_each_capture_once_if_values_are_equal(store: Store, library: Library, order: str) -> None:
     for number in range(1, 12):
         record = capture(
             number, label="aBcA"[number % 3], bytes=number // 4, verdict=("good", "poor", None)[number % 3]

@@ -217,9 +217,7 @@ NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), min_si
 
 @settings(max_examples=60, deadline=None)
 @given(names=st.lists(NAMES, min_size=1, max_size=4), cut=st.integers(0, 3000))
-def test_no_name_and_no_cut_writes_outside(
-    names: list[str], cut: int, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_no_name_nor_cut_writes_outside(names: list[str], cut: int, tmp_path_factory: pytest.TempPathFactory) -> None:
     root = tmp_path_factory.mktemp("any")
     data = tar_of(*((name, b"1") for name in names))
     (root / "upload").write_bytes(data[: len(data) - cut])
