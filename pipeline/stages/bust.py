@@ -109,7 +109,7 @@ def bare_ears(model: HeadModel, head_world: Mesh, votes: PartVotes) -> list[Bool
     """Returns the vertices of each ear about which the votes are for skin rather than for hair."""
     shares, left = part_shares(votes, head_world.vertices), model.vertices(np.zeros(0))[:, 0] > 0.0
     bare = shares[:, Part.SKIN.channel] - shares[:, Part.HAIR.channel]
-    return [ear for side in (left, ~left) if bare[ear := pinnae(model) & side].mean() > 0.0]
+    return [ear for side in (left, ~left) if bare[ear := pinnae(model) & side].sum() > 0.0]
 
 
 def shape_bust(
