@@ -65,6 +65,10 @@ def _loaded(path: Path, endings: tuple[str, ...] = MESH_ENDINGS) -> Any:
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # it would write to the user's terminal
     if path.suffix.lower() not in endings:
         raise InputError(path.name, [compose("no-mesh-ending" if endings == MESH_ENDINGS else "no-surface-ending")])
+    try:
+        path.open("rb").close()
+    except OSError as error:
+        raise InputError(path.name, [compose("no-file-read", reason=error.strerror or str(error))]) from error
     if path.suffix.lower() == ".glb":
         _check_glb(path)
     try:

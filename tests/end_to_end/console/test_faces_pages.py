@@ -32,9 +32,7 @@ def uploaded(service: RunningService, folder: Path, name: str, *, hidden: str = 
     return answer.json()
 
 
-def test_found_faces_lie_over_the_pictures(
-    v: Visit, service: RunningService, screenshots: Path, tmp_path: Path
-) -> None:
+def test_found_faces_lie_over_pictures(v: Visit, service: RunningService, screenshots: Path, tmp_path: Path) -> None:
     capture = uploaded(service, tmp_path, "beard-smile")
     assert not any(warning["code"].startswith("face-") for warning in capture["warnings"])
     page = v.go(f"/captures?capture={capture['id']}")

@@ -76,6 +76,8 @@ def test_the_glb_is_well_formed() -> None:
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
 def test_read_mesh_gives_geometry_and_colours_back(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"head{suffix}"
+    with pytest.raises(InputError, match="No such file"):
+        read_mesh(path)
     path.write_bytes({".ply": PLY, ".glb": glb_bytes(MESH), ".obj": obj_bytes(MESH)}[suffix])
     again = read_mesh(path)
     unit = 1000.0 if suffix == ".glb" else 1.0
