@@ -170,9 +170,7 @@ def test_a_picture_of_another_moment_says_of_which(good: Session, state: BundleS
     pytest.fail("no camera of the shot sees the board in the next one")
 
 
-def test_a_view_that_nothing_explains_contradicts_and_most_of_a_shot_was_moved(
-    good: Session, state: BundleState
-) -> None:
+def test_a_view_that_nothing_explains_contradicts_and_most_of_a_shot_moved(good: Session, state: BundleState) -> None:
     views = of_shot(good)
     odd = with_corners(views[0], views[0].found.corners + [40.0, -25.0])
     (drop,) = explained(good, state, [odd, *views[1:]], [odd])

@@ -25,9 +25,7 @@ def of_model(model: HeadModel) -> LandmarkMap:
     return landmark_map(model)
 
 
-def test_the_shipped_map_is_measured_and_its_jaw_line_and_forehead_slide(
-    model: HeadModel, of_model: LandmarkMap
-) -> None:
+def test_the_shipped_map_is_measured_and_its_jaw_and_forehead_slide(model: HeadModel, of_model: LandmarkMap) -> None:
     assert (of_model.rows == built_in_map("makehuman").rows).all()
     np.testing.assert_allclose(of_model.weights.sum(axis=1), 1.0, atol=1e-9)
     assert of_model.weights.min() > -1e-6

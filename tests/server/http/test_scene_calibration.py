@@ -38,9 +38,7 @@ def test_what_is_no_scene_is_refused_by_name(http: httpx.Client, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_photographs_of_a_scene_become_a_calibration(
-    service: RunningService, http: httpx.Client, tmp_path: Path
-) -> None:
+def test_pictures_of_a_scene_become_a_calibration(service: RunningService, http: httpx.Client, tmp_path: Path) -> None:
     write_photographs(tmp_path / "photos", wedge_rig())
     (tmp_path / "photos" / "scale.json").write_text(
         json.dumps({"tag": {"dictionary": "DICT_4X4_50", "size_mm": TAG_MM}})

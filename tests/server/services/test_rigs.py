@@ -58,9 +58,7 @@ def test_without_a_calibration_no_head_is_shot_but_the_board_is(rig: RealRig, tm
     assert {camera.state for camera in rig.describe().cameras} == {"open"}
 
 
-def test_a_calibration_put_to_use_goes_into_the_next_capture(
-    rig: RealRig, studio: StudioDevices, tmp_path: Path
-) -> None:
+def test_a_calibration_in_use_goes_into_the_next_capture(rig: RealRig, studio: StudioDevices, tmp_path: Path) -> None:
     write_rig(flat_rig(NAMES[:-1]), tmp_path / "fewer.json")
     with pytest.raises(Conflict) as refused:
         rig.use(tmp_path / "fewer.json")

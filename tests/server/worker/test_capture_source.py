@@ -104,9 +104,7 @@ def test_a_capture_that_is_on_its_way_is_awaited(
     assert questions == ["job"] * 2
 
 
-def test_a_cancelled_job_waits_no_longer(
-    settings: ServiceSettings, served: Store, remote: Store, tmp_path: Path
-) -> None:
+def test_a_cancelled_job_waits_no_more(settings: ServiceSettings, served: Store, remote: Store, tmp_path: Path) -> None:
     record = taken(served)
     (tmp_path / "nas").rename(tmp_path / "away")
     with pytest.raises(Cancelled), source(remote, settings, lambda _: False).files("job", record.id):
@@ -136,9 +134,7 @@ def test_what_is_erased_goes_from_a_workers_own_folder(served: Store, remote: St
     assert remote.ids("captures") == remote.ids("cache/captures") == [other.id]
 
 
-def test_results_leave_a_folder_that_is_the_workers_own(
-    settings: ServiceSettings, served: Store, remote: Store
-) -> None:
+def test_results_leave_a_folder_of_the_worker(settings: ServiceSettings, served: Store, remote: Store) -> None:
     record, job = taken(served), new_id()
     for store in (served, remote):
         (store.folder("jobs", job) / "result").mkdir(parents=True)

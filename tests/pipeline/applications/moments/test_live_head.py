@@ -50,9 +50,7 @@ def test_a_head_that_turns_at_once_is_followed(head: LiveHead, networks: FaceNet
     assert abs(left_deg(again)) < TURN_OFF_DEG
 
 
-def test_a_hidden_camera_lacks_the_face_and_hidden_cameras_lose_the_head(
-    head: LiveHead, networks: FaceNetworks
-) -> None:
+def test_a_hidden_camera_lacks_the_face_and_hidden_ones_lose_the_head(head: LiveHead, networks: FaceNetworks) -> None:
     one = follow(head, hidden_from(["cam3"], drawn_pictures()), networks)
     assert one is not None
     assert "cam3" not in one.sighting.pixels
