@@ -168,7 +168,7 @@ def finished(
     strands, neck = surface.scatter * shares[:, Part.HAIR.channel], np.zeros(len(seen))
     clothes, noise_mm = shares[:, Part.CLOTHES.channel], seen_deviation_mm(measured)
     if head is not None:
-        mesh = combine_with_head(mesh, seen * skin, head, noise_mm, seen_vertices)
+        mesh = combine_with_head(mesh, seen * skin, head, noise_mm, seen_vertices, shown == Part.HAIR)
         neck[seen] = skin[seen] * below_head(head.mesh_world, mesh.vertices[seen])
     few = seen.any() and np.median(measured.views[seen]) <= MIN_VIEWS  # then all relief of a neck is noise
     hair = np.maximum(strands, neck) if few else strands

@@ -23,7 +23,7 @@ from pipeline.compute.trace import traced
 from pipeline.fusion.grid import Grid
 from pipeline.fusion.prior import near_rim
 from pipeline.fusion.refinement import EDGE_MM, SeenVertices, neighbours
-from pipeline.fusion.skin import mean_around, skin_share
+from pipeline.fusion.skin import STEP_SHARE, mean_around, skin_share
 from pipeline.fusion.view_stack import ViewStack
 from pipeline.fusion.vote_kernels import CENTRE, blurred_over_mesh
 from pipeline.geometry.nearest import PointTree, nearest
@@ -44,7 +44,6 @@ STUBBLE_MM = (1.0, 3.0)
 CELLS = 64  # about a cell, whose mean height counts: 12 mm about it
 RESOLVED_MM = 4.0  # standard deviation of the mean that a vertex of hair takes: gravel is 2 to 5 mm wide
 CLOTHES_DEVIATIONS = 2.0  # of depth, by which that mean may move clothes: shirts lose half of their gravel, a rim stays
-STEP_SHARE = 0.46  # variance of one step of a mean, by the area of a vertex
 OFF_HEAD_MM = 8.0  # from the head there is no skin: strands that hang before it have skin's colours in shade
 NECK_MM = 45.0  # above the head's end necks are off their model's place, and below it is a chest
 FRAME_PX = 3  # from the border of a photograph, where the outline is the photograph's

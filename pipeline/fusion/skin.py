@@ -34,12 +34,17 @@ Adjacency = tuple[Int64[np.ndarray, " s"], Int32[np.ndarray, " e"]]
 
 REACH_MM = 15.0  # height over the head above which the surface is something else (hair, a collar, a hand)
 SURROUNDINGS = 24  # steps of a mean over neighbours: 5 mm (standard deviation) where vertices are 1.5 mm apart
+STEP_SHARE = 0.46  # variance of one step of a mean, by the area of a vertex
+DOUBTED_MM = 10.0  # standard deviation of the mean by which depth doubts the head: chance matches make pits 8 mm wide
 # Radius within which depths err alike (highlights, shading, repeated patterns), and guesses of what no view sees.
 CORRELATED_MM, GUESSES_CORRELATED_MM = 16.0, 5.0
 MIN_DEVIATION_MM = 0.12  # of depth and of the head: what neither states (cameras, shading)
 STIFFNESS = 0.4  # of the head's error by its inverse variance
 LENGTH_MM = 7.5  # over which the head's error falls to zero on skin
-SURE_MM = 2.0  # deviation of a head from which on its error is no longer smooth: ears lie beside their place
+# Deviation that a head states, on skin and under hair, from which on its error is not smooth (ears lie beside their
+# place), and how far depth may differ from it over a neighbourhood.
+SURE_MM, SURE_UNDER_HAIR_MM, DOUBT_MM = 2.0, 1.0, 1.0
+SKIN_ABOVE, BELOW_MM = 0.5, 1.0  # p from which on a place so far below the head is skin: no hair grows there
 OUTLIER_DEVIATIONS = 3.0  # of depth and head together: the scale of Geman and McClure's weights ...
 NARROWING = (8.0, 4.0, 2.0, 1.0)  # ... and by what it is multiplied, round after round
 SWEEPS, OVER_RELAXATION = 16, 1.6  # in each round
@@ -66,7 +71,12 @@ class HeightField:
 
 @traced
 def combine_with_head(
-    mesh_world: Mesh, skin: PerVertex, head: HeadSkin, deviation_mm: PerVertex, seen: SeenVertices
+    mesh_world: Mesh,
+    skin: PerVertex,
+    head: HeadSkin,
+    deviation_mm: PerVertex,
+    seen: SeenVertices,
+    hairy: Bool[np.ndarray, " v"],
 ) -> Mesh:
     """Moves the vertices of skin along the head's normals to the estimate from depth and head.
 
@@ -76,6 +86,7 @@ def combine_with_head(
         head: the delivered head.
         deviation_mm: standard deviation of depth along the normal, where a view sees the vertex.
         seen: by any view.
+        hairy: vertices of hair's colour, among them skin under stubble or a beard.
     """
     field = heights_over(head, mesh_world)
     if not len(field.row) or not seen.themselves.any():
@@ -86,12 +97,17 @@ def combine_with_head(
     noise_mm = depth_deviation_mm(beside, deviation_mm, seen)
     height, stated_mm, within = np.zeros(count), np.zeros(count), np.zeros(count)
     height[row], stated_mm[row], within[row] = field.height_mm, np.hypot(field.deviation_mm, MIN_DEVIATION_MM), 1.0
+    share = np.where(share > SKIN_ABOVE, np.maximum(share, np.clip(-height / BELOW_MM, 0.0, 1.0)), share)
+    area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / count
     most = 4.0 * np.hypot(noise_mm, stated_mm)
     shown = within * seen.themselves * skin
-    offset = within * mean_around(beside, np.clip(height, -most, most), shown)
-    head_mm = np.sqrt(stated_mm**2 + mean_around(beside, offset**2, shown))
-    stiffness = within * head_stiffness(head_mm)
-    area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / count
+    offset = within * mean_around(
+        beside, np.clip(height, -most, most), shown, round(DOUBTED_MM**2 / (STEP_SHARE * area_mm2))
+    )
+    doubt_mm = np.sqrt(mean_around(beside, offset**2, shown))
+    head_mm = np.hypot(stated_mm, doubt_mm)
+    unsure = np.maximum(stated_mm / np.where(hairy, SURE_UNDER_HAIR_MM, SURE_MM), doubt_mm / DOUBT_MM)
+    stiffness = within * head_stiffness(head_mm, unsure)
     pull = share * stiffness * area_mm2 / LENGTH_MM**2
     information = within * depth_information(noise_mm, seen.themselves, area_mm2)
     both_mm, root = np.hypot(noise_mm, head_mm), np.sqrt(stiffness)
@@ -115,11 +131,10 @@ def depth_deviation_mm(beside: Adjacency, stated_mm: PerVertex, seen: SeenVertic
     return np.hypot(noise_mm, MIN_DEVIATION_MM)
 
 
-def head_stiffness(head_mm: PerVertex) -> PerVertex:
-    """Returns k (1/mm2) by the head's deviation, 0 to ``STIFFNESS / MIN_DEVIATION_MM**2``; above ``SURE_MM`` it falls
-    with the fourth power."""
-    unsure = np.maximum(head_mm / SURE_MM, 1.0)
-    return STIFFNESS / (np.maximum(head_mm, MIN_DEVIATION_MM) * unsure) ** 2
+def head_stiffness(head_mm: PerVertex, unsure: PerVertex) -> PerVertex:
+    """Returns k (1/mm2) by the head's deviation, 0 to ``STIFFNESS / MIN_DEVIATION_MM**2``; where ``unsure`` exceeds 1
+    it falls with its square."""
+    return STIFFNESS / (np.maximum(head_mm, MIN_DEVIATION_MM) * np.maximum(unsure, 1.0)) ** 2
 
 
 def depth_information(noise_mm: PerVertex, seen: Bool[np.ndarray, " v"], area_mm2: float) -> PerVertex:
@@ -153,8 +168,8 @@ def skin_share(beside: Adjacency, skin: PerVertex, seen: SeenVertices) -> PerVer
     return np.where(seen.themselves, skin, mean_around(beside, share, np.ones(len(skin))))
 
 
-def mean_around(beside: Adjacency, values: PerVertex, weight: PerVertex) -> PerVertex:
-    """Returns, for each vertex of a closed mesh, the weighted mean of the values over its surroundings
-    (``SURROUNDINGS`` steps); about 0 where no weight is near. ``beside`` are its ``neighbours``."""
-    both = blurred_over_mesh(np.stack([weight * values, weight], axis=1).astype(float), *beside, SURROUNDINGS)
+def mean_around(beside: Adjacency, values: PerVertex, weight: PerVertex, steps: int = SURROUNDINGS) -> PerVertex:
+    """Returns, for each vertex of a closed mesh, the weighted mean of the values over its surroundings; about 0 where
+    no weight is near. ``beside`` are its ``neighbours``, ``steps`` how far it reaches along them."""
+    both = blurred_over_mesh(np.stack([weight * values, weight], axis=1).astype(float), *beside, steps)
     return both[:, 0] / np.maximum(both[:, 1], 1e-6)

@@ -26,13 +26,16 @@ def combined(
     skin: np.ndarray | float = 1.0,
     depth_mm: np.ndarray | float = DEPTH_MM,
     stated_mm: float = STATED_MM,
+    hairy: bool = False,
 ) -> np.ndarray:
     """Returns the heights (mm) over the head of a surface at the given heights, after both are combined."""
     count = len(head.vertices)
     surface = lifted(head, height_mm)
     depth_mm = depth_mm * np.ones(count)
     seen = SeenVertices.of(surface.vertices, depth_mm > 0.0)
-    mesh = combine_with_head(surface, skin * np.ones(count), stating(head, stated_mm), depth_mm, seen)
+    mesh = combine_with_head(
+        surface, skin * np.ones(count), stating(head, stated_mm), depth_mm, seen, hairy * np.ones(count, bool)
+    )
     return ((mesh.vertices - head.vertices) * head.normals()).sum(axis=1)
 
 
@@ -67,6 +70,27 @@ def test_a_crater_and_a_speck_go_to_the_head(height_mm: float) -> None:
     spot = np.linalg.norm(head.vertices - head.vertices[0], axis=1) < 4.0
     assert 4 < spot.sum() < 10
     assert np.abs(combined(head, 0.1 + height_mm * spot)).max() < 0.5
+
+
+def test_a_pit_of_chance_matches_goes_to_the_head() -> None:
+    """Several views agree on a false place, next to which the head states a millimetre."""
+    head = ellipsoid(6)
+    pit = np.linalg.norm(head.vertices - head.vertices[0], axis=1) < 5.0
+    assert combined(head, -6.0 * pit, depth_mm=0.3, stated_mm=1.0).min() > -1.0
+
+
+def test_no_hair_grows_below_the_skin() -> None:
+    head = ellipsoid(5)
+    left = [np.median(np.abs(combined(head, height, skin=0.6, depth_mm=2.0))) for height in (-1.5, 1.5)]
+    assert left[0] < 0.7 * left[1]
+
+
+def test_under_hair_an_unsure_head_counts_less() -> None:
+    head = ellipsoid(5)
+    bare, hairy = (
+        np.std(combined(head, noise(head, 2.0), depth_mm=1.5, stated_mm=2.0, hairy=h)) for h in (False, True)
+    )
+    assert bare < 0.8 * hairy
 
 
 @pytest.mark.parametrize("height_mm", [3.0, 8.0])
@@ -130,7 +154,7 @@ def test_without_depth_nothing_moves() -> None:
     surface = lifted(head, 0.3)
     none = np.zeros(len(head.vertices))
     seen = SeenVertices.of(surface.vertices, none > 0.0)
-    assert combine_with_head(surface, none, stating(head), none, seen) is surface
+    assert combine_with_head(surface, none, stating(head), none, seen, none > 0.0) is surface
 
 
 HEAD = ellipsoid(4)  # edges of 8 mm: triangles of 30 mm2
