@@ -23,7 +23,7 @@ NEAREST, EVEN_MM = 64, 5.0  # vertices that a mean is taken of, and the distance
 SURE_MM = 0.5  # no guess is better
 # About an ear within which the head says where it ends. And how far it may stand out of its outlines, which would cut a
 # thin rim to shreds.
-EAR_MM, EAR_SPARED_MM = 15.0, 4.0
+EAR_MM, EAR_SPARED_MM = 15.0, 10.0
 CANDIDATES = 8  # of the head's triangles, for the one nearest to a place
 
 

@@ -39,7 +39,7 @@ ONE_SIDED = 0.3  # length of the mean direction to the cameras above which nobod
 BEHIND_QUANTILE, THICK_QUANTILE = 0.998, 0.9  # of seen points (to the front, too), and of their heights: the hair
 MIN_ENDED = 0.4  # of the rim, ended by outlines: people16's masks .67 and .70; where photographs end the bust, .15
 OUT_QUANTILE = 0.95  # of an ear's vertices: so far it stands out of its outlines
-FLATTENINGS, FLATTEST = 4, 0.5  # of such an ear, and by what share of its height at most each time
+FLATTEST = 0.25  # share of its height by which such an ear is laid flat at most
 HEAD_EVERY = 4  # vertices of the head stand for the others
 Field = Float32[np.ndarray, " n"]
 Points = Float[np.ndarray, "m 3"]
@@ -201,12 +201,11 @@ class HeadEars:
         for ear in ears:
             way = placed[ear].mean(axis=0) - placed.mean(axis=0)
             way /= np.linalg.norm(way)
-            for _ in range(FLATTENINGS):  # pictures are known to a few millimetres beside the subject
-                height = placed[ear] @ way
-                height -= height.min()
-                edges_mm, outlines_mm = views.outside(placed[ear])
-                out_mm = np.quantile(np.where(edges_mm > 0.0, 0.0, outlines_mm).max(axis=0), OUT_QUANTILE)
-                placed[ear] -= np.clip(out_mm / height.max(), 0.0, FLATTEST) * height[:, None] * way
+            height = placed[ear] @ way  # pictures are known to a few millimetres beside the subject
+            height -= height.min()
+            edges_mm, outlines_mm = views.outside(placed[ear])
+            out_mm = np.quantile(np.where(edges_mm > 0.0, 0.0, outlines_mm).max(axis=0), OUT_QUANTILE)
+            placed[ear] -= np.clip(out_mm / height.max(), 0.0, FLATTEST) * height[:, None] * way
             around += [head_world.vertices[ear], placed[ear]]
         return cls(Mesh(placed, head_world.faces), np.concatenate(around))
 

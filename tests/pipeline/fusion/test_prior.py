@@ -81,7 +81,7 @@ def test_values_of_a_box_are_read_linearly() -> None:
     )
 
 
-def test_an_ear_is_laid_into_its_outlines_and_replaces_fragments_of_depth() -> None:
+def test_an_ear_is_laid_towards_its_outlines_and_replaces_fragments_of_depth() -> None:
     """A head of 56 mm has an ear on one side that stands off by 16 mm; pictures show a ball of 60 mm."""
     made = scene([Ellipsoid((0, 0, 0), (60, 60, 60))], fan(200, 150))
     head = ball(56.0, 0.0)
@@ -89,7 +89,7 @@ def test_an_ear_is_laid_into_its_outlines_and_replaces_fragments_of_depth() -> N
     standing = Mesh(head.vertices + np.where(ear, 16.0, 0.0)[:, None] * (1.0, 0.0, 0.0), head.faces)
     ears = HeadEars.of(standing, [ear], stack_views(made.maps, made.silhouettes, made.rig))
     assert standing.vertices[ear, 0].max() > 71.0
-    assert 58.0 < ears.head_world.vertices[ear, 0].max() < 67.0  # laid flat as a whole, its middle stands out
+    assert 70.0 < ears.head_world.vertices[ear, 0].max() < 71.0  # laid flat by a quarter of its 6 mm at most
     assert np.array_equal(ears.head_world.vertices[~ear], standing.vertices[~ear])
     box = whole_box(np.array([30.0, -20.0, -20.0]), np.array([60.0, 40.0, 40.0]), 3.0)
     height = (box.places()[:, 0] - 40.0).astype(np.float32)  # fragments that depth shows 20 mm too deep
