@@ -1,2 +1,3 @@
-"""Solves several shots of one person together. A *moment* is one synchronised set of pictures; a *take* is a set of
-moments of one person with different expressions. They share one identity: the head's shape without expression."""
+"""Reconstructs several shots of one person together. A *moment* is one synchronised set of pictures; a *take* is a set
+of moments of one person with different expressions. All moments of a take share one identity: the head's shape without
+expression."""

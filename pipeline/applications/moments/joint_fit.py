@@ -1,15 +1,16 @@
-"""Solves for the one identity of several moments, together with pose, expression and cameras of each moment.
+"""Estimates one identity common to several moments, together with the pose, expression and cameras of each moment.
 
-In: the contour solver's solution of every moment, fitted to outlines or photographs. Out: the same solutions with one
-identity. The identity's coefficients and the log of scale are shared; all other unknowns belong to one moment. The
-equations therefore form an arrow (``arrow``). The cost is the sum of the moments' costs.
+The input is the contour solver's solution for every moment, fitted to outlines or photographs. The output is the same
+solutions with one common identity. The identity's coefficients and the logarithm of scale are shared; each other
+unknown belongs to one moment. The normal equations therefore have the form of an arrow (module ``arrow``). The cost is
+the sum of the moments' costs. Each moment's cost contains the prior of the shared unknowns.
 
-Each of these costs contains the prior of the shared unknowns. With independent errors it would count once. But cameras,
-light, hair and the misfit of the model are the same in all moments. If the fraction ``COMMON`` of the error variance is
-common, K moments are worth K / (1 + COMMON (K - 1)) independent ones; so the prior counts 1 + COMMON (K - 1) times.
-Counted once, it left the joint head of eight moments from three cameras no better than the mean of their own heads.
+With independent errors, the sum should contain this prior only once. However, errors of cameras, light, hair and head
+model are the same in all moments. If the fraction ``COMMON`` of the error variance is common, K moments are worth K /
+(1 + COMMON (K - 1)) independent ones; the prior is therefore multiplied by 1 + COMMON (K - 1). With a factor of 1, the
+joint head of eight moments from three cameras was no better than the mean of the eight separate heads.
 
-A moment whose photographs show too little has no fine modes; it contributes only to the modes that it has.
+A moment whose photographs lack detail has no coefficients for fine modes; it contributes only to the modes that it has.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -37,8 +38,8 @@ Rows = Int[np.ndarray, "_"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Holds the position of each moment's unknowns among all unknowns: those of the identity first, then the log of
-    scale, then each moment's own."""
+    """Holds the index of each moment's unknowns in the vector of all unknowns: identity coefficients first, then the
+    logarithm of scale, then each moment's remaining unknowns."""
 
     identity: int  # coefficients
     places: tuple[Rows, ...]  # by moment: the row of each of its unknowns
@@ -48,7 +49,7 @@ class Layout:
 
     @property
     def arrow(self) -> Arrow:
-        """Returns the arrow: its shaft is the shared unknowns and the expression weights."""
+        """Returns the arrow structure, in which the shared unknowns and the expression weights are not eliminated."""
         return Arrow(self.size, self.free)
 
 
@@ -58,7 +59,7 @@ def identity_of(solved: ContourSolution, state: State) -> Float[np.ndarray, " i"
 
 
 def lay_out(solutions: Sequence[ContourSolution], problems: Sequence[Problem[State]]) -> Layout:
-    """Returns the layout of the moments' unknowns."""
+    """Returns the layout of all moments' unknowns in one vector."""
     identity = max(len(identity_of(each, each.state)) for each in solutions)
     places, weights, free, size = [], [], [], identity + 1
     for solved, problem in zip(solutions, problems, strict=True):
@@ -76,8 +77,8 @@ def lay_out(solutions: Sequence[ContourSolution], problems: Sequence[Problem[Sta
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointTerm:
-    """Computes the cost of all moments, each by its own problem. The prior of the shared unknowns counts ``1 + common
-    (K - 1)`` times for K moments."""
+    """Computes the sum of the costs of all moments. For K moments, the prior of the shared unknowns is multiplied by
+    ``1 + common (K - 1)``."""
 
     problems: tuple[Problem[State], ...]
     solutions: tuple[ContourSolution, ...]
@@ -100,8 +101,8 @@ class JointTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedJointTerm:
-    """Holds the moments' linearised costs, and what is subtracted: the information of the ``repeated`` priors, at the
-    shared ``values``."""
+    """Holds the moments' linearised costs, and the information matrix of the superfluous priors, which is subtracted at
+    the shared ``values``."""
 
     term: JointTerm
     parts: tuple[Linearised, ...]
@@ -110,11 +111,11 @@ class LinearisedJointTerm:
 
     @property
     def cost(self) -> float:
-        """Returns the sum of the moments' costs, without the repeated priors."""
+        """Returns the sum of the moments' costs, without the superfluous priors."""
         return sum(part.cost for part in self.parts) - float(self.repeated @ self.values**2)
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds each moment's equations at its rows, in place."""
+        """Adds each moment's normal equations at its indices, in place."""
         layout = self.term.layout
         for part, problem, rows in zip(self.parts, self.term.problems, layout.places, strict=True):
             local = problem.equations(part)
@@ -126,7 +127,7 @@ class LinearisedJointTerm:
 
 
 def joint_problem(solutions: Sequence[ContourSolution], common: float = COMMON) -> tuple[Problem[States], Layout]:
-    """Builds the least-squares problem of all moments, from the last stage of each one's solution."""
+    """Builds the least-squares problem of all moments, from the last stage of each moment's solution."""
     problems = tuple(last_problem(each)[0] for each in solutions)
     layout = lay_out(solutions, problems)
     term = JointTerm(problems, tuple(solutions), layout, common)
@@ -147,8 +148,8 @@ def joint_problem(solutions: Sequence[ContourSolution], common: float = COMMON) 
 
 
 def start_at_mean(solutions: Sequence[ContourSolution]) -> States:
-    """Returns each moment's state with the mean identity and scale of all. For a mode that some moments lack, it is the
-    mean of the others."""
+    """Returns each moment's state with its identity and scale replaced by the mean over all moments. For a mode that
+    some moments lack, the mean is taken over the others."""
     identities = [identity_of(each, each.state) for each in solutions]
     stacked = np.full((len(solutions), max(map(len, identities))), np.nan)
     for row, identity in zip(stacked, identities, strict=True):
@@ -159,7 +160,7 @@ def start_at_mean(solutions: Sequence[ContourSolution]) -> States:
 
 
 def with_identity(solved: ContourSolution, state: State, identity: Float[np.ndarray, " i"], scale: float) -> State:
-    """Returns a moment's state with another identity (truncated to the moment's modes) and scale."""
+    """Returns a moment's state with the given identity (truncated to the moment's modes) and scale."""
     coefficients, posed = state.coefficients.copy(), np.asarray(solved.problem.model.posed, int)
     rows = np.setdiff1d(np.arange(len(coefficients)), posed)
     coefficients[rows] = identity[: len(rows)]
@@ -170,7 +171,7 @@ def with_identity(solved: ContourSolution, state: State, identity: Float[np.ndar
 def fit_jointly(
     solutions: Sequence[ContourSolution], eigenheads: int, *, watch: Callable[[], None] = lambda: None
 ) -> tuple[ContourSolution, ...]:
-    """Returns the solutions at the one identity that explains all moments best.
+    """Returns the moments' solutions after a joint fit, which gives all of them the identity with the least total cost.
 
     Args:
         solutions: of at least two moments, with models of one mesh and one basis; some may have fine modes, too.
@@ -200,8 +201,8 @@ def _with_evidence(
     here: Linearised,
     eigenheads: int,
 ) -> States:
-    """Solves once more for shape and expressions, as ``expression_evidence`` does for one moment; the prior variance of
-    each group of modes is estimated from all moments."""
+    """Estimates the prior variance of each group of modes from all moments and solves once more for shape and
+    expressions, as ``expression_evidence`` does for one moment."""
     longest = max(range(len(states)), key=lambda k: len(states[k].coefficients))
     posed = solutions[longest].problem.model.posed
     identity = identity_of(solutions[longest], states[longest])
@@ -235,9 +236,10 @@ def _with_evidence(
 
 
 def joint_covariances(solutions: Sequence[ContourSolution]) -> Iterator[Float[np.ndarray, "p p"]]:
-    """Yields the covariance of each moment's coefficients, rotation, translation and log scale, given the evidence of
-    all moments. The independent part follows from the joint normal matrix, with the prior once; the fraction ``COMMON``
-    keeps the covariance of the single moment. Weights at bounds are treated as in ``finish``."""
+    """Yields the covariance of each moment's coefficients, rotation, translation and log scale after the joint fit. The
+    independent part of the errors follows from the joint normal matrix with a single prior; the fraction ``COMMON``
+    keeps the covariance of the moment's separate fit. Weights at their bounds are treated as in ``contour_fit``'s
+    ``finish``."""
     problem, layout = joint_problem(solutions, common=0.0)
     here = problem.at(tuple(each.state for each in solutions))
     assert isinstance(here, Sum)

@@ -1,13 +1,13 @@
-"""Tracks the head of the person in front of the cameras, by the face's landmarks in small pictures: fast, not precise.
+"""Tracks the head of a person in front of the cameras from face landmarks in small pictures; speed matters more than
+precision.
 
-In: the current pictures of all cameras, and the previous head. Out: the head with its pose, its expression and its
-landmarks in each camera.
+The input is the current picture of each camera and the previous head. The output is the head's pose, its expression and
+its landmarks in each camera.
 
-At first the face is searched in all views, and the model's shape is fitted to its triangulated landmarks. The result is
-the person of a sequence (``sequence_person``), without outlines and texture. From then on the network searches at the
-previous position, and the sequence's own terms (``face_evidence``) fit pose and weights, starting from the previous
-ones. If the head moved far, the network searches again at the new position.
-"""
+In the first pictures, the face is searched in all views, and the head model is fitted to the triangulated landmarks.
+The fitted head is stored like the person of a sequence (``sequence_person``), without outlines and texture. In later
+pictures the network searches at the previous position, and the cost terms of ``face_evidence`` fit pose and weights,
+starting from the previous values. If the head has moved far, the network searches again at the new position."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -52,8 +52,9 @@ MESH = "p99"  # the level that is shown
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LivePerson:
-    """Holds everything constant over time: the person, its ``scale`` relative to the model, the networks' reference
-    values, the vertices of the small mesh and then the 468 landmarks, with their expressions (head frame, mm)."""
+    """Holds everything that does not change over time: the person, the head's ``scale`` relative to the head model,
+    reference values of the networks, and the neutral positions and expressions of a small mesh and the 468 landmarks
+    (head frame, mm)."""
 
     person: SequencePerson
     scale: float
@@ -64,7 +65,7 @@ class LivePerson:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveHead:
-    """Holds the head at one moment.
+    """Holds the tracked head at one moment.
 
     Attributes:
         who: the person.
@@ -84,19 +85,20 @@ class LiveHead:
 
     @property
     def vertices_world(self) -> Float[np.ndarray, "v 3"]:
-        """Returns the vertices of the small mesh (mm)."""
+        """Returns the vertices of the small mesh (world frame, mm)."""
         return self.points_world[:-LANDMARKS]
 
     @property
     def landmarks_world(self) -> Float[np.ndarray, "468 3"]:
-        """Returns the 468 landmarks on the head (mm)."""
+        """Returns the 468 landmarks on the head (world frame, mm)."""
         return self.points_world[-LANDMARKS:]
 
 
 def meet(
     model: HeadModel, face: MatchedFaces, pictures: Mapping[str, ImageRgb], rig: Rig, networks: FaceNetworks
 ) -> LiveHead | None:
-    """Builds the person whose face was found in the pictures. Returns None if the pictures do not confirm the face."""
+    """Builds the head of a person whose face was detected in the pictures. Returns None if the networks do not find the
+    face again at the fitted head."""
     alignment = align_to_face(model, face, landmark_map(model))
     state = _shaped(alignment.landmarks, alignment.world_from_head, min(MODES, len(model.modes)))
     scale, names = state.world_from_head.scale, tracked_names(model)
@@ -118,7 +120,7 @@ def meet(
 
 
 def _shaped(observed: LandmarkObservations, start: Similarity, modes: int) -> State:
-    """Fits the first modes and the pose of the model to triangulated landmarks."""
+    """Fits the head model's first modes and its pose to triangulated landmarks."""
     stage = Stage("full", modes, False, (), False, False, 0)
     rows = np.eye(modes + 1, modes + POSE_WITH_SCALE)
     rows[modes, [modes, modes + LOG_SCALE]] = 0.0, 1.0 / SCALE_SPREAD
@@ -129,12 +131,12 @@ def _shaped(observed: LandmarkObservations, start: Similarity, modes: int) -> St
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapePrior:
-    """Computes the prior of coefficients and scale, as ``contour_fit.prior_term`` for a whole problem."""
+    """Computes the prior of shape coefficients and scale, like ``contour_fit.prior_term``."""
 
     rows: Float[np.ndarray, "n p"]  # by coefficients and pose, in deviations
 
     def at(self, state: State) -> Residuals:
-        """Returns the coefficients, and the log of scale divided by its standard deviation."""
+        """Returns the coefficients, and the logarithm of scale divided by its standard deviation."""
         residual = np.append(state.coefficients, np.log(state.world_from_head.scale) / SCALE_SPREAD)
         return Residuals(residual[:, None], lambda: self.rows[:, None])
 
@@ -174,7 +176,8 @@ def _fitted(who: LivePerson, found: Sighting, start: Motion) -> Motion:
 
 
 def _misfits(who: LivePerson, found: Sighting, motion: Motion) -> dict[str, float]:
-    """Returns the RMS distance of each camera's landmarks from the head's, relative to the face's size there."""
+    """Returns, for each camera, the RMS distance between detected landmarks and the head's projected landmarks,
+    relative to the face's size in the picture."""
     reference, misfits = who.reference, {}
     world = motion.world_from_head.apply(reference.points(motion.weights))
     for name, pixels in found.pixels.items():

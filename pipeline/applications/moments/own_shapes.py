@@ -1,14 +1,14 @@
-"""Estimates the neutral head and the person's own shapes from the heads of a take.
+"""Estimates a person's neutral head and personal blendshapes from the heads of a take.
 
-At each vertex, the head of moment k is the model's prediction plus what the model does not explain,
+At each vertex, the head y_k of moment k, measured from the head model's prediction, is
 
     y_k = u + sum_e w_ke d_e + noise,    u ~ N(0, r^2),    d_e ~ N(0, (OWN |S_e|)^2)
 
-with u the relief common to all moments, d_e the difference of the person's shape e from the model's S_e, and w_ke the
-weights. The noise is each head's standard deviation. A fraction ``COMMON`` of its variance is the same in all moments
-(cameras, hair, light); more moments do not reduce it. Vertices are independent of each other: neighbours agree because
-the heads are smooth. Everything is Gaussian, so the K x K covariance of the y_k at each vertex is enough.
-"""
+where the relief u is common to all moments, d_e is the difference between the person's blendshape e and the head
+model's S_e, and w_ke are the expression weights. The noise's standard deviation is that of each head. Cameras, hair and
+light make a fraction ``COMMON`` of the noise variance the same in all moments, so more moments do not reduce it. Each
+vertex is computed separately; the results are smooth because the heads are smooth. All distributions are Gaussian, so
+the K x K covariance of the y_k at each vertex suffices."""
 
 from dataclasses import dataclass
 
@@ -26,8 +26,8 @@ COMMON = 0.5  # share of the variance that a take's heads have in common
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OwnShapes:
-    """Holds a person's neutral head (head frame, mm) with Apple's 52 shapes in that person's form. ``shown`` are the
-    names that occur in the take; all other shapes are the model's own."""
+    """Holds a person's neutral head (head frame, mm) and the person's 52 blendshapes under Apple's names. ``shown``
+    lists the blendshapes that occur in the take; all others are copied from the head model."""
 
     neutral: Float[np.ndarray, "v 3"]
     deviation_mm: Float[np.ndarray, " v"]
@@ -44,7 +44,7 @@ def estimate_own_shapes(
     heads: Float[np.ndarray, "k v 3"],
     deviation_mm: Float[np.ndarray, "k v"],
 ) -> OwnShapes:
-    """Returns the neutral head and shapes that explain the heads of a take.
+    """Estimates the neutral head and blendshapes that best explain the heads of a take.
 
     Args:
         model: the head model, with its expressions.

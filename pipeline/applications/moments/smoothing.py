@@ -1,14 +1,14 @@
-"""Smooths each unknown of a sequence over time, forward and backward, as strongly as its noise requires.
+"""Smooths each unknown of a sequence over time, using earlier and later frames, as strongly as its noise requires.
 
-For every unknown x, measured as y with standard deviation s at each of T frames, the smooth course minimises
+For an unknown x, measured as y_t with standard deviation s_t in each of T frames, the smooth course minimises
 
     sum_t (x_t - y_t)^2 / s_t^2 + sum_t log(q^2 + a_t^2) ,    a_t = x_t+1 - 2 x_t + x_t-1
 
-where q is a multiple of its noise. The logarithm suppresses accelerations that noise explains, and tolerates larger
-ones: a blink stays as it is. The unknowns of a group (a rotation's three) accelerate together. It is solved by repeated
-weighted least squares, with a Cholesky factor of five diagonals for all unknowns at once; the same factor gives the
-standard deviations. A frame without a measurement is interpolated, with accelerations typical of the sequence.
-"""
+where q is a multiple of the noise in the acceleration. The logarithm suppresses accelerations that noise can explain
+and hardly changes larger ones, so blinks are not flattened. The unknowns of a group, such as the three rotation angles,
+share one weight for their accelerations. The minimum is found by iteratively reweighted least squares with a
+pentadiagonal Cholesky factor, which also gives the standard deviations. A frame without a measurement is interpolated,
+assuming accelerations typical of the sequence."""
 
 from collections.abc import Sequence
 
@@ -28,7 +28,7 @@ Courses = Float[np.ndarray, "t p"]
 def smooth(
     measured: Courses, deviation: Courses, failed: Bool[np.ndarray, " t"], groups: Sequence[Int[np.ndarray, " g"]]
 ) -> tuple[Courses, Courses]:
-    """Returns the smooth courses and their standard deviations.
+    """Returns the smoothed courses and their standard deviations.
 
     Args:
         measured: the courses; what stands at failed frames does not matter.

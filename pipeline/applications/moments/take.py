@@ -1,9 +1,8 @@
-"""Reconstructs a take: several captures of one person, solved as one.
+"""Reconstructs a take, several captures of one person, with one common identity.
 
-Each moment runs the stages of a single job up to the fit to its photographs. Then one fit of all moments estimates
-their common identity (``joint_fit``); from there each moment continues to its fine surface, colours and evidence. The
-heads of all moments have the same vertices; the neutral head and the person's own shapes follow from them
-(``own_shapes``).
+Each moment runs the stages of a single job up to the fit to photographs. Then one joint fit estimates the common
+identity (``joint_fit``); afterwards each moment continues to its fine surface, colours and evidence. The heads of all
+moments have corresponding vertices; the person's neutral head and blendshapes are computed from them (``own_shapes``).
 """
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -42,7 +41,8 @@ SHARES = (0.45, 0.55)  # of a take's time, at which the joint fit begins and end
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """Holds a take's results of a moment. Arrays are by the model's expressions and the full level's vertices."""
+    """Holds the result of one moment of a take. Arrays are indexed by the head model's expressions or by the vertices
+    of its finest mesh."""
 
     name: str
     detail: str  # the level that was reached
@@ -57,7 +57,7 @@ class Moment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Take:
-    """Holds the person of a take: the neutral head with its shapes, and the moments."""
+    """Holds the result of a take: the person's neutral head and blendshapes, and the moments."""
 
     model: HeadModel
     person: OwnShapes
@@ -77,7 +77,7 @@ def reconstruct_take(
     *,
     report: Progress = discard_progress,
 ) -> Take:
-    """Reconstructs the moments of one person, by their names.
+    """Reconstructs the moments of one person; ``contexts`` is indexed by the moments' names.
 
     Args:
         contexts: a capture each, with the same model and settings.
@@ -114,7 +114,7 @@ def reconstruct_take(
 
 
 def joined(head: HeadFit, solved: ContourSolution, covariance: Float[np.ndarray, "p p"], eigenheads: int) -> HeadFit:
-    """Returns a moment's fitted head according to the joint solution, with that solution's uncertainty."""
+    """Returns a moment's fitted head with the joint solution and its covariance."""
     state, level = solved.state, head.detail.level
     fit = replace(
         head.fit,
@@ -132,15 +132,16 @@ def joined(head: HeadFit, solved: ContourSolution, covariance: Float[np.ndarray,
 
 
 def differ_by(alone: Fit, joint: ContourSolution, eigenheads: int) -> float:
-    """Returns the difference between a moment's own identity and the joint one: the RMS over the eigenheads, in
-    standard deviations of the moment's own posterior."""
+    """Returns the difference between a moment's separately estimated identity and the joint identity: the RMS over the
+    eigenheads, in standard deviations of the moment's separate posterior."""
     assert alone.covariance is not None
     apart = (alone.coefficients - joint.state.coefficients[: len(alone.coefficients)])[:eigenheads]
     return float(np.sqrt(apart @ np.linalg.solve(alone.covariance[:eigenheads, :eigenheads], apart) / eigenheads))
 
 
 def solution_of(head: HeadFit) -> ContourSolution:
-    """Returns the contour solution behind a moment's fit. Raises InputError for a fit by the simplex method."""
+    """Returns the contour solver's solution in a moment's fit. Raises InputError for a fit by the simplex method, which
+    has none."""
     if head.solution is None:
         raise InputError("take", [compose("take-needs-contour")])
     return head.solution
@@ -148,7 +149,7 @@ def solution_of(head: HeadFit) -> ContourSolution:
 
 @contextmanager
 def named(name: str) -> Iterator[None]:
-    """Puts the moment's name in front of refusals in the block."""
+    """Prefixes the messages of errors in the ``with`` block with the moment's name."""
     try:
         yield
     except Cancelled:
@@ -191,7 +192,7 @@ def _own_shapes(model: HeadModel, joint: Sequence[ContourSolution], moments: Seq
 
 
 class _Advance:
-    """Converts progress of the moments' stages to that of the take, which never decreases."""
+    """Converts the progress of each moment's stages to the progress of the take, which never decreases."""
 
     def __init__(self, report: Progress, count: int) -> None:
         self._report, self._count, self._most = report, count, 0.0

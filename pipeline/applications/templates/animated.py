@@ -1,20 +1,21 @@
-"""Builds a head for animation, in a registered mesh or in the model's own: Apple's 52 shapes, pivots, and, if the mesh
-lacks them, eyeballs behind open eyes and teeth and a tongue behind lips that part. A registered mesh also gets visemes,
-and shapes without crossing triangles.
+"""Builds a head for animation, either in a template's vertex order or in the head model's. The head gets Apple's 52
+blendshapes, pivots and, if its mesh lacks them, eyeballs, teeth and a tongue. A template also gets visemes, and its
+blendshapes are corrected until no triangles cross.
 
-The lips of a fitted head may be some tenths of a millimetre apart, and teeth would show through: photographs of shut
-lips show a dark line, and the surface there comes from the model. Such lips are shut; a wider gap is an open mouth, and
-stays. The inner edge of an open mouth is smoothed.
+The lips of a fitted head may be some tenths of a millimetre apart, and teeth would show through the gap. Such a gap is
+closed; a wider gap counts as an open mouth and is not changed. The inner edge of an open mouth's lips is smoothed.
 
-A model's expressions move a registered mesh as follows: the skin moves as it is attached (``carrying``). Deeper
-vertices are attached as well, if the mesh connects them to the skin over vertices that move alike. (An expression parts
-lips that touch; a smooth map in space would tear the inside of one lip along with the other.) Vertices that cannot be
-attached move with their neighbours on the mesh. Separate parts, not connected to the skin, are
+A head model's expressions move a template's vertices as follows: skin vertices move with the triangles of the head
+model that they are attached to (``carrying``). Vertices below the skin are attached in the same way if mesh edges
+connect them to the skin over vertices with similar displacements. A smooth map in space cannot replace this: where an
+expression parts two touching lips, it would tear the inside of one lip along with the other lip. Vertices that cannot
+be attached get the mean displacement of their neighbours in the mesh. Parts of the mesh that no edge connects to the
+skin are of three kinds:
 
-- round and closed: eyeballs, which no shape moves (rotate them about their pivots);
-- at the skin: lashes and brows, which stand on the skin's triangle at their roots and rotate with it;
-- inside: teeth and tongue, which move with the jaw below the line of the lips, and else stay with the skull.
-"""
+- eyeballs are round and closed, and no blendshape moves them: an animator rotates them about their pivots;
+- lashes and brows stand on the skin, and rotate with the skin triangle at their roots;
+- teeth and tongue lie inside the head: they move with the jaw below the line between the lips, and with the skull above
+  it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -56,7 +57,8 @@ Shapes = Mapping[str, Float[np.ndarray, "v 3"]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neutral:
-    """Holds a head without expression: the model's full level (mm), its triangles, and the mesh's position on it."""
+    """Holds a head without expression: the vertices (mm) and triangles of the head model's finest mesh, and the
+    template's vertices on that head."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -70,7 +72,8 @@ def carried_shapes(
     shapes: Shapes,
     landmarks: Points,
 ) -> dict[str, Places]:
-    """Returns the displacement of each vertex of a mesh (mm, weight 1), by shape; everything in the head frame.
+    """Returns the displacement of each vertex of a template (mm, at weight 1), by name of the blendshape, in the head
+    frame.
 
     ``surface_binding``: binding of the mesh to the model. ``triangles``: triangles of the mesh. ``neutral``: head
     without expression. ``shapes``: displacements of the model's full level. ``landmarks``: landmarks of that head.
@@ -100,7 +103,7 @@ def carried_shapes(
 def loose_parts(
     surface_binding: SurfaceBinding, triangles: Int[np.ndarray, "g 3"], count: int
 ) -> Int[np.ndarray, " t"]:
-    """Returns the index of the separate part that each vertex of a mesh belongs to, -1 for vertices connected to the
+    """Returns the index of the separate part to which each vertex of a mesh belongs, -1 for vertices connected to the
     skin."""
     edges = _edges(triangles)
     parts = connected_components(_matrix(edges, np.ones(len(edges)), count), directed=False)[1]
@@ -114,13 +117,13 @@ def _edges(triangles: Int[np.ndarray, "g 3"]) -> Int[np.ndarray, "e 2"]:
 
 
 def _matrix(edges: Int[np.ndarray, "e 2"], values: np.ndarray, count: int) -> sparse.csr_array:
-    """Returns the symmetric matrix with a value for each edge."""
+    """Returns a symmetric sparse matrix with one value for each edge."""
     rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
     return sparse.csr_array((np.concatenate([values, values]), (rows, columns)), shape=(count, count))
 
 
 def _with_skin(attachment: Attachment, surface_binding: SurfaceBinding) -> Attachment:
-    """Returns the attachment of all vertices, with the skin attached as registered."""
+    """Returns the attachment of all vertices; the skin's part is taken from the registered template."""
     skin, registered = surface_binding.skin, surface_binding.attachment
     for whole, part in (
         (attachment.triangles, registered.triangles),
@@ -143,8 +146,8 @@ def _led(
     skin: Int[np.ndarray, " n"],
     near: Bool[np.ndarray, " t"],
 ) -> Bool[np.ndarray, " t"]:
-    """Tells which vertices the surface carries: the skin, and vertices connected to it by edges over vertices near the
-    surface that move alike in every shape."""
+    """Returns a mask of the vertices that move with the head model's surface: the skin, and near vertices connected to
+    it by edges over vertices with similar displacements."""
     a, b = edges.T
     parting = np.linalg.norm(moves[a] - moves[b], axis=2).max(axis=1, initial=0.0)
     alike = parting < ALIKE * np.linalg.norm(mesh[a] - mesh[b], axis=1) + ALIKE_MM
@@ -162,8 +165,8 @@ def _follow(
     leading: Bool[np.ndarray, " t"],
     following: Bool[np.ndarray, " t"],
 ) -> None:
-    """Sets the displacements of ``following`` vertices to the mean of their neighbours', weighted by nearness;
-    ``leading`` vertices keep theirs."""
+    """Sets the displacements of the ``following`` vertices to the mean of their neighbours' displacements, weighted by
+    nearness."""
     rows, fixed = np.flatnonzero(following), np.flatnonzero(leading)
     if not len(rows):
         return
@@ -176,7 +179,7 @@ def _follow(
 
 
 def _jaw_moves(landmarks: Points, neutral: Neutral, shapes: Shapes, mesh: Places) -> Float[np.ndarray, "t s 3"]:
-    """Returns the displacement of each vertex as if it were fixed to the lower jaw."""
+    """Returns the displacement that each vertex would have if it were fixed to the lower jaw."""
     motions = jaw_motions(landmarks, neutral.vertices, shapes)
     still = np.zeros_like(mesh)
     return np.stack([motions[name].apply(mesh) - mesh if name in motions else still for name in shapes], axis=1)
@@ -189,7 +192,8 @@ def _standing_at_roots(
     skin: Int[np.ndarray, "g 3"],
     moves: Float[np.ndarray, "t s 3"],
 ) -> Float[np.ndarray, "r s 3"] | None:
-    """Returns the displacements of a part that stands on the skin; None if it is not near the skin."""
+    """Returns the displacements of a part that stands on the skin, such as lashes; None if the part is not near the
+    skin."""
     hits = SurfaceIndex(mesh, skin).closest(mesh[rows])
     roots = hits.distances < ROOT_MM
     if not roots.any():
@@ -200,7 +204,7 @@ def _standing_at_roots(
 def _nearest_root(
     mesh: Places, edges: Int[np.ndarray, "e 2"], rows: Int[np.ndarray, " r"], roots: Bool[np.ndarray, " r"]
 ) -> Int[np.ndarray, " r"]:
-    """Returns, for each vertex of a part, its nearest root along the part's edges."""
+    """Returns, for each vertex of a part, the root vertex that is nearest along the part's edges."""
     number = np.full(len(mesh), -1)
     number[rows] = np.arange(len(rows))
     inside = edges[(number[edges] >= 0).all(axis=1)]
@@ -213,7 +217,8 @@ def _nearest_root(
 def _standing(
     mesh: Places, rows: Int[np.ndarray, " r"], corners: Int[np.ndarray, "r 3"], moves: Float[np.ndarray, "t s 3"]
 ) -> Float[np.ndarray, "r s 3"]:
-    """Returns the displacements of vertices that stand on triangles of the mesh's own skin and rotate with them."""
+    """Returns the displacements of vertices that stand on triangles of the template's skin and rotate with these
+    triangles."""
     used, local = np.unique(corners, return_inverse=True)
     faces, rest = local.reshape(-1, 3), mesh[used]
     thirds = np.full((len(rows), 3), 1.0 / 3.0)
@@ -227,7 +232,7 @@ def _standing(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnimatedMesh:
-    """Holds a mesh without expression, its shapes and its pivots, in the head frame, mm."""
+    """Holds a mesh without expression, its blendshapes and its pivots, in the head frame, mm."""
 
     neutral: Float[np.ndarray, "t 3"]
     shapes: Mapping[str, Float[np.ndarray, "t 3"]]  # displacements at weight 1: Apple's, others of the head, visemes
@@ -248,7 +253,8 @@ def animated_mesh(
     *,
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> AnimatedMesh:
-    """Carries shapes to a mesh and keeps its lips and lids apart; adds the visemes, pivots, eyeballs, teeth and tongue.
+    """Transfers a head model's blendshapes to a template, keeps lips and lids from crossing, and adds visemes, pivots,
+    eyeballs, teeth and a tongue.
 
     ``surface_binding``: binding of the mesh to the model. ``triangles``: triangles of the mesh. ``vertices``: the
     model's full level without expression, head frame, mm. ``faces``: its triangles. ``shapes``: displacements of that
@@ -283,8 +289,9 @@ def animated_head(
     *,
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> AnimatedMesh:
-    """Shuts the lips of a model's full level (head frame, mm), and adds pivots, eyeballs, teeth and a tongue. The
-    triangles ``opened`` lack those that close eyes and mouth. Lips and lids move according to the model's shapes."""
+    """Closes the lips of the head model's finest mesh (head frame, mm), and adds pivots, eyeballs, teeth and a tongue.
+    The triangles ``opened`` leave holes at the eyes and the mouth. The head model's blendshapes move the lips and lids.
+    """
     landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
     vertices = shut_lips(vertices, opened, landmarks)
     bare = AnimatedMesh(vertices, shapes, pivots(landmarks, vertices, shapes, []), {}, gazes=gazes)
@@ -299,7 +306,8 @@ def _with_parts(
     jaw: Mapping[str, RigidTransform],
     loose: Int[np.ndarray, " t"],
 ) -> AnimatedMesh:
-    """Returns the mesh with missing eyeballs, teeth and tongue added, and lids and lips that do not touch these."""
+    """Returns the mesh with missing eyeballs, teeth and tongue added, and corrects lids and lips so that they do not
+    touch these parts."""
     mesh, shapes = bare.neutral, bare.shapes
     lacking = {name: at for name, at in bare.pivots.items() if name.startswith("eye_") and name not in bare.eyeballs}
     added = placed_eyeballs(mesh, triangles, landmarks, lacking, bare.gazes)
@@ -314,7 +322,7 @@ def _with_parts(
 def parted_shapes(
     rest: RestSurface, shapes: Mapping[str, Float[np.ndarray, "t 3"]]
 ) -> dict[str, Float[np.ndarray, "t 3"]]:
-    """Returns shapes without crossing triangles, and the visemes mixed from them, also without crossing.
+    """Returns the blendshapes corrected until no triangles cross, and visemes mixed from the corrected blendshapes.
 
     ``mouthClose`` closes a mouth that ``jawOpen`` has opened, and is corrected together with it: by Apple's definition,
     lips cross if it is used alone."""
@@ -333,8 +341,8 @@ def parted_shapes(
 def shut_lips(
     vertices: Float[np.ndarray, "v 3"], opened: Int[np.ndarray, "f 3"], landmarks: Points
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns the vertices (head frame, mm) with nearly shut lips shut. ``opened``: triangles without those that close
-    the mouth."""
+    """Returns the vertices of a head (head frame, mm) after a nearly shut mouth has been closed. The triangles
+    ``opened`` leave a hole at the mouth."""
     rim = min(
         boundary_loops(opened), key=lambda loop: np.linalg.norm(vertices[loop].mean(axis=0) - landmarks["stomion"])
     )
@@ -365,8 +373,8 @@ def shut_lips(
 def _lips(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], rim: Int[np.ndarray, " r"]
 ) -> tuple[Int[np.ndarray, " u"], Int[np.ndarray, " l"]]:
-    """Returns the rows of the upper and of the lower lip: each vertex belongs to the half of the inner edge that is
-    nearer along the mesh."""
+    """Returns the vertex indices of the upper and of the lower lip: each vertex belongs to the half of the lips' inner
+    edge that is nearer along the mesh."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     long = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
     graph = sparse.csr_array((long, (ends[:, 0], ends[:, 1])), shape=(len(vertices), len(vertices)))

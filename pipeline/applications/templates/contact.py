@@ -1,13 +1,13 @@
-"""Changes shapes so that lips and lids meet but do not pass through each other, at every weight from 0 to 1.
+"""Corrects blendshapes so that lips and lids may touch but do not pass through each other at any weight from 0 to 1.
 
-A blendshape is linear and ignores collisions. If triangles of a posed mesh cross that do not cross at rest:
+A blendshape moves every vertex along a straight line and ignores collisions. The correction begins where triangles of
+the posed mesh cross that do not cross at rest:
 
-- lids, which are apart at rest, stop where they first meet: their displacement is scaled there;
-- lips, which touch at rest, move together: their displacement is blended with its mean over the surrounding space. (A
-  smooth field in space carries both lips alike; if it changes by less than 1 mm per mm, nothing can cross.)
+- lids are apart at rest: their displacement is scaled down until they only touch;
+- lips touch at rest: their displacement is blended with its mean over the surrounding space. (Such a mean moves both
+  lips alike; if it changes by less than 1 mm per mm, no triangles can cross.)
 
-Both changes are as small as possible and widen until nothing crosses; all other vertices keep their displacement.
-"""
+Each correction starts small and grows until no triangles cross; all other vertices keep their displacement."""
 
 from dataclasses import dataclass
 
@@ -37,8 +37,9 @@ Rows = Int[np.ndarray, " r"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RestSurface:
-    """Holds a mesh at rest for contact: ``beside`` is 1 for every two vertices joined by an edge. Triangles that cross
-    others at rest, and their neighbours, are ``excluded``, because no shape can separate them."""
+    """Holds a mesh without expression for the collision tests; ``beside`` is 1 for every two vertices that an edge
+    joins. Triangles that cross others at rest, and their neighbours, are ``excluded``, because no blendshape can
+    separate them."""
 
     vertices: Vertices
     faces: Int[np.ndarray, "f 3"]
@@ -47,7 +48,7 @@ class RestSurface:
 
 
 def rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurface:
-    """Prepares a mesh at rest (mm)."""
+    """Prepares a mesh without expression (mm) for the collision tests."""
     count = len(vertices)
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     ones = sparse.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
@@ -59,15 +60,16 @@ def rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurfa
 
 
 def crossings(rest: RestSurface, displacement: Vertices, weights: tuple[float, ...] = WEIGHTS) -> Int[np.ndarray, " w"]:
-    """Returns, at each weight of a shape, the number of triangles that cross others but do not at rest."""
+    """Returns, for each weight of a blendshape, how many triangles cross others at this weight but do not cross at
+    rest."""
     moved = _moved(rest, displacement)
     return np.array([np.count_nonzero(_crossing(rest, displacement, w, moved)) for w in weights])
 
 
 def kept_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> Vertices:
-    """Returns the displacement (mm, weight 1) with the smallest change so that no triangles cross at ``WEIGHTS`` that
-    do not at rest; if that is impossible, as few as possible cross. ``closing``: lids, which stop where they meet; all
-    other vertices move together."""
+    """Returns a blendshape's displacement (mm, at weight 1) with the smallest change that leaves as few new crossings
+    of triangles at ``WEIGHTS`` as possible. If ``closing``, the shape closes the lids, which stop where they meet;
+    otherwise vertices on both sides of a crossing move together."""
     spot = _spot(rest, displacement, WEIGHTS[1::2])
     best, fewest, zone = displacement, np.count_nonzero(spot), np.zeros(len(rest.vertices), bool)
     for _ in range(MAX_ZONES):
@@ -84,12 +86,12 @@ def kept_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> V
 
 
 def _moved(rest: RestSurface, displacement: Vertices) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles a shape moves. Unmoved triangles cannot begin to cross each other."""
+    """Returns a mask of the triangles that a blendshape moves. Unmoved triangles cannot begin to cross each other."""
     return (np.abs(displacement).max(axis=1) > STILL_MM)[rest.faces].any(axis=1)
 
 
 def _stopped(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
-    """Returns the displacement scaled by the weight at which its triangles first meet."""
+    """Returns the displacement scaled by the weight at which triangles of the zone first meet."""
     scale = np.ones(len(displacement))
     for _ in range(MEETING_ROUNDS):
         first = np.full(len(displacement), np.inf)
@@ -105,7 +107,8 @@ def _stopped(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
 
 
 def _together(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
-    """Returns the displacement blended with its mean over growing radii, until no triangles of a zone cross."""
+    """Returns the displacement blended with its mean over spheres of growing radius, until no triangles of the zone
+    cross."""
     out, rounds = displacement, 0
     best, fewest = displacement, np.inf
     for radius_mm in RADII_MM:
@@ -129,7 +132,8 @@ def _together(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices
 
 
 def _relaxed(rest: RestSurface, wanted: Vertices, clean: Vertices, zone: Rows) -> Vertices:
-    """Returns the displacement between ``clean`` and ``wanted`` that is nearest to ``wanted`` and does not cross."""
+    """Returns the displacement between ``clean`` and ``wanted`` that is nearest to ``wanted`` and makes no triangles
+    cross."""
     if (wanted == clean).all() or _spot(rest, clean, WEIGHTS, zone).any():
         return clean
     low, high = 0.0, 1.0
@@ -141,7 +145,8 @@ def _relaxed(rest: RestSurface, wanted: Vertices, clean: Vertices, zone: Rows) -
 
 
 def _mean_in_space(vertices: Vertices, rows: Rows, radius_mm: float) -> sparse.csr_array:
-    """Returns the matrix of Gaussian means around some vertices, over all vertices near them."""
+    """Returns the matrix that averages displacements around some vertices, with Gaussian weights over all vertices near
+    them."""
     near = KDTree(vertices).query_ball_point(vertices[rows], 2.0 * radius_mm)
     counts = np.array([len(each) for each in near])
     column, row = np.concatenate(near).astype(int), np.repeat(np.arange(len(rows)), counts)
@@ -154,7 +159,7 @@ def _mean_in_space(vertices: Vertices, rows: Rows, radius_mm: float) -> sparse.c
 def _crossing(
     rest: RestSurface, displacement: Vertices, weight: float, active: Bool[np.ndarray, " f"]
 ) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles cross at a weight; only pairs with an active one are tested."""
+    """Returns a mask of the triangles that cross at a weight; only pairs with at least one active triangle are tested."""
     if not active.any():
         return active
     few = active if active.mean() < FEW else None
@@ -162,7 +167,8 @@ def _crossing(
 
 
 def _crossing_within(rest: RestSurface, displacement: Vertices, weight: float, rows: Rows) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles of ``rows`` cross each other at a weight; it takes a tenth of the time of testing all."""
+    """Returns a mask of the triangles in ``rows`` that cross each other at a weight; it tests only these triangles,
+    which takes a tenth of the time."""
     out = np.zeros(len(rest.faces), bool)
     out[rows] = crossing_faces(rest.vertices + weight * displacement, rest.faces[rows])
     return out & ~rest.excluded
@@ -171,7 +177,7 @@ def _crossing_within(rest: RestSurface, displacement: Vertices, weight: float, r
 def _spot(
     rest: RestSurface, displacement: Vertices, weights: tuple[float, ...], zone: Rows | None = None
 ) -> Bool[np.ndarray, " t"]:
-    """Tells which vertices are corners of triangles that cross at some weight; with a ``zone``, only its triangles."""
+    """Returns a mask of the vertices whose triangles cross at some weight, in a ``zone`` or everywhere."""
     out, moved = np.zeros(len(rest.vertices), bool), _moved(rest, displacement)
     for weight in weights:
         crossing = (
@@ -190,7 +196,8 @@ def _grown(rest: RestSurface, chosen: Bool[np.ndarray, " t"], rings: int) -> Boo
 
 
 def _faded(rest: RestSurface, retained: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
-    """Returns factors that rise to 1 over the rings around vertices with smaller factors."""
+    """Raises the factors of a mesh's vertices to 1 step by step over the rings of neighbours around vertices with
+    smaller factors."""
     count = np.maximum(np.asarray(rest.beside.sum(axis=1)).ravel(), 1.0)
     out = retained
     for _ in range(SOFT_RINGS):

@@ -1,5 +1,5 @@
-"""Builds a head model from a folder of raw scans: checks, correspondence (section 3.2), alignment, principal components
-(3.1)."""
+"""Builds a head model from a folder of raw scans: checks, correspondence (the paper's section 3.2), alignment,
+principal components (3.1)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -39,8 +39,9 @@ def build_model(
 ) -> Built:
     """Builds a model from the scans of a folder and saves it as ``out``.
 
-    Every scan is checked before any other work. With ``on_bad="stop"`` bad scans raise InputError, which names all of
-    them; with ``"skip"`` they are left out. Raises InputError too if fewer than 3 sound scans remain."""
+    All scans are checked before any other work. With ``on_bad="stop"``, scans with faults raise InputError, which lists
+    all of these scans; with ``"skip"`` they are left out. Also raises InputError if fewer than 3 scans without faults
+    remain."""
     parts, sha256 = read_parts(model_path("default"))
     template = assemble(parts, sha256)
     good, skipped = read_checked(scans_folder, template, report)
@@ -69,7 +70,8 @@ def build_model(
 
 
 def read_checked(folder: Path, template: HeadModel, report: Progress) -> tuple[list[Checked], dict[str, str]]:
-    """Returns the sound scans of a folder, and the others' faults by name. Raises InputError for an empty folder."""
+    """Returns the scans of a folder that passed all checks, and the faults of the other scans by name. Raises
+    InputError for an empty folder."""
     paths = find_scans(folder)
     with workers(WORKERS, len(paths)) as crew:
         found = crew.over(partial(_read_and_check, template), paths, "checking scans", report)
@@ -78,7 +80,7 @@ def read_checked(folder: Path, template: HeadModel, report: Progress) -> tuple[l
 
 
 def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
-    """Returns the checked scan, or a text that says what is wrong with it."""
+    """Returns the checked scan, or a text that describes its faults."""
     try:
         return check(read_scan(path), template)
     except InputError as fault:
@@ -86,11 +88,13 @@ def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
 
 
 def cages_through(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> Float[np.ndarray, "N V0 3"]:
-    """Computes cages (mm) whose subdivided surface passes through the points at the cage's vertices.
+    """Computes coarse control meshes, cages (mm), whose subdivision surface passes through the given points at the
+    cage's vertices.
 
-    The subdivided surface lies inside the cage. So the cage C must solve S C = P, where S are the rows of the
-    subdivision matrix for the cage vertices. S nearly removes detail as fine as the cage itself, so its inverse would
-    amplify noise. A few steps C += P - S C, starting from the template's own detail, end before that happens."""
+    A subdivision surface lies inside its cage. The cage C must therefore solve S C = P, where P are the points and S
+    the rows of the subdivision matrix for the cage's vertices. S nearly removes details as fine as the cage itself, so
+    its inverse would amplify noise. A few iterations C += P - S C, starting with the template's details, avoid this
+    amplification."""
     rows = template.levels["full"].operator[: len(template.mean)]
     mean = template.mean.astype(float)
     away = points - rows @ mean
