@@ -1,4 +1,5 @@
-"""Prepares finished heads for clinics: a patient's axes, two visits compared, a head registered to the surface of a CT.
+"""Prepares finished heads for clinics: exports in a patient's axes, compares two visits, and registers a head to the
+surface of a CT.
 
-In: result folders, and meshes of other programs in mm. Out: meshes, landmarks, tables and pictures.
+The input is result folders, and meshes of other programs in mm. The output is meshes, landmarks, tables and pictures.
 """
