@@ -182,8 +182,7 @@ def length_changes(earlier: Visit, later: Visit) -> dict[str, LengthChange]:
 
 
 def _start(earlier: Visit, later: Visit) -> RigidTransform:
-    """Returns later_from_earlier from the landmarks that both heads have; without common landmarks, from the two head
-    frames."""
+    """Returns later_from_earlier, computed from common landmarks or, without any, from the two head frames."""
     marks = earlier.measured.landmarks, later.measured.landmarks
     names = [name for name in START_NAMES if all(name in of for of in marks)]
     if len(names) < MIN_MARKS:

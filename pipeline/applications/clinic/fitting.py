@@ -192,8 +192,8 @@ class UprightHead:
 
 
 def fitting_measures(visit: Visit) -> dict[str, Fitted]:
-    """Returns every measure that can be computed for the head, by name. Raises InputError if the head lacks landmarks
-    of the Frankfurt plane."""
+    """Returns every measure that the head allows, by name. Raises InputError if the head lacks landmarks of the
+    Frankfurt plane."""
     measured = visit.measured
     frame = frankfurt_axes(measured, "RAS")
     motion = frame.patient_from_world
@@ -255,8 +255,8 @@ def splay_angle(head: UprightHead) -> float | None:
 
 
 def frontal_angle(head: UprightHead) -> float | None:
-    """Returns the mean angle (degrees) between the flanks of the nose's bridge and the vertical; positive if the bridge
-    widens downwards."""
+    """Returns the mean angle (degrees) between the flanks of the nose's bridge and the vertical; positive if it widens
+    downwards."""
     crest = _crest(head, FLANK_HEIGHTS_MM[0])
     if crest is None:
         return None
@@ -320,8 +320,8 @@ def _crest(head: UprightHead, below_mm: float) -> float | None:
 
 
 def _width(head: UprightHead, below_mm: float, depth_mm: float | None, plane: float | None = None) -> float | None:
-    """Returns the distance between the nose's flanks in a horizontal section, at a depth behind the section's front or
-    in a given vertical plane."""
+    """Returns the nose's width in a horizontal section, at a depth behind the section's front or in a given vertical
+    plane."""
     points = _nose_section(head, below_mm)
     if len(points) < 4:
         return None
@@ -361,8 +361,7 @@ def _brow_to_cheek(head: UprightHead, side: str) -> float | None:
 
 
 def _fields(vertices: Points) -> list[Float[np.ndarray, " v"]]:
-    """Returns smooth random fields of unit variance over a surface, as sums of waves with the spectrum of the head
-    models' covariance."""
+    """Returns smooth random fields of unit variance over a surface: sums of waves with the head models' spectrum."""
     rng = np.random.default_rng(0)
     weights = np.array([scale.amplitude_mm**2 for scale in SCALES])
     lengths = np.array([scale.length_mm for scale in SCALES])

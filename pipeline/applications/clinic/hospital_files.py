@@ -64,8 +64,7 @@ def write_hospital_files(
 
 
 def close_head(visit: Visit, frame: AnatomicalFrame) -> Mesh:
-    """Returns the head as a closed mesh in the axes of ``frame``, mm. Raises NotAManifold if the head's openings cannot
-    be closed."""
+    """Returns the head as a closed mesh in the axes of ``frame``, mm. Raises NotAManifold."""
     head_from_world = visit.measured.head_from_world
     mesh = visit.measured.mesh_world
     closed = close_borders(Mesh(head_from_world.apply(mesh.vertices), mesh.faces))

@@ -151,9 +151,8 @@ def trimmed_fit(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Met:
-    """Holds each point's closest point on the surface, whether it is a valid match, the signed distance along the
-    surface's normal (positive if the point lies outside), the weight, and the standard deviation of the points with a
-    weight."""
+    """Holds each point's closest surface point, whether this is a valid match, the signed distance along the surface's
+    normal (positive if the point lies outside), the weight, and the standard deviation of the weighted points."""
 
     hits: Hits
     valid: PointFlags
@@ -172,8 +171,7 @@ def _met(
     share: float,
     beside: Callable[[Hits], PointFlags],
 ) -> _Met | None:
-    """Returns the closest surface points of the moved patch; None if fewer than ``MIN_POINTS`` of them are valid
-    matches."""
+    """Returns the closest surface points of the moved patch; None if fewer than ``MIN_POINTS`` are valid matches."""
     normals = patch.normals @ motion.rotation.T
     hits = surface.closest(there, facing=normals, facing_mm=FACING_MM)
     alike = np.einsum("nx,nx->n", normals, hits.normals) > FACING
@@ -320,8 +318,7 @@ def _distances(
 
 def read_surface_landmarks(path: Path, axes: Axes) -> dict[str, Float[np.ndarray, " 3"]]:
     """Returns landmarks by this project's names, in the CT surface's axes. A .mrk.json file states its own axes; other
-    files use the surface's axes. Raises InputError for an unusable file, also if fewer than ``MIN_MARKS`` names are
-    known."""
+    files use the surface's axes. Raises InputError, also if fewer than ``MIN_MARKS`` names are known."""
     known = read_landmarks(path, axes)
     if len(known) < MIN_MARKS:
         raise InputError(path.name, [compose("marks-too-few", found=len(known), needed=MIN_MARKS)])

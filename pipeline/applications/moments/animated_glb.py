@@ -1,5 +1,4 @@
-"""Adds an animation to a binary glTF file with one node: it animates the node's pose and the weights of its morph
-targets.
+"""Adds an animation of the node's pose and its morph targets' weights to a binary glTF file with one node.
 
 https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations
 """

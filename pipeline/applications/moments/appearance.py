@@ -51,8 +51,7 @@ class Samples:
 
 
 def spread(person: SequencePerson) -> Samples:
-    """Returns sample points spread over the person's face except the lids, because a lid may show the eyeball instead
-    of skin."""
+    """Returns sample points spread over the person's face without the lids, which may show the eyeball instead of skin."""
     level, lids = person.model.levels["full"], lid_motion_mm(person) > LID_MM
     skin = level.face_region & ~lids
     corners, shares = spread_samples(person.neutral, level.faces[skin[level.faces].all(axis=1)], SAMPLE_MM)
@@ -69,15 +68,14 @@ def lid_motion_mm(person: SequencePerson) -> Float[np.ndarray, " v"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texture:
-    """Holds the fine texture of a picture and its derivatives along x and y per pixel; the picture was shrunk by the
-    factor ``reduced``."""
+    """Holds the fine texture of a picture and its derivatives by x and y (per pixel), at a size divided by ``reduced``."""
 
     image: Float32[np.ndarray, "h w 3"]
     reduced: int
 
     def read(self, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-        """Returns the texture and its derivatives at pixels of the full-size picture, and a mask of the pixels that lie
-        inside it."""
+        """Returns texture and derivatives at pixels of the full-size picture, and a mask of the pixels inside the
+        picture."""
         height, width = self.image.shape[:2]
         scaled = (pixels + 0.5) / self.reduced - 0.5
         inside = np.all((scaled >= 0.0) & (scaled < (width - 1.001, height - 1.001)), axis=1)  # False for NaN

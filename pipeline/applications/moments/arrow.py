@@ -1,11 +1,11 @@
-"""Solves linear equations whose matrix has the form of an arrow: some unknowns are shared by all blocks, each other
-unknown belongs to one block. No equation connects the unknowns of two blocks, so each block's unknowns are eliminated
+"""Solves linear equations whose matrix has the form of an arrow: some unknowns are shared by all blocks, the others
+belong to one block each. No equation connects the unknowns of two blocks, so each block's unknowns are eliminated
 separately
 
     S = M_ss - sum_k M_sk M_kk^-1 M_ks        (Schur complement of what is left)
 
-and computed after the shared unknowns are known. Unknowns with bounds are not eliminated but solved together with the
-shared unknowns."""
+and computed after the shared unknowns are known. Unknowns with bounds are not eliminated but solved with the shared
+unknowns."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -62,8 +62,7 @@ class Arrow:
         return self._whole(matrix, right, cholesky_solve)
 
     def least(self, matrix: Matrix, gradient: Vector, lower: Vector, upper: Vector) -> Vector:
-        """Minimises a quadratic form within bounds by active sets, like ``least_within``. Eliminated unknowns must have
-        no bound."""
+        """Minimises a quadratic form within bounds, like ``least_within``. Eliminated unknowns must have no bound."""
         bounds = lower[self.left], upper[self.left]
         return self._whole(matrix, -gradient, lambda rest, right: least_within(rest, -right, *bounds))
 

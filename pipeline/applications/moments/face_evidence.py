@@ -46,8 +46,7 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceReference:
-    """Holds the landmarks' positions on the person's head, and statistics of the networks' results in the frames from
-    which the person was estimated."""
+    """Holds the landmarks' positions on the person's head, and statistics of the networks' results on this person."""
 
     which: Int[np.ndarray, " n"]  # of the 468
     neutral: Float[np.ndarray, "n 3"]

@@ -76,7 +76,7 @@ class Footage:
     @contextmanager
     def capture(self, number: int) -> Iterator[tuple[Capture, Rig]]:
         """Yields one frame as a capture with its plates and masks, together with the full-size cameras. Raises
-        InputError if a file cannot be used."""
+        InputError."""
         with tempfile.TemporaryDirectory() as scratch:
             folder, frame = Path(scratch), self.frames[number]
             rig_file = find_rig_file(self.folder)
@@ -158,8 +158,7 @@ def open_footage(folder: Path) -> Footage:
 
 
 def _spread(path: Path, rig: Rig) -> float:
-    """Returns how much later (s) the last camera exposes than the first, from clock.json. Raises InputError if the file
-    cannot be used."""
+    """Returns how much later (s) the last camera exposes than the first, from clock.json. Raises InputError."""
     if not path.is_file():
         return 0.0
     try:

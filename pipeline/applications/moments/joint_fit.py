@@ -238,8 +238,7 @@ def _with_evidence(
 def joint_covariances(solutions: Sequence[ContourSolution]) -> Iterator[Float[np.ndarray, "p p"]]:
     """Yields the covariance of each moment's coefficients, rotation, translation and log scale after the joint fit. The
     independent part of the errors follows from the joint normal matrix with a single prior; the fraction ``COMMON``
-    keeps the covariance of the moment's separate fit. Weights at their bounds are treated as in ``contour_fit``'s
-    ``finish``."""
+    keeps the covariance of the moment's separate fit. Weights at their bounds are treated as in ``finish``."""
     problem, layout = joint_problem(solutions, common=0.0)
     here = problem.at(tuple(each.state for each in solutions))
     assert isinstance(here, Sum)

@@ -53,8 +53,7 @@ MESH = "p99"  # the level that is shown
 @dataclass(frozen=True, slots=True, eq=False)
 class LivePerson:
     """Holds everything that does not change over time: the person, the head's ``scale`` relative to the head model,
-    reference values of the networks, and the neutral positions and expressions of a small mesh and the 468 landmarks
-    (head frame, mm)."""
+    reference values of the networks, and a small mesh and the 468 landmarks with their expressions (head frame, mm)."""
 
     person: SequencePerson
     scale: float
@@ -97,8 +96,8 @@ class LiveHead:
 def meet(
     model: HeadModel, face: MatchedFaces, pictures: Mapping[str, ImageRgb], rig: Rig, networks: FaceNetworks
 ) -> LiveHead | None:
-    """Builds the head of a person whose face was detected in the pictures. Returns None if the networks do not find the
-    face again at the fitted head."""
+    """Builds the head of a person whose face was detected in the pictures. Returns None if a second detection does not
+    confirm the face."""
     alignment = align_to_face(model, face, landmark_map(model))
     state = _shaped(alignment.landmarks, alignment.world_from_head, min(MODES, len(model.modes)))
     scale, names = state.world_from_head.scale, tracked_names(model)

@@ -162,8 +162,8 @@ def poses_from_first(course: Course) -> list[RigidTransform]:
 
 
 def write_preview(path: Path, person: SequencePerson, footage: Footage, course: Course, report: Progress) -> None:
-    """Writes preview.mp4, the front camera's pictures beside the rendered head. If several shares end at the same time,
-    each may write this file."""
+    """Writes preview.mp4, the front camera's pictures beside the rendered head. Shares that end at the same time may
+    each write it."""
     name, count = person.rig.front_camera(), len(course)
     camera = person.rig[name]
     size = 2 * camera.intrinsics.width, camera.intrinsics.height

@@ -129,8 +129,7 @@ def tracked_names(model: HeadModel) -> tuple[str, ...]:
 def weights_alone(
     shapes: Float32[np.ndarray, "n v 3"], weights: Float[np.ndarray, " n"], rows: list[int]
 ) -> Float[np.ndarray, " e"]:
-    """Returns weights for only the shapes ``rows`` that move the head as nearly as possible like the full set of
-    ``weights``."""
+    """Returns weights for only the shapes ``rows`` that move the head as nearly as possible like all ``weights``."""
     flat = shapes.reshape(len(shapes), -1)
     alone = flat[rows]
     matrix = (alone @ alone.T).astype(float)

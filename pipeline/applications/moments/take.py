@@ -41,8 +41,8 @@ SHARES = (0.45, 0.55)  # of a take's time, at which the joint fit begins and end
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """Holds the result of one moment of a take. Arrays are indexed by the head model's expressions or by the vertices
-    of its finest mesh."""
+    """Holds the result of one moment of a take. Arrays are indexed by expression or by vertex of the head model's
+    finest mesh."""
 
     name: str
     detail: str  # the level that was reached
@@ -140,8 +140,7 @@ def differ_by(alone: Fit, joint: ContourSolution, eigenheads: int) -> float:
 
 
 def solution_of(head: HeadFit) -> ContourSolution:
-    """Returns the contour solver's solution in a moment's fit. Raises InputError for a fit by the simplex method, which
-    has none."""
+    """Returns the contour solver's solution in a moment's fit. Raises InputError for a fit by the simplex method."""
     if head.solution is None:
         raise InputError("take", [compose("take-needs-contour")])
     return head.solution

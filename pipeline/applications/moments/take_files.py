@@ -53,9 +53,8 @@ class Shot(NamedTuple):
 def make_take(
     folder: Path, shots: Mapping[str, Shot], *, model: str, settings: Settings, report: Progress
 ) -> dict[str, Any]:
-    """Reconstructs a take from its captures and writes it into ``folder``; ``shots`` is indexed by the moments' names.
-    Returns the content of report.json. Raises the errors of ``reconstruct_take``, UnknownModel or BadModel, and
-    OSError."""
+    """Reconstructs a take from its captures and writes it into ``folder``; ``shots`` are indexed by moment. Returns the
+    content of report.json. Raises the errors of ``reconstruct_take``, UnknownModel or BadModel, and OSError."""
     head_model, colours = load_model(model), Colours()
 
     def deliver(name: str, result: Reconstruction) -> None:

@@ -57,8 +57,8 @@ Shapes = Mapping[str, Float[np.ndarray, "v 3"]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neutral:
-    """Holds a head without expression: the vertices (mm) and triangles of the head model's finest mesh, and the
-    template's vertices on that head."""
+    """Holds a head without expression: vertices (mm) and triangles of the model's finest mesh, and a template on this
+    head."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -192,8 +192,7 @@ def _standing_at_roots(
     skin: Int[np.ndarray, "g 3"],
     moves: Float[np.ndarray, "t s 3"],
 ) -> Float[np.ndarray, "r s 3"] | None:
-    """Returns the displacements of a part that stands on the skin, such as lashes; None if the part is not near the
-    skin."""
+    """Returns the displacements of a part that stands on the skin, such as lashes; None if it is not near the skin."""
     hits = SurfaceIndex(mesh, skin).closest(mesh[rows])
     roots = hits.distances < ROOT_MM
     if not roots.any():
@@ -217,8 +216,7 @@ def _nearest_root(
 def _standing(
     mesh: Places, rows: Int[np.ndarray, " r"], corners: Int[np.ndarray, "r 3"], moves: Float[np.ndarray, "t s 3"]
 ) -> Float[np.ndarray, "r s 3"]:
-    """Returns the displacements of vertices that stand on triangles of the template's skin and rotate with these
-    triangles."""
+    """Returns the displacements of vertices that stand on the template's skin triangles and rotate with them."""
     used, local = np.unique(corners, return_inverse=True)
     faces, rest = local.reshape(-1, 3), mesh[used]
     thirds = np.full((len(rows), 3), 1.0 / 3.0)
@@ -289,7 +287,7 @@ def animated_head(
     *,
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> AnimatedMesh:
-    """Closes the lips of the head model's finest mesh (head frame, mm), and adds pivots, eyeballs, teeth and a tongue.
+    """Closes the lips of the head model's finest mesh (head frame, mm), and adds pivots, eyeballs, teeth and tongue.
     The triangles ``opened`` leave holes at the eyes and the mouth. The head model's blendshapes move the lips and lids.
     """
     landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
@@ -306,8 +304,7 @@ def _with_parts(
     jaw: Mapping[str, RigidTransform],
     loose: Int[np.ndarray, " t"],
 ) -> AnimatedMesh:
-    """Returns the mesh with missing eyeballs, teeth and tongue added, and corrects lids and lips so that they do not
-    touch these parts."""
+    """Returns the mesh with missing eyeballs, teeth and tongue, and with lids and lips corrected to avoid them."""
     mesh, shapes = bare.neutral, bare.shapes
     lacking = {name: at for name, at in bare.pivots.items() if name.startswith("eye_") and name not in bare.eyeballs}
     added = placed_eyeballs(mesh, triangles, landmarks, lacking, bare.gazes)

@@ -64,8 +64,7 @@ def frames(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceBinding:
-    """Holds how all n vertices of a template follow the surface of a head model: attached skin vertices, and anchors
-    for the others."""
+    """Holds how a template's n vertices follow a head model's surface: attached skin vertices, anchors for all others."""
 
     rest: Float[np.ndarray, "t 3"]  # where the mesh lay when it was registered, mm
     skin: Int[np.ndarray, " n"]  # rows that the surface carries, as ``attachment`` says

@@ -38,8 +38,7 @@ Rows = Int[np.ndarray, " r"]
 @dataclass(frozen=True, slots=True, eq=False)
 class RestSurface:
     """Holds a mesh without expression for the collision tests; ``beside`` is 1 for every two vertices that an edge
-    joins. Triangles that cross others at rest, and their neighbours, are ``excluded``, because no blendshape can
-    separate them."""
+    joins. Triangles that already cross others at rest, and their neighbours, are ``excluded`` from the tests."""
 
     vertices: Vertices
     faces: Int[np.ndarray, "f 3"]
@@ -60,8 +59,7 @@ def rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurfa
 
 
 def crossings(rest: RestSurface, displacement: Vertices, weights: tuple[float, ...] = WEIGHTS) -> Int[np.ndarray, " w"]:
-    """Returns, for each weight of a blendshape, how many triangles cross others at this weight but do not cross at
-    rest."""
+    """Returns, for each weight of a blendshape, how many triangles cross others that do not cross at rest."""
     moved = _moved(rest, displacement)
     return np.array([np.count_nonzero(_crossing(rest, displacement, w, moved)) for w in weights])
 
@@ -107,8 +105,7 @@ def _stopped(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
 
 
 def _together(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
-    """Returns the displacement blended with its mean over spheres of growing radius, until no triangles of the zone
-    cross."""
+    """Returns the displacement blended with its mean over growing spheres, until no triangles of the zone cross."""
     out, rounds = displacement, 0
     best, fewest = displacement, np.inf
     for radius_mm in RADII_MM:
@@ -132,8 +129,7 @@ def _together(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices
 
 
 def _relaxed(rest: RestSurface, wanted: Vertices, clean: Vertices, zone: Rows) -> Vertices:
-    """Returns the displacement between ``clean`` and ``wanted`` that is nearest to ``wanted`` and makes no triangles
-    cross."""
+    """Returns the displacement between ``clean`` and ``wanted`` that is nearest to ``wanted`` without crossings."""
     if (wanted == clean).all() or _spot(rest, clean, WEIGHTS, zone).any():
         return clean
     low, high = 0.0, 1.0
@@ -145,8 +141,7 @@ def _relaxed(rest: RestSurface, wanted: Vertices, clean: Vertices, zone: Rows) -
 
 
 def _mean_in_space(vertices: Vertices, rows: Rows, radius_mm: float) -> sparse.csr_array:
-    """Returns the matrix that averages displacements around some vertices, with Gaussian weights over all vertices near
-    them."""
+    """Returns the matrix that averages displacements near some vertices with Gaussian weights."""
     near = KDTree(vertices).query_ball_point(vertices[rows], 2.0 * radius_mm)
     counts = np.array([len(each) for each in near])
     column, row = np.concatenate(near).astype(int), np.repeat(np.arange(len(rows)), counts)
@@ -167,8 +162,7 @@ def _crossing(
 
 
 def _crossing_within(rest: RestSurface, displacement: Vertices, weight: float, rows: Rows) -> Bool[np.ndarray, " f"]:
-    """Returns a mask of the triangles in ``rows`` that cross each other at a weight; it tests only these triangles,
-    which takes a tenth of the time."""
+    """Returns a mask of the triangles in ``rows`` that cross each other at a weight, in a tenth of the time."""
     out = np.zeros(len(rest.faces), bool)
     out[rows] = crossing_faces(rest.vertices + weight * displacement, rest.faces[rows])
     return out & ~rest.excluded
@@ -196,8 +190,7 @@ def _grown(rest: RestSurface, chosen: Bool[np.ndarray, " t"], rings: int) -> Boo
 
 
 def _faded(rest: RestSurface, retained: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
-    """Raises the factors of a mesh's vertices to 1 step by step over the rings of neighbours around vertices with
-    smaller factors."""
+    """Raises the factors to 1 gradually over the rings of neighbours around vertices with smaller factors."""
     count = np.maximum(np.asarray(rest.beside.sum(axis=1)).ravel(), 1.0)
     out = retained
     for _ in range(SOFT_RINGS):

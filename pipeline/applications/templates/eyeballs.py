@@ -160,8 +160,7 @@ def sample_triangles(mesh: Places, triangles: Int[np.ndarray, "g 3"]) -> Float[n
 
 
 def _depths(eyeball: Eyeball, points: Float[np.ndarray, "g 7 3"]) -> Float[np.ndarray, " g"]:
-    """Returns how deep (mm) each triangle lies within an eyeball, enlarged by the required gap; 0 for triangles
-    outside."""
+    """Returns how deep (mm) each triangle lies in an eyeball or the required gap around it; 0 for triangles outside."""
     away = points - eyeball.centre
     distance = np.linalg.norm(away, axis=2)
     reach = eyeball.reach((away / np.maximum(distance, 1e-9)[:, :, None]).reshape(-1, 3)).reshape(distance.shape)
@@ -171,8 +170,7 @@ def _depths(eyeball: Eyeball, points: Float[np.ndarray, "g 7 3"]) -> Float[np.nd
 def lifted(
     mesh: Places, triangles: Int[np.ndarray, "g 3"], displacement: Places, eyeballs: Mapping[str, Eyeball]
 ) -> Places:
-    """Returns a blendshape's displacement (mm) with the lids lifted off the eyeballs at ``WEIGHTS``; all other vertices
-    are unchanged."""
+    """Returns a blendshape's displacement (mm) with lids lifted off the eyeballs at ``WEIGHTS``, otherwise unchanged."""
     out = displacement
     for eyeball in eyeballs.values():
         about = triangles[_near(mesh, triangles, eyeball.centre)]

@@ -75,8 +75,7 @@ class FlameModel:
     def surface(
         self, parameters: FlameParameters, offsets: Float[np.ndarray, "v 3"] | None = None
     ) -> Float[np.ndarray, "v 3"]:
-        """Returns the vertices of a face, m. ``offsets`` are added to the vertices before any joint rotates
-        (``static_offset`` in FLAME's files)."""
+        """Returns the vertices of a face, m. ``offsets`` are added before any joint rotates (``static_offset``)."""
         shaped = self.shaped(parameters)
         return self.posed(shaped if offsets is None else shaped + offsets, parameters.pose) + parameters.translation
 
@@ -89,8 +88,7 @@ class FlameModel:
         return np.einsum("vxy,vy->vx", self.blended(turns), corrected) + self.weights @ shifts
 
     def blended(self, turns: Float[np.ndarray, "5 3 3"]) -> Float[np.ndarray, "v 3 3"]:
-        """Returns the matrix that rotates each vertex: the mean of the joints' rotations, weighted by the vertex's
-        skinning weights."""
+        """Returns the matrix that rotates each vertex: the mean of the joints' rotations with the skinning weights."""
         return np.tensordot(self.weights, turns, axes=1)
 
 
@@ -116,8 +114,7 @@ def joint_shifts(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlameFit:
-    """Holds fitted FLAME parameters, the distances that remain between the vertices and the mesh, and offsets that
-    remove these distances, m."""
+    """Holds fitted FLAME parameters, the remaining vertex distances from the mesh, and offsets that remove them, m."""
 
     parameters: FlameParameters
     distances: Float[np.ndarray, " v"]  # from the mesh to the surface that the parameters make, m
@@ -149,8 +146,8 @@ def fit_flame(
 
 
 def _start(model: FlameModel, target: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, " v"]) -> FlameParameters:
-    """Returns the parameters of the mean head, moved rigidly to the mesh's position. The rigid motion rotates about the
-    root joint."""
+    """Returns the parameters of the mean head, moved rigidly to the mesh's position. The motion rotates about the root
+    joint."""
     placed = rigid_fit(model.template, target, weights)
     mean, root = model.neutral(), model.joint_regressor[0] @ model.template
     pose = np.zeros((JOINTS, 3))
@@ -174,7 +171,7 @@ def _moved(value: FlameParameters, step: Float[np.ndarray, " p"]) -> FlameParame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Prior:
-    """Holds the priors: shape and expression coefficients are N(0, 1), angles of the joints below the root N(0,
+    """Holds the priors: shape and expression coefficients are N(0, 1), joint angles except the root's N(0,
     ``TURN_RAD``)."""
 
     form: Quadratic

@@ -4,8 +4,7 @@ touch the teeth or the tongue.
 A similarity transform between mouth landmarks places the shipped teeth and tongue (``load_inner_mouth``) in the
 person's head. Teeth and tongue are then moved back until no lip touches them, with the mouth shut or open. Upper teeth
 stay with the skull; lower teeth and tongue move with the jaw (``pivots.jaw_motions``). Where a blendshape would press
-lips through the teeth, the lips and their surroundings are lifted, as lids are lifted off eyeballs
-(``eyeballs.lifted``)."""
+lips through the teeth, the lips are lifted, as lids are lifted off eyeballs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -37,8 +36,7 @@ ANCHORS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InnerPart:
-    """Holds teeth or a tongue with vertex colours, and the part's displacement when the tongue is out (mm; empty if the
-    part does not move)."""
+    """Holds teeth or a tongue, and the part's displacement when the tongue is out (mm; empty if it does not move)."""
 
     mesh: Mesh
     tongue_out: Float[np.ndarray, "n 3"]
@@ -210,8 +208,7 @@ def _meets(mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inne
 
 
 def _is_covered(mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth) -> bool:
-    """Returns whether the mesh hides the gap between the front teeth although the jaw is open, because its lips do not
-    part."""
+    """Returns whether the mesh hides the gap between the front teeth although the jaw is open."""
     if "jawOpen" not in shapes:
         return True
     posed = inner.posed("jawOpen", 1.0)
@@ -255,8 +252,7 @@ def _lift(
     name: str,
     inner: InnerMouth,
 ) -> Float[np.ndarray, "m 3"] | None:
-    """Returns a change of a displacement after which no triangle touches the teeth; None if no triangle touches them
-    anyway."""
+    """Returns a change of a displacement that keeps all triangles off the teeth; None if no change is needed."""
     lift, fronts = np.zeros_like(rest), {}
     for _ in range(ROUNDS):
         need = np.zeros(len(rest))
@@ -334,7 +330,7 @@ class _Front:
         return turn, height, np.hypot(x, z)
 
     def depths(self, posed: Float[np.ndarray, "m 3"], triangles: Int[np.ndarray, "a 3"]) -> Float[np.ndarray, " a"]:
-        """Returns how deep (mm) each triangle lies in the teeth or in the required gap before them; 0 for triangles
+        """Returns how deep (mm) each triangle lies in the teeth or the required gap before them; 0 for triangles
         outside."""
         points = sample_triangles(posed, triangles).reshape(-1, 3)
         turn, height, away = self.cells(points)

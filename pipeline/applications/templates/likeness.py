@@ -52,8 +52,8 @@ ROWS = 6000  # vertices of the model that look for the mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceMarks:
-    """Holds points on a head model's surface, each a weighted mean of three vertices of its finest mesh, and the
-    positions of these points on another mesh."""
+    """Holds points on a head model's surface, each a weighted mean of three vertices of its finest mesh, and their
+    positions on another mesh."""
 
     rows: Int[np.ndarray, "p 3"]
     weights: Float[np.ndarray, "p 3"]
@@ -141,8 +141,7 @@ def _modes_on(model: HeadModel, marks: SurfaceMarks) -> Float[np.ndarray, "p 3 m
 
 
 class MetSurface:
-    """Holds the mesh to which the head model is fitted, with search trees for the closest point and for the closest
-    point with a similar normal."""
+    """Holds the mesh to which the head model is fitted, with search trees by position and by position with normal."""
 
     def __init__(self, mesh: Surface) -> None:
         self._mesh, self._surface = mesh, SurfaceIndex(mesh.vertices, mesh.faces)

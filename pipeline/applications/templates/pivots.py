@@ -58,8 +58,7 @@ def hinge(landmarks: Points) -> Float[np.ndarray, " 3"]:
 
 
 def _lid_centre(vertices: Vertices, blink: Vertices) -> Float[np.ndarray, " 3"]:
-    """Returns the centre of the eyeball under a lid: the centre of the ball that the lid's edge touches both open and
-    closed."""
+    """Returns the centre of the eyeball under a lid: of the ball that the lid's edge touches both open and closed."""
     moved = np.linalg.norm(blink, axis=1)
     rows = moved > SLIDING * moved.max()
     points = np.concatenate([vertices[rows], vertices[rows] + blink[rows]])

@@ -61,8 +61,7 @@ def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -
 
 def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]], name: str) -> Similarity:
     """Computes head_from_template from at least four landmarks of the mesh (its frame) and the head model's. Raises
-    InputError, whose message begins with the mesh's ``name``, if there are fewer landmarks or they determine no
-    similarity."""
+    InputError, which begins with the mesh's ``name``, if the landmarks do not suffice."""
     names = [each for each in landmarks if each in model.landmarks]
     if len(names) < 4:
         raise InputError(name, [compose("template-landmarks-too-few", count=len(names), names=names or ["none"])])

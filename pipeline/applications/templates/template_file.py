@@ -124,8 +124,7 @@ def _template(meta: dict, arrays: Mapping[str, np.ndarray], flame: FlameModel | 
 
 
 def _check(path: Path, template: Template) -> None:
-    """Raises BadTemplate if indices or numbers of a template file are invalid, because a job would otherwise fail only
-    at its end."""
+    """Raises BadTemplate if indices or numbers of a template file are invalid, before a job uses the file."""
     mesh, surface_binding = template.mesh, template.surface_binding
     count = len(surface_binding.rest)
     rows = (mesh.corners, surface_binding.skin, surface_binding.anchors, surface_binding.whole_anchors)

@@ -57,8 +57,7 @@ class Delivered:
 
 def updated_model(parts: ModelParts, delivered: Delivered, *, name: str, report: Progress) -> ModelParts:
     """Returns the head model ``parts`` after it was updated with heads that were reconstructed with it. Its figures
-    include the mean distance (mm) between a face and the span of the modes, before and after the update, with each head
-    held out once."""
+    include the mean distance (mm) between a face and the modes' span before and after, with each head held out once."""
     known = Population(parts.mean.astype(float), parts.modes.astype(float))
     weights = above_neck(known.mean, parts.landmarks)
     heads = np.array([rigid_fit(head, known.mean, weights).apply(head) for head in delivered.cages])
@@ -159,8 +158,7 @@ def build_from_results(folder: Path, out: Path, *, name: str, report: Progress =
     """Builds a model from all results in or below ``folder`` and saves it as ``out``. Results with warnings that
     question the head are left out.
 
-    Raises InputError that lists every fault, if results are damaged or made with several models, or if fewer than 3
-    remain."""
+    Raises InputError with all faults, if results are damaged or of several models, or if fewer than 3 remain."""
     folders = find_results(folder)
     parts = _model_of(folder, folders)
     delivered, skipped = read_delivered(folder, folders, assemble(parts, ""), report=report)
@@ -214,8 +212,7 @@ def read_delivered(
 
 
 def _model_of(folder: Path, folders: tuple[Path, ...]) -> ModelParts:
-    """Returns the head model with which all results were made. Raises InputError if it is not the same or not
-    installed."""
+    """Returns the one head model with which all results were made. Raises InputError."""
     made: dict[tuple[str, str], list[str]] = {}
     for place, identity in zip(folders, map(identity_of, folders), strict=True):
         made.setdefault((identity.model, identity.sha256), []).append(place.relative_to(folder).as_posix())
@@ -230,8 +227,7 @@ def _model_of(folder: Path, folders: tuple[Path, ...]) -> ModelParts:
 
 
 def _neutral_points(model: HeadModel, measured: Measured) -> Float[np.ndarray, "V0 3"]:
-    """Returns the head's surface points at the vertices of the coarsest mesh, the cage, with the expression removed, in
-    the head frame."""
+    """Returns the head's surface points at the coarsest mesh's vertices, without the expression (head frame, mm)."""
     count = len(model.mean)
     known = {name: weight for name, weight in measured.expression.items() if name in model.expressions.names}
     moved = (model.levels["full"].operator @ model.expressions.moved(known))[:count]

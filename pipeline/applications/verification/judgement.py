@@ -178,8 +178,8 @@ class Judgement:
 
 
 def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) -> Judgement:
-    """Judges heads of one subject, made with one head model, against the reference scan. Raises InputError if the
-    reference shows another head."""
+    """Judges heads of one subject, made with one head model, against the reference scan. Raises InputError if it shows
+    another head."""
     captures = tuple(judge_one(one, reference) for one in measured)
     first = measured[0]
     deviations = np.stack([one.deviation_mm for one in captures])
@@ -216,8 +216,7 @@ def judge_one(measured: Measured, reference: Reference) -> Judged:
 
 
 def region_errors(deviation_mm: Float[np.ndarray, " v"], measured: Measured) -> dict[str, RegionError]:
-    """Returns the errors in every region of which the reference contains at least the fraction ``MIN_COVERED`` of the
-    area."""
+    """Returns the errors in every region with at least the fraction ``MIN_COVERED`` of its area in the reference."""
     found = {}
     known = np.isfinite(deviation_mm)
     for name in REGIONS:

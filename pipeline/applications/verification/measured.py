@@ -52,8 +52,7 @@ def is_result(folder: Path) -> bool:
 
 
 def identity_of(folder: Path) -> ResultIdentity:
-    """Returns the head model with which a result was made. Raises InputError if report.json is missing, damaged or does
-    not name the model."""
+    """Returns the head model with which a result was made. Raises InputError if report.json does not name it."""
     try:
         model = read_report(folder)["model"]
         return ResultIdentity(str(model["name"]), str(model["sha256"]))
@@ -62,8 +61,8 @@ def identity_of(folder: Path) -> ResultIdentity:
 
 
 def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
-    """Reads a result folder that was made with ``model``. Raises InputError that names each missing or invalid file or
-    field."""
+    """Reads a result folder that was made with ``model``. Raises InputError with all missing or invalid files and
+    fields."""
     report = read_report(folder)
     mesh, stated_mm = read_head_ply(folder / "head.ply")
     full = model.levels["full"]
@@ -92,8 +91,7 @@ def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
 
 
 def read_report(folder: Path) -> ReportDocument:
-    """Returns the decoded report.json of a result without checking its contents. Raises InputError if the file cannot
-    be read."""
+    """Returns the decoded report.json of a result without checking its contents. Raises InputError."""
     try:
         return json.loads((folder / "report.json").read_text(encoding="utf-8"))
     except FileNotFoundError as error:

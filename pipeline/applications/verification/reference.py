@@ -51,8 +51,7 @@ class Reference:
         return cls(name, sha256, mesh, dict(landmarks), SurfaceIndex(mesh.vertices, mesh.faces, SPACING_MM), rim)
 
     def beside(self, hits: Hits) -> Bool[np.ndarray, " n"]:
-        """Returns a mask of the closest points that lie on an open edge of the scan and are therefore not valid
-        matches."""
+        """Returns a mask of the closest points that lie on an open edge of the scan, so are no valid matches."""
         corners, off = self.mesh.faces[hits.triangles], hits.weights < ON_EDGE
         found = np.zeros(len(corners), bool)
         for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):

@@ -19,8 +19,7 @@ VerificationReport = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Occasion:
-    """Holds the report's content besides the judgement: the date of the test (ISO 8601), the head model, and the
-    limits."""
+    """Holds the report's content besides the judgement: date of the test (ISO 8601), head model, and limits."""
 
     date: str
     model: ResultIdentity

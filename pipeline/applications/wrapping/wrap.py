@@ -94,9 +94,9 @@ class _Glance:
 
 
 def unit_of(scale: float) -> tuple[str | None, float]:
-    """Returns the name of the unit, and its length in mm, in which a face has a human size; ``scale`` is the face's
-    size in the scan's unit relative to a mean adult's in mm. If no unit fits, returns None and the factor to a mean
-    adult's size."""
+    """Returns the unit's name, and its length in mm, in which a face has a human size; ``scale`` is the face's size in
+    the scan's unit relative to a mean adult's in mm. If no unit fits, returns None and the factor to a mean adult's
+    size."""
     for unit, factor in UNITS_MM.items():
         if SIZE_RANGE[0] < scale * factor < SIZE_RANGE[1]:
             return unit, factor
@@ -443,8 +443,7 @@ def wrap(
 
 
 def residual_colours(distance_mm: Float[np.ndarray, " t"], covered: Bool[np.ndarray, " t"]) -> UInt8[np.ndarray, "t 3"]:
-    """Returns colours for distances: white at 0, yellow at 0.5 mm, red from 1 mm on; grey where the scan has no
-    surface."""
+    """Returns colours for distances: white at 0, yellow at 0.5 mm, red from 1 mm on; grey for missing scan surface."""
     share = np.clip(distance_mm, 0.0, 1.0)
     colours = np.stack(
         [np.ones_like(share), np.clip(2.0 - 2.0 * share, 0, 1), np.clip(1.0 - 2.0 * share, 0, 1)], axis=1

@@ -109,8 +109,7 @@ def _write_residuals(folder: Path, wrapped: Wrapped) -> None:
 
 
 def wrap_picture(wrapped: Wrapped) -> ImageRgb:
-    """Draws the scan in grey clay, the template on it, and the residuals, each from front and side, with a row of
-    close-ups of the face."""
+    """Draws the scan in grey clay, the template on it, and the residuals, from front and side, with close-ups."""
     scan = wrapped.placed.surface()  # both in the frame and scale of the mean head
     template = Mesh(wrapped.placed.head_from_scan.apply(wrapped.vertices), wrapped.template.mesh.triangles())
     colours = residual_colours(wrapped.distance_mm, wrapped.covered)

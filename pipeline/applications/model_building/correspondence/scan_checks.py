@@ -1,9 +1,8 @@
-"""Checks raw scans before a model is built of them: units, left and right, orientation of faces, landmarks off the
-surface, holes.
+"""Checks raw scans for problems: units, left and right, orientation of faces, landmarks off the surface, holes.
 
 A problem with one obvious remedy (units, a mirrored file, exchanged landmark names, inverted faces) is repaired and
-reported. Every other problem is a fault, and all faults of a scan are reported. Landmarks are compared with the default
-model's mean."""
+reported. Every other problem is a fault, and all faults are reported. Landmarks are compared with the default model's
+mean."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -47,8 +46,8 @@ class Checked:
 
 
 def check(scan: Scan, template: HeadModel) -> Checked:
-    """Returns the scan in millimetres, with left and right and the orientation of faces repaired. Raises BadScan that
-    lists every fault."""
+    """Returns the scan in millimetres, with left and right and the orientation of faces repaired. Raises BadScan with
+    all faults."""
     _check_complete(scan)
     scan, repairs = _in_millimetres(scan, template)
     scan, side_repairs = _sides_and_windings(scan, template)
@@ -123,8 +122,7 @@ def _landmark_faults(scan: Scan, template: HeadModel) -> list[str]:
 
 
 def _surface_faults(scan: Scan) -> list[str]:
-    """Returns a fault if neighbouring faces are oriented differently, which shows as an edge that both use in the same
-    direction."""
+    """Returns a fault if neighbouring faces are oriented differently, so that both use their edge in one direction."""
     directed = np.concatenate([scan.faces[:, [0, 1]], scan.faces[:, [1, 2]], scan.faces[:, [2, 0]]]).astype(np.int64)
     keys = directed[:, 0] * len(scan.vertices) + directed[:, 1]
     doubled = len(keys) - len(np.unique(keys))

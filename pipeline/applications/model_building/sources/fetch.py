@@ -112,8 +112,7 @@ def _check_out(
 
 
 def _git(name: str, folder: Path, timeout_s: float, *arguments: str, report: Progress = discard_progress) -> str:
-    """Runs one git command and returns its output. Git never asks for a password; its progress lines are passed to
-    ``report``."""
+    """Runs one git command and returns its output. Git never asks for a password; its progress lines are reported."""
     environment = os.environ | {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C", "GIT_LFS_SKIP_SMUDGE": "1"}
     try:
         with (folder.parent / f"{folder.name}.log").open("w+b") as errors:
@@ -141,8 +140,7 @@ def _git(name: str, folder: Path, timeout_s: float, *arguments: str, report: Pro
 
 
 def _waited(process: subprocess.Popen[bytes], errors: IO[bytes], until: float, report: Progress) -> bytes:
-    """Waits for a process, reports its progress lines meanwhile, and returns its standard output. Raises
-    TimeoutExpired."""
+    """Waits for a process while reporting its progress lines, and returns its standard output. Raises TimeoutExpired."""
     while True:
         try:
             return process.communicate(timeout=min(0.25, until - time.monotonic()))[0]

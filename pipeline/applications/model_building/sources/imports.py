@@ -135,7 +135,7 @@ def import_model(path: Path, *, name: str | None = None, report: Progress = disc
 
 def read_ict_compact(path: Path) -> Foreign:
     """Returns the model in the one-file copy of ICT-FaceKit Light: mean, modes, faces, landmarks68, in mm. Raises
-    CannotImport if the file cannot be used."""
+    CannotImport."""
     with open_npz(path) as file:
         mean, modes, faces = (file[key] for key in ("mean", "modes", "faces"))
         points = file["landmarks68"]
@@ -143,8 +143,7 @@ def read_ict_compact(path: Path) -> Foreign:
 
 
 def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
-    """Returns the expressions from the file beside the identity file: names, and displacements of the same vertices in
-    mm."""
+    """Returns the expressions from the file beside the identity file: names, and displacements of its vertices in mm."""
     beside = path.with_name(path.stem.removesuffix("_light") + ICT_EXPRESSIONS)
     if not beside.is_file():
         return None
@@ -174,7 +173,7 @@ def read_ict_repository(folder: Path, *, report: Progress = discard_progress) ->
 
 def _repository_expressions(folder: Path, neutral: Vertices, report: Progress) -> Expressions | None:
     """Returns the expressions from meshes whose files are named after them: browDown_L.obj and so on. Raises
-    CannotImport if a file cannot be used."""
+    CannotImport."""
     paths = [path for path in sorted(folder.glob("*.obj")) if ICT_EXPRESSION.fullmatch(path.stem)]
     if not paths:
         return None
@@ -185,8 +184,7 @@ def _repository_expressions(folder: Path, neutral: Vertices, report: Progress) -
 def _displacements(
     folder: Path, paths: list[Path], neutral: Vertices, stage: str, report: Progress
 ) -> Float[np.ndarray, "M S 3"]:
-    """Returns the displacements (mm) of the meshes in ``paths`` (cm) from the neutral mesh. Raises CannotImport if a
-    file cannot be used."""
+    """Returns the displacements (mm) of the meshes in ``paths`` (cm) from the neutral mesh. Raises CannotImport."""
     shapes = []
     for k, path in enumerate(paths):
         vertices, _ = read_obj(path, polygons=False)

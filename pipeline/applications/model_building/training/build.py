@@ -39,9 +39,9 @@ def build_model(
 ) -> Built:
     """Builds a model from the scans of a folder and saves it as ``out``.
 
-    All scans are checked before any other work. With ``on_bad="stop"``, scans with faults raise InputError, which lists
-    all of these scans; with ``"skip"`` they are left out. Also raises InputError if fewer than 3 scans without faults
-    remain."""
+    All scans are checked before any other work. With ``on_bad="stop"``, scans with faults raise one InputError that
+    lists them; with ``"skip"`` they are left out. Also raises InputError if fewer than 3 scans without faults remain.
+    """
     parts, sha256 = read_parts(model_path("default"))
     template = assemble(parts, sha256)
     good, skipped = read_checked(scans_folder, template, report)
@@ -70,8 +70,8 @@ def build_model(
 
 
 def read_checked(folder: Path, template: HeadModel, report: Progress) -> tuple[list[Checked], dict[str, str]]:
-    """Returns the scans of a folder that passed all checks, and the faults of the other scans by name. Raises
-    InputError for an empty folder."""
+    """Returns the scans of a folder that passed all checks, and the other scans' faults by name. Raises InputError for
+    an empty folder."""
     paths = find_scans(folder)
     with workers(WORKERS, len(paths)) as crew:
         found = crew.over(partial(_read_and_check, template), paths, "checking scans", report)
@@ -88,13 +88,11 @@ def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
 
 
 def cages_through(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> Float[np.ndarray, "N V0 3"]:
-    """Computes coarse control meshes, cages (mm), whose subdivision surface passes through the given points at the
-    cage's vertices.
+    """Computes coarse control meshes, called cages (mm), whose subdivision surface passes through given points.
 
-    A subdivision surface lies inside its cage. The cage C must therefore solve S C = P, where P are the points and S
-    the rows of the subdivision matrix for the cage's vertices. S nearly removes details as fine as the cage itself, so
-    its inverse would amplify noise. A few iterations C += P - S C, starting with the template's details, avoid this
-    amplification."""
+    A subdivision surface lies inside its cage. The cage C must therefore solve S C = P, with the points P and the
+    subdivision matrix's rows S for the cage's vertices. S nearly removes details as fine as the cage itself, so its
+    inverse would amplify noise. A few iterations C += P - S C, starting with the template's details, avoid this."""
     rows = template.levels["full"].operator[: len(template.mean)]
     mean = template.mean.astype(float)
     away = points - rows @ mean

@@ -57,8 +57,7 @@ def scan_head(
     scanner: Scanner,
     rng: np.random.Generator,
 ) -> Scan:
-    """Simulates a raw scan of a head (head frame, mm); the scan is in the scanner's frame, slightly rotated and
-    shifted."""
+    """Simulates a raw scan of a head (head frame, mm); the scan is slightly rotated and shifted."""
     angles, heights = _grid(vertices, scanner, rng)
     columns, rows = np.meshgrid(angles, heights)
     radii = CylinderIndex(vertices, faces).cast(columns.ravel(), rows.ravel())
@@ -108,8 +107,7 @@ def _swallowed(
 def _grid_faces(
     valid: Bool[np.ndarray, "H A"], points: Float[np.ndarray, "N 3"], jump_mm: float
 ) -> Int[np.ndarray, "F 3"]:
-    """Returns triangles between neighbouring samples, also across the seam of the angle; no edge is ``jump_mm`` or
-    longer."""
+    """Returns triangles between neighbouring samples, also across the angle's seam; no edge is ``jump_mm`` or longer."""
     rows, columns = valid.shape
     index = np.arange(rows * columns).reshape(rows, columns)
     here, right = index[:-1], np.roll(index, -1, 1)[:-1]

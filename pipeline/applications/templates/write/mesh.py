@@ -77,8 +77,7 @@ def template_textures(
 
 
 def _places(layout: Layout, surface_binding: SurfaceBinding) -> Float[np.ndarray, "t 2"]:
-    """Returns the position of each skin vertex in the head model's texture; all other vertices get the texture's
-    corner."""
+    """Returns each skin vertex's position in the head model's texture; other vertices get the texture's corner."""
     attached = surface_binding.attachment
     out = np.zeros((len(surface_binding.rest), 2))
     out[surface_binding.skin] = np.einsum("nk,nkx->nx", attached.weights, layout.uv[layout.faces[attached.triangles]])

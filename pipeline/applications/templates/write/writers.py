@@ -8,8 +8,8 @@ was made of. Eyeballs, teeth and tongue that this program added have no ``rows``
 ``head-NAME-parts.obj`` and ``head-NAME-parts.usdz`` hold the same named parts without blendshapes.
 
 The image of an eyeball is centred at the iris; distance from its centre is proportional to the angle from the gaze. The
-part of the eyeball between the lids gets the head's texture; the hidden part gets the median colour of the iris, ring
-by ring, or of the white."""
+eyeball between the lids gets the head's texture; its hidden part gets the iris's median colours, ring by ring, or the
+white's."""
 
 import io
 import json
@@ -132,8 +132,8 @@ def _front(
 def _photographed(
     eyeball: Eyeball, directions: Float[np.ndarray, "n 3"], photographed: PhotographedEyes
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Returns the photographed colours (sRGB) in these directions from an eyeball's centre, and a mask of the
-    directions that no lid hides."""
+    """Returns photographed colours (sRGB) in these directions from an eyeball's centre, and a mask of directions that
+    no lid hides."""
     head, atlas = photographed.head, photographed.atlas
     if atlas is None or not len(photographed.between):
         return np.zeros_like(directions), np.zeros(len(directions), bool)
@@ -150,8 +150,8 @@ def _photographed(
 
 
 def load_template_writers(name: str | None, model: HeadModel) -> tuple[ResultWriter, ...]:
-    """Loads the named template, if any, for a job with the head model ``model``; returns the writers of posed.glb and
-    of the template's files.
+    """Loads the named template, if any, for a job with ``model``; returns the writers of posed.glb and the template's
+    files.
 
     Raises UnknownTemplate, BadTemplate, OtherModel.
     """
@@ -236,9 +236,9 @@ def write_template_shapes(folder: Path, result: Reconstruction, template: Templa
 
 
 def write_posed(folder: Path, result: Reconstruction) -> None:
-    """Writes posed.glb if the settings request morph targets and the head model has blendshapes. The file holds the
-    head without expression, its texture, blendshapes, pivots, eyeballs, teeth and tongue, and the blendshape weights of
-    the photographed head. Raises OSError."""
+    """Writes posed.glb if the settings request morph targets and the head model has blendshapes. It holds the head
+    without expression, with texture, blendshapes, pivots, eyeballs, teeth and tongue, and the photographed weights.
+    Raises OSError. Raises OSError."""
     blendshape_rig = result.evidence.blendshape_rig
     if blendshape_rig is None or not result.settings.outputs.morphs:
         return
@@ -266,8 +266,7 @@ def write_posed(folder: Path, result: Reconstruction) -> None:
 
 
 def _is_bridged(pivot: str, result: Reconstruction) -> bool:
-    """Returns whether an eye of the head was closed by a bridge between its lids, without a blink expression of the
-    head model."""
+    """Returns whether an eye of the head was closed by a bridge between its lids instead of a blink expression."""
     side, found = pivot.removeprefix("eye_"), result.evidence.blendshape_rig
     eye, blink = result.faces.eyes.get(side), f"eyeBlink{side.title()}"
     return isinstance(eye, UnseenEye) and eye.cause == "closed" and not (found and found.weights.get(blink))
