@@ -36,6 +36,6 @@ def _root(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
 
 
 def factorised(matrix: sparse.csc_array) -> SuperLU:
-    """Returns the sparse factorisation of a symmetric positive definite matrix. It omits pivoting and orders the
-    unknowns for symmetric matrices, which takes a third to a tenth of the time of SuperLU's defaults."""
+    """Returns the sparse factorisation of a symmetric positive definite matrix. The function omits pivoting and orders
+    the unknowns for symmetric matrices, which takes a third to a tenth of the time of SuperLU's defaults."""
     return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})

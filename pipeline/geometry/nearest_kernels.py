@@ -85,8 +85,8 @@ def find_nearest(
 ) -> None:
     """Finds the tree points nearest to the query points ``first`` to ``last`` of ``places`` (n, 3), sorted by distance.
     Fills ``distance`` and ``near`` (both n, count) with the distances and point indices. Of equally distant points, the
-    lower index comes first. If fewer than count points are nearer than ``within``, the missing distances are infinite
-    and the missing indices are the number of points."""
+    lower index comes first. If fewer than the requested points are nearer than ``within``, the missing distances are
+    infinite and the missing indices are the number of points."""
     points, row, boxes, levels = tree
     leaves, total, count = 2**levels - 1, len(points), distance.shape[1]
     node_at, first_at, last_at = np.empty(DEEPEST, np.int64), np.empty(DEEPEST, np.int64), np.empty(DEEPEST, np.int64)

@@ -1,2 +1,2 @@
-"""Holds head models (the paper's section 3): the mean head, its modes, landmarks, expressions and meshes of several
+"""Holds head models (the paper's section 3): mean head, modes, landmarks, expressions and meshes of several
 resolutions."""

@@ -2,12 +2,12 @@
 not occur in the population.
 
 The modes come from a Gaussian process on the mean surface, as in Gaussian process morphable models (Luethi et al. 2018,
-https://doi.org/10.1109/TPAMI.2017.2739743): displacement along the mean's normal with the covariance
+https://doi.org/10.1109/TPAMI.2017.2739743): displacement along the mean's normal with the covariance k.
 
     k(x, y) = sum_i a_i^2 [ (1 - f) (g_i(x, y) + g_i(x, My)) + f g_i(x, y) ],
     g_i(x, y) = exp(-|x - y|^2 / (2 l_i^2)),
 
-where M mirrors at the median plane, because faces deviate from their population mostly symmetrically. The leading
+Here M mirrors at the median plane, because faces deviate from their population mostly symmetrically. The leading
 eigenfunctions of this process are computed by Nystroem's method on a subset of the vertices, scaled by their standard
 deviations and appended to the eigenheads as modes with unit prior, orthogonal to the span of the eigenheads.
 Displacements are along the normal only, because sliding along the surface changes no silhouette."""
@@ -61,8 +61,8 @@ def with_fine_kernel(model: HeadModel, *, length_mm: float, amplitude_mm: float)
     """Returns the model with additional modes of a shorter correlation length that deform only the face region, for
     solvers that use more of the face than its outline.
 
-    The modes fade out over half a correlation length beyond the region. They are not orthogonal to the model's other
-    modes, because the prior variances of all correlation lengths should add up."""
+    The modes fade out over half a correlation length beyond the region. The new modes are not orthogonal to the model's
+    other modes, because the prior variances of all correlation lengths should add up."""
     level = model.levels["cage"]
     points = model.mean.astype(float)
     inside = points[level.face_region]

@@ -114,9 +114,9 @@ def rounds_of_rig(factor: float) -> tuple[Round, ...]:
     of the usual rig.
 
     Each round has the usual number of steps, over a range ``factor`` times as wide. For each doubling of the factor,
-    the last round is repeated once, and then once more over half its range: with only three cameras in front, outlines
-    leave the middle of a face undetermined by 8 mm, and large errors converge slowly. Shading is removed in these last
-    rounds as well, because gloss looks like a change of depth."""
+    the last round is repeated once, and then once more over half its range, because with only three cameras in front,
+    outlines leave the middle of a face undetermined by 8 mm. Shading is removed in these last rounds as well, because
+    gloss looks like a change of depth."""
     more = round(math.log2(factor))
     wider = [replace(each, reach_mm=factor * each.reach_mm) for each in ROUNDS]
     wider[-1] = replace(wider[-1], with_shading=not more)
@@ -126,8 +126,8 @@ def rounds_of_rig(factor: float) -> tuple[Round, ...]:
 
 @lru_cache(maxsize=1)  # 150 MB; studios work with one model
 def finer(model: HeadModel) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
-    """Returns the model with additional fine modes, its patches, and its modes at the patches' centres. These arrays
-    depend on the model alone and are cached."""
+    """Returns the model with additional fine modes, its patches, and its modes at the patches' centres. The result
+    depends on the model alone and is cached."""
     length, amplitude = FINE_LENGTH_MM, FINE_AMPLITUDE_MM
     sizes = {
         "sample_mm": SAMPLE_MM,

@@ -3,8 +3,8 @@ writes the comparison files.
 
 The later head is aligned rigidly to the earlier one on the forehead and the bridge of the nose, which neither
 expression nor jaw moves. Then each vertex of the earlier head gets its signed distance (mm) to the later head's
-surface, positive if the later surface lies outside. A change is significant if it exceeds ``SURE`` combined standard
-deviations; these combine the errors of both surfaces and of the alignment as independent errors.
+surface, positive if the later surface lies outside. A change is significant if it exceeds ``SURE`` standard deviations,
+which combine the errors of both surfaces and of the alignment as independent errors.
 
 The files are compare.json, tables, the map of changes as PLY and GLB, pictures, and a PDF.
 

@@ -1,17 +1,17 @@
 """Measures a finished head for the fitting of helmets, masks and spectacles, with standard deviations. Also chooses the
 size of such a product: it computes the probability of each size from a measure and its standard deviation.
 
-Measures have the names of ISO 7250-1 and ISO 8559-1 where these standards define one (``ISO_NAMES``). The head is first
-turned until its Frankfurt plane is horizontal (``anatomical_frame``), as people hold their heads:
+Measures have the names of ISO 7250-1 and ISO 8559-1 where these standards define one (``ISO_NAMES``). Before measuring,
+the head is turned until its Frankfurt plane is horizontal (``anatomical_frame``), as people hold their heads:
 
-- head circumference: the length of a tape along the convex hull of a section without the ears; the section passes
-  through glabella and opisthocranion and is horizontal from side to side;
-- nose-bridge width: measured in the horizontal section ``BRIDGE_BELOW_NASION_MM`` below nasion, at the depth
-  ``PAD_DEPTH_MM`` behind its front, where the pads of spectacles lie. The splay angle is measured there between each
-  flank of the nose and straight ahead. The frontal angle is between each flank and the vertical, computed from the
-  widths at two heights;
-- frame angle (pantoscopic): between the vertical and the line that touches brow and cheek in front of each eye,
-  positive if the lower rim of spectacles comes nearer to the face.
+- The head circumference is the length of a tape along the convex hull of a section without the ears; the section passes
+  through glabella and opisthocranion and is horizontal from side to side.
+- The nose-bridge width is measured in the horizontal section ``BRIDGE_BELOW_NASION_MM`` below nasion, at the depth
+  ``PAD_DEPTH_MM`` behind its front, where the pads of spectacles lie. The splay angle is measured in the same section
+  between each flank of the nose and straight ahead. The frontal angle is the angle between each flank of the nose and
+  the vertical, computed from the widths at two heights.
+- The frame angle (pantoscopic) is the angle between the vertical and the line that touches brow and cheek in front of
+  each eye, positive if the lower rim of spectacles comes nearer to the face.
 
 Standard deviations come from ``DRAWS`` random heads: vertices move along their normals by the result's standard
 deviation (``quality`` of head.ply), times a smooth random field with the correlation of the head models

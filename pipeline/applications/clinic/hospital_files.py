@@ -139,7 +139,8 @@ def fill_voxels(closed: Mesh) -> tuple[UInt8[np.ndarray, "x y z"], Float[np.ndar
     """Returns a mask of the voxels whose centre lies within a closed mesh (mm), and the affine transform from voxels to
     mm.
 
-    A centre is inside if a vertical ray from below crosses the mesh an odd number of times before it."""
+    A centre is inside if a vertical ray from below crosses the mesh an odd number of times before it reaches the
+    centre."""
     low = np.floor(closed.vertices.min(axis=0) / VOXEL_MM) - 1.0
     size = (np.ceil(closed.vertices.max(axis=0) / VOXEL_MM) - low + 2.0).astype(int)
     corners = (closed.vertices / VOXEL_MM - low)[closed.faces]

@@ -20,8 +20,8 @@ HEADER, CHUNK = 12, 8  # bytes of the file's header and of a chunk's
 def animated(
     glb: bytes, times_s: Float[np.ndarray, " t"], weights: Float[np.ndarray, "t m"], poses: Sequence[RigidTransform]
 ) -> bytes:
-    """Returns the glTF file with an animation of its first node. ``weights`` are for the mesh's morph targets in their
-    order; ``poses`` are in mm."""
+    """Returns the glTF file with an animation of its first node. ``weights`` are those of the mesh's morph targets, in
+    their order; ``poses`` are in mm."""
     (length,) = struct.unpack_from("<I", glb, HEADER)
     document = json.loads(glb[HEADER + CHUNK : HEADER + CHUNK + length])
     payload = bytearray(glb[HEADER + CHUNK + length + CHUNK :])

@@ -1,7 +1,7 @@
 """Models the fine texture of a person's skin in a sequence, at sample points of the surface and for each camera.
 
-The texture of a picture is the logarithm of its grey values minus their local mean, so neither a camera's gain nor
-shading changes it. The reference of a sample in a camera is its mean texture over the frames from which the person was
+The texture of a picture is the logarithm of its grey values minus their local mean, so camera gain and shading do not
+change it. The reference of a sample in a camera is its mean texture over the frames from which the person was
 estimated; a camera that never saw the sample uses the mean over all cameras. Each frame is compared with the reference
 and never with the previous frame, so errors do not accumulate."""
 

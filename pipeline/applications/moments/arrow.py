@@ -1,11 +1,11 @@
 """Solves linear equations whose matrix has the form of an arrow: some unknowns are shared by all blocks, the others
 belong to one block each. No equation connects the unknowns of two blocks, so each block's unknowns are eliminated
-separately
+separately:
 
     S = M_ss - sum_k M_sk M_kk^-1 M_ks        (Schur complement of what is left)
 
-and computed after the shared unknowns are known. Unknowns with bounds are not eliminated but solved with the shared
-unknowns."""
+The blocks' unknowns are computed after the shared unknowns are known. Unknowns with bounds are not eliminated but
+solved with the shared unknowns."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class Eliminated:
 
     @property
     def taken(self) -> Left:
-        """Returns the matrix that the elimination subtracts from the matrix of the remaining unknowns."""
+        """Returns the matrix that the block's elimination subtracts from the matrix of the remaining unknowns."""
         half = scipy.linalg.solve_triangular(self.root, self.across, lower=True, check_finite=False)
         return half.T @ half
 
@@ -58,7 +58,7 @@ class Arrow:
         return np.setdiff1d(np.arange(self.size), np.concatenate([np.zeros(0, int), *self.blocks]))
 
     def solve(self, matrix: Matrix, right: Vector) -> Vector:
-        """Solves the equations ``matrix x = right``. Raises LinAlgError if they are not positive definite."""
+        """Solves the equations ``matrix x = right``. Raises LinAlgError if the matrix is not positive definite."""
         return self._whole(matrix, right, cholesky_solve)
 
     def least(self, matrix: Matrix, gradient: Vector, lower: Vector, upper: Vector) -> Vector:
@@ -74,8 +74,8 @@ class Arrow:
         return found
 
     def covariances(self, matrix: Matrix, blocks: tuple[Rows, ...]) -> Iterator[Float[np.ndarray, "_ _"]]:
-        """Yields, for each of ``blocks``, its square part of the inverse of ``matrix``, exactly symmetric. Raises
-        LinAlgError if the matrix is not positive definite."""
+        """Yields, for each of ``blocks``, the square block of the inverse of ``matrix`` at these rows and columns,
+        exactly symmetric. Raises LinAlgError if the matrix is not positive definite."""
         gone = self._eliminated(matrix)
         known = inverse(self._rest(matrix, gone))
         for block in blocks:

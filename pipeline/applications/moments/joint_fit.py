@@ -1,17 +1,20 @@
-"""Estimates one identity common to several moments, together with the pose, expression and cameras of each moment.
+"""Estimates one identity common to several captures, together with the pose, expression and cameras of each capture.
 
-The input is the contour solver's solution for every moment, fitted to outlines or photographs. The output is the same
-solutions with one common identity. The identity's coefficients and the logarithm of scale are shared; each other
-unknown belongs to one moment. The normal equations therefore have the form of an arrow (module ``arrow``). The cost is
-the sum of the moments' costs. Each moment's cost contains the prior of the shared unknowns.
+The input is the contour solver's solution for every capture, fitted to outlines or photographs. The output is the same
+solutions with one common identity.
 
-With independent errors, the sum should contain this prior only once. However, errors of cameras, light, hair and head
-model are the same in all moments. If the fraction ``COMMON`` of the error variance is common, K moments are worth K /
-(1 + COMMON (K - 1)) independent ones; the prior is therefore multiplied by 1 + COMMON (K - 1). With a factor of 1, the
-joint head of eight moments from three cameras was no better than the mean of the eight separate heads.
+The identity's coefficients and the logarithm of scale are shared; each other unknown belongs to one capture. The normal
+equations therefore have the form of an arrow: a shared block, and one block for each capture (module ``arrow``).
 
-A moment whose photographs lack detail has no coefficients for fine modes; it contributes only to the modes that it has.
-"""
+The cost is the sum of the captures' costs. Each capture's cost contains the prior of the shared unknowns, so the sum
+contains this prior K times for K captures. With independent errors, the prior should count once. However, the errors of
+cameras, light, hair and head model are the same in all captures. If the fraction ``COMMON`` of the error variance is
+common, K captures are worth K / (1 + COMMON (K - 1)) independent ones; the prior should therefore count 1 + COMMON
+(K - 1) times. When the prior counted once, the joint head of eight captures from three cameras was no better than the
+mean of the eight separate heads.
+
+A capture whose photographs lack detail has no coefficients for fine modes; it contributes only to the modes that it
+has."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -38,8 +41,8 @@ Rows = Int[np.ndarray, "_"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Holds the index of each moment's unknowns in the vector of all unknowns: identity coefficients first, then the
-    logarithm of scale, then each moment's remaining unknowns."""
+    """Holds the index of each capture's unknowns in the vector of all unknowns: identity coefficients first, then the
+    logarithm of scale, then each capture's remaining unknowns."""
 
     identity: int  # coefficients
     places: tuple[Rows, ...]  # by moment: the row of each of its unknowns
@@ -54,12 +57,12 @@ class Layout:
 
 
 def identity_of(solved: ContourSolution, state: State) -> Float[np.ndarray, " i"]:
-    """Returns the coefficients of a moment's head without expression weights."""
+    """Returns the coefficients of a capture's head without expression weights."""
     return np.delete(state.coefficients, np.asarray(solved.problem.model.posed, int))
 
 
 def lay_out(solutions: Sequence[ContourSolution], problems: Sequence[Problem[State]]) -> Layout:
-    """Returns the layout of all moments' unknowns in one vector."""
+    """Returns the layout of all captures' unknowns in one vector."""
     identity = max(len(identity_of(each, each.state)) for each in solutions)
     places, weights, free, size = [], [], [], identity + 1
     for solved, problem in zip(solutions, problems, strict=True):
@@ -77,7 +80,7 @@ def lay_out(solutions: Sequence[ContourSolution], problems: Sequence[Problem[Sta
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointTerm:
-    """Computes the sum of the costs of all moments. For K moments, the prior of the shared unknowns is multiplied by
+    """Computes the sum of the costs of all captures. For K captures, the prior of the shared unknowns is multiplied by
     ``1 + common (K - 1)``."""
 
     problems: tuple[Problem[State], ...]
@@ -86,7 +89,7 @@ class JointTerm:
     common: float
 
     def at(self, states: States) -> "LinearisedJointTerm":
-        """Returns the linearised term; ``states`` has one state for each moment."""
+        """Returns the linearised term; ``states`` has one state for each capture."""
         parts = tuple(problem.at(state) for problem, state in zip(self.problems, states, strict=True))
         counts = np.zeros(self.layout.identity + 1)  # priors too many
         values = np.zeros(self.layout.identity + 1)
@@ -101,8 +104,8 @@ class JointTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedJointTerm:
-    """Holds the moments' linearised costs, and the information matrix of the superfluous priors, which is subtracted at
-    the shared ``values``."""
+    """Holds the captures' linearised costs, and the information matrix of the superfluous copies of the prior, which is
+    subtracted at the shared ``values``."""
 
     term: JointTerm
     parts: tuple[Linearised, ...]
@@ -111,11 +114,11 @@ class LinearisedJointTerm:
 
     @property
     def cost(self) -> float:
-        """Returns the sum of the moments' costs, without the superfluous priors."""
+        """Returns the sum of the captures' costs, without the superfluous copies of the prior."""
         return sum(part.cost for part in self.parts) - float(self.repeated @ self.values**2)
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds each moment's normal equations at its indices, in place."""
+        """Adds each capture's normal equations at its indices, in place."""
         layout = self.term.layout
         for part, problem, rows in zip(self.parts, self.term.problems, layout.places, strict=True):
             local = problem.equations(part)
@@ -127,7 +130,7 @@ class LinearisedJointTerm:
 
 
 def joint_problem(solutions: Sequence[ContourSolution], common: float = COMMON) -> tuple[Problem[States], Layout]:
-    """Builds the least-squares problem of all moments, from the last stage of each moment's solution."""
+    """Builds the least-squares problem of all captures, from the last stage of each capture's solution."""
     problems = tuple(last_problem(each)[0] for each in solutions)
     layout = lay_out(solutions, problems)
     term = JointTerm(problems, tuple(solutions), layout, common)
@@ -148,8 +151,8 @@ def joint_problem(solutions: Sequence[ContourSolution], common: float = COMMON) 
 
 
 def start_at_mean(solutions: Sequence[ContourSolution]) -> States:
-    """Returns each moment's state with its identity and scale replaced by the mean over all moments. For a mode that
-    some moments lack, the mean is taken over the others."""
+    """Returns each capture's state with its identity and scale replaced by the mean over all captures. For a mode that
+    some captures lack, the mean is taken over the others."""
     identities = [identity_of(each, each.state) for each in solutions]
     stacked = np.full((len(solutions), max(map(len, identities))), np.nan)
     for row, identity in zip(stacked, identities, strict=True):
@@ -160,7 +163,7 @@ def start_at_mean(solutions: Sequence[ContourSolution]) -> States:
 
 
 def with_identity(solved: ContourSolution, state: State, identity: Float[np.ndarray, " i"], scale: float) -> State:
-    """Returns a moment's state with the given identity (truncated to the moment's modes) and scale."""
+    """Returns a capture's state with the given identity (truncated to the capture's modes) and scale."""
     coefficients, posed = state.coefficients.copy(), np.asarray(solved.problem.model.posed, int)
     rows = np.setdiff1d(np.arange(len(coefficients)), posed)
     coefficients[rows] = identity[: len(rows)]
@@ -171,7 +174,8 @@ def with_identity(solved: ContourSolution, state: State, identity: Float[np.ndar
 def fit_jointly(
     solutions: Sequence[ContourSolution], eigenheads: int, *, watch: Callable[[], None] = lambda: None
 ) -> tuple[ContourSolution, ...]:
-    """Returns the moments' solutions after a joint fit, which gives all of them the identity with the least total cost.
+    """Returns the captures' solutions after a joint fit, which gives all of them the identity with the least total
+    cost.
 
     Args:
         solutions: of at least two moments, with models of one mesh and one basis; some may have fine modes, too.
@@ -201,8 +205,8 @@ def _with_evidence(
     here: Linearised,
     eigenheads: int,
 ) -> States:
-    """Estimates the prior variance of each group of modes from all moments and solves once more for shape and
-    expressions, as ``expression_evidence`` does for one moment."""
+    """Estimates the prior variance of each group of modes from all captures and solves once more for shape and
+    expressions, as ``expression_evidence`` does for one capture."""
     longest = max(range(len(states)), key=lambda k: len(states[k].coefficients))
     posed = solutions[longest].problem.model.posed
     identity = identity_of(solutions[longest], states[longest])
@@ -236,9 +240,10 @@ def _with_evidence(
 
 
 def joint_covariances(solutions: Sequence[ContourSolution]) -> Iterator[Float[np.ndarray, "p p"]]:
-    """Yields the covariance of each moment's coefficients, rotation, translation and log scale after the joint fit. The
-    independent part of the errors follows from the joint normal matrix with a single prior; the fraction ``COMMON``
-    keeps the covariance of the moment's separate fit. Weights at their bounds are treated as in ``finish``."""
+    """Yields the covariance of each capture's coefficients, rotation, translation and log scale after the joint fit.
+    The independent part of the errors follows from the joint normal matrix; the common part, the fraction ``COMMON``,
+    keeps the covariance of the capture's separate fit. Weights at their bounds have the variance that ``finish`` gives
+    them."""
     problem, layout = joint_problem(solutions, common=0.0)
     here = problem.at(tuple(each.state for each in solutions))
     assert isinstance(here, Sum)

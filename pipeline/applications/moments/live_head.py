@@ -64,7 +64,7 @@ class LivePerson:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveHead:
-    """Holds the tracked head at one moment.
+    """Holds the tracked head in the current pictures.
 
     Attributes:
         who: the person.
@@ -119,7 +119,7 @@ def meet(
 
 
 def _shaped(observed: LandmarkObservations, start: Similarity, modes: int) -> State:
-    """Fits the head model's first modes and its pose to triangulated landmarks."""
+    """Fits the head model's first modes and its pose to triangulated face landmarks."""
     stage = Stage("full", modes, False, (), False, False, 0)
     rows = np.eye(modes + 1, modes + POSE_WITH_SCALE)
     rows[modes, [modes, modes + LOG_SCALE]] = 0.0, 1.0 / SCALE_SPREAD

@@ -1,14 +1,14 @@
 """Estimates a person's neutral head and personal blendshapes from the heads of a take.
 
-At each vertex, the head y_k of moment k, measured from the head model's prediction, is
+At each vertex, y_k is the difference between the head of capture k and the head model's prediction:
 
     y_k = u + sum_e w_ke d_e + noise,    u ~ N(0, r^2),    d_e ~ N(0, (OWN |S_e|)^2)
 
-where the relief u is common to all moments, d_e is the difference between the person's blendshape e and the head
-model's S_e, and w_ke are the expression weights. The noise's standard deviation is that of each head. Cameras, hair and
-light make a fraction ``COMMON`` of the noise variance the same in all moments, so more moments do not reduce it. Each
-vertex is computed separately; the results are smooth because the heads are smooth. All distributions are Gaussian, so
-the K x K covariance of the y_k at each vertex suffices."""
+Here the relief u is common to all captures, d_e is the difference between the person's blendshape e and the head
+model's S_e, and w_ke are the expression weights. The noise has the standard deviation that the fit of each head states.
+Cameras, hair and light make a fraction ``COMMON`` of the noise variance the same in all captures; averaging over
+captures does not reduce this fraction. Each vertex is computed separately; the results are smooth because the heads are
+smooth. All distributions are Gaussian, so the K x K covariance of the y_k at each vertex suffices."""
 
 from dataclasses import dataclass
 

@@ -59,8 +59,8 @@ requestAnimationFrame(next);
 
 @dataclass(frozen=True, slots=True)
 class Skew:
-    """Holds how much later a camera exposes than the mean of all cameras (ms), the scatter over shots, and the standard
-    deviation of the mean."""
+    """Holds how much later a camera exposes than the mean of all cameras (ms), this offset's scatter over shots, and
+    the standard deviation of the mean offset."""
 
     shots: int
     mean_ms: float

@@ -1,8 +1,8 @@
 """Tracks a head through a sequence: estimates one identity, and the pose and expression of every frame.
 
 The identity is estimated from the sharpest frames of the first second (``sequence_person``). Then each frame is fitted,
-starting from the previous frame's motion after extrapolation (``track_frame``). A lost head is searched in the whole
-pictures; if this fails too, the frame counts as failed and is interpolated. At the end, pose and weights are smoothed
+starting from the motion extrapolated from the previous frames (``track_frame``). A lost head is searched in the whole
+pictures; if no head is found, the frame counts as failed and is interpolated. At the end, pose and weights are smoothed
 over time (``smoothing``).
 
 Results are stored in chunks of frames, each written under a temporary name first. No chunk depends on another one: a
@@ -68,7 +68,8 @@ class Course:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracker:
-    """Holds everything that the tracking of all frames shares."""
+    """Holds what the tracking of all frames has in common: the person, the sample points, their reference texture, and
+    the face networks."""
 
     person: SequencePerson
     samples: Samples
@@ -128,7 +129,7 @@ def track_sequence(
 ) -> tuple[SequencePerson, Course | None]:  # fmt: skip
     """Tracks a head through all frames of a sequence. ``kept`` is the folder that stores finished chunks. ``share`` (k,
     n) tracks only part k of n of the sequence, k from 1. Returns the person and the unsmoothed course; the course is
-    None while chunks of other shares are missing. Raises what ``find_person`` raises."""
+    None while chunks of other shares are missing. Raises the errors of ``find_person``."""
     inputs = json.dumps(inputs_of(footage, model, settings)).encode()
     if not (kept / INPUTS).is_file() or (kept / INPUTS).read_bytes() != inputs:
         for path in kept.glob("*.npz"):
@@ -165,7 +166,7 @@ def _track_chunks(footage: Footage, person: SequencePerson, missing: Mapping[int
 
 
 def _track_chunk(tracker: Tracker, pictures: Iterator[Pictures], frames: range, count: int, report: Progress) -> Course:
-    """Tracks the pictures of one chunk, ``frames``, of a sequence with ``count`` frames."""
+    """Tracks the pictures of one chunk, whose frame numbers are ``frames``, in a sequence of ``count`` frames."""
     found, shown, last = list[Tracked | None](), list[list[bool]](), list[Motion]()
     for number, taken in zip(frames, pictures, strict=False):  # takes no picture after the last frame
         report(f"frame {number + 1} of {count}", SHARE + (1.0 - SHARE) * number / count)
@@ -217,8 +218,8 @@ def smoothed(course: Course) -> Course:
 
 
 def inputs_of(footage: Footage, model: HeadModel, settings: Settings) -> dict[str, Any]:
-    """Returns everything on which a sequence's result depends: its files by name, size and time, the head model, the
-    settings, and the format version of stored chunks."""
+    """Returns what a sequence's result depends on: its files by name, size and time, the head model, the settings, the
+    number of frames in a chunk, and the program's version."""
     digest, paths = hashlib.sha256(), sorted(path for path in footage.folder.rglob("*") if path.is_file())
     for path in paths:
         status = path.stat()

@@ -1,16 +1,16 @@
 """Tracks a sequence from its folder, and writes the result files.
 
-sequence.npz    frames (t), times_s, expressions (e), weights and weight_deviations (t e), rotations (t 3 3),
-                translations (t 3, mm; world_from_head), pose_deviations (t 6: rad, mm), alike (t: correlation of the
-                skin's texture), failed (t), skew_mm (t: how far the face moves between the first and the last
-                camera's exposure, by clock.json); all smoothed
-person.npz      names (e), neutral (v 3, head frame, mm), shapes (e v 3, mm at weight 1), the corrected cameras; the
-                head of a frame is rotation (neutral + sum of weights times shapes) + translation
-sequence.glb    the head, animated: its expressions as morph targets, its pose relative to the first frame
-sequence.usdc   the same as a point cache of OpenUSD, where it is asked for
-preview.mp4     the front camera's pictures beside the head in clay
-report.json     what was found, written last
-.chunks/        what a run that was killed goes on from
+    sequence.npz   frames (t), times_s, expressions (e), weights and weight_deviations (t e), rotations (t 3 3),
+                   translations (t 3, mm; world_from_head), pose_deviations (t 6: rad, mm), alike (t: correlation of the
+                   skin's texture with its reference), failed (t), skew_mm (t: how far the face moves between the first
+                   and the last camera's exposure, by clock.json); all are smoothed over time
+    person.npz     names (e), neutral (v 3, head frame, mm), shapes (e v 3, mm at weight 1), the corrected cameras; the
+                   head of a frame is rotation (neutral + sum of weights times shapes) + translation
+    sequence.glb   the animated head: expressions as morph targets, pose relative to the first frame
+    sequence.usdc  the same as a point cache of OpenUSD, if requested
+    preview.mp4    the front camera's pictures beside the rendered head
+    report.json    the report, written last
+    .chunks/       stored chunks, with which a run continues after an interruption
 """
 
 import json

@@ -1,7 +1,7 @@
 """Estimates the person of a sequence: one head from frames of the first second, solved as a take.
 
 The input is the sequence's footage. The output is the neutral head, the displacements of its vertices by each
-expression, the corrected cameras, and the pose and weights of each of these frames."""
+expression, the corrected cameras, and the pose and weights in each frame used."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -121,7 +121,7 @@ def person_of(
 
 def tracked_names(model: HeadModel) -> tuple[str, ...]:
     """Returns the head model's expressions that have one of Apple's 52 names. The head model's other expressions
-    largely repeat these, and together they could imitate a shift of the whole head."""
+    largely repeat the named ones, and together they could imitate a shift of the whole head."""
     parts = arkit_parts(model.expressions.names)
     return tuple(model.expressions.names[row] for row in sorted({row for of in parts.values() for row in of}))
 
@@ -139,7 +139,7 @@ def weights_alone(
 
 
 def _corrected(rig: Rig, joint: tuple[ContourSolution, ...]) -> Rig:
-    """Returns the cameras corrected by the mean of the frames' corrections, because the cameras do not move."""
+    """Returns the cameras after the mean correction over all frames, because the cameras do not move."""
     shifts: dict[str, list[np.ndarray]] = {name: [] for name in rig.names}
     for each in joint:
         for name, shift in zip(each.problem.views.names, each.state.camera_shift, strict=True):

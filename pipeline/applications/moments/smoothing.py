@@ -1,10 +1,11 @@
 """Smooths each unknown of a sequence over time, using earlier and later frames, as strongly as its noise requires.
 
-For an unknown x, measured as y_t with standard deviation s_t in each of T frames, the smooth course minimises
+For an unknown x, measured as y_t with standard deviation s_t in each of T frames, the smooth course minimises this
+cost:
 
     sum_t (x_t - y_t)^2 / s_t^2 + sum_t log(q^2 + a_t^2) ,    a_t = x_t+1 - 2 x_t + x_t-1
 
-where q is a multiple of the noise in the acceleration. The logarithm suppresses accelerations that noise can explain
+Here q is a multiple of the noise in the acceleration a_t. The logarithm suppresses accelerations that noise can explain
 and hardly changes larger ones, so blinks are not flattened. The unknowns of a group, such as the three rotation angles,
 share one weight for their accelerations. The minimum is found by iteratively reweighted least squares with a
 pentadiagonal Cholesky factor, which also gives the standard deviations. A frame without a measurement is interpolated,

@@ -1,10 +1,9 @@
-"""Fits one frame of a sequence: the pose of a known head and its expression weights, starting from the previous
-frame's.
+"""Fits one frame of a sequence: the pose of a known head and its expression weights, starting from those of the
+previous frame.
 
 One least-squares problem combines three residuals: face landmarks, lid openings, and the difference between skin
-texture and its reference (``appearance``). Landmarks find a head that moved far; texture is the most precise. Landmarks
-suffice for a head that moved far; texture is the most precise. The prior of the weights is that of a job with one
-capture (``contour_fit.prior_term``).
+texture and its reference (``appearance``). Landmarks find a head that moved far; texture is the most precise. The prior
+of the weights is that of a job with one capture (``contour_fit.prior_term``).
 
     r_texture = (T_k(pi_k(R x_s(w) + t)) - reference_ks) / sigma
     r_landmark = (pi_k(R x_i(w) + t) + bias_ki - found_ki) / sigma_px

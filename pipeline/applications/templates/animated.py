@@ -1,21 +1,21 @@
 """Builds a head for animation, either in a template's vertex order or in the head model's. The head gets Apple's 52
-blendshapes, pivots and, if its mesh lacks them, eyeballs, teeth and a tongue. A template also gets visemes, and its
-blendshapes are corrected until no triangles cross.
+blendshapes, rotation centres (pivots) and, if its mesh lacks them, eyeballs, teeth and tongue. A template also gets
+visemes, and its blendshapes are corrected until no triangles cross.
 
-The lips of a fitted head may be some tenths of a millimetre apart, and teeth would show through the gap. Such a gap is
-closed; a wider gap counts as an open mouth and is not changed. The inner edge of an open mouth's lips is smoothed.
+The lips of a fitted head may be some tenths of a millimetre apart, and teeth would show through the gap. A gap of this
+width is closed; a wider gap counts as an open mouth and is not changed. The inner edge of an open mouth's lips is
+smoothed.
 
-A head model's expressions move a template's vertices as follows: skin vertices move with the triangles of the head
-model that they are attached to (``carrying``). Vertices below the skin are attached in the same way if mesh edges
-connect them to the skin over vertices with similar displacements. A smooth map in space cannot replace this: where an
-expression parts two touching lips, it would tear the inside of one lip along with the other lip. Vertices that cannot
-be attached get the mean displacement of their neighbours in the mesh. Parts of the mesh that no edge connects to the
-skin are of three kinds:
+A head model's expressions move a template as follows: each skin vertex moves with the head model's triangle to which it
+is attached (``carrying``). Vertices below the skin are attached too if mesh edges connect them to the skin over
+vertices with similar displacements. A smooth map of space would not suffice: where an expression parts two touching
+lips, it would tear the inside of one lip along with the other lip. Vertices that cannot be attached get the mean
+displacement of their neighbours in the mesh. Parts of the mesh that no edge connects to the skin belong to three kinds:
 
-- eyeballs are round and closed, and no blendshape moves them: an animator rotates them about their pivots;
-- lashes and brows stand on the skin, and rotate with the skin triangle at their roots;
-- teeth and tongue lie inside the head: they move with the jaw below the line between the lips, and with the skull above
-  it."""
+- Eyeballs are round and closed, and no blendshape moves them: an animator rotates them about their pivots.
+- Lashes and brows stand on the skin, and rotate with the skin triangle at their roots.
+- Teeth and tongue lie inside the head. Below the line between the lips they move with the jaw, above it with the skull.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -123,7 +123,7 @@ def _matrix(edges: Int[np.ndarray, "e 2"], values: np.ndarray, count: int) -> sp
 
 
 def _with_skin(attachment: Attachment, surface_binding: SurfaceBinding) -> Attachment:
-    """Returns the attachment of all vertices; the skin's part is taken from the registered template."""
+    """Returns the attachment in which skin vertices have the attachment of the registered template."""
     skin, registered = surface_binding.skin, surface_binding.attachment
     for whole, part in (
         (attachment.triangles, registered.triangles),

@@ -44,8 +44,8 @@ def bind_vertices(
     vertices: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
 ) -> tuple[Attachment, Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Attaches each point to the nearest point of a mesh whose normal has a similar direction. Returns the attachment,
-    the distances (mm), and the cosine between each point's unit normal and the mesh's normal."""
+    """Attaches each point to the nearest point of a mesh that has a similar normal. Returns the attachment, the
+    distances (mm), and the cosine between each point's unit normal and the mesh's normal."""
     surface = SurfaceIndex(vertices, faces)
     hits = surface.closest(points, CANDIDATES, facing=normals)
     offsets = np.einsum("nax,nx->na", frames(vertices[faces[hits.triangles]]), points - hits.points)

@@ -1,11 +1,11 @@
 """Corrects blendshapes so that lips and lids may touch but do not pass through each other at any weight from 0 to 1.
 
-A blendshape moves every vertex along a straight line and ignores collisions. The correction begins where triangles of
-the posed mesh cross that do not cross at rest:
+A blendshape moves every vertex along a straight line and ignores collisions. Triangles that cross in the posed mesh but
+not at rest are corrected as follows:
 
-- lids are apart at rest: their displacement is scaled down until they only touch;
-- lips touch at rest: their displacement is blended with its mean over the surrounding space. (Such a mean moves both
-  lips alike; if it changes by less than 1 mm per mm, no triangles can cross.)
+- Lids are apart at rest, so their displacement is scaled down until they only touch.
+- Lips touch at rest, so their displacement is blended with its mean over the surrounding space. (A mean moves both lips
+  in the same way; if it changes by less than 1 mm per mm, no triangles can cross.)
 
 Each correction starts small and grows until no triangles cross; all other vertices keep their displacement."""
 
@@ -59,7 +59,7 @@ def rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurfa
 
 
 def crossings(rest: RestSurface, displacement: Vertices, weights: tuple[float, ...] = WEIGHTS) -> Int[np.ndarray, " w"]:
-    """Returns, for each weight of a blendshape, how many triangles cross others that do not cross at rest."""
+    """Returns, for each weight of a blendshape, the number of triangles that cross others only in the posed mesh."""
     moved = _moved(rest, displacement)
     return np.array([np.count_nonzero(_crossing(rest, displacement, w, moved)) for w in weights])
 
@@ -89,7 +89,7 @@ def _moved(rest: RestSurface, displacement: Vertices) -> Bool[np.ndarray, " f"]:
 
 
 def _stopped(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
-    """Returns the displacement scaled by the weight at which triangles of the zone first meet."""
+    """Returns the displacement scaled by the weight at which triangles of the zone first touch."""
     scale = np.ones(len(displacement))
     for _ in range(MEETING_ROUNDS):
         first = np.full(len(displacement), np.inf)

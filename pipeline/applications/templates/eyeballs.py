@@ -102,8 +102,8 @@ def _colours(angles: Float[np.ndarray, " n"], pupil: float, limbus: float) -> UI
 
 
 def turn_to(gaze: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
-    """Returns the rotation of an eye from straight ahead to ``gaze`` (unit, head frame), without roll about the line of
-    sight (Listing's law)."""
+    """Returns the rotation of an eye from straight ahead to ``gaze`` (unit vector, head frame), without roll about the
+    line of sight (Listing's law)."""
     axis = np.cross(AHEAD, gaze)
     sine = float(np.linalg.norm(axis))
     return rotation_from_vector(axis * (np.arctan2(sine, gaze @ AHEAD) / sine if sine > 0.0 else 1.0))

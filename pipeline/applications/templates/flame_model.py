@@ -7,7 +7,7 @@ out of the face. The joints are, in this order, the root, the neck, the jaw and 
 
 The parameters are fitted to a mesh in FLAME's vertex order by Levenberg-Marquardt on the vertex distances, with
 Gaussian priors. The standard deviation of the vertex distances is estimated anew in each round of the fit. The smaller
-this standard deviation, the less the priors count; they decide parameters that the mesh leaves undetermined."""
+this standard deviation, the less the priors count; the priors decide parameters that the mesh leaves undetermined."""
 
 from dataclasses import dataclass, replace
 

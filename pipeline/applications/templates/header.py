@@ -132,7 +132,7 @@ def read_header(path: Path) -> TemplateHeader:
 
 
 def read_meta(path: Path, file: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Returns the decoded ``meta`` entry of an open template file. Raises BadTemplate for other files."""
+    """Returns the decoded ``meta`` entry of an open template file. Raises BadTemplate for files of another kind."""
     if "meta" not in file:
         raise BadTemplate(path, compose("template-without-format"))
     meta = json.loads(file["meta"].tobytes())
@@ -142,7 +142,7 @@ def read_meta(path: Path, file: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def header_words(meta: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the text fields of a template's header from its decoded ``meta`` entry. Raises KeyError if one is
+    """Returns the text fields of a template's header from its decoded ``meta`` entry. Raises KeyError if a field is
     missing."""
     return {word: str(meta[word]) for word in WORDS}
 

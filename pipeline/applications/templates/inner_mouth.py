@@ -78,8 +78,8 @@ Shapes = Mapping[str, Places]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InnerMouth:
-    """Holds teeth and tongue without expression by name (head frame, mm), and the displacements of each by blendshape;
-    blendshapes that do not move a part are missing. ``absence`` is the reason if there are no teeth and tongue."""
+    """Holds teeth and tongue without expression by name (head frame, mm), and their displacements by blendshape,
+    without blendshapes that do not move them. ``absence`` is the reason if there are no teeth and tongue."""
 
     parts: Mapping[str, Mesh] = field(default_factory=dict)
     moves: Mapping[str, Mapping[str, Float[np.ndarray, "n 3"]]] = field(default_factory=dict)
@@ -284,7 +284,7 @@ def _spread(
 
 
 def _axis(inner: InnerMouth) -> Float[np.ndarray, " 2"]:
-    """Returns the x and z of the vertical line around which the arch of the teeth bends."""
+    """Returns the horizontal position (x and z) of the vertical axis about which the arch of the teeth bends."""
     rest = inner.parts["teeth_upper"].vertices
     return np.array([0.5 * (rest[:, 0].min() + rest[:, 0].max()), rest[:, 2].min()])
 

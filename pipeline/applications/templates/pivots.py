@@ -1,12 +1,12 @@
 """Computes the points about which a head's jaw, eyes and neck rotate (head frame: x to the subject's left, y up, z out
 of the face).
 
-- ``jaw``: the middle of the hinge axis, which lies 13 mm from each tragion towards the outer corner of the eye (Beyron
-  1942, the arbitrary hinge axis of dental articulators).
-- ``eye_right``, ``eye_left``: the centre of the mesh's eyeball; without one, of a ball of 12 mm radius (an adult's)
-  over which the closing lid slides.
-- ``neck``: the joint of skull and spine, 26 mm below and 11 mm behind the midpoint between the ear openings (Ewing and
-  Thomas 1972)."""
+- ``jaw`` is the middle of the hinge axis, which lies 13 mm from each tragion towards the outer corner of the eye
+  (Beyron 1942, the arbitrary hinge axis of dental articulators).
+- ``eye_right`` and ``eye_left`` are the centres of the mesh's eyeballs; without eyeballs, of balls of 12 mm radius (an
+  adult's) over which the closing lids slide.
+- ``neck`` is the joint of skull and spine, 26 mm below and 11 mm behind the midpoint between the ear openings (Ewing
+  and Thomas 1972)."""
 
 from collections.abc import Mapping
 
@@ -28,7 +28,7 @@ Points = Mapping[str, Float[np.ndarray, " 3"]]
 def pivots(
     landmarks: Points, vertices: Vertices, shapes: Mapping[str, Vertices], balls: list[Float[np.ndarray, "b 3"]]
 ) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns the pivots of a head by name (head frame, mm).
+    """Returns the pivots (rotation centres) of a head's parts by name, in the head frame, mm.
 
     Args:
         landmarks: of the head without expression.
@@ -58,7 +58,7 @@ def hinge(landmarks: Points) -> Float[np.ndarray, " 3"]:
 
 
 def _lid_centre(vertices: Vertices, blink: Vertices) -> Float[np.ndarray, " 3"]:
-    """Returns the centre of the eyeball under a lid: of the ball that the lid's edge touches both open and closed."""
+    """Returns the centre of the eyeball under a lid: the lid's edge touches this ball both open and closed."""
     moved = np.linalg.norm(blink, axis=1)
     rows = moved > SLIDING * moved.max()
     points = np.concatenate([vertices[rows], vertices[rows] + blink[rows]])

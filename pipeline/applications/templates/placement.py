@@ -2,8 +2,8 @@
 landmarks or by a search.
 
 The search tries millimetres, centimetres, decimetres and metres, every orientation of the axes, and three start
-positions for each combination. Iterated closest points (Besl and McKay 1992; with Umeyama's scale) then refines it,
-from the head model's surface to the mesh, so that teeth, eyeballs or shoulders have no effect."""
+positions for each combination. Iterated closest points (Besl and McKay 1992; with Umeyama's scale) from the head
+model's surface to the mesh then refine the transform; teeth, eyeballs or shoulders of the mesh have no effect."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ UNLIKE_MM = 8.0  # mean distance of the face beyond which a place is none
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Holds a triangle mesh with unit vertex normals; in mm once it has been placed."""
+    """Holds a triangle mesh with unit vertex normals; lengths are in mm after placement in the head frame."""
 
     vertices: Float[np.ndarray, "t 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -60,8 +60,8 @@ def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -
 
 
 def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]], name: str) -> Similarity:
-    """Computes head_from_template from at least four landmarks of the mesh (its frame) and the head model's. Raises
-    InputError, which begins with the mesh's ``name``, if the landmarks do not suffice."""
+    """Computes head_from_template from at least four landmarks in the mesh's frame. Raises InputError, which begins
+    with the mesh's ``name``, if the landmarks do not suffice."""
     names = [each for each in landmarks if each in model.landmarks]
     if len(names) < 4:
         raise InputError(name, [compose("template-landmarks-too-few", count=len(names), names=names or ["none"])])
@@ -158,7 +158,7 @@ def _closest_points(
 ) -> tuple[float, Similarity]:
     """Refines a similarity by iterated closest points. Returns the smallest weighted mean distance (mm, clipped at
     ``FAR_MM``) of the head model's points from the mesh, and the similarity. ``tree`` is a search tree over the mesh's
-    points with their normals, in units of ``factor``."""
+    points, scaled by ``factor``, with their normals."""
     start = place.scale
     found = (FAR_MM, place)
     for step in range(steps + 1):

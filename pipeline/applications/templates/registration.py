@@ -1,4 +1,4 @@
-"""Registers another program's mesh to a head model once (the paper's section 3.2 in the opposite direction).
+"""Registers another program's mesh to a head model once, so that the mesh can deform with fitted heads.
 
 The head model is fitted to the mesh as closely as possible (``fit_model_to_mesh``). Then
 ``geometry.registration.nonrigid`` deforms the mesh's skin onto the fitted head, so that the difference between mesh and
@@ -143,7 +143,7 @@ def weld(mesh: Surface) -> tuple[Surface, Int[np.ndarray, " t"]]:
     """Joins vertices at the same position along open borders, because mesh files cut surfaces along texture seams.
     Returns the mesh and the new index of each old vertex.
 
-    Lashes stay separate, because the lid has no border at their roots."""
+    Lashes remain separate parts, because the lid has no border at their roots."""
     ends = np.zeros(len(mesh.vertices), bool)
     ends[boundary_edges(mesh.faces)] = True
     identity = np.where(ends, -1, np.arange(len(ends)))[:, None]
@@ -199,8 +199,8 @@ def _used(mesh: Surface) -> Flags:
 def parting(
     attachment: Attachment, rest: Vertices, skin: Flags, faces: Int[np.ndarray, "f 3"], model: HeadModel
 ) -> Flags:
-    """Returns a mask of the vertices that move away from their neighbours on at least one random head. Such vertices
-    were attached to the wrong layer of the surface, such as the inside of a lid or the eyeball."""
+    """Returns a mask of the vertices that move away from their neighbours on at least one random head. A vertex that
+    does was attached to the wrong layer of the surface, such as the inside of a lid or the eyeball."""
     graph = _graph(faces[skin[faces].all(axis=1)], len(rest))
     graph = sparse.csr_array(((graph + graph.T) > 0).astype(float))
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)[:, None]
@@ -213,8 +213,8 @@ def parting(
 
 
 def without_edge(skin: Flags, faces: Int[np.ndarray, "f 3"]) -> Flags:
-    """Returns the mask of skin vertices without those next to deeper parts. Where a lid turns inwards, these vertices
-    match the head model's lid only by chance; without them the deeper parts follow the skin evenly."""
+    """Returns the mask of skin vertices without those next to deeper parts. Where a lid turns inwards, vertices at the
+    edge of the skin match the head model's lid only by chance, so deeper parts would follow the skin unevenly."""
     out = skin.copy()
     for _ in range(EDGE_RINGS):
         out[faces[~out[faces].all(axis=1)]] = False

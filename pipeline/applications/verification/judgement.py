@@ -5,12 +5,14 @@ Deviations are signed distances (mm, positive outside) from the reference scan t
 the best fit, weighted by the area of each vertex. Vertices are not judged if their closest point lies at the scan's
 open edge or farther than 10 mm away; the fraction of judged area is reported.
 
-- probing error of form: the range that contains the deviations of 99.7 % of the face's area;
-- probing error of size: the scale of the best fit minus 1, in percent;
-- distance error: distances between landmarks, measured minus reference. These distances need no alignment;
-- repeatability: the scatter of the heads over repeated captures (``repeatability``). Its limit applies to the scatter
-  along the normal, because sliding of a vertex along the surface does not change the shape;
-- error by region: mean, RMS, median and 95th percentile, also of the mean deviation over all captures (``repeated``).
+- The probing error of form is the range that contains the deviations of 99.7 % of the face's area.
+- The probing error of size is the scale of the best fit minus 1, in percent.
+- The distance error compares distances between landmarks: measured minus reference. Distances between landmarks need no
+  alignment.
+- The repeatability is the scatter of the heads over repeated captures (``repeatability``). The limit of repeatability
+  applies to the scatter along the normal, because sliding of a vertex along the surface does not change the shape.
+- Errors by region are mean, RMS, median and 95th percentile, also of the mean deviation over all captures
+  (``repeated``).
 
 Repeatability is computed from heads of one subject that was captured several times. All heads have the head model's
 vertices, so each vertex is compared with itself. The heads are aligned by rigid motions, without scale, to their mean

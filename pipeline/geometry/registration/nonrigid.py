@@ -4,7 +4,7 @@ interpolation).
 
 The warp uses the distance itself as its radial kernel, which minimises bending in three dimensions (F. Bookstein's thin
 plate in 3-D; Carr et al. 2001, *Reconstruction and Representation of 3D Objects with Radial Basis Functions*, section
-3). A linear polynomial makes affine motions exact everywhere."""
+3). An additional linear polynomial makes affine motions exact everywhere."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

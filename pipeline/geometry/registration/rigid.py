@@ -203,8 +203,8 @@ def generalised_procrustes(
     """Computes the most likely similarity T for ``target = T(source + e) + f``, where the errors e (head frame) and f
     (world frame) are correlated between points.
 
-    Iterates generalised least squares from ``start``; the residuals' covariance ``s^2 R C R^T + F`` is updated with
-    each estimate."""
+    Iterates generalised least squares from ``start`` with the residual covariance ``s^2 R C R^T + F`` of the last
+    estimate. The logarithm of the scale s has the prior N(0, ``scale_spread``^2)."""
     scale, rotation, translation = start.scale, start.rotation, start.translation
     for _ in range(ITERATIONS):
         turn = scale * np.kron(np.eye(len(source)), rotation)

@@ -132,8 +132,8 @@ def _surface_faults(scan: Scan) -> list[str]:
 
 
 def _hole_faults(scan: Scan, template: HeadModel) -> list[str]:
-    """Returns a fault for each hole below the crown that is too wide, seen from the axis. The width is the diameter of
-    a disc with the hole's area."""
+    """Returns a fault for each hole below the crown that is too wide, seen from the axis. A hole's width is the
+    diameter of a disc with the same area."""
     void, face = voids(scan, template)
     faults = []
     for where, mask, limit in (("face", void & face, FACE_HOLE_MM), ("head", void, HEAD_HOLE_MM)):
@@ -166,8 +166,8 @@ def outward_share(scan: Scan, template: HeadModel) -> float:
 
 
 def _widest(mask: Bool[np.ndarray, "H A"]) -> float:
-    """Returns the diameter (mm) of a disc with the area of the mask's largest connected patch. The first and last
-    column are neighbours around the head."""
+    """Returns the diameter (mm) of a disc with the area of the mask's largest connected patch. The mask's first and
+    last column are neighbours on the cylinder."""
     # Two copies side by side, so that the seam cuts no patch.
     twice = np.zeros((len(mask), 2 * mask.shape[1]), np.int32)
     ndimage.label(np.concatenate([mask, mask], 1), output=twice)

@@ -69,7 +69,7 @@ def welded(mesh: Mesh) -> tuple[Mesh, Bool[np.ndarray, " F"]]:
     """Returns the mesh with each position stored once, without unused vertices, colours and degenerate triangles; also
     a mask of the triangles that remain.
 
-    Mesh files repeat vertices along texture seams or for each triangle. A mesh torn in this way lacks the neighbours
+    Mesh files repeat vertices along texture seams or for each triangle. A mesh torn along seams lacks the neighbours
     that are needed to smooth noise."""
     _, first, index = np.unique(mesh.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
     corners = index.ravel()[mesh.faces]

@@ -92,7 +92,8 @@ def cages_through(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> F
 
     A subdivision surface lies inside its cage. The cage C must therefore solve S C = P, with the points P and the
     subdivision matrix's rows S for the cage's vertices. S nearly removes details as fine as the cage itself, so its
-    inverse would amplify noise. A few iterations C += P - S C, starting with the template's details, avoid this."""
+    inverse would amplify noise. A few iterations C += P - S C, starting with the template's details, avoid the noise.
+    """
     rows = template.levels["full"].operator[: len(template.mean)]
     mean = template.mean.astype(float)
     away = points - rows @ mean

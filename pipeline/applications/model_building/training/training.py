@@ -1,6 +1,6 @@
 """Computes the content of a model file from corresponded heads: alignment, principal components, decimated meshes, face
 region. Also measures compactness, generalisation and specificity (R. Davies, *Learning Shape: Optimal Models for
-Analysing Natural Variability*, 2002, chapter 5). These measures need each other: a model of one head is compact and
+Analysing Natural Variability*, 2002, chapter 5). No single measure suffices: a model of one head is compact and
 specific, and a model that allows any shape generalises well."""
 
 from collections.abc import Iterable, Mapping
@@ -36,7 +36,8 @@ class Training:
 
 
 def train(training: Training, *, report: Progress) -> ModelParts:
-    """Computes a model's parts: rigid Procrustes alignment (no scale), PCA, levels, generalisation and specificity.
+    """Computes a model's parts: rigid Procrustes alignment (no scale), PCA, decimated meshes, generalisation and
+    specificity.
 
     Raises NotAManifold if the faces form no manifold."""
     check_manifold(training.faces)
@@ -156,7 +157,7 @@ def generalisation(
     """Computes, by number of modes, the mean vertex distance (mm, over ``region``) between each head and its best fit
     in the PCA of all others.
 
-    Training heads are represented exactly in the principal axes of the N heads. Each of these PCAs is therefore
+    Training heads are represented exactly in the principal axes of the N heads. Each PCA without one head is therefore
     computed in N - 1 dimensions instead of 3 V."""
     counts = list(counts)
     points = components.scores * components.sigma  # mm, orthonormal axes

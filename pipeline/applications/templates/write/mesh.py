@@ -1,7 +1,7 @@
 """Writes a fitted head as ``head-NAME.obj``, in a template's vertex order and with the template's polygons, groups and
 texture coordinates. Also writes ``head_hair-NAME.obj``, the head with its surface moved out to its hair.
 
-Both files are in the world frame, mm, like head.ply and head.obj. If the result has a texture and the template has
+The OBJ files are in the world frame, mm, like head.ply and head.obj. If the result has a texture and the template has
 texture coordinates, the skin is textured (head-NAME.mtl, head-NAME.jpg, and one more image for each further UDIM tile);
 otherwise the vertices are coloured. Each texel of the template's texture lies in a triangle whose corners have
 positions in the head model's texture, and its colour is read there. Triangles that cross a seam of the head model's
@@ -120,7 +120,7 @@ def read_in_tile(
 
 def filled(image: UInt8[np.ndarray, "s s 3"], known: Bool[np.ndarray, "s s"]) -> UInt8[np.ndarray, "s s 3"]:
     """Returns the image with unknown texels filled: texels near known ones with the nearest known colour, all others
-    with the mean colour. The margin serves blurred texture reads and seams; known texels do not change."""
+    with the mean colour. Filled texels near the border serve blurred texture reads; known texels do not change."""
     step = max(1, len(image) // COARSE)
     if not known[::step, ::step].any():
         return image

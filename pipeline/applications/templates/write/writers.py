@@ -1,15 +1,16 @@
 """Writes the files that applications add to a job's result. ``head-NAME.glb`` and ``head-NAME-shapes.npz`` hold the
-template's mesh without expression and its blendshapes. ``posed.glb`` holds the same for the head model's mesh, with its
-texture.
+template's mesh without expression and its blendshapes. ``posed.glb`` holds the head model's mesh with texture and
+blendshapes.
 
-All three are in the head frame: the GLB files in metres, the NPZ file in mm. Vertices keep the template's or the head
-model's order. In a GLB file, eyeballs are separate nodes, and a node's ``extras.rows`` lists the mesh vertices that it
-was made of. Eyeballs, teeth and tongue that this program added have no ``rows``. For the formats OBJ and USDZ,
-``head-NAME-parts.obj`` and ``head-NAME-parts.usdz`` hold the same named parts without blendshapes.
+The GLB files are in the head frame in metres, the NPZ file is in the head frame in mm. Vertices keep the order of the
+template or of the head model. In a GLB file, eyeballs are separate nodes, and a node's ``extras.rows`` lists the
+indices of its vertices in the mesh. Eyeballs, teeth and tongue that this program added have no ``rows``. For the
+formats OBJ and USDZ, ``head-NAME-parts.obj`` and ``head-NAME-parts.usdz`` hold the template's named parts without
+blendshapes.
 
-The image of an eyeball is centred at the iris; distance from its centre is proportional to the angle from the gaze. The
-eyeball between the lids gets the head's texture; its hidden part gets the iris's median colours, ring by ring, or the
-white's."""
+The image of an eyeball is centred at the iris; distance from its centre is proportional to the angle from the gaze.
+Between the lids, an eyeball's image shows the head's texture; elsewhere it shows the median colours of the iris, ring
+by ring, or of the white."""
 
 import io
 import json
@@ -160,11 +161,11 @@ def load_template_writers(name: str | None, model: HeadModel) -> tuple[ResultWri
 
 
 def template_writers(template: Template) -> tuple[ResultWriter, ...]:
-    """Returns the functions with which ``write_result`` also writes a result in the template's vertex order:
+    """Returns the functions with which ``write_result`` also writes files in the template's vertex order:
 
-    - head-NAME.obj with its textures, and head_hair-NAME.obj if the head's surface was moved out to its hair,
-    - if the settings request morph targets: head-NAME.glb and head-NAME-shapes.npz,
-    - flame_param.npz if the template was made from a FLAME model, and ``template`` in report.json.
+    - head-NAME.obj is written with its textures, and head_hair-NAME.obj if the result has hair.
+    - head-NAME.glb and head-NAME-shapes.npz are written if the settings request morph targets.
+    - flame_param.npz is written if the template was made from a FLAME model; report.json gets the entry ``template``.
     """
     writers = (write_flame, write_template, write_template_shapes, write_template_hair)
     return tuple(partial(write, template=template) for write in writers)
@@ -236,9 +237,9 @@ def write_template_shapes(folder: Path, result: Reconstruction, template: Templa
 
 
 def write_posed(folder: Path, result: Reconstruction) -> None:
-    """Writes posed.glb if the settings request morph targets and the head model has blendshapes. It holds the head
-    without expression, with texture, blendshapes, pivots, eyeballs, teeth and tongue, and the photographed weights.
-    Raises OSError. Raises OSError."""
+    """Writes posed.glb if the settings request morph targets and the head model has blendshapes. The file holds the
+    head without expression, with texture, blendshapes, pivots, eyeballs, teeth and tongue, and the photographed
+    weights. Raises OSError."""
     blendshape_rig = result.evidence.blendshape_rig
     if blendshape_rig is None or not result.settings.outputs.morphs:
         return
@@ -278,9 +279,9 @@ def _towards_irises(
     from_world: RigidTransform,
     photographed: PhotographedEyes,
 ) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns the directions from the centres of added eyeballs to the photographed irises. These directions put each
-    iris where it was photographed, although the lids constrain the ball's position. If an iris was not measured, the
-    darkest area between the open lids replaces it."""
+    """Returns the directions from the centres of added eyeballs to the photographed irises. Each iris thus lies where
+    it was photographed, although the lids constrain the ball's position. If an iris was not measured, the darkest area
+    between the open lids replaces it."""
     found = {}
     for name, ball in animated.added.items():
         eye = eyes.get(name.removeprefix("eye_"))
