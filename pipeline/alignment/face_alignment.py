@@ -63,8 +63,8 @@ def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> 
 
 
 def spread_points(places: LandmarkMap) -> Int[np.ndarray, " n"]:
-    """Returns the indices of at most ``POINTS`` landmarks spread evenly over the face, without landmarks that slide
-    along the surface."""
+    """Returns the indices of at most ``POINTS`` landmarks that are spread evenly over the face and do not slide along
+    it."""
     rest = np.flatnonzero(~places.slides)
     deviation = np.sqrt((places.deviation_mm**2).sum(axis=1))
     position = point_table().shape_mm

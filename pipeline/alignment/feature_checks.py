@@ -1,6 +1,6 @@
 """Checks feature points before a fit: their names, their number of views, whether they span a triangle, and whether
-they lie on the face in the photographs. Also suggests feature points from a detected face, which a person can correct
-(the paper's section 4.2).
+they lie on the face in the photographs. Also suggests feature points from a detected face, for a person to correct (the
+paper's section 4.2).
 
 For suggestions, the mean head is aligned to the face and deformed to its landmarks, after the detector's mean error has
 been subtracted; landmarks that slide along the surface (jaw line, forehead) are ignored. A view gets a suggested point

@@ -106,8 +106,7 @@ def moved_to_hull(
     pose: Similarity, camera: Camera, model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> Similarity:
     """Returns the pose moved along the camera's line of sight into the visual hull, and scaled so that its image in the
-    camera does not change. It serves poses whose distance from the camera is unknown. Raises NoSubject if the
-    silhouettes have no common volume."""
+    camera does not change. The function serves poses whose distance from the camera is unknown. Raises NoSubject."""
     origin = head_origin(model, silhouettes, rig, pose.rotation)
     along = pose.translation - camera.centre_world
     share = float((origin - camera.centre_world) @ along / (along @ along))
@@ -188,7 +187,7 @@ def head_origin(
     model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig, axes: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, " 3"]:
     """Returns the position (world frame, mm) of the mean head's origin at which its crown and centre match those of the
-    subject's head in the visual hull. Raises NoSubject if the silhouettes have no common volume."""
+    subject's head in the visual hull. Raises NoSubject."""
     line = np.arange(-REACH_MM, REACH_MM + 1, SPACING_MM)
     grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)  # along the head's axes
     points = rig.centre_world() + grid @ axes.T
@@ -220,8 +219,7 @@ def head_origin(
 
 
 def turned(start: Similarity, yaw_deg: float, pitch_deg: float) -> Similarity:
-    """Returns the pose after a rotation of the head in its own frame: by the yaw about its vertical axis, and by the
-    pitch."""
+    """Returns the pose after a rotation of the head in its frame: by the yaw about its vertical axis, and by the pitch."""
     turn = rotation_from_vector(np.radians([0.0, yaw_deg, 0.0])) @ rotation_from_vector(
         np.radians([pitch_deg, 0.0, 0.0])
     )

@@ -55,8 +55,7 @@ def depth_map(
 
 @traced
 def depth_maps(rig: Rig, mesh_world: Mesh) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """Returns the depth map of a mesh in every camera of a rig: camera z (mm) at each pixel, infinite where the mesh is
-    not visible."""
+    """Returns the depth map of a mesh in every camera of a rig: camera z (mm) at each pixel, infinite beside the mesh."""
     vertices, faces = mesh_world.vertices, mesh_world.faces
     found = map_in_threads(lambda k: depth_map(rig.cameras[k], vertices, faces)[0], len(rig))
     return dict(zip(rig.names, found, strict=True))

@@ -58,8 +58,7 @@ class Hits:
 
 
 class SurfaceIndex:
-    """Holds a triangle surface prepared for closest-point queries. ``spacing`` (mm) is the largest gap between the
-    surface samples."""
+    """Holds a triangle surface prepared for closest-point queries. ``spacing`` (mm) bounds the gap between samples."""
 
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], spacing: float = 2.0) -> None:
         self.faces = faces
@@ -119,8 +118,7 @@ def corners_at_vertices(
 def facing_cosine(
     place: Float[np.ndarray, " 3"], points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns the cosine between the unit normal of each point and the direction from the point to a place, such as a
-    camera centre."""
+    """Returns the cosine between the unit normal of each point and the direction from the point to another point."""
     return cosines_towards(
         np.ascontiguousarray(place, float), np.ascontiguousarray(points, float), np.ascontiguousarray(normals, float)
     )

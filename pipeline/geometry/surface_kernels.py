@@ -144,8 +144,7 @@ def sort_corners(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cosines_towards(place: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Returns the cosine between the unit normal (n, 3) of each of the points (n, 3) and the direction to a place, such
-    as a camera centre."""
+    """Returns the cosine between the unit normal (n, 3) of each of the points (n, 3) and the direction to one place."""
     cosine = np.empty(len(points))
     for n in range(len(points)):
         x, y, z = place[0] - points[n, 0], place[1] - points[n, 1], place[2] - points[n, 2]

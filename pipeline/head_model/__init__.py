@@ -1,2 +1,1 @@
-"""Holds head models (the paper's section 3): mean head, modes, landmarks, expressions and meshes of several
-resolutions."""
+"""Holds head models (the paper's section 3): mean head, modes, landmarks, expressions and meshes."""

@@ -82,8 +82,8 @@ def words(name: str) -> str:
 
 def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
     """Returns, for each of Apple's 52 names, the indices of the model's blendshapes that together correspond to it;
-    empty if there is none. Usually this is the one blendshape with the same name. A model may instead have two, one for
-    each side (ICT-FaceKit's cheekPuff_L and cheekPuff_R)."""
+    empty if there is none. For most names this is exactly one blendshape, which has the same name. A model may instead
+    have two blendshapes for one name, left and right (ICT-FaceKit's cheekPuff_L and cheekPuff_R)."""
     known = {plain_name(name): k for k, name in enumerate(names)}
     found = {}
     for name in ARKIT:

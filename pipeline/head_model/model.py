@@ -29,7 +29,7 @@ MODES_AT_ONCE = 16  # in double precision: they stay in the processor's cache
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """Holds one level of a head model, which is a mesh of one resolution. Its vertices are ``operator @
+    """Holds one level of a head model, which is a mesh of one resolution. The level's vertices are ``operator @
     vertices_cage``; faces are anticlockwise seen from outside."""
 
     faces: Int[np.ndarray, "F 3"]

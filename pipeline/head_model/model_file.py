@@ -114,8 +114,7 @@ def read_parts(path: Path) -> tuple[ModelParts, str]:
 
 
 def expression_names(path: Path) -> tuple[str, ...]:
-    """Returns the names of the expressions in a model file without reading their displacements. Raises BadModel if the
-    file cannot be used."""
+    """Returns the names of the expressions in a model file without reading their displacements. Raises BadModel."""
     try:
         with open_npz(path) as file:
             return tuple(json.loads(file["meta"].tobytes()).get("expressions", ()))

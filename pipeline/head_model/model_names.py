@@ -1,8 +1,8 @@
 """Lists the available head models and their files. This module loads no model, so the command line can call it quickly.
 
-The data folder is the option ``--data``, otherwise the variable EIGENHEAD_DATA, otherwise ``$XDG_DATA_HOME/eigenhead``,
-otherwise ~/.local/share/eigenhead. Models are stored in its subfolder ``models``, unless EIGENHEAD_MODELS names another
-folder. The command line, the service and its workers use the same folders."""
+The data folder is given by the option ``--data``, otherwise by the variable EIGENHEAD_DATA; it is otherwise
+``$XDG_DATA_HOME/eigenhead`` or ~/.local/share/eigenhead. Models are stored in the data folder's subfolder ``models``,
+unless EIGENHEAD_MODELS names another folder. The command line, the service and its workers use the same folders."""
 
 import os
 from functools import lru_cache
@@ -60,7 +60,7 @@ def model_path(name_or_path: str | Path) -> Path:
 
 def model_sha256(path: Path) -> str:
     """Returns the SHA-256 of a model file; results state the model that they were made with by this hash. Raises
-    OSError if the file cannot be read."""
+    OSError."""
     state = path.stat()
     return _sha256(path, state.st_mtime_ns, state.st_size)
 

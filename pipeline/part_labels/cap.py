@@ -128,8 +128,8 @@ def chromaticity(colour: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]
 def _resembles(
     colour: Float32[np.ndarray, "*n 3"], cap: Float[np.ndarray, " 3"], cheeks: Float[np.ndarray, " 3"], hue_deg: float
 ) -> Bool[np.ndarray, "*n"]:
-    """Returns a mask of the colours that match the cap's colour, apart from shading and sheen, and are nearer to it
-    than to the cheeks' colour."""
+    """Returns a mask of the colours that match the cap's except for shading and sheen, and are not nearer to the
+    cheeks'."""
     seen, worn, skin = chromaticity(colour), chromaticity(cap), chromaticity(cheeks)
     saturation = float(np.linalg.norm(worn))
     if saturation < NEUTRAL:

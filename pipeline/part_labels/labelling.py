@@ -295,8 +295,7 @@ def upsample_guided(
     image: UInt8[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns the cells' probabilities (255ths) at each pixel of the photograph, smooth except at the photograph's
-    edges."""
+    """Returns the cells' probabilities (255ths) at each pixel, smooth except at the photograph's edges."""
     grid = np.zeros((*inside.shape, 3), np.float32)
     grid[inside] = share
     radius = max(1, round(0.5 * SMOOTH_MM / CELL_MM))

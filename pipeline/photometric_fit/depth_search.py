@@ -100,8 +100,7 @@ class SampleVisibility:
 def sample_visibility(
     problem: ContourProblem, state: State, patches: Patches, speaks: Bool[np.ndarray, " k"]
 ) -> SampleVisibility:
-    """Finds which surface samples each camera sees on the head of ``state``, by drawing the head's depth map in every
-    view."""
+    """Finds which surface samples each camera sees on the head of ``state``, from the head's depth maps."""
     head, coarse = head_of(problem, state), head_of(problem, state, DEPTH_LEVEL)
     return visibility_of(head, coarse, moved_cameras(problem, state), problem.views, patches, speaks)
 
@@ -289,8 +288,7 @@ def find_places(
 
 def head_depth_factor(head_world: Mesh, face: Int[np.ndarray, " n"], cameras: Sequence[Camera]) -> float:
     """Returns the median of ``depth_factor`` over the head's vertices ``face`` (vertices in mm). Each vertex is assumed
-    to be visible in its ``MAX_VIEWS`` most frontal cameras; occlusion is ignored. Returns 1 if no vertex faces two
-    cameras."""
+    to be visible in its ``MAX_VIEWS`` most frontal cameras. Returns 1 if no vertex faces two cameras."""
     points, normals = head_world.vertices[face], head_world.normals()[face]
     centres = np.array([camera.centre_world for camera in cameras])
     towards = centres[None] - points[:, None]

@@ -159,8 +159,7 @@ def write_image_motion(view, places, axes, cameras, ahead, slides):
 def add_by_camera(view, pull, slides, by_camera):
     """Fills the derivative of each patch's depth by the camera corrections: adds ``pull * slides``, summed over the
     image axes of each view, to the six columns of the view's camera in ``by_camera`` (n, 6 k), in place. ``pull`` (n,
-    a) is the derivative of the depth by an image shift, ``slides`` (n, a, 6) the derivative of the image shift by the
-    camera correction."""
+    a) is the derivative of the depth by an image shift, ``slides`` (n, a, 6) that of the shift by the correction."""
     for n in range(len(view)):
         for row in range(pull.shape[1]):
             first = 6 * view[n, row // 2]

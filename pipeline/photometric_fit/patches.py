@@ -1,9 +1,9 @@
 """Chooses where photographs are compared: sample points over the face region, and patches of samples around chosen
 vertices.
 
-A patch is a piece of the curved surface of the current head, not a square of an image or a tangent plane. Its samples
-move with the head during the fit and are projected into each view, with lens distortion. Overlapping patches share
-samples, so every image is read once per sample for any size of the patches."""
+A patch is a piece of the curved surface of the current head, not a square of an image or a tangent plane. A patch's
+samples move with the head during the fit and are projected into each view, with lens distortion. Overlapping patches
+share samples, so every image is read once per sample for any size of the patches."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -53,8 +53,7 @@ class Patches:
         return mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
 
     def sums(self, weights: Float[np.ndarray, " e"], values: Float[np.ndarray, "s n"]) -> Float[np.ndarray, "c n"]:
-        """Returns, for each patch, the sum of ``values`` over its samples, with one weight for each sample of each
-        patch."""
+        """Returns, for each patch, the sum of ``values`` over its samples, weighted by ``weights``."""
         shape = (len(self.centre), len(self.corners))
         return sparse.csr_array((weights, self.member, self.start), shape=shape) @ values
 

@@ -115,8 +115,8 @@ def rounds_of_rig(factor: float) -> tuple[Round, ...]:
 
     Each round has the usual number of steps, over a range ``factor`` times as wide. For each doubling of the factor,
     the last round is repeated once, and then once more over half its range, because with only three cameras in front,
-    outlines leave the middle of a face undetermined by 8 mm. Shading is removed in these last rounds as well, because
-    gloss looks like a change of depth."""
+    outlines leave the middle of a face undetermined by 8 mm. Shading is also removed in the last rounds, because gloss
+    looks like a change of depth."""
     more = round(math.log2(factor))
     wider = [replace(each, reach_mm=factor * each.reach_mm) for each in ROUNDS]
     wider[-1] = replace(wider[-1], with_shading=not more)
@@ -157,8 +157,8 @@ def finer(model: HeadModel) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m 
 
 def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " v"]:
     """Returns a mask of the vertices near ``hair`` in the mesh that the contour fit uses; ``hair`` are the finest
-    mesh's vertices under hair. The outline at these vertices is that of hair: a fit to contours alone bulged into the
-    hair at its border with the face."""
+    mesh's vertices under hair. The outline at these vertices is that of hair, and a fit to contours alone bulged into
+    the hair."""
     mean = model.vertices(np.zeros(0))
     if not len(hair):
         return np.zeros(model.levels[LEVEL].count, bool)

@@ -66,8 +66,7 @@ def _move(function: Function, points: Float[np.ndarray, "n1 n"], values: Float[n
     centre = points[:-1].mean(axis=0)
 
     def try_at(factor: float) -> tuple[Float[np.ndarray, " n"], float]:
-        """Returns the point at ``factor`` times the worst point's offset from the centroid of the other points, and its
-        value."""
+        """Returns the point at ``factor`` times the worst point's offset from the others' centroid, and its value."""
         point = centre + factor * (points[-1] - centre)
         return point, function(point)
 

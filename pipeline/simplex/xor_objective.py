@@ -7,14 +7,14 @@ back.
 Some pixels get no weight. In eq. (5) a mismatch far from the input contour has hardly any weight. This suffices for
 parts *inside* the outline that the model lacks, but not for parts of the input outside it that no model can reproduce.
 Below the model's cut through the neck, the input silhouette continues into shoulders; every pixel by which the mesh's
-open edge moves down would reduce the cost, and the head would grow a neck. In the same way, hair would reward an
-enlarged skull. A pixel therefore counts only if the nearest part of the aligned head's outline belongs to the face
-region (ear to ear, forehead to chin); all other pixels have weight zero. The pixels are chosen once for each mesh, from
-the head at the start of its search, so that the cost during the search is a fixed function of the coefficients: eq. (5)
-with some weights zero. ``speaking="all"`` gives exactly the paper's cost.
+open edge moves down would reduce the cost, and the head would grow a neck. Hair would likewise reward an enlarged
+skull. A pixel therefore counts only if the nearest part of the aligned head's outline belongs to the face region (ear
+to ear, forehead to chin); all other pixels have weight zero. The pixels are chosen once for each mesh, from the head at
+the start of its search, so that the cost during the search is a fixed function of the coefficients: eq. (5) with some
+weights zero. ``speaking="all"`` gives exactly the paper's cost.
 
 The cut through the neck has no weight, so triangles close it and back faces need not be drawn, which saves 5 of 19 ms
-in each evaluation. If the cut is not flat, these triangles add a thousandth of the area, all of it at the cut."""
+in each evaluation. If the neck's cut is not flat, the closing triangles add a thousandth of the silhouette's area."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -54,8 +54,7 @@ class SilhouetteObjective:
         weighted: bool = True,
     ) -> None:
         """Takes a mesh ``level`` of the model and a ``scale`` of the images (0.5 is half the width); the head at
-        ``start`` decides which pixels count. ``weighted`` selects the paper's eq. (5); otherwise all pixels have equal
-        weight, as in eq. (4)."""
+        ``start`` decides which pixels count. ``weighted`` selects the paper's eq. (5), otherwise eq. (4)."""
         self._turn = world_from_head.scale * world_from_head.rotation
         mean = model.levels[level].operator @ model.mean
         self._mean_world = world_from_head.apply(mean.astype(np.float64))
@@ -85,8 +84,7 @@ class SilhouetteObjective:
         self._drawn.close()
 
     def __call__(self, coefficients: Float[np.ndarray, " m"]) -> float:
-        """Returns the cost E of the paper's eq. (2) at ``coefficients`` (standard deviations), in units of pixels on
-        the contour."""
+        """Returns the cost E of the paper's eq. (2) at ``coefficients`` (standard deviations), in contour pixels."""
         return float(self._drawn.xor_costs(self.vertices_world(coefficients)).sum())
 
     def vertices_world(self, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, "v 3"]:

@@ -192,8 +192,7 @@ class UprightHead:
 
 
 def fitting_measures(visit: Visit) -> dict[str, Fitted]:
-    """Returns every measure that the head allows, by name. Raises InputError if the head lacks landmarks of the
-    Frankfurt plane."""
+    """Returns all measures of a head by name. Raises InputError if landmarks of the Frankfurt plane are missing."""
     measured = visit.measured
     frame = frankfurt_axes(measured, "RAS")
     motion = frame.patient_from_world
@@ -255,8 +254,7 @@ def splay_angle(head: UprightHead) -> float | None:
 
 
 def frontal_angle(head: UprightHead) -> float | None:
-    """Returns the mean angle (degrees) between the flanks of the nose's bridge and the vertical; positive if it widens
-    downwards."""
+    """Returns the mean angle (degrees) between the bridge's flanks and the vertical; positive if it widens downwards."""
     crest = _crest(head, FLANK_HEIGHTS_MM[0])
     if crest is None:
         return None
@@ -320,8 +318,7 @@ def _crest(head: UprightHead, below_mm: float) -> float | None:
 
 
 def _width(head: UprightHead, below_mm: float, depth_mm: float | None, plane: float | None = None) -> float | None:
-    """Returns the nose's width in a horizontal section, at a depth behind the section's front or in a given vertical
-    plane."""
+    """Returns the nose's width in a horizontal section, at a depth behind its front or in a given vertical plane."""
     points = _nose_section(head, below_mm)
     if len(points) < 4:
         return None

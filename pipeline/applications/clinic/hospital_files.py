@@ -51,9 +51,8 @@ def clinic_module(name: str) -> Any:
 def write_hospital_files(
     folder: Path, visit: Visit, frame: AnatomicalFrame, form: HospitalFormat, patient: str
 ) -> dict[str, Any]:
-    """Writes head.dcm, or a mask with a BIDS name, and frame.json; returns the content of frame.json. ``frame`` must
-    have the axes of the format; ``patient`` consists of letters and digits. Raises NoClinic, NotAManifold and OSError.
-    """
+    """Writes head.dcm or a NIfTI mask, and frame.json; returns the content of frame.json. ``frame`` must have the axes
+    of the format; ``patient`` consists of letters and digits. Raises NoClinic, NotAManifold and OSError."""
     if form == "dicom":
         write_atomically(folder / "head.dcm", dicom_bytes(visit, frame, patient))
     else:
@@ -139,8 +138,7 @@ def fill_voxels(closed: Mesh) -> tuple[UInt8[np.ndarray, "x y z"], Float[np.ndar
     """Returns a mask of the voxels whose centre lies within a closed mesh (mm), and the affine transform from voxels to
     mm.
 
-    A centre is inside if a vertical ray from below crosses the mesh an odd number of times before it reaches the
-    centre."""
+    A centre is inside if a vertical ray from below crosses the mesh an odd number of times up to the centre."""
     low = np.floor(closed.vertices.min(axis=0) / VOXEL_MM) - 1.0
     size = (np.ceil(closed.vertices.max(axis=0) / VOXEL_MM) - low + 2.0).astype(int)
     corners = (closed.vertices / VOXEL_MM - low)[closed.faces]

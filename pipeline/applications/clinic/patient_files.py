@@ -112,8 +112,8 @@ COLOUR_END_MM = 2.0  # distance at which a colour of residual.ply is full
 
 
 def write_registration(folder: Path, found: Registration) -> dict[str, Any]:
-    """Writes head.ply, residual.ply, landmarks.mrk.json and registration.json; returns the content of the latter.
-    Raises OSError."""
+    """Writes head.ply, residual.ply, landmarks.mrk.json and registration.json; returns the content of
+    registration.json. Raises OSError."""
     motion, axes = found.fit.motion, found.surface.axes
     write_patient_mesh(folder / HEAD_FILE, found.visit, motion, axes)
     write_patient_mesh(

@@ -1,7 +1,6 @@
 """Adds an animation of the node's pose and its morph targets' weights to a binary glTF file with one node.
 
-https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations
-"""
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations"""
 
 import json
 import struct

@@ -74,8 +74,7 @@ class Texture:
     reduced: int
 
     def read(self, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-        """Returns texture and derivatives at pixels of the full-size picture, and a mask of the pixels inside the
-        picture."""
+        """Returns texture and derivatives at pixels of the full-size picture, and a mask of the pixels inside it."""
         height, width = self.image.shape[:2]
         scaled = (pixels + 0.5) / self.reduced - 0.5
         inside = np.all((scaled >= 0.0) & (scaled < (width - 1.001, height - 1.001)), axis=1)  # False for NaN

@@ -1,11 +1,9 @@
 """Solves linear equations whose matrix has the form of an arrow: some unknowns are shared by all blocks, the others
-belong to one block each. No equation connects the unknowns of two blocks, so each block's unknowns are eliminated
-separately:
+belong to one block each. No equation connects two blocks' unknowns, so each block is eliminated separately:
 
     S = M_ss - sum_k M_sk M_kk^-1 M_ks        (Schur complement of what is left)
 
-The blocks' unknowns are computed after the shared unknowns are known. Unknowns with bounds are not eliminated but
-solved with the shared unknowns."""
+The blocks' unknowns are computed after the shared unknowns are known. Unknowns with bounds are not eliminated."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -75,8 +75,7 @@ class Footage:
 
     @contextmanager
     def capture(self, number: int) -> Iterator[tuple[Capture, Rig]]:
-        """Yields one frame as a capture with its plates and masks, together with the full-size cameras. Raises
-        InputError."""
+        """Yields one frame as a capture with its plates and masks, and the full-size cameras. Raises InputError."""
         with tempfile.TemporaryDirectory() as scratch:
             folder, frame = Path(scratch), self.frames[number]
             rig_file = find_rig_file(self.folder)

@@ -1,20 +1,18 @@
 """Estimates one identity common to several captures, together with the pose, expression and cameras of each capture.
 
 The input is the contour solver's solution for every capture, fitted to outlines or photographs. The output is the same
-solutions with one common identity.
-
-The identity's coefficients and the logarithm of scale are shared; each other unknown belongs to one capture. The normal
-equations therefore have the form of an arrow: a shared block, and one block for each capture (module ``arrow``).
+solutions with one common identity. The identity's coefficients and the logarithm of scale are shared; each other
+unknown belongs to one capture. The normal equations therefore have the form of an arrow: a shared block, and one block
+for each capture (module ``arrow``).
 
 The cost is the sum of the captures' costs. Each capture's cost contains the prior of the shared unknowns, so the sum
 contains this prior K times for K captures. With independent errors, the prior should count once. However, the errors of
 cameras, light, hair and head model are the same in all captures. If the fraction ``COMMON`` of the error variance is
 common, K captures are worth K / (1 + COMMON (K - 1)) independent ones; the prior should therefore count 1 + COMMON
 (K - 1) times. When the prior counted once, the joint head of eight captures from three cameras was no better than the
-mean of the eight separate heads.
+mean of the separate heads.
 
-A capture whose photographs lack detail has no coefficients for fine modes; it contributes only to the modes that it
-has."""
+A capture whose photographs lack detail has no fine modes; it contributes only to the modes that it has."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -174,8 +172,7 @@ def with_identity(solved: ContourSolution, state: State, identity: Float[np.ndar
 def fit_jointly(
     solutions: Sequence[ContourSolution], eigenheads: int, *, watch: Callable[[], None] = lambda: None
 ) -> tuple[ContourSolution, ...]:
-    """Returns the captures' solutions after a joint fit, which gives all of them the identity with the least total
-    cost.
+    """Returns the captures' solutions after a joint fit that gives all of them the same identity.
 
     Args:
         solutions: of at least two moments, with models of one mesh and one basis; some may have fine modes, too.
@@ -242,8 +239,7 @@ def _with_evidence(
 def joint_covariances(solutions: Sequence[ContourSolution]) -> Iterator[Float[np.ndarray, "p p"]]:
     """Yields the covariance of each capture's coefficients, rotation, translation and log scale after the joint fit.
     The independent part of the errors follows from the joint normal matrix; the common part, the fraction ``COMMON``,
-    keeps the covariance of the capture's separate fit. Weights at their bounds have the variance that ``finish`` gives
-    them."""
+    keeps the covariance of the capture's separate fit. Weights at bounds are treated as in ``finish``."""
     problem, layout = joint_problem(solutions, common=0.0)
     here = problem.at(tuple(each.state for each in solutions))
     assert isinstance(here, Sum)

@@ -5,7 +5,7 @@ The input is the current picture of each camera and the previous head. The outpu
 its landmarks in each camera.
 
 In the first pictures, the face is searched in all views, and the head model is fitted to the triangulated landmarks.
-The fitted head is stored like the person of a sequence (``sequence_person``), without outlines and texture. In later
+The fitted head has the form of a recorded sequence's head (``sequence_person``), without outlines and texture. In later
 pictures the network searches at the previous position, and the cost terms of ``face_evidence`` fit pose and weights,
 starting from the previous values. If the head has moved far, the network searches again at the new position."""
 
@@ -96,8 +96,7 @@ class LiveHead:
 def meet(
     model: HeadModel, face: MatchedFaces, pictures: Mapping[str, ImageRgb], rig: Rig, networks: FaceNetworks
 ) -> LiveHead | None:
-    """Builds the head of a person whose face was detected in the pictures. Returns None if a second detection does not
-    confirm the face."""
+    """Builds the head of a person whose face was detected in the pictures. Returns None if a second detection fails."""
     alignment = align_to_face(model, face, landmark_map(model))
     state = _shaped(alignment.landmarks, alignment.world_from_head, min(MODES, len(model.modes)))
     scale, names = state.world_from_head.scale, tracked_names(model)
@@ -175,8 +174,7 @@ def _fitted(who: LivePerson, found: Sighting, start: Motion) -> Motion:
 
 
 def _misfits(who: LivePerson, found: Sighting, motion: Motion) -> dict[str, float]:
-    """Returns, for each camera, the RMS distance between detected landmarks and the head's projected landmarks,
-    relative to the face's size in the picture."""
+    """Returns, by camera, the RMS distance between detected and projected landmarks, relative to the face's size there."""
     reference, misfits = who.reference, {}
     world = motion.world_from_head.apply(reference.points(motion.weights))
     for name, pixels in found.pixels.items():

@@ -1,4 +1,4 @@
-"""Estimates a person's neutral head and personal blendshapes from the heads of a take.
+"""Estimates a person's neutral head and personal blendshapes from heads of the same person with different expressions.
 
 At each vertex, y_k is the difference between the head of capture k and the head model's prediction:
 
@@ -44,7 +44,7 @@ def estimate_own_shapes(
     heads: Float[np.ndarray, "k v 3"],
     deviation_mm: Float[np.ndarray, "k v"],
 ) -> OwnShapes:
-    """Estimates the neutral head and blendshapes that best explain the heads of a take.
+    """Estimates the neutral head and blendshapes that best explain several heads of one person.
 
     Args:
         model: the head model, with its expressions.

@@ -1,8 +1,7 @@
 """Writes a moving mesh as a point cache of OpenUSD (package extra ``usd``), with the points of every frame in one
 layer.
 
-https://openusd.org/release/api/class_usd_geom_point_based.html
-"""
+https://openusd.org/release/api/class_usd_geom_point_based.html"""
 
 import tempfile
 from collections.abc import Sequence

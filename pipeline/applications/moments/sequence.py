@@ -68,8 +68,7 @@ class Course:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracker:
-    """Holds what the tracking of all frames has in common: the person, the sample points, their reference texture, and
-    the face networks."""
+    """Holds what the tracking of all frames has in common: person, sample points, reference texture, face networks."""
 
     person: SequencePerson
     samples: Samples

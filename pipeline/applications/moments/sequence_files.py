@@ -162,8 +162,7 @@ def poses_from_first(course: Course) -> list[RigidTransform]:
 
 
 def write_preview(path: Path, person: SequencePerson, footage: Footage, course: Course, report: Progress) -> None:
-    """Writes preview.mp4, the front camera's pictures beside the rendered head. Shares that end at the same time may
-    each write it."""
+    """Writes preview.mp4, the front camera's pictures beside the rendered head. Several shares may each write it."""
     name, count = person.rig.front_camera(), len(course)
     camera = person.rig[name]
     size = 2 * camera.intrinsics.width, camera.intrinsics.height

@@ -1,4 +1,4 @@
-"""Estimates the person of a sequence: one head from frames of the first second, solved as a take.
+"""Estimates the head of the person in a sequence jointly from several frames of the first second.
 
 The input is the sequence's footage. The output is the neutral head, the displacements of its vertices by each
 expression, the corrected cameras, and the pose and weights in each frame used."""
@@ -61,8 +61,8 @@ class SequencePerson:
 def find_person(
     footage: Footage, model: HeadModel, settings: Settings, renderer: Renderer, report: Callable[[float], None]
 ) -> SequencePerson:
-    """Solves the best frames of the first second as a take; frames that show no head are left out. If no frame shows a
-    head, raises the first frame's error from ``reconstruct``; raises InputError for the method simplex."""
+    """Estimates one head jointly from the best frames of the first second; frames that show no head are left out.
+    Raises the first frame's error if no frame shows a head, and InputError for the method simplex."""
     keys, solved, refused = best_frames(footage), dict[int, ContourSolution](), list[EigenheadError]()
     warnings: dict[str, Message] = {}
     for done, key in enumerate(keys):

@@ -1,4 +1,4 @@
-"""Reconstructs a take, several captures of one person, with one common identity.
+"""Reconstructs a take (several captures of one person) with one common identity.
 
 Each capture runs the stages of a single job up to the fit to photographs. Then one joint fit estimates the common
 identity (``joint_fit``); afterwards each capture continues to its fine surface, colours and evidence. The heads of all
@@ -41,8 +41,7 @@ SHARES = (0.45, 0.55)  # of a take's time, at which the joint fit begins and end
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """Holds the result of one capture of a take. Arrays are indexed by expression or by vertex of the head model's
-    finest mesh."""
+    """Holds the result of one capture of a take. Arrays are indexed by expression or by vertex of the finest mesh."""
 
     name: str
     detail: str  # the level that was reached
@@ -57,7 +56,7 @@ class Moment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Take:
-    """Holds the result of a take: the person's neutral head and blendshapes, and the captures."""
+    """Holds the result of a take: the person's neutral head and blendshapes, and each capture's result."""
 
     model: HeadModel
     person: OwnShapes

@@ -43,7 +43,7 @@ TOLD = 0.02  # a smaller weight is left out of report.json
 
 
 class Shot(NamedTuple):
-    """Holds a capture of a take, and the function that computes its silhouettes."""
+    """Holds a capture, and the function that computes its silhouettes."""
 
     capture: Capture
     rig: Rig

@@ -1,10 +1,9 @@
 """Builds a head for animation, either in a template's vertex order or in the head model's. The head gets Apple's 52
 blendshapes, rotation centres (pivots) and, if its mesh lacks them, eyeballs, teeth and tongue. A template also gets
-visemes, and its blendshapes are corrected until no triangles cross.
+visemes and blendshapes without crossing triangles.
 
 The lips of a fitted head may be some tenths of a millimetre apart, and teeth would show through the gap. A gap of this
-width is closed; a wider gap counts as an open mouth and is not changed. The inner edge of an open mouth's lips is
-smoothed.
+width is closed; a wider gap counts as an open mouth and is not changed. The inner edge of open lips is smoothed.
 
 A head model's expressions move a template as follows: each skin vertex moves with the head model's triangle to which it
 is attached (``carrying``). Vertices below the skin are attached too if mesh edges connect them to the skin over
@@ -57,8 +56,7 @@ Shapes = Mapping[str, Float[np.ndarray, "v 3"]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neutral:
-    """Holds a head without expression: vertices (mm) and triangles of the model's finest mesh, and a template on this
-    head."""
+    """Holds a head without expression: vertices (mm) and triangles of the model's finest mesh, and a template on it."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -287,9 +285,8 @@ def animated_head(
     *,
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> AnimatedMesh:
-    """Closes the lips of the head model's finest mesh (head frame, mm), and adds pivots, eyeballs, teeth and tongue.
-    The triangles ``opened`` leave holes at the eyes and the mouth. The head model's blendshapes move the lips and lids.
-    """
+    """Closes the lips of the head model's finest mesh, and adds pivots, eyeballs, teeth and tongue (head frame, mm).
+    The triangles ``opened`` leave holes at the eyes and the mouth. The model's blendshapes move lips and lids."""
     landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
     vertices = shut_lips(vertices, opened, landmarks)
     bare = AnimatedMesh(vertices, shapes, pivots(landmarks, vertices, shapes, []), {}, gazes=gazes)

@@ -116,8 +116,7 @@ def placed_eyeballs(
     centres: Mapping[str, Float[np.ndarray, " 3"]],
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> dict[str, Eyeball]:
-    """Returns eyeballs behind the open eyes of a mesh without expression, by pivot; an eye that the mesh closes gets
-    none.
+    """Returns eyeballs behind the open eyes of a mesh without expression, by pivot; closed eyes get none.
 
     Args:
         mesh: vertices, head frame, mm.

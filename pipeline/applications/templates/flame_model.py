@@ -146,8 +146,7 @@ def fit_flame(
 
 
 def _start(model: FlameModel, target: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, " v"]) -> FlameParameters:
-    """Returns the parameters of the mean head, moved rigidly to the mesh's position. The motion rotates about the root
-    joint."""
+    """Returns the parameters of the mean head, moved rigidly to the mesh. The motion rotates about the root joint."""
     placed = rigid_fit(model.template, target, weights)
     mean, root = model.neutral(), model.joint_regressor[0] @ model.template
     pose = np.zeros((JOINTS, 3))
@@ -171,8 +170,7 @@ def _moved(value: FlameParameters, step: Float[np.ndarray, " p"]) -> FlameParame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Prior:
-    """Holds the priors: shape and expression coefficients are N(0, 1), joint angles except the root's N(0,
-    ``TURN_RAD``)."""
+    """Holds the priors: coefficients are N(0, 1), joint angles except the root's N(0, ``TURN_RAD``)."""
 
     form: Quadratic
 

@@ -142,8 +142,7 @@ def read_meta(path: Path, file: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def header_words(meta: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the text fields of a template's header from its decoded ``meta`` entry. Raises KeyError if a field is
-    missing."""
+    """Returns the text fields of a template's header from its ``meta`` entry. Raises KeyError if a field is missing."""
     return {word: str(meta[word]) for word in WORDS}
 
 

@@ -86,8 +86,8 @@ class InnerMouth:
     absence: Absence | None = None
 
     def posed(self, shape: str, weight: float) -> dict[str, Float[np.ndarray, "n 3"]]:
-        """Returns the vertices of teeth and tongue at a weight of one blendshape. Blendshapes that presuppose an open
-        jaw, such as ``mouthClose``, are combined with ``jawOpen``."""
+        """Returns the vertices of teeth and tongue at a weight of one blendshape. Blendshapes for an open jaw, such as
+        ``mouthClose``, are combined with ``jawOpen``."""
         with_jaw, out = jaw_weight(shape, weight), {}
         for name, part in self.parts.items():
             moves = self.moves[name]
@@ -330,8 +330,7 @@ class _Front:
         return turn, height, np.hypot(x, z)
 
     def depths(self, posed: Float[np.ndarray, "m 3"], triangles: Int[np.ndarray, "a 3"]) -> Float[np.ndarray, " a"]:
-        """Returns how deep (mm) each triangle lies in the teeth or the required gap before them; 0 for triangles
-        outside."""
+        """Returns how deep (mm) each triangle lies in the teeth or the required gap before them; 0 outside."""
         points = sample_triangles(posed, triangles).reshape(-1, 3)
         turn, height, away = self.cells(points)
         inside = (height >= 0) & (height < self.reach.shape[1])

@@ -52,8 +52,7 @@ ROWS = 6000  # vertices of the model that look for the mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceMarks:
-    """Holds points on a head model's surface, each a weighted mean of three vertices of its finest mesh, and their
-    positions on another mesh."""
+    """Holds points on a head model's surface, each a mean of three vertices, and their positions on another mesh."""
 
     rows: Int[np.ndarray, "p 3"]
     weights: Float[np.ndarray, "p 3"]

@@ -147,8 +147,7 @@ def _check(path: Path, template: Template) -> None:
 def load_template(name: str | None, model: HeadModel) -> Template | None:
     """Loads the named template for a job with the head model ``model``; returns None if ``name`` is None.
 
-    Raises UnknownTemplate, BadTemplate, OtherModel.
-    """
+    Raises UnknownTemplate, BadTemplate, OtherModel."""
     if name is None:
         return None
     template = read_template(template_path(name))

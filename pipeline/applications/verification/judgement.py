@@ -1,9 +1,9 @@
 """Computes the figures of a verification after the standard VDI/VDE 2634 part 3, with a mannequin head in place of the
 standard's spheres.
 
-Deviations are signed distances (mm, positive outside) from the reference scan to the vertices of a measured head after
-the best fit, weighted by the area of each vertex. Vertices are not judged if their closest point lies at the scan's
-open edge or farther than 10 mm away; the fraction of judged area is reported.
+Deviations are signed distances (mm, positive outside) from the reference scan to a measured head's vertices after the
+best fit, weighted by vertex area. Vertices are not judged if their closest point lies at the scan's open edge or
+farther than 10 mm away; the fraction of judged area is reported.
 
 - The probing error of form is the range that contains the deviations of 99.7 % of the face's area.
 - The probing error of size is the scale of the best fit minus 1, in percent.
@@ -14,14 +14,13 @@ open edge or farther than 10 mm away; the fraction of judged area is reported.
 - Errors by region are mean, RMS, median and 95th percentile, also of the mean deviation over all captures
   (``repeated``).
 
-Repeatability is computed from heads of one subject that was captured several times. All heads have the head model's
-vertices, so each vertex is compared with itself. The heads are aligned by rigid motions, without scale, to their mean
-over the given vertices, and the mean is recomputed (generalised Procrustes analysis without scale; Gower 1975,
-https://doi.org/10.1007/BF02291478).
+Repeatability is computed from heads of one subject captured several times. All heads have corresponding vertices, which
+are compared. The heads are aligned by rigid motions, without scale, to their mean over the given vertices, and the mean
+is recomputed (generalised Procrustes analysis without scale; Gower 1975, https://doi.org/10.1007/BF02291478).
 
 The default limits are about one and a half times the values that a bare mannequin from outside the head model's
-population gives in the simulated studio (tests/laboratory/notes/verification.md). With these limits, a rig without
-faults passes, and a rig with a permanent fault does not."""
+population gives in the simulated studio (tests/laboratory/notes/verification.md). Rigs without faults pass, and rigs
+with a permanent fault do not."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -180,8 +179,7 @@ class Judgement:
 
 
 def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) -> Judgement:
-    """Judges heads of one subject, made with one head model, against the reference scan. Raises InputError if it shows
-    another head."""
+    """Judges heads of one subject and one head model against the reference scan. Raises InputError if it shows another."""
     captures = tuple(judge_one(one, reference) for one in measured)
     first = measured[0]
     deviations = np.stack([one.deviation_mm for one in captures])

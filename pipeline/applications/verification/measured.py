@@ -61,8 +61,7 @@ def identity_of(folder: Path) -> ResultIdentity:
 
 
 def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
-    """Reads a result folder that was made with ``model``. Raises InputError with all missing or invalid files and
-    fields."""
+    """Reads a result folder that was made with ``model``. Raises InputError with all invalid files and fields."""
     report = read_report(folder)
     mesh, stated_mm = read_head_ply(folder / "head.ply")
     full = model.levels["full"]

@@ -22,8 +22,7 @@ from rig.mesh import edges_of, vertex_normals
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Holds the limits for one stage of the search for correspondences between a head's vertices and a scan. Lengths
-    are in mm."""
+    """Holds the limits for one stage of a search for correspondences between vertices and a scan. Lengths are in mm."""
 
     steps: int
     reach_mm: float  # a match farther than this is another part of the head
@@ -56,8 +55,7 @@ def draw_to_target(
     mark_weight: float = 0.0,
 ) -> Float[np.ndarray, "V 3"]:
     """Deforms a mesh onto a target by non-rigid closest points (``draw_to_matches``). Each vertex is matched with the
-    point that is nearest by position and normal together. ``marks`` are target positions of vertices (mm), by vertex
-    index."""
+    point that is nearest by position and normal together. ``marks`` are target positions (mm) by vertex index."""
     tree, fixed = oriented_tree(target, search), np.array(list(marks), int)
 
     def match(shape: Float[np.ndarray, "V 3"]) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, " V"]]:
@@ -96,8 +94,7 @@ def draw_to_matches(
 def match_points(
     shape: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], target: Target, tree: KDTree, search: Search
 ) -> tuple[Int[np.ndarray, " V"], Float[np.ndarray, " V"]]:
-    """Returns the nearest scan point of each vertex, and a weight: 1 if the point is near and its normal similar,
-    otherwise 0."""
+    """Returns the nearest scan point of each vertex, and a weight: 1 for a near point with a similar normal, else 0."""
     normals = vertex_normals(shape, faces)
     near = np.asarray(tree.query(np.concatenate([shape, normals * search.normal_mm], 1), workers=1)[1])
     distance = np.linalg.norm(target.vertices[near] - shape, axis=1)

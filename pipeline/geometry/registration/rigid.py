@@ -1,8 +1,8 @@
 """Fits rigid motions and similarities of points to a surface. Gauss-Newton steps minimise the distances along the
 normals (Chen and Medioni 1992), over a motion and, if requested, shape coefficients. A search from many starts uses
 trimmed iterated closest points, by position and normal (Besl and McKay 1992, https://doi.org/10.1109/34.121791): few
-iterations from all starts, more from the best ones. Procrustes analysis (the paper's section 4.2, eq. 3) also exists in
-a version that uses the covariance of the points."""
+iterations from all starts, more from the best ones. Procrustes analysis (the paper's section 4.2, eq. 3) is also
+possible with a covariance."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -102,8 +102,8 @@ def solve_with_prior(
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Holds the limits of one round of the search: numbers of points and iterations, the fraction of points used, and
-    the number of starts that continue."""
+    """Holds the limits of one round of the search: numbers of points and iterations, fraction of points, number of
+    starts."""
 
     points: int
     iterations: int

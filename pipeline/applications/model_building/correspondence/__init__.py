@@ -1,2 +1,1 @@
-"""Brings scans into correspondence (the paper's section 3.2): warps a reference head to landmarks, then fits it to the
-surface."""
+"""Brings scans into correspondence (the paper's section 3.2): warps a reference to landmarks, then fits it to surfaces."""

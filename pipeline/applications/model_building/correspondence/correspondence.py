@@ -1,12 +1,11 @@
-"""Brings raw scans into correspondence (the paper's section 3.2) by landmark warp, cylindrical resampling and
-refinement.
+"""Brings raw scans into correspondence (the paper's section 3.2): landmark warp, cylindrical resampling, refinement.
 
 Each scan is first moved rigidly into the head frame by its landmarks. The result has the vertices and triangles of the
 default model, because modes on a scan's hundred thousand vertices would take a hundred megabytes; the paper keeps the
 scan's vertices. The functions ``on_reference`` and ``warp_and_resample`` are the paper's steps; they serve only to draw
-its figure 3. Landmarks alone do not fix the vertices between them along the surface. A model is therefore built from
-refined heads: the most probable head under a prior of heads, given the scan's landmarks and surface, is displaced
-smoothly along its normals onto the scan.
+its figure 3. Landmarks alone leave the vertices between them free to slide along the surface. A model is therefore
+built from refined heads: the most probable head under a prior of heads, given the scan's landmarks and surface, is
+displaced smoothly along its normals onto the scan.
 
 The prior contains more heads than the span of a PCA. A PCA of 138 heads has 137 directions, and a head outside this
 span would be fitted with vertices at wrong positions. Two assumptions extend the sample of heads. A head and its mirror
@@ -16,8 +15,8 @@ keeps only the correlation of near vertices (localised models: Luethi et al. 201
 section 3.3). The prior mixes the original and the localised covariance.
 
 Resampling casts rays outwards from the vertical axis through the head. A ray is (angle, height): angle 0 points along
-+z (out of the face), pi/2 along +x (the subject's left); height is y. Scans are processed in several processes, because
-SuperLU and numpy do not release the interpreter lock."""
++z (out of the face), pi/2 along +x (the subject's left); height is y. Several processes work on scans, because SuperLU
+and numpy do not release the interpreter lock."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor

@@ -1,8 +1,8 @@
 """Checks raw scans for problems: units, left and right, orientation of faces, landmarks off the surface, holes.
 
 A problem with one obvious remedy (units, a mirrored file, exchanged landmark names, inverted faces) is repaired and
-reported. Every other problem is a fault, and all faults are reported. Landmarks are compared with the default model's
-mean."""
+reported. All other problems are faults, and all faults are reported. Landmarks are compared with the default model's.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -46,8 +46,7 @@ class Checked:
 
 
 def check(scan: Scan, template: HeadModel) -> Checked:
-    """Returns the scan in millimetres, with left and right and the orientation of faces repaired. Raises BadScan with
-    all faults."""
+    """Returns the scan in millimetres, with left and right and faces repaired. Raises BadScan with all faults."""
     _check_complete(scan)
     scan, repairs = _in_millimetres(scan, template)
     scan, side_repairs = _sides_and_windings(scan, template)

@@ -1,9 +1,8 @@
-"""Reads raw scans and their landmarks: a mesh file (PLY, OBJ, GLB) and a landmark file with the same name in the same
-folder.
+"""Reads raw scans and their landmarks: a mesh file (PLY, OBJ, GLB) and a landmark file of the same name beside it.
 
 Landmark files are ``.json`` (``{"points": {"pronasale": [x, y, z]}}``, or the names at the top level), MeshLab's picked
 points ``.pp``, landmarker.io's ``.ljson`` (versions 1 to 3; a label with a single point is a landmark), and 3D Slicer's
-``.mrk.json``. Landmark names are the 26 in landmarks.py; case, blanks and hyphens do not matter."""
+``.mrk.json``. Landmark names are the 26 in landmarks.py, in any case and with blanks or hyphens."""
 
 import json
 import xml.etree.ElementTree as ElementTree

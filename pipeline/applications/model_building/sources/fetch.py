@@ -1,8 +1,7 @@
-"""Downloads the published head model ICT-FaceKit Light at one fixed (pinned) git commit and imports it into the user's
-folder of models.
+"""Downloads the head model ICT-FaceKit Light at one fixed (pinned) git commit into the user's folder of models.
 
-A git commit is a hash over every byte of the files. If a server or folder delivers a commit other than the pinned one,
-the download is refused before any of its files is read."""
+A git commit is a hash over every byte of the files. A download with another commit than the pinned one is refused
+before any of its files is read."""
 
 import os
 import re

@@ -1,11 +1,11 @@
 """Imports head models of other formats: ICT-FaceKit, statismo and Basel HDF5 files, plain npz.
 
-Every reader returns a ``Foreign`` model in millimetres and in the head frame's axes; ``adopt`` converts it to a model
-of this project. The imported model keeps its vertices. Modes that are not orthogonal are replaced by the principal axes
-of the same Gaussian (``pca.orthogonalised``), so the probability of every head stays the same. Landmarks that the
-source lacks come from the default model, which is fitted to the imported mean head and then warped onto it. The face
-region follows from the landmarks. New triangles between existing vertices close the openings of eyes and mouth, so that
-the head hides what is behind the openings."""
+Every reader returns a ``Foreign`` model in millimetres and head-frame axes; ``adopt`` converts it to this project's
+form. The imported model keeps its vertices. Modes that are not orthogonal are replaced by the principal axes of the
+same Gaussian (``pca.orthogonalised``), so the probability of every head stays the same. Landmarks that the source lacks
+come from the default model, which is fitted to the imported mean head and then warped onto it. The face region follows
+from the landmarks. New triangles between existing vertices close the openings of eyes and mouth, which hides what is
+behind."""
 
 import json
 import re
@@ -134,7 +134,7 @@ def import_model(path: Path, *, name: str | None = None, report: Progress = disc
 
 
 def read_ict_compact(path: Path) -> Foreign:
-    """Returns the model in the one-file copy of ICT-FaceKit Light: mean, modes, faces, landmarks68, in mm. Raises
+    """Returns the model in ICT-FaceKit Light's one-file copy: mean, modes, faces, landmarks68 (mm). Raises
     CannotImport."""
     with open_npz(path) as file:
         mean, modes, faces = (file[key] for key in ("mean", "modes", "faces"))
@@ -172,8 +172,7 @@ def read_ict_repository(folder: Path, *, report: Progress = discard_progress) ->
 
 
 def _repository_expressions(folder: Path, neutral: Vertices, report: Progress) -> Expressions | None:
-    """Returns the expressions from meshes whose files are named after them: browDown_L.obj and so on. Raises
-    CannotImport."""
+    """Returns the expressions from mesh files that are named after them: browDown_L.obj and so on. Raises CannotImport."""
     paths = [path for path in sorted(folder.glob("*.obj")) if ICT_EXPRESSION.fullmatch(path.stem)]
     if not paths:
         return None

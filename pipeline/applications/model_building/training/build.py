@@ -40,8 +40,7 @@ def build_model(
     """Builds a model from the scans of a folder and saves it as ``out``.
 
     All scans are checked before any other work. With ``on_bad="stop"``, scans with faults raise one InputError that
-    lists them; with ``"skip"`` they are left out. Also raises InputError if fewer than 3 scans without faults remain.
-    """
+    lists them; with ``"skip"`` they are left out. Also raises InputError if fewer than 3 scans remain."""
     parts, sha256 = read_parts(model_path("default"))
     template = assemble(parts, sha256)
     good, skipped = read_checked(scans_folder, template, report)
@@ -70,8 +69,7 @@ def build_model(
 
 
 def read_checked(folder: Path, template: HeadModel, report: Progress) -> tuple[list[Checked], dict[str, str]]:
-    """Returns the scans of a folder that passed all checks, and the other scans' faults by name. Raises InputError for
-    an empty folder."""
+    """Returns the faultless scans of a folder, and all others' faults by name. Raises InputError for an empty folder."""
     paths = find_scans(folder)
     with workers(WORKERS, len(paths)) as crew:
         found = crew.over(partial(_read_and_check, template), paths, "checking scans", report)
@@ -92,8 +90,7 @@ def cages_through(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> F
 
     A subdivision surface lies inside its cage. The cage C must therefore solve S C = P, with the points P and the
     subdivision matrix's rows S for the cage's vertices. S nearly removes details as fine as the cage itself, so its
-    inverse would amplify noise. A few iterations C += P - S C, starting with the template's details, avoid the noise.
-    """
+    inverse would amplify noise. A few iterations C += P - S C from the template's details avoid the noise."""
     rows = template.levels["full"].operator[: len(template.mean)]
     mean = template.mean.astype(float)
     away = points - rows @ mean

@@ -36,8 +36,7 @@ class Training:
 
 
 def train(training: Training, *, report: Progress) -> ModelParts:
-    """Computes a model's parts: rigid Procrustes alignment (no scale), PCA, decimated meshes, generalisation and
-    specificity.
+    """Computes a model's parts: rigid Procrustes alignment (no scale), PCA, decimated meshes, quality figures.
 
     Raises NotAManifold if the faces form no manifold."""
     check_manifold(training.faces)

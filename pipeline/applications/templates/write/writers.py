@@ -9,8 +9,7 @@ formats OBJ and USDZ, ``head-NAME-parts.obj`` and ``head-NAME-parts.usdz`` hold 
 blendshapes.
 
 The image of an eyeball is centred at the iris; distance from its centre is proportional to the angle from the gaze.
-Between the lids, an eyeball's image shows the head's texture; elsewhere it shows the median colours of the iris, ring
-by ring, or of the white."""
+Between the lids, an eyeball's image shows the head's texture, elsewhere median colours of iris or white."""
 
 import io
 import json
@@ -120,8 +119,8 @@ def darkest_direction(eyeball: Eyeball, photographed: PhotographedEyes) -> Float
 def _front(
     gaze: Float[np.ndarray, " 3"],
 ) -> tuple[Float[np.ndarray, "s s"], Bool[np.ndarray, "s s"], Float[np.ndarray, "n 3"]]:
-    """Returns, for each texel of an eyeball's image, the angle from the gaze (rad) and whether the texel is on the
-    front half; also the directions of the texels on that half."""
+    """Returns, for each texel of an eyeball's image, the angle from the gaze (rad) and whether it is on the front half;
+    also the directions of these texels."""
     offsets = (np.arange(SIZE_PX) + 0.5) / SIZE_PX - 0.5
     x, y = np.meshgrid(offsets, -offsets)
     angle = 2.0 * np.pi * np.hypot(x, y)
@@ -133,8 +132,7 @@ def _front(
 def _photographed(
     eyeball: Eyeball, directions: Float[np.ndarray, "n 3"], photographed: PhotographedEyes
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Returns photographed colours (sRGB) in these directions from an eyeball's centre, and a mask of directions that
-    no lid hides."""
+    """Returns photographed colours (sRGB) in directions from an eyeball's centre, and which directions no lid hides."""
     head, atlas = photographed.head, photographed.atlas
     if atlas is None or not len(photographed.between):
         return np.zeros_like(directions), np.zeros(len(directions), bool)
@@ -151,11 +149,9 @@ def _photographed(
 
 
 def load_template_writers(name: str | None, model: HeadModel) -> tuple[ResultWriter, ...]:
-    """Loads the named template, if any, for a job with ``model``; returns the writers of posed.glb and the template's
-    files.
+    """Loads the named template, if any, for a job with ``model``; returns the writers of posed.glb and template files.
 
-    Raises UnknownTemplate, BadTemplate, OtherModel.
-    """
+    Raises UnknownTemplate, BadTemplate, OtherModel."""
     template = load_template(name, model)
     return (write_posed, *(() if template is None else template_writers(template)))
 
@@ -237,9 +233,9 @@ def write_template_shapes(folder: Path, result: Reconstruction, template: Templa
 
 
 def write_posed(folder: Path, result: Reconstruction) -> None:
-    """Writes posed.glb if the settings request morph targets and the head model has blendshapes. The file holds the
-    head without expression, with texture, blendshapes, pivots, eyeballs, teeth and tongue, and the photographed
-    weights. Raises OSError."""
+    """Writes posed.glb if the settings request morph targets and the head model has blendshapes. The file holds a head
+    without expression, texture, blendshapes, pivots, eyeballs, teeth, tongue, and the photographed weights. Raises
+    OSError."""
     blendshape_rig = result.evidence.blendshape_rig
     if blendshape_rig is None or not result.settings.outputs.morphs:
         return
@@ -280,8 +276,7 @@ def _towards_irises(
     photographed: PhotographedEyes,
 ) -> dict[str, Float[np.ndarray, " 3"]]:
     """Returns the directions from the centres of added eyeballs to the photographed irises. Each iris thus lies where
-    it was photographed, although the lids constrain the ball's position. If an iris was not measured, the darkest area
-    between the open lids replaces it."""
+    it was photographed. The darkest area between the open lids replaces an iris that was not measured."""
     found = {}
     for name, ball in animated.added.items():
         eye = eyes.get(name.removeprefix("eye_"))
