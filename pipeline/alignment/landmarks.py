@@ -119,7 +119,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig) -> Feature
 def _sides_exchanged(
     model: HeadModel, names: list[str], target: Points, noise: Float[np.ndarray, "n 3 3"], kept: Bool[np.ndarray, " n"]
 ) -> bool:
-    """Returns whether most points agree with the mean head only after right and left have been exchanged in all names."""
+    """Returns whether most points agree with the mean head only after right and left are exchanged in all names."""
     others = [mirrored(name) for name in names]
     if float(kept.mean()) >= MIN_AGREED_SIDES or others == names or not all(name in model.landmarks for name in others):
         return False

@@ -219,7 +219,7 @@ def head_origin(
 
 
 def turned(start: Similarity, yaw_deg: float, pitch_deg: float) -> Similarity:
-    """Returns the pose after a rotation of the head in its frame: by the yaw about its vertical axis, and by the pitch."""
+    """Returns the pose after a rotation of the head in its frame: by yaw about its vertical axis, and by the pitch."""
     turn = rotation_from_vector(np.radians([0.0, yaw_deg, 0.0])) @ rotation_from_vector(
         np.radians([pitch_deg, 0.0, 0.0])
     )

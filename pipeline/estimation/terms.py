@@ -36,7 +36,7 @@ ValueIn = TypeVar("ValueIn", contravariant=True)
 
 @runtime_checkable
 class Linearised(Protocol):
-    """Describes a term linearised at one value of the unknowns: its cost, and its contribution to the normal equations."""
+    """Describes a term linearised at one value of the unknowns: its cost and its contribution to normal equations."""
 
     @property
     def cost(self) -> float:
@@ -132,7 +132,7 @@ class LinearisedQuadratic:
 
     @property
     def cost(self) -> float:
-        """Returns the value of the quadratic form; it is negative where the linear part outweighs the quadratic part."""
+        """Returns the value of the quadratic form; it is negative where the linear part dominates."""
         return float(self.away @ self.term.matrix @ self.away - 2.0 * self.term.pull @ self.away)
 
     def add_to(self, equations: NormalEquations) -> None:

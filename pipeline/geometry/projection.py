@@ -21,7 +21,7 @@ MAX_RADIUS = 1e6  # instead of an endless turning radius, which compiled loops w
 
 
 def packed_lens(camera: Camera) -> Float[np.ndarray, " 10"]:
-    """Returns the lens as numbers: fx fy cx cy k1 k2 p1 p2 k3 and the radius up to which the distortion model is valid."""
+    """Returns the lens as numbers: fx fy cx cy k1 k2 p1 p2 k3 and the radius up to which distortion is valid."""
     k = camera.intrinsics
     return np.append(k.values(), min(k.distortion.max_valid_radius(), MAX_RADIUS))
 
@@ -55,7 +55,7 @@ def depth_map(
 
 @traced
 def depth_maps(rig: Rig, mesh_world: Mesh) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """Returns the depth map of a mesh in every camera of a rig: camera z (mm) at each pixel, infinite beside the mesh."""
+    """Returns the depth map of a mesh in every camera of a rig: camera z (mm) at each pixel, inf beside the mesh."""
     vertices, faces = mesh_world.vertices, mesh_world.faces
     found = map_in_threads(lambda k: depth_map(rig.cameras[k], vertices, faces)[0], len(rig))
     return dict(zip(rig.names, found, strict=True))

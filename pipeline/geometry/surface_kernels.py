@@ -1,4 +1,4 @@
-"""Holds the compiled loops of ``pipeline.geometry.surface_index``, and a search among the triangles of nearby vertices."""
+"""Holds the compiled loops of ``pipeline.geometry.surface_index``, and a search among triangles of nearby vertices."""
 
 from typing import NamedTuple
 

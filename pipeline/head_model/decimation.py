@@ -12,7 +12,7 @@ from rig.mesh import face_normals
 
 
 class _Collapser:
-    """Holds the state of one decimation: the triangles around each vertex, quadrics, and a heap of half-edge collapses."""
+    """Holds the state of one decimation: triangles around each vertex, quadrics, and a heap of half-edge collapses."""
 
     # Lists of floats, not arrays: on vectors of three numpy's overhead is ten times the arithmetic.
     def __init__(

@@ -45,7 +45,7 @@ def list_models() -> dict[str, Path]:
 
 
 def model_path(name_or_path: str | Path) -> Path:
-    """Returns the file of a head model that is given by its name or path. Raises UnknownModel if there is no such file."""
+    """Returns the file of a head model that is given by its name or path. Raises UnknownModel if none exists."""
     name = str(name_or_path)
     if name in PACK_FILES:
         return PACKS / PACK_FILES[name]

@@ -74,7 +74,7 @@ def pinnae(model: HeadModel) -> Bool[np.ndarray, " v"]:
 
 
 def scalp(model: HeadModel) -> Bool[np.ndarray, " v"]:
-    """Returns a mask of the finest mesh's vertices that can have hair: cranium and temples, without the ears' pinnae."""
+    """Returns a mask of the finest mesh's vertices that can have hair: cranium and temples, without the pinnae."""
     regions = head_regions(model)
     return (regions["cranium"] | regions["ears"]) & ~pinnae(model)
 

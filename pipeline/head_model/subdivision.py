@@ -163,7 +163,7 @@ def _odd_rule(
 
 
 def refine(faces: Int[np.ndarray, "F 3"], count: int, steps: int) -> tuple[sparse.csr_array, Int[np.ndarray, "G 3"]]:
-    """Computes several steps of Loop subdivision as one operator (the identity for 0 steps), and the refined triangles."""
+    """Computes several steps of Loop subdivision as one operator (the identity for 0 steps), and refined triangles."""
     operator: sparse.csr_array = sparse.csr_array(sparse.identity(count, format="csr"))
     for _ in range(steps):
         step, faces = subdivision(faces, row_count(operator))

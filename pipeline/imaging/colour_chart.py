@@ -132,7 +132,7 @@ def empty_plates(plates: tuple[Plate, ...]) -> tuple[Plate, ...]:
 
 
 def charts_in(plates: tuple[Plate, ...]) -> list[Chart]:
-    """Finds the colour charts in one camera's clean plates. If the plates are nearly equal, only the first is searched."""
+    """Finds the colour charts in one camera's clean plates. If the plates are nearly equal, the first is searched."""
     searched = plates if len(plates) > 1 and _differ(plates) else plates[:1]
     return [chart for chart in map(find_chart, searched) if chart is not None]
 

@@ -173,7 +173,7 @@ def _means(values: np.ndarray, size: int) -> np.ndarray:
 def _seen(
     camera: Camera, size: int, head: HeadGuide, shape: tuple[int, int]
 ) -> tuple[Float32[np.ndarray, "r c"], Float32[np.ndarray, "r c 5"]]:
-    """Returns the head's depth (mm) at every cell's centre, inf beside the head, and the head's position values there."""
+    """Returns the head's depth (mm) at every cell's centre, inf beside the head, and the position values there."""
     pixels = (camera.project(head.mesh.vertices) - (size - 1) / 2) / size
     depths = camera_depths(camera, head.mesh.vertices)
     depth, face = rasterise(pixels, depths, head.mesh.faces, *shape)

@@ -259,7 +259,7 @@ def _presence(
 
 
 def posterior(logs: Float32[np.ndarray, "n 4"], prior: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
-    """Returns the probability of skin, hair and clothes in each cell; the remainder to 1 belongs to the outlier class."""
+    """Returns the probability of skin, hair and clothes in each cell; the remainder to 1 is for outliers."""
     share = prior * np.exp(logs - logs.max(axis=1, keepdims=True))
     return share[:, :3] / share.sum(axis=1, keepdims=True)
 

@@ -88,7 +88,7 @@ class SilhouetteObjective:
         return float(self._drawn.xor_costs(self.vertices_world(coefficients)).sum())
 
     def vertices_world(self, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, "v 3"]:
-        """Returns the mesh's vertices for these coefficients in the world frame, mm, which is T(H(alpha)) in the paper."""
+        """Returns the mesh's vertices for these coefficients (world frame, mm), which is T(H(alpha)) in the paper."""
         moved = (np.asarray(coefficients, np.float32) @ self._basis).reshape(-1, 3)
         return self._mean_world + moved @ self._turn.T
 

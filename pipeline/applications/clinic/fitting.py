@@ -254,7 +254,7 @@ def splay_angle(head: UprightHead) -> float | None:
 
 
 def frontal_angle(head: UprightHead) -> float | None:
-    """Returns the mean angle (degrees) between the bridge's flanks and the vertical; positive if it widens downwards."""
+    """Returns the mean angle (degrees) of the bridge's flanks to the vertical; positive if they widen downwards."""
     crest = _crest(head, FLANK_HEIGHTS_MM[0])
     if crest is None:
         return None

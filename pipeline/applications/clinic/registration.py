@@ -307,7 +307,7 @@ def _best(patch: Patch, surface: PatientSurface, starts: list[RigidTransform]) -
 def _distances(
     visit: Visit, surface: PatientSurface, motion: RigidTransform, normals: Float[np.ndarray, "v 3"]
 ) -> Float[np.ndarray, " v"]:
-    """Returns the signed distance of every vertex to the CT surface, NaN where the surface lacks this part of the head."""
+    """Returns the signed distance of every vertex to the CT surface, NaN where the surface lacks that part."""
     there, facing = motion.apply(visit.measured.mesh_world.vertices), normals @ motion.rotation.T
     hits = surface.reference.index.closest(there, facing=facing)
     alike: Bool[np.ndarray, " v"] = np.einsum("nx,nx->n", facing, hits.normals) > 0.3

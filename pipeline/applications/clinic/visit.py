@@ -1,4 +1,4 @@
-"""Reads one visit of a patient from a result folder: head, landmarks and measurements with their standard deviations."""
+"""Reads one visit of a patient from a result folder: head, landmarks and measurements with standard deviations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

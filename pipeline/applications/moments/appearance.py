@@ -51,7 +51,7 @@ class Samples:
 
 
 def spread(person: SequencePerson) -> Samples:
-    """Returns sample points spread over the person's face without the lids, which may show the eyeball instead of skin."""
+    """Returns sample points spread over the person's face without the lids, which may show the eyeball, not skin."""
     level, lids = person.model.levels["full"], lid_motion_mm(person) > LID_MM
     skin = level.face_region & ~lids
     corners, shares = spread_samples(person.neutral, level.faces[skin[level.faces].all(axis=1)], SAMPLE_MM)
@@ -68,7 +68,7 @@ def lid_motion_mm(person: SequencePerson) -> Float[np.ndarray, " v"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texture:
-    """Holds the fine texture of a picture and its derivatives by x and y (per pixel), at a size divided by ``reduced``."""
+    """Holds the fine texture of a picture and its derivatives by x and y (per px), reduced by a factor ``reduced``."""
 
     image: Float32[np.ndarray, "h w 3"]
     reduced: int

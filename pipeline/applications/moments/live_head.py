@@ -174,7 +174,7 @@ def _fitted(who: LivePerson, found: Sighting, start: Motion) -> Motion:
 
 
 def _misfits(who: LivePerson, found: Sighting, motion: Motion) -> dict[str, float]:
-    """Returns, by camera, the RMS distance between detected and projected landmarks, relative to the face's size there."""
+    """Returns, by camera, the RMS distance between detected and projected landmarks, relative to the face's size."""
     reference, misfits = who.reference, {}
     world = motion.world_from_head.apply(reference.points(motion.weights))
     for name, pixels in found.pixels.items():

@@ -1,16 +1,16 @@
 """Tracks a sequence from its folder, and writes the result files.
 
-    sequence.npz   frames (t), times_s, expressions (e), weights and weight_deviations (t e), rotations (t 3 3),
+``sequence.npz``   frames (t), times_s, expressions (e), weights and weight_deviations (t e), rotations (t 3 3),
                    translations (t 3, mm; world_from_head), pose_deviations (t 6: rad, mm), alike (t: correlation of the
                    skin's texture with its reference), failed (t), skew_mm (t: how far the face moves between the first
                    and the last camera's exposure, by clock.json); all are smoothed over time
-    person.npz     names (e), neutral (v 3, head frame, mm), shapes (e v 3, mm at weight 1), the corrected cameras; the
+``person.npz``     names (e), neutral (v 3, head frame, mm), shapes (e v 3, mm at weight 1), the corrected cameras; the
                    head of a frame is rotation (neutral + sum of weights times shapes) + translation
-    sequence.glb   the animated head: expressions as morph targets, pose relative to the first frame
-    sequence.usdc  the same as a point cache of OpenUSD, if requested
-    preview.mp4    the front camera's pictures beside the rendered head
-    report.json    the report, written last
-    .chunks/       stored chunks, with which a run continues after an interruption
+``sequence.glb``   the animated head: expressions as morph targets, pose relative to the first frame
+``sequence.usdc``  the same as a point cache of OpenUSD, if requested
+``preview.mp4``    the front camera's pictures beside the rendered head
+``report.json``    the report, written last
+``.chunks/``       stored chunks, with which a run continues after an interruption
 """
 
 import json
@@ -104,7 +104,7 @@ def make_sequence(
 
 
 def skew_mm(person: SequencePerson, footage: Footage, course: Course) -> Float[np.ndarray, " t"]:
-    """Returns, for each frame, how far landmarks move on average (mm) between the first and the last camera's exposure."""
+    """Returns, for each frame, the landmarks' mean motion (mm) between the first and the last camera's exposure."""
     rows = list(person.model.landmarks.values())
     moved = person.neutral[rows] + np.einsum("te,emx->tmx", course.weights, person.shapes[:, rows])
     places = np.einsum("txy,tmy->tmx", course.rotations, moved) + course.translations[:, None]

@@ -1,12 +1,12 @@
 """Reconstructs a take from its captures, and writes the result files.
 
-    neutral.ply      the person's head without expression: head frame, mm; quality is its standard deviation
-    neutral.glb      the same in metres, with the person's blendshapes as morph targets under Apple's 52 names
-    shapes.npz       names (n), shapes (n v 3, mm at weight 1) and deviations (n v, mm), in vertex order
-    take.npz         moments (k), expressions (e), weights and weight_deviations (k e), rotations (k 3 3),
+``neutral.ply``      the person's head without expression: head frame, mm; quality is its standard deviation
+``neutral.glb``      the same in metres, with the person's blendshapes as morph targets under Apple's 52 names
+``shapes.npz``       names (n), shapes (n v 3, mm at weight 1) and deviations (n v, mm), in vertex order
+``take.npz``         moments (k), expressions (e), weights and weight_deviations (k e), rotations (k 3 3),
                      translations (k 3, mm), scale, heads (k v 3, head frame, mm) and deviations (k v, mm)
-    moments/<name>/  the result folder of each moment, all with the same vertex order
-    report.json      the report, written last
+``moments/<name>/``  the result folder of each moment, all with the same vertex order
+``report.json``      the report, written last
 """
 
 import io

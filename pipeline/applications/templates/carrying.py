@@ -64,7 +64,7 @@ def frames(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceBinding:
-    """Holds how a template's n vertices follow a head model's surface: attached skin vertices, anchors for all others."""
+    """Holds how a template's n vertices follow a head model's surface: attached skin vertices, anchors for others."""
 
     rest: Float[np.ndarray, "t 3"]  # where the mesh lay when it was registered, mm
     skin: Int[np.ndarray, " n"]  # rows that the surface carries, as ``attachment`` says
@@ -79,7 +79,7 @@ class SurfaceBinding:
         return self.with_skin(self.attachment.on(vertices, faces))
 
     def with_skin(self, skin: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "t 3"]:
-        """Returns the template's vertices for given positions of its skin vertices; all other vertices follow the skin."""
+        """Returns the template's vertices for given positions of its skin vertices; other vertices follow the skin."""
         out = np.empty_like(self.rest)
         out[self.skin] = skin
         deep = self.wholes < 0

@@ -154,7 +154,7 @@ def _mean_in_space(vertices: Vertices, rows: Rows, radius_mm: float) -> sparse.c
 def _crossing(
     rest: RestSurface, displacement: Vertices, weight: float, active: Bool[np.ndarray, " f"]
 ) -> Bool[np.ndarray, " f"]:
-    """Returns a mask of the triangles that cross at a weight; only pairs with at least one active triangle are tested."""
+    """Returns a mask of the triangles that cross at a weight; only pairs with an active triangle are tested."""
     if not active.any():
         return active
     few = active if active.mean() < FEW else None

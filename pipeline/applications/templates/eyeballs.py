@@ -169,7 +169,7 @@ def _depths(eyeball: Eyeball, points: Float[np.ndarray, "g 7 3"]) -> Float[np.nd
 def lifted(
     mesh: Places, triangles: Int[np.ndarray, "g 3"], displacement: Places, eyeballs: Mapping[str, Eyeball]
 ) -> Places:
-    """Returns a blendshape's displacement (mm) with lids lifted off the eyeballs at ``WEIGHTS``, otherwise unchanged."""
+    """Returns a blendshape's displacement (mm) with lids lifted off the eyeballs at ``WEIGHTS``, else unchanged."""
     out = displacement
     for eyeball in eyeballs.values():
         about = triangles[_near(mesh, triangles, eyeball.centre)]

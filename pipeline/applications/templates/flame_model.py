@@ -190,7 +190,7 @@ class _Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Vertices:
-    """Holds the vertex distances as a cost term; ``roots`` are the inverse standard deviations of the distances (1/m)."""
+    """Holds the vertex distances as a cost term; ``roots`` are the distances' inverse standard deviations (1/m)."""
 
     model: FlameModel
     target: Float[np.ndarray, "v 3"]

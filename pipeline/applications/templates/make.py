@@ -1,4 +1,4 @@
-"""Makes a template file for the command ``eigenhead template add``. Jobs that use a template do not import this module."""
+"""Makes a template file for the command ``eigenhead template add``. Jobs with a template do not import this module."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path

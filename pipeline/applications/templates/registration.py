@@ -248,7 +248,7 @@ def _drawn(mesh: Surface, skin: Flags, head: Surface, marks: Sequence[tuple[np.n
 
 
 def _followed(before: Vertices, after: Vertices, skin: Flags) -> Vertices:
-    """Returns ``after`` for skin vertices; all other vertices move from ``before`` smoothly with the skin around them."""
+    """Returns ``after`` for skin vertices; other vertices move from ``before`` smoothly with the skin around them."""
     rows = np.flatnonzero(skin)
     rows = rows[spread_nodes(before[rows], min(400, len(rows)))]
     out = after.copy()

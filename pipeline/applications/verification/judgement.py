@@ -49,7 +49,7 @@ MIN_FACING = 0.5  # share of the judged face where both surfaces face the same w
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Holds the limit of each figure of a verification: the largest allowed value; ``least_covered`` is the smallest."""
+    """Holds the limit of each verification figure: the largest allowed value, for ``least_covered`` the smallest."""
 
     face_rms_mm: float = 0.35  # deviation from the reference, of any capture
     features_rms_mm: float = 0.8  # the same of eyes, nose and mouth, the worst of them
@@ -179,7 +179,7 @@ class Judgement:
 
 
 def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) -> Judgement:
-    """Judges heads of one subject and one head model against the reference scan. Raises InputError if it shows another."""
+    """Judges heads of one subject and head model against the reference scan. Raises InputError if it shows another."""
     captures = tuple(judge_one(one, reference) for one in measured)
     first = measured[0]
     deviations = np.stack([one.deviation_mm for one in captures])
@@ -248,7 +248,7 @@ def weighted_range(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, "
 def weighted_quantiles(
     values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], shares: Sequence[float]
 ) -> list[float]:
-    """Returns, for each of ``shares`` (0 to 1), the value below which this fraction of the weight lies, interpolated."""
+    """Returns, for each of ``shares`` (0 to 1), the value below which this fraction of weight lies, interpolated."""
     order = np.argsort(values)
     reached = (np.cumsum(weights[order]) - 0.5 * weights[order]) / weights.sum()
     return np.interp(shares, reached, values[order]).tolist()

@@ -1,4 +1,4 @@
-"""Writes the folder of a verification: report.json, certificate.pdf, and one file with the pictures in the certificate."""
+"""Writes the folder of a verification: report.json, certificate.pdf, and one file with the certificate's pictures."""
 
 import json
 from dataclasses import dataclass
@@ -106,7 +106,7 @@ def legend(width: int = 600, height: int = 24) -> Resized:
 def write_verification(
     folder: Path, first: Measured, reference: Reference, judgement: Judgement, occasion: Occasion
 ) -> VerificationReport:
-    """Writes a verification's files, report.json last, and returns its content. ``first`` is the first capture's head."""
+    """Writes verification files, report.json last, and returns its content. ``first`` is the first capture's head."""
     document, pictures = report_document(judgement, reference, occasion), draw(first, reference, judgement)
     rows = [np.hstack(row) for row in (pictures.reference, pictures.result, pictures.error)]
     write_image(folder / "error.png", np.vstack(rows))

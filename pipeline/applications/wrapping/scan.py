@@ -53,7 +53,7 @@ class RawScan:
         return np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
 
     def drawable(self) -> Mesh:
-        """Returns the scan with vertex colours; triangles are subdivided until vertex colours do not blur the texture."""
+        """Returns the scan with vertex colours, subdivided so that vertex colours do not blur the texture."""
         mesh = self.painted.mesh
         if self.painted.image is None or self.painted.uv is None:
             return mesh

@@ -139,7 +139,7 @@ def _git(name: str, folder: Path, timeout_s: float, *arguments: str, report: Pro
 
 
 def _waited(process: subprocess.Popen[bytes], errors: IO[bytes], until: float, report: Progress) -> bytes:
-    """Waits for a process while reporting its progress lines, and returns its standard output. Raises TimeoutExpired."""
+    """Waits for a process, reporting its progress lines, and returns its standard output. Raises TimeoutExpired."""
     while True:
         try:
             return process.communicate(timeout=min(0.25, until - time.monotonic()))[0]

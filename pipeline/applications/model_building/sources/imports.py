@@ -143,7 +143,7 @@ def read_ict_compact(path: Path) -> Foreign:
 
 
 def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
-    """Returns the expressions from the file beside the identity file: names, and displacements of its vertices in mm."""
+    """Returns the expressions from the file beside the identity file: names and displacements of its vertices in mm."""
     beside = path.with_name(path.stem.removesuffix("_light") + ICT_EXPRESSIONS)
     if not beside.is_file():
         return None
@@ -172,7 +172,7 @@ def read_ict_repository(folder: Path, *, report: Progress = discard_progress) ->
 
 
 def _repository_expressions(folder: Path, neutral: Vertices, report: Progress) -> Expressions | None:
-    """Returns the expressions from mesh files that are named after them: browDown_L.obj and so on. Raises CannotImport."""
+    """Returns the expressions from mesh files named after them: browDown_L.obj and so on. Raises CannotImport."""
     paths = [path for path in sorted(folder.glob("*.obj")) if ICT_EXPRESSION.fullmatch(path.stem)]
     if not paths:
         return None

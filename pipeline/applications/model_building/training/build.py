@@ -69,7 +69,7 @@ def build_model(
 
 
 def read_checked(folder: Path, template: HeadModel, report: Progress) -> tuple[list[Checked], dict[str, str]]:
-    """Returns the faultless scans of a folder, and all others' faults by name. Raises InputError for an empty folder."""
+    """Returns the faultless scans of a folder, and all others' faults. Raises InputError for an empty folder."""
     paths = find_scans(folder)
     with workers(WORKERS, len(paths)) as crew:
         found = crew.over(partial(_read_and_check, template), paths, "checking scans", report)

@@ -107,7 +107,7 @@ def _swallowed(
 def _grid_faces(
     valid: Bool[np.ndarray, "H A"], points: Float[np.ndarray, "N 3"], jump_mm: float
 ) -> Int[np.ndarray, "F 3"]:
-    """Returns triangles between neighbouring samples, also across the angle's seam; no edge is ``jump_mm`` or longer."""
+    """Returns triangles between neighbouring samples, also across the angle's seam; no edge reaches ``jump_mm``."""
     rows, columns = valid.shape
     index = np.arange(rows * columns).reshape(rows, columns)
     here, right = index[:-1], np.roll(index, -1, 1)[:-1]

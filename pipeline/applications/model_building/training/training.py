@@ -22,7 +22,7 @@ USED_MODES = 60  # section 4.4
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Training:
-    """Holds corresponded heads (mm, in any common pose, y up, z out of the face), and the other inputs of the training."""
+    """Holds corresponded heads (mm, in any common pose, y up, z out of the face), and the training's other inputs."""
 
     name: str
     licence: str
