@@ -43,8 +43,8 @@ def cached_arrays(
     """Returns the arrays that ``make()`` computes, from a cache file if an earlier process stored them.
 
     Args:
-        name: what the arrays are; the file's name begins with it.
-        inputs: everything that ``make`` starts from: arrays, and values whose ``repr`` identifies them.
+        name: a name for the arrays, with which the file's name begins.
+        inputs: all inputs of ``make``: arrays, and values whose ``repr`` identifies them.
         make: computes the arrays, of numbers or booleans, by name.
         made_by: functions and classes of other modules on which the result depends; when their source changes, the
             arrays are computed again.

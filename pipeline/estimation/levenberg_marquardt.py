@@ -88,7 +88,7 @@ def minimise(
         limits: when to stop.
         solve: solves a symmetric positive definite system. Where the matrix is not definite it raises LinAlgError; the
             step is then tried again with more damping.
-        least: as ``least_within``, for steps that meet a bound.
+        least: a function like ``least_within``, for steps that reach a bound.
         at_start: the problem linearised at ``start``, if the caller has it already.
         watch: called before every step; an exception that it raises ends the search.
     """

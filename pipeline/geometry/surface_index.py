@@ -25,10 +25,10 @@ def closest_candidates(
 
     Args:
         points: the query points.
-        candidates: rows of ``corners`` for each point; of equally close ones the first is taken.
-        corners: of the triangles.
+        candidates: indices into ``corners`` for each point; of equally close triangles the first is chosen.
+        corners: corner positions of all triangles.
         facing: unit normals of the points; a triangle that faces the opposite way counts as ``facing_mm`` farther away.
-        facing_mm: that distance.
+        facing_mm: the additional distance.
     """
     triangle, weights = np.zeros(len(points), np.int64), np.zeros((len(points), 3))
     places, rows = np.ascontiguousarray(points, float), np.ascontiguousarray(candidates, np.int64)

@@ -34,8 +34,8 @@ def link_nodes(index: Int32[np.ndarray, "n 3"], shape: tuple[int, int, int]) -> 
     """Returns the indices of each node's neighbours in the directions -x +x -y +y -z +z, -1 if there is no neighbour.
 
     Args:
-        index: of the nodes, in the order of ``node_keys``.
-        shape: of the full grid.
+        index: positions of the nodes in the full grid, in the order of ``node_keys``.
+        shape: the number of nodes of the full grid along each axis.
     """
     return linked(index, node_keys(index, shape), shape[1], shape[2])
 
@@ -46,8 +46,8 @@ def surface_net(
     """Builds the mesh of a field's zero level on a sparse grid; each quadrilateral is split along its shorter diagonal.
 
     Args:
-        field: at the nodes; negative inside.
-        index: of the nodes in the full grid, in the order of ``node_keys``.
+        field: the field's values at the nodes, negative inside.
+        index: positions of the nodes in the full grid, in the order of ``node_keys``.
         neighbours: the result of ``link_nodes``; every cell with both signs must be complete.
     """
     vertices, of_cell = net_vertices(field, index, neighbours)

@@ -79,8 +79,8 @@ def without_highlights(
     """Returns the images with the highlights on the head darkened to the skin's own light level.
 
     Args:
-        images: sRGB, by camera.
-        silhouettes: by camera; a view whose silhouette is not usable is neither compared nor changed.
+        images: sRGB photographs, by camera.
+        silhouettes: silhouettes by camera; a view with an unusable silhouette is neither compared nor changed.
         rig: the cameras.
         head_world: the fitted head, mm.
     """
@@ -107,7 +107,7 @@ def highlight_levels(colours: Float32[np.ndarray, "k v 3"], faces: Int[np.ndarra
 
     Args:
         colours: linear light of each view at each vertex of the head; NaN where the view does not see it.
-        faces: of the head, which define the neighbours of a vertex.
+        faces: triangles of the head, which define the neighbours of a vertex.
     """
     light = colours @ LIGHT
     seen = np.isfinite(light)

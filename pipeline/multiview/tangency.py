@@ -29,7 +29,7 @@ class Tangency:
     """Holds one tangent plane of two cameras; each attribute has one value for each camera.
 
     Attributes:
-        cameras: their names.
+        cameras: names of the cameras.
         pixels: the point of the outline that the plane touches.
         steepness: how much the plane turns about the line through both centres for each pixel across the epipolar line,
             rad.
@@ -161,10 +161,10 @@ def tangency(
     """Builds the tangency of two contour points that the same plane should touch.
 
     Args:
-        cameras: their names.
+        cameras: names of the cameras.
         pixels: the contour point in each image.
         slopes: ``angle_slopes`` at both points.
-        difference: angle of the plane through the first point less that through the second, rad.
+        difference: angle of the plane through the first point minus that through the second, rad.
         outward: 1.0 if the angle grows out of the subject, else -1.0.
     """
     steepness = float(np.linalg.norm(slopes[0])), float(np.linalg.norm(slopes[1]))

@@ -84,8 +84,8 @@ def triangulate_many(
     """Triangulates many points, each visible in every camera.
 
     Args:
-        pixels: of each point in each view.
-        cameras: of the views.
+        pixels: the pixel of each point in each view.
+        cameras: the cameras of the views.
         noise_px: standard deviation of each coordinate of a pixel; infinite where a view does not count for a point.
         start: points near the result, if known; parallel rays are then not reported.
 

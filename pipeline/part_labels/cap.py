@@ -59,7 +59,7 @@ def find_cap(
 
     ``images``: sRGB photographs by camera. ``masks``: of the subject, by camera. ``rig``: the cameras as calibrated.
     ``head_world``: a head at the subject's pose, such as the mean head (mm). ``face_region``: its vertices.
-    ``landmarks_world``: its landmarks (mm). ``colour``: of the cap, about, linear RGB. ``thickness_mm``: the cap's.
+    ``landmarks_world``: its landmarks (mm). ``colour``: the cap's approximate linear RGB. ``thickness_mm``: the cap's.
     """
     guide = head_guide(head_world, face_region, landmarks_world)
     used = rig.subset(name for name in rig.names if name in masks and name in images)
@@ -87,7 +87,7 @@ def cap_cells(
     """Returns the cells that show the cap, by camera, and the fraction of the head above the brows that they cover.
 
     Args:
-        cells: of each view.
+        cells: the cells of each view.
         brows_mm: height of the brows above the chin.
         stated: the cap's colour, as ``colour_of`` returns it.
     """

@@ -12,7 +12,7 @@ def spread_parts(slope, offset, size_px, grey, mask, out):
     Pixels outside ``mask`` do not change.
 
     ``slope`` and ``offset`` (r, c, 3) are interpolated between the middles of cells of ``size_px`` pixels, and constant
-    beyond the outermost ones; ``grey`` (h, w) is 0 to 255, and counts as 0 to 1.
+    beyond the outermost cells; ``grey`` (h, w) is 0 to 255, and is scaled to 0 to 1.
     """
     rows, columns = slope.shape[:2]
     one, per = np.float32(1.0), np.float32(1.0 / 255.0)

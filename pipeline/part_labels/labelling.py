@@ -86,7 +86,7 @@ def classify_parts(
 
     Args:
         images: sRGB photographs by camera.
-        silhouettes: of the subject, by camera; views that are not usable are left out.
+        silhouettes: silhouettes of the subject, by camera; unusable views are left out.
         rig: the cameras as calibrated.
         head_world: the fitted head without hair (mm).
         face_region: its vertices from ear to ear and from the lower forehead to under the chin.
@@ -94,7 +94,7 @@ def classify_parts(
         report: progress.
 
     Returns:
-        A map for each view that takes part.
+        A map for each usable view with a photograph.
     """
     masks = {n: s.mask for n, s in silhouettes.items() if s.quality.usable and n in images and n in rig.names}
     used = rig.subset(name for name in rig.names if name in masks)

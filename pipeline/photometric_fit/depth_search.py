@@ -124,7 +124,7 @@ def visibility_of(
 
     ``head_world``: the mesh that the patches belong to, mm. ``coarse_world``: the same surface with fewer triangles.
     ``cameras``: cameras of the views, at their current poses. ``views``: the silhouettes. ``patches``: the patches to
-    test. ``speaks``: which views have a photograph with texture; the others see nothing.
+    test. ``speaks``: which views have a photograph with texture; other views are ignored.
     """
     normals = head_world.normals()
     points, outward = patches.points(head_world.vertices), patches.normals(normals)

@@ -34,9 +34,9 @@ TRAGION_STD_MM = 3.0  # of the tragion above or below the porion
 class AnatomicalFrame:
     """Holds the rigid transform of a head into a patient's axes.
 
-    ``sources`` tells, for each point of the Frankfurt plane, whether it was marked or what replaces it. ``tilt_deg`` is
+    ``sources`` states for each point of the Frankfurt plane whether it was marked or what replaces it. ``tilt_deg`` is
     the angle between the head frame's horizontal plane and the Frankfurt plane, about the line through the ears,
-    positive where the nose rises; ``tilt_std_deg`` is its standard deviation. Without a plane both are None.
+    positive if the nose rises; ``tilt_std_deg`` is its standard deviation. Both are None without a plane.
     """
 
     axes: Axes
@@ -58,9 +58,9 @@ def frankfurt_axes(measured: Measured, axes: Axes, marked: Mapping[str, Vector] 
     head can have them.
 
     Args:
-        measured: the result.
+        measured: the head and its landmarks.
         axes: LPS or RAS.
-        marked: any of ``POINTS`` (world frame, mm) that were marked; the others are substituted.
+        marked: any of ``POINTS`` (world frame, mm) that were marked; all others are replaced.
     """
     points, sources = _plane_points(measured, marked or {})
     right, left = points["porion_right"], points["porion_left"]

@@ -327,8 +327,8 @@ def comparison_pdf(document: Mapping[str, Any], rows: Sequence[tuple[str, Sequen
     """Returns the comparison as PDF. The same document and pictures give the same bytes.
 
     Args:
-        document: what compare.json says.
-        rows: of pictures, with their titles.
+        document: the content of compare.json.
+        rows: titles, each with a row of pictures.
     """
     pdf = PdfPage("eigenhead: comparison of two visits", document["date"])
     pdf.add_page()

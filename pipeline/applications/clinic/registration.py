@@ -83,7 +83,7 @@ class Patch:
 class TrimmedFit:
     """Holds the rigid motion of a patch onto a surface, with residuals and covariance.
 
-    ``residual_mm`` is each point's signed distance along the surface's normal, NaN without a counterpart; ``weights``
+    ``residual_mm`` is each point's signed distance along the surface's normal, NaN without a match; ``weights``
     are 0 for outliers. ``covariance`` (6 x 6: rotation about ``centre`` in rad, shift in mm) follows from the scatter;
     the number of independent errors is the number of patches of ``CORRELATED_MM`` in the area.
     """
@@ -113,11 +113,11 @@ def trimmed_fit(
     surface.
 
     Args:
-        patch: of the head, in any frame.
-        surface: that is met.
-        start: the motion to begin with.
-        share: of the points with a counterpart, the nearest, that count.
-        beside: tells which closest points lie on an open edge of the surface.
+        patch: points of the head, in any frame.
+        surface: the surface to which the patch is fitted.
+        start: the starting motion.
+        share: the fraction of the matched points, the nearest ones, that get a weight.
+        beside: returns which closest points lie on an open edge of the surface.
     """
     reached = MAX_REACH_MM
 
@@ -245,8 +245,8 @@ def register(
 
     Args:
         visit: the head.
-        surface: of the patient.
-        landmarks: of the surface, in its frame, three or more of the 26; or none.
+        surface: the CT surface of the patient.
+        landmarks: three or more of the 26 landmarks on the surface (its frame, mm), or None.
     """
     measured = visit.measured
     rng = np.random.default_rng(0)

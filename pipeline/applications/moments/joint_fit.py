@@ -175,8 +175,8 @@ def fit_jointly(
     """Returns the captures' solutions after a joint fit that gives all of them the same identity.
 
     Args:
-        solutions: of at least two moments, with models of one mesh and one basis; some may have fine modes, too.
-        eigenheads: how many of the modes, the first ones, are eigenheads.
+        solutions: those of at least two captures, with the same mesh and basis; some may also have fine modes.
+        eigenheads: the number of eigenheads, which are the first modes.
         watch: called before every step; an exception that it raises ends the fit.
     """
     problem, layout = joint_problem(solutions)

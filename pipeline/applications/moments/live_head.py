@@ -70,8 +70,8 @@ class LiveHead:
         who: the person.
         motion: pose and weights.
         sighting: pixels of the landmarks by camera, and the openings of the lids.
-        facing: cosine between where the face looks and each camera.
-        strangers: cameras that show landmarks where this head has none.
+        facing: cosine between the direction of the face and that to each camera.
+        strangers: cameras in which the detected landmarks belong to another head.
         points_world: the vertices of the small mesh, then the 468 landmarks (mm).
     """
 

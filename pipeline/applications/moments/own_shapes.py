@@ -48,11 +48,11 @@ def estimate_own_shapes(
 
     Args:
         model: the head model, with its expressions.
-        neutral: the modelled neutral head that all moments share, full level, head frame, mm.
-        scale: of the subject, by which the model's shapes are multiplied.
-        weights: of the model's expressions in each moment, 0 to 1.
-        heads: each moment's head, full level, head frame, mm.
-        deviation_mm: of each moment's vertices along their normals.
+        neutral: the head model's neutral head for all captures, finest mesh, head frame, mm.
+        scale: the subject's scale, by which the model's blendshapes are multiplied.
+        weights: the weights of the model's expressions in each capture, 0 to 1.
+        heads: each capture's head, finest mesh, head frame, mm.
+        deviation_mm: the standard deviation of each capture's vertices along their normals.
     """
     operator, names = model.levels["full"].operator, model.expressions.names
     full = np.zeros((len(names), *neutral.shape), np.float32)

@@ -113,8 +113,8 @@ def measure_skews(refreshes: Mapping[str, Float[np.ndarray, " n"]], rate_hz: flo
     """Measures the time offset of each camera.
 
     Args:
-        refreshes: by camera, of each shot what ``read_refresh`` says; NaN where it is unknown.
-        rate_hz: refreshes of the screen in a second.
+        refreshes: by camera, the result of ``read_refresh`` for each shot; NaN if it is unknown.
+        rate_hz: the screen's refresh rate.
 
     Returns only cameras that have shots in common with other cameras."""
     rows = np.array([*refreshes.values()])

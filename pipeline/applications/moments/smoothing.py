@@ -32,10 +32,10 @@ def smooth(
     """Returns the smoothed courses and their standard deviations.
 
     Args:
-        measured: the courses; what stands at failed frames does not matter.
-        deviation: of each measurement, by all that is unknown of it.
-        failed: frames without a measurement.
-        groups: unknowns that accelerate together; all must be in one.
+        measured: the measured courses; values at failed frames are ignored.
+        deviation: the standard deviation of each measurement, from all sources of error.
+        failed: a mask of the frames without a measurement.
+        groups: groups of unknowns that accelerate together; each unknown must be in one group.
     """
     known = np.flatnonzero(~failed)
     if len(measured) < 3 or len(known) < 2:

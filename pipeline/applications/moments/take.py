@@ -79,9 +79,9 @@ def reconstruct_take(
     """Reconstructs the captures of one person; ``contexts`` is indexed by the captures' names.
 
     Args:
-        contexts: a capture each, with the same model and settings.
-        deliver: receives each moment's finished result, which is not kept.
-        report: receives the progress of the whole; raises Cancelled to stop. The contexts' own hooks are not called.
+        contexts: one for each capture, all with the same model and settings.
+        deliver: receives each capture's finished result, which is then discarded.
+        report: receives the overall progress; raises Cancelled to stop. The contexts' hooks are not called.
 
     Raises InputError for fewer than two captures or the method ``simplex``, and the errors of ``reconstruct`` with the
     capture's name."""

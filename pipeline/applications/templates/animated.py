@@ -74,7 +74,7 @@ def carried_shapes(
     frame.
 
     ``surface_binding``: binding of the mesh to the model. ``triangles``: triangles of the mesh. ``neutral``: head
-    without expression. ``shapes``: displacements of the model's full level. ``landmarks``: landmarks of that head.
+    without expression. ``shapes``: displacements of its finest mesh. ``landmarks``: landmarks of this head.
     """
     names = list(shapes)
     mesh, count = neutral.mesh, len(neutral.mesh)
@@ -253,9 +253,9 @@ def animated_mesh(
     eyeballs, teeth and a tongue.
 
     ``surface_binding``: binding of the mesh to the model. ``triangles``: triangles of the mesh. ``vertices``: the
-    model's full level without expression, head frame, mm. ``faces``: its triangles. ``shapes``: displacements of that
-    level, by Apple's names or the model's. ``landmark_rows``: the model's landmarks, as rows of that level. ``gazes``:
-    directions of the eyes (unit vectors, head frame), by pivot; straight ahead for missing ones.
+    model's finest mesh without expression, head frame, mm. ``faces``: its triangles. ``shapes``: its displacements, by
+    Apple's names or the model's. ``landmark_rows``: the indices of its landmarks. ``gazes``: directions of the eyes
+    (unit vectors, head frame), by pivot; missing ones are straight ahead.
     """
     mesh = surface_binding.on(vertices, faces)
     landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
@@ -318,8 +318,8 @@ def parted_shapes(
 ) -> dict[str, Float[np.ndarray, "t 3"]]:
     """Returns the blendshapes corrected until no triangles cross, and visemes mixed from the corrected blendshapes.
 
-    ``mouthClose`` closes a mouth that ``jawOpen`` has opened, and is corrected together with it: by Apple's definition,
-    lips cross if it is used alone."""
+    ``mouthClose`` closes a mouth that ``jawOpen`` has opened, and is corrected together with ``jawOpen``: by
+    Apple's definition, lips cross if ``mouthClose`` is used alone."""
     out = {
         name: kept_apart(rest, shape, closing=name.startswith(LIDS))
         for name, shape in shapes.items()

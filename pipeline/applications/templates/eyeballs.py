@@ -120,10 +120,10 @@ def placed_eyeballs(
 
     Args:
         mesh: vertices, head frame, mm.
-        triangles: of the mesh.
-        landmarks: of the head.
+        triangles: triangles of the mesh.
+        landmarks: landmarks of the head.
         centres: the pivots ``eye_right`` and ``eye_left``, or one of them.
-        gazes: where they look (unit vectors, head frame), straight ahead where there is none.
+        gazes: their viewing directions (unit vectors, head frame); missing ones are straight ahead.
     """
     out = {}
     for name in centres:

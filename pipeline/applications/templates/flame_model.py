@@ -46,11 +46,11 @@ class FlameModel:
         template: vertices of the mean head, m.
         shape_modes: displacement for one standard deviation of each coefficient of shape, m.
         expression_modes: the same for expression.
-        pose_modes: displacement by each element of the rotation matrices of the joints below the root, less the
-            identity's, m.
-        joint_regressor: weights that make the joints of the shaped vertices.
-        weights: how much each vertex turns with each joint.
-        parents: the joint above each joint; the root's own is -1.
+        pose_modes: displacement by each element of the rotation matrices (minus the identity) of the joints below
+            the root, m.
+        joint_regressor: weights that compute the joints from the shaped vertices.
+        weights: skinning weight of each vertex for each joint.
+        parents: the parent of each joint; -1 for the root.
         faces: triangles.
     """
 
@@ -129,7 +129,7 @@ def fit_flame(
     Args:
         model: the model.
         target: the mesh's vertices, m, in any frame.
-        weights: how much each vertex counts, 0 to 1; equally by default.
+        weights: the weight of each vertex, 0 to 1; 1 by default.
     """
     counted = np.ones(len(target)) if weights is None else weights
     value, deviation = _start(model, target, counted), FIRST_M

@@ -31,9 +31,9 @@ def pivots(
     """Returns the pivots (rotation centres) of a head's parts by name, in the head frame, mm.
 
     Args:
-        landmarks: of the head without expression.
-        vertices: its full level.
-        shapes: displacements of the full level, by Apple's names.
+        landmarks: landmarks of the head without expression.
+        vertices: its finest mesh.
+        shapes: displacements of the finest mesh, by Apple's names.
         balls: vertices of each eyeball of the mesh.
     """
     out = {"jaw": hinge(landmarks)}

@@ -46,7 +46,7 @@ class BestFit:
     """Holds the rigid motion that aligns a head to its reference.
 
     ``start`` is "landmarks" or "search". ``rms_mm`` is the RMS distance after the rigid motion, over the ``points``
-    that have a counterpart on the reference. ``scale`` is the size of the measured head relative to the reference, 1 if
+    that have a match on the reference. ``scale`` is the size of the measured head relative to the reference, 1 if
     correct.
     """
 

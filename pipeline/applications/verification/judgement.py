@@ -100,8 +100,8 @@ class Scatter:
         """Returns statistics of the ``kept`` vertices, weighted by ``weights``: the RMS scatter and the RMS standard
         deviation that the results state (mm, along the normal).
 
-        ``scatter_over_stated`` is their ratio: 1 if the stated deviation is all scatter, less if a part of it repeats
-        in each shot. ``rank_correlation`` tells whether vertices with a larger stated deviation scatter more.
+        ``scatter_over_stated`` is their ratio: 1 if all stated deviation is scatter, less if a part of it repeats
+        in each capture. ``rank_correlation`` shows whether vertices with a larger stated deviation scatter more.
         """
         share = weights[kept] / weights[kept].sum()
         position, normal, stated = self.position_mm[kept], self.normal_mm[kept], stated_mm[kept]

@@ -409,10 +409,10 @@ def wrap(
     """Wraps a scan in the vertex order of a template.
 
     Args:
-        scan: in any unit and orientation.
-        template: registered to ``model``.
+        scan: the scan, in any unit and orientation.
+        template: a template registered to ``model``.
         model: the head model.
-        landmarks: in the scan's frame; None finds the face on renders.
+        landmarks: landmarks in the scan's frame; None detects the face in rendered pictures.
         report: progress.
 
     Raises InputError if the scan shows no face, or is not a head."""
