@@ -21,7 +21,7 @@ from pipeline.head_model.model import HeadModel
 from rig.geometry import Similarity
 from rig.rig import Rig
 
-POINTS = 72  # spread over the face: neighbours err alike and tell nothing more
+POINTS = 72  # spread over the face: errors of neighbours are correlated
 ROUNDS = 3  # of reweighting
 FORGIVEN_SIGMAS = 2.5  # a residual of that many deviations has twice its variance
 

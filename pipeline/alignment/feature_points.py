@@ -16,7 +16,7 @@ from rig.capture import Features
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
-GROSS_NOISE = 3.0  # times the noise of a click: who clicks carelessly is not told that points are another shot's
+GROSS_NOISE = 3.0  # times the noise of a click: careless clicks must not count as points of another shot
 MIN_JUDGED_VIEWS, MIN_JUDGED_POINTS = 3, 3  # of a point, whose contradiction is its own; and points
 WRONG_SHARE, RIGHT_SHARE = 0.6, 0.8  # of the points
 CONTRADICTION = 1e-4  # probability of a misfit this large by chance; one point in 10,000 is lost without need

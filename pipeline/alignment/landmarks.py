@@ -36,7 +36,7 @@ from rig.rig import Rig
 Points = Float[np.ndarray, "n 3"]
 
 MIN_POINTS = 3
-MIN_AGREED_SIDES = 0.85  # of all points, that agree where right and left are as they should be
+MIN_AGREED_SIDES = 0.85  # share of points that agree when right and left are correct
 MIN_TRIANGLE_MM = 5.0  # rms distance from the best line; less leaves the turn about that line to the noise
 OUTLIER_SIGMAS = 4.0  # of a point's own expected spread; 1 in 1,000 good points is lost (chi-square, 3 degrees)
 

@@ -33,24 +33,24 @@ from rig.messages.message import compose
 from rig.progress import Progress
 from rig.rig import Rig
 
-SPACING_MM, REACH_MM = 12.0, 264.0  # hull grid about the middle of the rig
+SPACING_MM, REACH_MM = 12.0, 264.0  # step and half width of the hull's grid about the rig's centre
 HEAD_SLAB_MM = (30.0, 150.0)  # below the crown: cranium and face, above any shoulder
-HAIR_MM = 12.0  # what hair adds to the crown, in the middle of what people wear
+HAIR_MM = 12.0  # height that typical hair adds to the crown
 YAWS_DEG, PITCHES_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0), (-15.0, 0.0, 15.0)
 YAWS_AROUND_DEG = tuple(np.arange(-180.0, 180.0, 30.0).tolist())
 ROLLS_DEG = (0.0, 90.0, 180.0, -90.0)
 FINALISTS, MANY_FINALISTS = 4, 8  # of starts about one guess, and of starts all around
 SAME_POSE_DEG, OTHER_POSE_DEG = 10.0, 20.0  # poses nearer than the first are one, beyond the second they are rivals
 MIN_AGREEMENT = 0.5  # of the borders where the body leaves the pictures: 1 where all say the same
-MIN_FAN = 0.3  # a ring has 0, cameras over half a circle 0.64
+MIN_FAN = 0.3  # fan strength: a full ring of cameras has 0, half a circle 0.64
 COARSE = Stage("p99", 6, False, (40.0, 20.0, 10.0), False, True, 4)
 FINE = Stage("p95", 15, False, (20.0, 10.0, 6.0), False, True, 4)
 DEEP = Stage("p95", 60, True, (6.0, 4.0, 2.0), False, True, 4)
-SEEN_SHARE = 0.6  # of the cameras that see the best seen point; above the frame of most, nothing carves the hull
+SEEN_SHARE = 0.6  # of the cameras that see the best seen point: with fewer cameras, the hull is not carved
 RANKED_PX = 6.0  # robust scale at which coarse fits are compared
 JUDGED_PX, JUDGED_MM = 2.0, 1.0  # and finalists, whichever is the larger: a right pose explains much of the outline
 # closely, a wrong one nearly all of it badly, which 6 px took for better in one of fifty draws
-REFERENCE_PX = 3000.0  # outline length that costs are scaled to, so that hiding the rim wins nothing
+REFERENCE_PX = 3000.0  # outline length to which costs are scaled, so that a hidden rim does not lower them
 
 
 class NoSubject(EigenheadError):

@@ -89,7 +89,7 @@ def _share(slices: list[tuple[int, int]], work: Callable[[int, int], None], thre
         while left:
             try:
                 first, last = left.pop()
-            except IndexError:  # another was quicker
+            except IndexError:  # another thread took the last slice
                 return
             work(first, last)
 

@@ -25,7 +25,7 @@ from pipeline.estimation.terms import Linearised, NormalEquations, Problem, Valu
 
 MIN_DAMPING = 1e-7  # after accepted steps; relative to the diagonal, Gauss-Newton to seven digits
 DAMPING_REFUSED = 1e-2  # at least, after a refused step
-MIN_DIAGONAL = 1e-12  # of what nothing determines: damping then keeps it where it is
+MIN_DIAGONAL = 1e-12  # of an undetermined unknown: damping then keeps it constant
 
 Reason = Literal["converged", "no step lowers the cost", "step limit"]
 Solve = Callable[[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]], Float[np.ndarray, " p"]]
@@ -110,7 +110,7 @@ def minimise(
                     step, predicted = _within(equations, damping, step, problem.room(now.value), least)
                 value, evaluations = problem.after(now.value, step), evaluations + 1
                 tried = _Place(value, there := problem.at(value), there.cost)
-                if tried.cost < max(recent[-limits.memory :]):  # False for the NaN of a value that makes no sense
+                if tried.cost < max(recent[-limits.memory :]):  # False if the cost is NaN
                     accepted = tried
                     break
                 if predicted < limits.tolerance:

@@ -29,7 +29,7 @@ def balance(
         return gains, offsets
     w = (weights[:, shared] > 0).astype(float)
     w *= np.sqrt(weights[:, shared] / weights[:, shared].max())
-    w *= (colours[:, shared].max(axis=2) < 0.98) & (colours[:, shared].min(axis=2) > 0.002)  # clipped tells nothing
+    w *= (colours[:, shared].max(axis=2) < 0.98) & (colours[:, shared].min(axis=2) > 0.002)  # not clipped ones
     for channel in range(3):
         values = colours[:, shared, channel].astype(float)
         gains[:, channel], offsets[:, channel] = _solve(values, w)

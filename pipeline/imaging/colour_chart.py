@@ -22,7 +22,7 @@ MIN_CELLS = 4  # a chart of 50 px in a thousand has 6
 ROWS, COLUMNS = 4, 6
 WIDTHS_PX = (1024, 2048)  # of the picture, as it is searched: finds charts of 90 px and more there, then smaller ones
 INNER = 0.5  # of a patch's sides: its rim is blurred, and its frame black
-CLIPPED = 0.97  # linear: what a sensor no longer tells
+CLIPPED = 0.97  # linear level at which a sensor saturates
 MIN_PATCHES = 18  # that are not clipped, for nine numbers
 MAX_OFF = 0.06  # rms of what the correction leaves of the patches: its own colours in another order leave 0.2
 
@@ -106,7 +106,7 @@ def chart_correction(charts: list[Chart]) -> ChartCorrection | None:
     kept = (seen < CLIPPED).all(axis=1)
     if kept.sum() < MIN_PATCHES:
         return None
-    # What is dark is to be as right as what is bright, as eyes have it.
+    # Dark patches should be as accurate as bright ones, relative to their brightness.
     weight = 1.0 / (0.1 + true[kept].mean(axis=1, keepdims=True))
     matrix = np.linalg.lstsq(seen[kept] * weight, true[kept] * weight, rcond=None)[0].T
     off = float(np.sqrt(np.mean((seen[kept] @ matrix.T - true[kept]) ** 2)))

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 LUMINANCE = np.array([0.35, 0.45, 0.2], np.float32)  # least noise for skin: its texture is in green and red alike
-QUIET_LEVELS = 1.2  # noise of a photograph that a comparison of windows need not care for
+QUIET_LEVELS = 1.2  # noise below which matching needs no more blur
 
 
 def noise_level(grey: Float32[np.ndarray, "h w"]) -> float:

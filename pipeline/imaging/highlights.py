@@ -39,7 +39,7 @@ MIN_COVERAGE = 0.05  # share of a window whose places are known
 MIN_FACING = 0.15  # cosine
 HIDDEN_MM = 1.5  # a nearer surface hides a vertex beyond this
 OUTLINE_MM = 1.5  # nothing is compared nearer to the outline
-MIN_VIEWS = 3  # of a place: of two, nobody knows which shines
+MIN_VIEWS = 3  # of a vertex: with two, the shining view is ambiguous
 DARKEST_SHARE = 1.0 / 3.0  # of the views, whose mean is the skin's own light
 MIN_SHARE = 0.04  # of that light, that a highlight adds at least; it counts whole at twice that. Skin lit evenly and
 # photographed by one kind of camera differs by less
@@ -68,8 +68,8 @@ class Excess:
     than the skin."""
 
     levels: Float32[np.ndarray, "k v"]  # 0 to 255, as displayed
-    sure: Bool[np.ndarray, "k v"]  # where nothing but a highlight explains it
-    known: Bool[np.ndarray, "k v"]  # where enough views see the place
+    sure: Bool[np.ndarray, "k v"]  # where only a highlight explains the excess
+    known: Bool[np.ndarray, "k v"]  # where enough views see the vertex
 
 
 @traced

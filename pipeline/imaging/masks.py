@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, UInt8
 from pipeline.imaging.sampling_kernels import refine_distance, segments_of_level
 
 BAND_PX = 12
-FAR = 0.01  # weight of a window four times as wide, which speaks where the near one holds no pixel
+FAR = 0.01  # weight of a window four times as wide, which counts where the near window is empty
 
 
 def box_around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:

@@ -27,13 +27,13 @@ NEIGHBOURS, MAX_ANGLE_DEG, MIN_ANGLE_DEG = 4, 50.0, 1.5  # of the rays at the su
 MUTUAL_RATIO = 0.75  # of the best match's distance to the second's (Lowe 2004 has 0.8)
 MAX_MISS_PX = 1.5  # of the reduced picture
 MAX_KEYPOINTS = 2500  # of a subject
-CONTRAST = 0.004  # of SIFT's peaks, a tenth of what is usual: skin has faint ones, and the cameras tell which are right
+CONTRAST = 0.004  # of SIFT's peaks, a tenth of the usual: skin has faint peaks, and epipolar lines reject wrong ones
 MAX_WIDTH = 1400  # px: larger pictures are reduced
-INSET_PX = 4.0  # from the outline, where a keypoint is of the backdrop, too
+INSET_PX = 4.0  # from the outline: nearer keypoints contain backdrop
 BAND = 0.004  # of the picture's width beside the line that the other camera allows: 4 px
 RATIO, MAX_DISTANCE = 0.85, 0.6  # of descriptors: to the second best, and at all
-MIN_LIKENESS = 1.0 - 0.5 * (MAX_DISTANCE / RATIO) ** 2  # of a second best that could put the best one in doubt
-MIN_VIEWS = 3  # of a point; with 2 there are more points, and each says less
+MIN_LIKENESS = 1.0 - 0.5 * (MAX_DISTANCE / RATIO) ** 2  # of a second match that makes the best one ambiguous
+MIN_VIEWS = 3  # of a point; with 2 there are more but less informative points
 MAX_MISS = 0.005  # of the picture's width: more is a wrong match
 
 

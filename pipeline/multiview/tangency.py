@@ -20,7 +20,7 @@ from rig.rig import Rig
 Vector = Float[np.ndarray, " 3"]
 
 BORDER_PX = 4.0  # a tangent this near the image border may belong to what the border has cut off
-LONGEST_SPAN = 2.0  # rad of a silhouette about the line of two centres: beyond, the epipole lies in or near it
+LONGEST_SPAN = 2.0  # angle (rad) of a silhouette about the baseline: beyond, the epipole lies in or near it
 MIN_SLOPE = 1e-9  # rad a pixel: at the epipole a plane has no direction
 
 

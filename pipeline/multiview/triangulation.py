@@ -18,10 +18,10 @@ from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 USUAL = 0.70  # of eleven cameras around a face: median over its patches, 0.69 to 0.70 on five captures of two renderers
-MIN_PARALLAX = 0.1  # cameras that stand nearer together say nothing of depth
+MIN_PARALLAX = 0.1  # with less parallax, depth is unknown
 CLICK_NOISE_PX = 1.5  # of a person's click; measured on captures rendered by another program
 STEPS = 10  # three are usual
-SETTLED = 1e-9  # share of the misfit that a last step still takes away
+SETTLED = 1e-9  # relative decrease of the misfit at which the iteration ends
 MIN_RAYS_APART = 1e-4  # rad; between rays closer to parallel, 0.1 px at f = 1500 px, depth is unknown
 
 

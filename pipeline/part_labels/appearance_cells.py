@@ -23,7 +23,7 @@ from rig.rig import Rig
 
 Vector = Float[np.ndarray, " 3"]
 
-BALANCE_VERTICES = 3000  # of the face, enough to tell the cameras' gains
+BALANCE_VERTICES = 3000  # vertices of the face that estimate the cameras' gains
 CHEEK_INSIDE_MM, CHEEK_MARGIN_MM = 12.0, 3.0  # from the border of the face, and above the nose's lower end
 DOWNWARD = (-0.25, -0.5)  # cosine between normal and up: below jaw and chin, where light from above leaves skin dark
 MIN_FACING = 0.5  # cosine: flatter skin shines
@@ -60,7 +60,7 @@ class Cells:
     size_px: int
     colour: Float32[np.ndarray, "r c 3"]  # log red / green, log blue / green, log luminance; gains taken out
     detail: Float32[np.ndarray, "r c"]  # log of fine structure against the mean
-    grey: Float32[np.ndarray, "r c"]  # as displayed, 0 to 1: what edges are seen in
+    grey: Float32[np.ndarray, "r c"]  # sRGB, 0 to 1; its edges guide the smoothing of labels
     inside: Float32[np.ndarray, "r c"]  # share of the cell in the silhouette
     on_head: Bool[np.ndarray, "r c"]
     into_face_mm: Float32[np.ndarray, "r c"]

@@ -18,13 +18,13 @@ from rig.mesh import Mesh
 from rig.rig import Rig
 
 CELL_MM = 1.2  # edge of a cell: three pixels of the usual rig
-STATED_DEG, OWN_DEG = 32.0, 18.0  # how far hues of a cap lie from the stated one, and from the capture's own
+STATED_DEG, OWN_DEG = 32.0, 18.0  # largest hue difference from the stated colour, and from the measured one
 PALEST = 0.3  # of a cap's saturation: sheen leaves no less
 NEUTRAL = 0.12  # saturation (white 0, a primary 1) below which a cap has no hue; skin has 0.2 to 0.3
 LIGHT_RANGE = 2.2  # log luminance of a cap without hue, in shadow and in light
 ABOVE_BROWS_MM = 30.0  # where a cap covers the head, whoever wears it
-MIN_SHARE = 0.35  # of what all views show there
-MIN_VIEW_SHARE = 0.2  # of what one view shows there
+MIN_SHARE = 0.35  # of the head above the brows, over all views
+MIN_VIEW_SHARE = 0.2  # of the head above the brows, in one view
 MIN_ABOVE = 0.4  # of a piece, above the brows: from behind, a cap reaches down to the neck
 CLOSED_MM = 7.0  # highlights and seams of that width are filled
 

@@ -38,13 +38,13 @@ CHROMA_BLUR, LIGHT_BLUR, DETAIL_BLUR = 0.9, 1.6, 1.2  # bins; light falls off wi
 SHADE_SHARE, SHADE_BLUR = 0.4, 4.0  # of a part's looks: its colours in light that only others of them have; bins
 OUTLIER = 0.02  # share of what belongs to no part
 BARE_PRIOR, BEARD_PRIOR = (0.8, 0.17), (0.3, 0.67)  # of skin and hair on a lower face without a beard, and with one
-BEARD_SHARE = (0.2, 0.45)  # of the lower face that looks otherwise than the cheeks: no beard, a beard for certain
-CONFIDENT = 0.8  # only cells so probable teach how their part looks: others would pull all parts together
-MIN_PRESENT = 1e-3  # share of a part's sure places that do not look like skin: a bald head has no hair
-SKIN_RATIO = 0.15  # looks that skin has so much less often than the whole subject are half not skin's
+BEARD_SHARE = (0.2, 0.45)  # share of the lower face that differs from the cheeks: no beard, certain beard
+CONFIDENT = 0.8  # only cells this probable train their label: others would make all labels alike
+MIN_PRESENT = 1e-3  # share of cells certain by position that differ from skin: a bald head has no hair
+SKIN_RATIO = 0.15  # ratio of frequencies (skin to subject) at which an appearance is half skin
 OUTLIER_BINS = RED_BINS * BLUE_BINS * LIGHT_BINS * DETAIL_BINS / 50.0  # that a part of its own would fill evenly
 PLAIN = 0.1  # a cell that is less of a feature or underside than this is plain skin, or a beard
-FLOOR = 0.02  # of a part's looks that its histogram has not shown
+FLOOR = 0.02  # probability of appearances that a label's histogram lacks
 
 
 @dataclass(frozen=True, slots=True, eq=False)

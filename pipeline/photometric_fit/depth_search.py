@@ -52,7 +52,7 @@ from rig.camera import Camera
 from rig.geometry import RigidTransform, second_difference, vertex_offset
 from rig.mesh import Mesh
 
-MIN_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
+MIN_VIEW = 0.08  # least squared cosine of a view that is used: 73 degrees
 
 CENTRE_MM = 3.0  # distance of patches
 MAX_VIEWS = 5  # most frontal views between which a patch is compared
@@ -68,7 +68,7 @@ MIN_FACING = 0.2  # cosine: at a flatter angle than 78 degrees a pixel smears ov
 EDGE_PX = 4  # nothing is read nearer to the image's edge
 WINDOW_PX = 3  # around a sample in which a nearer surface may blur over it
 FLATTEST = 1e-6  # curvature of correlation by a step squared: below it a peak has no place of its own
-BOUND_HEIGHT = 0.9  # correlation from which on hair says where it is
+BOUND_HEIGHT = 0.9  # correlation from which on a patch of hair gives its position
 SLOPE_SLACK = 1.5 * 1.414 * WINDOW_PX  # how much nearer its own slope may bring a surface within the window
 
 
@@ -210,7 +210,7 @@ def observe(
     found = find_places(photographs, patches, visibility, problem.views, scale, each=each)
     several, clear, view, value = found.several, found.clear, found.view, found.value
     kept = np.flatnonzero(several & clear & (~hair | ((found.place < 0.0) & (found.height > BOUND_HEIGHT))))
-    # Patches overlap: what they say together is worth their area, not their number.
+    # Patches overlap, so their information is proportional to their area, not to their number.
     overlap = max(1.0, 4.0 * np.pi * each.window_mm**2 / CENTRE_MM**2)
     information = 1.0 / (overlap * found.variance[kept])
     rows, place = patches.centre[kept], found.place[kept]

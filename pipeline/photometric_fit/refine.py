@@ -52,7 +52,7 @@ LEVEL, STEPS = "p95", 3  # the rim needs no more there, and the surface term is 
 MIN_VIEWS = 3
 NEIGHBOURS, NEAR_MM = 24, 4.0  # patches about a vertex: two windows
 HAIR_REACH_MM = 4.0  # patches are 3 mm apart
-LOST_MM = 2.5  # off by at least that where nothing matches: what two photographs still recognise
+LOST_MM = 2.5  # assumed distance where no views match: the largest at which two photographs still match
 MISFIT_FACTOR, MISFIT_LOCAL = 1.2, 0.6  # the latter is the share of a place's own misfit: its few patches know their
 # variance badly, all of them together well. So 95 % intervals hold 91 to 98 % of a scan and four draws
 

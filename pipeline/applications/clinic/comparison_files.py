@@ -43,8 +43,8 @@ from rig.messages.message import Message, compose
 
 SURE = 2.0  # combined standard deviations
 SHARE = 0.8  # of the stable region that must agree: the rest may be hair or a scar
-FAR_MM = 25.0  # beyond it there is no counterpart
-FACING = 0.3  # cosine between the normals of counterparts
+FAR_MM = 25.0  # beyond it there is no match
+FACING = 0.3  # least cosine between matched normals
 START_NAMES = (
     "glabella",
     "nasion",
@@ -55,7 +55,7 @@ START_NAMES = (
     ),
 )
 MIN_MARKS = 3
-MAX_STABLE_CHANGED = 0.05  # share of what no growth moves: two deviations leave as much to chance
+MAX_STABLE_CHANGED = 0.05  # share of the stable region: two deviations leave as much to chance
 NOT_THIS_MM = 1.5  # scatter on bone: one person has 0.02 to 0.3 mm, others 0.8 to 2.7; hair may be in the way
 PANEL_MM = 50.0  # width of a picture: three rows leave room for the notes
 NOTES = (
@@ -90,7 +90,7 @@ class RegionChange:
     mean_mm: float
     median_mm: float  # of the distances, as ``p95_mm``
     p95_mm: float
-    largest_mm: float  # of what changed for sure, with its sign; 0 where nothing did
+    largest_mm: float  # largest significant change, signed; 0 if there is none
     changed_share: float
     volume_ml: float
 

@@ -49,8 +49,8 @@ PointFlags = Bool[np.ndarray, " n"]
 
 TUKEY = 4.685  # standard deviations at which a point no longer counts: 95 % efficient with normal errors
 MIN_STD_MM = 0.01
-MAX_REACH_MM, MIN_REACH_MM = 20.0, 2.0  # of counterparts, at first and in the end
-FACING = 0.5  # cosine between the normals of counterparts
+MAX_REACH_MM, MIN_REACH_MM = 20.0, 2.0  # of matches, in the first and in the last step
+FACING = 0.5  # least cosine between matched normals
 FACING_MM = 10.0
 STEPS = 60
 STILL_MM = 1e-5
@@ -61,12 +61,12 @@ PLACES = 12  # of the surface's parts that look forward, at which the face may b
 FORWARD = 0.2  # cosine to the front from which a surface looks forward
 SHARE = 0.8  # of the face with a counterpart that must agree
 POINTS = 2500
-FEW = 600  # of these, for telling starts apart
+FEW = 600  # of these, to compare starts
 STARTS = 5
 MIN_MARKS = 3
 MIN_KEPT = 0.3  # share of the face, below which it is not this head
 NOT_THIS_MM = 2.0
-SAME_MM = 1.0  # near enough to the surface to count for a start
+SAME_MM = 1.0  # distance within which a point supports a start
 HEADER_BYTES = 4096  # in which SPACE stands: a comment of a PLY or OBJ, the 80 bytes of an STL
 
 

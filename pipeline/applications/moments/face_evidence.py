@@ -27,11 +27,11 @@ from pipeline.head_model.expressions import BLINKS, plain_name
 from rig.geometry import Similarity
 from rig.rig import Rig
 
-VIEWS = 3  # that the networks look at
+VIEWS = 3  # in which the networks search
 MIN_FACING = 0.5  # cosine between where a face looks and the camera
 CLOSED_OPENING = 0.045  # of lids that meet, as ``faces.eyes`` measures it on drawn heads and on people
 CLOSURE_SIGMA = 0.1  # of a closure, 0 to 1, by one frame: 0.05 on drawn heads
-ALIKE = 12.0  # landmarks that err alike
+ALIKE = 12.0  # number of landmarks with correlated errors
 FORGIVEN = 3.0  # deviations of a landmark
 MIN_SIGMA_PX = 0.5
 

@@ -31,7 +31,7 @@ from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.positive_definite import inverse
 from pipeline.estimation.terms import Linearised, NormalEquations, Problem, Sum
 
-COMMON = 0.5  # share of the variance of evidence that all moments have in common
+COMMON = 0.5  # share of the error variance that all captures have in common
 STEPS = 12  # Levenberg-Marquardt steps at most
 States = tuple[State, ...]
 Rows = Int[np.ndarray, "_"]
@@ -212,7 +212,7 @@ def _with_evidence(
     equations = problem.equations(here)
     matrix, gradient = equations.matrix, equations.gradient
     priors = 1.0 + COMMON * (len(states) - 1)
-    matrix[diagonal, diagonal] -= priors  # what the evidence says without the priors
+    matrix[diagonal, diagonal] -= priors  # the information without the priors
     gradient[diagonal] -= priors * identity
     before = [
         state.coefficients[solved.problem.model.posed.start : solved.problem.model.posed.stop]

@@ -37,17 +37,17 @@ from rig.capture import ImageRgb
 from rig.geometry import RigidTransform, Similarity, vector_from_rotation
 from rig.rig import Rig
 
-MODES = 40  # of the shape; landmarks tell nothing of finer ones
+MODES = 40  # of the shape; landmarks do not determine finer modes
 SHAPE_LIMITS, MOTION_LIMITS = Limits(8, 0.1), Limits(4, 0.05)
 MIN_VIEWS = 2
-EYES = 3  # cameras in which lids are looked at
-LOOKS = 3  # at one moment, each from where the one before has found the head
+EYES = 3  # cameras in which lids are measured
+LOOKS = 3  # searches for one set of pictures, each from the previous result
 FAR_DEG, FAR_MM = 4.0, 12.0  # of a motion: a crop so far off misplaces the landmarks
 COARSE = 8.0  # of the landmarks' deviation, for a head that may have moved far
 OPEN = 0.18  # an open eye's opening, at least (``faces.eyes``): the first look may have met closed ones
 MAX_MISFIT = 0.08  # RMS by the face's size in the picture: beyond it the landmarks are another face's
 NEAR = 0.03  # the same of a head that has hardly moved, in every camera
-MESH = "p99"  # the level that is shown
+MESH = "p99"  # the mesh that is displayed
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ from pipeline.head_model.model import HeadModel
 
 RELIEF_MM = 1.0  # r: deviation of what the heads have beyond the model's modes
 OWN = 0.3  # deviation of a person's shape from the model's, as a share of its displacement
-SHOWN = 0.1  # least weight in some moment of a shape that the take shows
+SHOWN = 0.1  # least weight of a shape, in some capture, that occurs in the take
 COMMON = 0.5  # share of the variance that a take's heads have in common
 
 
@@ -72,7 +72,7 @@ def estimate_own_shapes(
     moved = np.einsum("ve,ke,vkc->evc", prior, weights, pulled, optimize=True)
     explained = np.einsum("ke,vkj,je->ve", weights, known, weights, optimize=True)
     variance = np.maximum(prior - prior**2 * explained, 0.0).T
-    # What the model itself leaves open of the neutral head is in all of the heads alike.
+    # The model's own error of the neutral head is the same in all heads.
     common = COMMON * sigma.min(axis=1) ** 2
     rows = arkit_parts(names)
     shapes = np.stack([(full + moved)[list(rows[name])].sum(axis=0) for name in ARKIT])

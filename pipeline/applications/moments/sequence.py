@@ -38,10 +38,10 @@ from rig.progress import Progress
 from rig.render.renderer import Renderer
 
 INPUTS = "inputs.json"
-CHUNK = 25  # frames that are kept together
+CHUNK = 25  # frames of a stored chunk
 MIN_ALIKE = 0.5  # correlation of a frame's texture with the reference: .8 to .97 on drawn heads, .1 where it is lost
-KEPT = 0.5  # with all of it, an error along what pictures tell least grew from frame to frame
-SHARE = 0.1  # of the work, that finds the person
+KEPT = 0.5  # with 1.0, errors in poorly observed directions grew from frame to frame
+SHARE = 0.1  # share of the work that estimates the person
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,7 +112,7 @@ def make_tracker(footage: Footage, person: SequencePerson) -> Tracker:
     shown = [(next(footage.read(key)), motion) for key, motion in zip(person.keys, person.motions, strict=True)]
     tracker = _learn(person, samples, networks, shown)
     shown = [(pictures, tracker.fit(pictures, motion).motion) for pictures, motion in shown]
-    return _learn(person, samples, networks, shown)  # they agree on the skin once each is fitted to all of them
+    return _learn(person, samples, networks, shown)  # refitting each frame to all of them makes their textures agree
 
 
 def _learn(
@@ -137,7 +137,7 @@ def track_sequence(
     person = _kept_person(kept / "person.npz", footage, model)
     if person is None:
         found = find_person(footage, model, settings, renderer, lambda done: report("identity", SHARE * done))
-        if not (kept / "person.npz").is_file():  # else another share was earlier
+        if not (kept / "person.npz").is_file():  # another share may have written it
             _keep_person(kept / "person.npz", found)
         person = _kept_person(kept / "person.npz", footage, model)
         assert person is not None

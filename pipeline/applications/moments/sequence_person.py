@@ -49,8 +49,8 @@ class SequencePerson:
     neutral: Float[np.ndarray, "v 3"]
     shapes: Float32[np.ndarray, "e v 3"]  # mm at weight 1
     rig: Rig
-    keys: tuple[int, ...]  # frames by which the identity was found ...
-    motions: tuple[Motion, ...]  # ... and what the head does there
+    keys: tuple[int, ...]  # frames from which the identity was estimated ...
+    motions: tuple[Motion, ...]  # ... and the head's motion in them
     warnings: tuple[Message, ...] = ()  # of these frames' fits, one of each code
 
     def head(self, weights: Float[np.ndarray, " e"]) -> Float[np.ndarray, "v 3"]:

@@ -55,7 +55,7 @@ def smooth(
     near = failed[:-2] | failed[1:-1] | failed[2:]
     held = np.where(near[:, None], np.minimum(held, 1.0 / (least + usual)), held)
     variance = _inverse_diagonal(_factor(information, held))
-    lasting = np.where(failed[:, None], spread**2, np.maximum(spread**2 - noise**2, 0.0))  # what no smoothing removes
+    lasting = np.where(failed[:, None], spread**2, np.maximum(spread**2 - noise**2, 0.0))  # cannot be smoothed
     return found, np.sqrt(lasting + variance)
 
 

@@ -32,7 +32,7 @@ from rig.messages.message import Message, compose
 from rig.progress import Progress, discard_progress
 
 MIN_MOMENTS = 2
-OTHER_PERSON = 3.0  # RMS of the eigenheads' differences in standard deviations, beyond which a moment is another's
+OTHER_PERSON = 3.0  # RMS difference of the eigenheads (standard deviations) beyond which the person is another
 OBSERVED = ("segmentation", "faces", "alignment", "fit", "parts")
 DELIVERED = ("depth", "fine", "texture", "evidence", "bust")
 JOINT = "identity"  # the stage that solves for it
@@ -44,13 +44,13 @@ class Moment:
     """Holds the result of one capture of a take. Arrays are indexed by expression or by vertex of the finest mesh."""
 
     name: str
-    detail: str  # the level that was reached
+    detail: str  # the level of detail
     weights: Float[np.ndarray, " e"]
     weight_deviation: Float[np.ndarray, " e"]
     world_from_head: Similarity
     head: Float[np.ndarray, "v 3"]  # head frame, mm
     deviation_mm: Float[np.ndarray, " v"]
-    apart: float  # RMS of its own identity's differences from that of all, in standard deviations
+    apart: float  # RMS difference of its separate identity from the joint one, in standard deviations
     warnings: tuple[ReportWarning, ...]
 
 

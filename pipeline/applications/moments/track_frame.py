@@ -29,7 +29,7 @@ from rig.rig import Rig
 
 POSE = 6  # rotation (rad), translation (mm)
 SCALES = {2: 6.0, 1: 3.0}  # Geman-McClure, in deviations, by how much pictures are reduced
-ALIKE = 25.0  # samples that err alike: neighbours share pixels, and the head's own error
+ALIKE = 25.0  # samples with correlated errors: neighbours share pixels and the head's error
 STEPS, TOLERANCE = {2: 3, 1: 4}, 0.05
 
 

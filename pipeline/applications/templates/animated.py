@@ -37,7 +37,7 @@ from pipeline.head_model.subdivision import boundary_loops
 from rig.geometry import RigidTransform
 from rig.mesh import vertex_normals
 
-LIDS = "eye"  # what the names of shapes that close or move lids begin with
+LIDS = "eye"  # how names of shapes that close or move lids begin
 PARTED_MM = 1.5  # lips further apart are open
 PRESS_MM = 0.1  # by which shut lips overlap, so that no slit is left between the corners of their triangles
 LIP_MM = 14.0  # from the inner edge over a lip to its skin
@@ -47,10 +47,10 @@ SPREAD_COLUMNS = 5  # over which the widest gap counts: a triangle of a lip is a
 SMOOTH_ROUNDS = 12  # of the inner edge; they take out scallops of four edges' length
 Places = Float[np.ndarray, "t 3"]
 
-OFF_MM, FACING = 1.5, 0.4  # as the registration has it: what is farther off, or faces away, lies deeper
+OFF_MM, FACING = 1.5, 0.4  # as in the registration: vertices farther off, or facing away, lie deeper
 ALIKE = 2.0  # millimetres that neighbours may part by, a millimetre between them: 99 % of the models' own do by less
 ALIKE_MM = 0.5
-ROOT_MM = 3.0  # a part that comes so near to the skin is rooted there
+ROOT_MM = 3.0  # a part this near to the skin is rooted there
 Shapes = Mapping[str, Float[np.ndarray, "v 3"]]
 
 
@@ -236,7 +236,7 @@ class AnimatedMesh:
     eyeballs: Mapping[str, Int[np.ndarray, " b"]]  # rows of the mesh, by pivot
     added: Mapping[str, Eyeball] = field(default_factory=dict)  # eyeballs that the mesh lacks, by pivot
     inner: InnerMouth = field(default_factory=InnerMouth)  # teeth and tongue that the mesh lacks
-    gazes: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)  # of eyes that were seen, by pivot
+    gazes: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)  # gazes of measured eyes, by pivot
 
 
 def animated_mesh(

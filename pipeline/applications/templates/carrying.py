@@ -16,7 +16,7 @@ from pipeline.geometry.registration.rigid import procrustes
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.gaussian_process import spread_nodes
 
-CANDIDATES = 16  # triangles about a vertex that are looked at
+CANDIDATES = 16  # nearest triangles that are tested for a vertex
 ANCHORS = 360  # vertices of the skin that lead what lies deeper: 3 mm apart along lids and lips
 ALL_OVER = 60  # ... of them spread over all of the skin
 WHOLE_ANCHORS = 40  # that lead a closed part
@@ -66,8 +66,8 @@ def frames(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
 class SurfaceBinding:
     """Holds how a template's n vertices follow a head model's surface: attached skin vertices, anchors for others."""
 
-    rest: Float[np.ndarray, "t 3"]  # where the mesh lay when it was registered, mm
-    skin: Int[np.ndarray, " n"]  # rows that the surface carries, as ``attachment`` says
+    rest: Float[np.ndarray, "t 3"]  # the registered mesh, mm
+    skin: Int[np.ndarray, " n"]  # vertices attached to the surface by ``attachment``
     attachment: Attachment
     anchors: Int[np.ndarray, " a"]  # of ``skin``, rows of the mesh, that lead the rest
     wholes: Int[np.ndarray, " t"]  # number of the closed part that a vertex belongs to, -1 of none

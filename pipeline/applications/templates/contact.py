@@ -18,17 +18,17 @@ from scipy.spatial import KDTree
 
 from pipeline.fusion.crossings import crossing_faces
 
-WEIGHTS = (0.25, 0.5, 0.75, 1.0)  # at which shapes are looked at
+WEIGHTS = (0.25, 0.5, 0.75, 1.0)  # at which shapes are tested
 MEETING = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # ... lids, which meet late
 MEETING_ROUNDS = 6
-STILL_MM = 0.01  # what moves less stays
+STILL_MM = 0.01  # vertices that move less count as unmoved
 MARGIN = 0.02  # of the weight: lids stop so much before they meet
 RADII_MM = (3.0, 6.0, 12.0, 24.0)  # of the space over which lips move together; lips are some 10 mm high
 BLEND_STEP = 0.25  # of the way to moving together, a round
 MAX_ROUNDS = 60
-ZONE_RINGS = 6  # of triangles about what crosses that are looked at in a round; all are at the end
+ZONE_RINGS = 6  # rings tested around crossing triangles in a round; at the end all are
 MAX_ZONES = 5  # that a change makes wider
-FEW = 0.35  # share of the triangles from which looking at all of them takes less time
+FEW = 0.35  # share of the triangles from which testing all is faster
 SOFT_RINGS = 3  # over which a change fades
 RELAXING = 4  # halvings of the search for the least change that is enough
 Vertices = Float[np.ndarray, "t 3"]

@@ -27,7 +27,7 @@ RINGS, SECTORS = 40, 48
 OPEN_SHARE = 0.4  # of the eye's length, within which lids of an open eye have a border about its middle
 AHEAD = np.array([0.0, 0.0, 1.0])
 STRAIGHT: Mapping[str, Float[np.ndarray, " 3"]] = {}
-WHITE, IRIS, PUPIL = (225, 220, 214), (96, 72, 52), (12, 12, 12)  # sRGB; no photograph tells them
+WHITE, IRIS, PUPIL = (225, 220, 214), (96, 72, 52), (12, 12, 12)  # sRGB; not measured in photographs
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -54,7 +54,7 @@ def load_inner_mouth() -> tuple[dict[str, InnerPart], Mapping[str, Float[np.ndar
         return parts, dict(zip(ANCHORS, file["anchors"].astype(float), strict=True))
 
 
-ABOUT_MM = 25.0  # beyond the teeth, where the mesh is looked at: what a shape may bring to them
+ABOUT_MM = 25.0  # around the teeth, within which the mesh is tested: shapes may move it there
 BACK_MM, STEP_MM = 10.0, 1.0  # how far the parts are moved back until lips are free
 SPARE_MM = 0.5  # by which they are moved back once more
 OPENING = (0.0, 0.5, 1.0)  # weights of jawOpen at which parts must be free of the mesh
@@ -63,7 +63,7 @@ DEEP_MM = 10.0  # behind the teeth's front, a point is in the mouth, not in a to
 SHADE_MM = 40.0  # behind the lips, where the light of DEEP_LIGHT is left
 DEEP_LIGHT = 0.15  # of the light at the lips
 WEIGHTS = (0.5, 1.0)
-STILL_MM = 0.05  # a mouth that a shape moves less is left alone
+STILL_MM = 0.05  # shapes that move the mouth less are not corrected
 ROUNDS = 20
 NUDGE_MM = 0.3  # a round, for what meets teeth although its corners and middles do not
 SPREAD_MM = 5.0  # over which a lip that is lifted takes along what lies about: lips are some 10 mm thick
@@ -117,7 +117,7 @@ def placed_inner_mouth(
     shipped, anchors = load_inner_mouth()
     place = procrustes(np.stack([anchors[name] for name in ANCHORS]), np.stack([landmarks[name] for name in ANCHORS]))
     shift = landmarks["stomion"] - place.apply(anchors["stomion"])
-    shift[2] = 0.0  # how far behind the lips, the whole mouth says
+    shift[2] = 0.0  # depth behind the lips: fitted to the whole mouth
     parts = {
         name: Mesh(place.apply(part.mesh.vertices) + shift, part.mesh.faces, _shaded(part.mesh))
         for name, part in shipped.items()

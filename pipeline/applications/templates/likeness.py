@@ -41,13 +41,13 @@ STAGES = (
     Stage(6, None, 10.0, 12.0, 0.4),
     Stage(10, None, 5.0, 0.0, 0.05),
 )
-FACING = 0.6  # cosine between normals of what meets
+FACING = 0.6  # cosine between normals of matched points
 ROBUST, MIN_MM = 5.0, 0.05  # scale of Geman and McClure's weight, by the median residual; and its least
-MET_MM = 10.0  # what is nearer in the end was met
+MET_MM = 10.0  # points nearer at the end count as matched
 MARK_MM = 0.5  # to which a landmark is marked, an axis
 BULGE = 0.75  # of the way to the tangent planes at a triangle's corners, as its authors have it
 CANDIDATES = 16
-ROWS = 6000  # vertices of the model that look for the mesh
+ROWS = 6000  # vertices of the model that are matched
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -123,7 +123,7 @@ def _not_finite(arrays: Mapping[str, np.ndarray]) -> Iterable[Message]:
             yield compose("flame-not-finite", name=name)
 
 
-DEEP, WHOLE = (120, 150, 214), (120, 204, 150)  # what follows the skin, and what moves as a whole
+DEEP, WHOLE = (120, 150, 214), (120, 204, 150)  # vertices that follow the skin, and parts that move as a whole
 AZIMUTHS_DEG = (0.0, 55.0)
 
 

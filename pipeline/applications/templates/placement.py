@@ -23,14 +23,14 @@ from rig.messages.message import compose
 
 UNITS = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0}
 EXTENT_MM = (110.0, 750.0)  # of a face alone, and of a bust
-COARSE, FINE = 400, 3000  # points of the model that look for the mesh
+COARSE, FINE = 400, 3000  # points of the model that are matched
 SAMPLES = 20_000  # of the mesh's points that are found
 COARSE_STEPS, FINE_STEPS = 8, 30
-TRIED = 4  # coarse places that are looked at closely
-NORMAL_MM = 20.0  # what a normal that is off by a unit counts
-FAR_MM = 20.0  # no place is worse
+TRIED = 4  # coarse placements that are refined
+NORMAL_MM = 20.0  # distance that equals a unit difference of normals
+FAR_MM = 20.0  # distances are clipped here
 SCALE_RANGE = (0.7, 1.45)  # of adults' and children's heads by the model's
-UNLIKE_MM = 8.0  # mean distance of the face beyond which a place is none
+UNLIKE_MM = 8.0  # mean distance of the face beyond which a placement is rejected
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -56,9 +56,9 @@ class Registration:
 
     surface_binding: SurfaceBinding
     placed: Vertices  # the mesh at its first place in the head frame, in its own shape, mm
-    head: Float[np.ndarray, "v 3"]  # the model as like it as it can be, full level, mm
-    off_mm: Float[np.ndarray, " n"]  # skin to that head, after the mesh was drawn to it
-    unlike_mm: Float[np.ndarray, " n"]  # and before
+    head: Float[np.ndarray, "v 3"]  # the model fitted to it, finest mesh, mm
+    off_mm: Float[np.ndarray, " n"]  # distance of the skin from that head after the deformation
+    unlike_mm: Float[np.ndarray, " n"]  # the same before the deformation
     covered: float  # share of the model's face region that the mesh shows
 
     def figures(self) -> dict[str, float]:

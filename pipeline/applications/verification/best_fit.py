@@ -29,10 +29,10 @@ from pipeline.head_model.landmarks import stacked
 from rig.errors import InputError
 from rig.geometry import RigidTransform, Similarity, rigid_fit
 
-FAR_MM = 10.0  # from the reference: what is farther off has no counterpart on it
+FAR_MM = 10.0  # from the reference: farther points have no match on it
 POINTS = 2000  # of the face, for the fit: six numbers need no more
 PARTS = 4  # of the scan: shoulders or a stand move its middle away from the head's
-FEW = 300  # of these points, for telling starts apart
+FEW = 300  # of these points, to compare starts
 MIN_MARKS = 3
 MIN_COVERED = 0.3  # share of the face that must not lie at the scan's rim
 MIN_POINTS = 42  # with a counterpart: six to each unknown of a similarity

@@ -38,7 +38,7 @@ from rig.errors import InputError
 from rig.geometry import rigid_fit
 from rig.mesh import vertex_normals
 
-ROUNDS = 20  # of laying on and averaging; three are usual
+ROUNDS = 20  # of aligning and averaging; three are usual
 STILL_MM = 1e-7  # a mean that moves by less is the mean
 
 FORM_SHARE = 0.997  # of the area; the rest are outliers, as three of a thousand points

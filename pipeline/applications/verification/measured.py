@@ -18,7 +18,7 @@ from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 from rig.messages.message import compose
 
-# Codes of warnings that doubt the head.
+# Codes of warnings that question the head.
 DOUBTFUL = ("face-elsewhere", "no-face", "pose-doubtful", "scale-assumed", "scale-implausible")
 
 

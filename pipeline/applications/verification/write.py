@@ -23,12 +23,12 @@ AZIMUTHS_DEG = (-50.0, 0.0, 50.0)
 PANEL = (420, 460)
 HEAT_DARKEST = 0.7  # of a colour, so that shading leaves the scale readable
 PAPER = (255, 255, 255)
-UNTOLD = (190, 190, 190)  # grey: nothing is said there
+UNTOLD = (190, 190, 190)  # grey: unknown deviation
 # Blue, white, red: ColorBrewer's RdBu (https://colorbrewer2.org), which the colour-blind can read.
 RAMP = np.array([[33, 102, 172], [103, 169, 207], [247, 247, 247], [239, 138, 98], [178, 24, 43]], float)
 STEPS_MM = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # the ends that a scale may have
 SHOWN = 0.95  # share of the face that lies within the ends of the scale
-TOLD = 8  # captures that page one has room for
+TOLD = 8  # captures that fit on page one
 FIGURES = {  # name of the limit: (words, digits, unit)
     "face_rms_mm": ("Deviation of the face, RMS, worst capture", 3, "mm"),
     "features_rms_mm": ("Deviation of eyes, nose and mouth, RMS, the worst of them", 3, "mm"),

@@ -31,7 +31,7 @@ class Built:
     parts: ModelParts
     used: tuple[str, ...]
     repaired: Mapping[str, tuple[str, ...]]  # what was repaired, by scan
-    skipped: Mapping[str, str]  # why a scan was left out, by scan
+    skipped: Mapping[str, str]  # faults of each omitted scan, by name
 
 
 def build_model(

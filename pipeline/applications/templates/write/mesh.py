@@ -31,7 +31,7 @@ NEAR = 0.02  # of the side: so far from known texels the nearest one is repeated
 CUT = 0.05  # of the model's layout: a triangle longer than that lies over its cut
 
 Tile = tuple[int, int]
-NO_SKIN = 200  # grey of what no photograph shows
+NO_SKIN = 200  # grey of vertices without photographs
 SKIN_SHARE = 0.1  # of a material's polygons on the skin, beyond which it shows the texture: shoulders may be the rest
 
 

@@ -52,7 +52,7 @@ from rig.mesh import Mesh
 SIZE_PX = 512  # a texel is 0.15 mm, about a pixel of a photograph
 FRONT_DEG = 75.0  # from the gaze: lids hide what is farther
 ASIDE_MM = 0.5  # between a point of the ball and the nearest one between the lids, along the ball: more is hidden
-FEATHER_PX = 6  # over which what is seen fades to what is guessed
+FEATHER_PX = 6  # over which photographed colours fade to guessed ones
 RING_DEG = 1.0
 MIN_SEEN = 0.3  # of the iris
 BRIGHT = 0.7  # of what is seen beside the iris, the share that lids and their shadow may be
