@@ -35,8 +35,8 @@ class FaceAlignment:
 
 
 def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> FaceAlignment:
-    """Aligns the mean head to the landmarks of a face. ``places`` are the model's points that correspond to these
-    landmarks. ``model`` must have the modes that the later fit uses."""
+    """Aligns the mean head to the landmarks of a face. ``places`` are the model's points for the landmarks of the face.
+    ``model`` must have the modes that the later fit uses."""
     which = spread_points(places)
     mean, basis = blended_basis(model, places.rows[which], places.weights[which])
     modes = basis.reshape(len(basis), -1).T.astype(float)

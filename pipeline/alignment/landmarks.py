@@ -144,8 +144,8 @@ def consensus(source: Points, target: Points, expected_mm: Float[np.ndarray, " n
     """Returns a mask of the points that agree with one rigid alignment; None if no three points span a triangle.
 
     The rigid alignment of every three points is tried, and the alignment with the smallest truncated sum of squared
-    residuals is chosen. It is refitted to the points that agree with it; the result is all points within
-    ``OUTLIER_SIGMAS`` of the refitted alignment. 26 points make 2,600 triples, which take 0.3 s."""
+    residuals is chosen. The chosen alignment is refitted to the agreeing points; the result is all points within
+    ``OUTLIER_SIGMAS`` of it. 26 points make 2,600 triples, which take 0.3 s."""
     best, agreed = np.inf, None
     for triple in combinations(range(len(source)), MIN_POINTS):
         chosen = list(triple)

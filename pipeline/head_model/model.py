@@ -3,8 +3,8 @@ resolutions, called levels.
 
 A model is stored as a coarse control mesh, the cage (mean and modes), and a linear operator from the cage's vertices to
 each level's vertices. The default model is refined from its cage by Loop subdivision to at least 48,000 vertices. An
-imported model has the vertices of its source instead. Modes are scaled by their standard deviation, so coefficients are
-N(0, 1) (the paper's alpha_m equals sigma_m z_m).
+imported model has exactly the vertices of its source file. Modes are scaled by their standard deviation, so
+coefficients are N(0, 1) (the paper's alpha_m equals sigma_m z_m).
 
 A loaded model takes 12 (M + 1) V0 bytes for mean and modes (5 MB for the default's 137 modes), plus about 20 bytes for
 each entry of an operator (13 MB). ``basis`` caches the modes at all vertices of a level: 12 M V bytes (36 MB for the

@@ -119,7 +119,7 @@ def opened_faces(levels: Mapping[str, Int[np.ndarray, "F 3"]]) -> Int[np.ndarray
 
 def subdivision(faces: Int[np.ndarray, "F 3"], count: int) -> tuple[sparse.csr_array, Int[np.ndarray, "F4 3"]]:
     """Computes one step of Loop subdivision: the operator ((V + E) x V) from old vertices to new vertices, and the
-    refined triangles. The old vertices come first."""
+    refined triangles. In the new vertex order, the old vertices come first."""
     edges, opposite_edge, uses = edges_of(faces)
     moved = _even_rule(edges, uses, count)
     fresh = _odd_rule(faces, edges, opposite_edge, uses, count)

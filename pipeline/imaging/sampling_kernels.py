@@ -55,7 +55,8 @@ def sample_row(images, at, width, right, down):
 @njit(cache=True, nogil=True)
 def segments_of_level(field: np.ndarray, level: float) -> np.ndarray:
     """Finds the contour of ``field`` (h, w) at ``level`` by marching squares. Returns the contour's segments as rows
-    (x0, y0, x1, y1, x cell, y cell), px. A cell whose corner values allow two contours is decided by their mean."""
+    (x0, y0, x1, y1, x cell, y cell), px. Where the corner values of a cell allow two contours, the mean of all four
+    values decides."""
     height, width = field.shape
     out = np.empty((height * width // 4 + 16, 6), np.float32)
     count = 0

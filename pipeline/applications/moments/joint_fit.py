@@ -239,7 +239,7 @@ def _with_evidence(
 def joint_covariances(solutions: Sequence[ContourSolution]) -> Iterator[Float[np.ndarray, "p p"]]:
     """Yields the covariance of each capture's coefficients, rotation, translation and log scale after the joint fit.
     The independent part of the errors follows from the joint normal matrix; the common part, the fraction ``COMMON``,
-    keeps the covariance of the capture's separate fit. Weights at bounds are treated as in ``finish``."""
+    keeps the covariance of the capture's separate fit. Weights at bounds get the variance that ``finish`` defines."""
     problem, layout = joint_problem(solutions, common=0.0)
     here = problem.at(tuple(each.state for each in solutions))
     assert isinstance(here, Sum)

@@ -3,7 +3,7 @@ blendshapes, rotation centres (pivots) and, if its mesh lacks them, eyeballs, te
 visemes and blendshapes without crossing triangles.
 
 The lips of a fitted head may be some tenths of a millimetre apart, and teeth would show through the gap. A gap of this
-width is closed; a wider gap counts as an open mouth and is not changed. The inner edge of open lips is smoothed.
+size is closed; a wider gap counts as an open mouth and does not change. The inner edge of open lips is smoothed.
 
 A head model's expressions move a template as follows: each skin vertex moves with the head model's triangle to which it
 is attached (``carrying``). Vertices below the skin are attached too if mesh edges connect them to the skin over
