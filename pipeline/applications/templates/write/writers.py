@@ -1,8 +1,7 @@
 """Writes the files that applications add to a job's result. ``head-NAME.glb`` and ``head-NAME-shapes.npz`` hold the
-template's mesh without expression and its blendshapes. ``posed.glb`` holds the head model's mesh with texture and
-blendshapes.
+template's mesh without expression and its blendshapes. ``posed.glb`` holds the model's textured mesh and blendshapes.
 
-The GLB files are in the head frame in metres, the NPZ file is in the head frame in mm. Vertices keep the order of the
+The GLB files are in the head frame in metres, the NPZ file in the head frame in mm. Vertices keep the order of the
 template or of the head model. In a GLB file, eyeballs are separate nodes, and a node's ``extras.rows`` lists the
 indices of its vertices in the mesh. Eyeballs, teeth and tongue that this program added have no ``rows``. For the
 formats OBJ and USDZ, ``head-NAME-parts.obj`` and ``head-NAME-parts.usdz`` hold the template's named parts without
