@@ -1,8 +1,7 @@
 """Checks raw scans for problems: units, left and right, orientation of faces, landmarks off the surface, holes.
 
 A problem with one obvious remedy (units, a mirrored file, exchanged landmark names, inverted faces) is repaired and
-reported. All other problems are faults, and all faults are reported. Landmarks are compared with the default model's.
-"""
+reported. All other problems are faults, which are all reported. Landmarks are compared with the default model's."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
