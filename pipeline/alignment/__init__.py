@@ -1,5 +1,4 @@
-"""Determines the head's pose (section 4.2).
+"""Determines the head's pose (the paper's section 4.2).
 
-In: feature points in the images, or silhouettes alone, and the mean head. Out: ``world_from_head``, the similarity from
-which the fit starts.
-"""
+The input is feature points in the images, or silhouettes alone, and the mean head. The output is ``world_from_head``,
+the similarity from which the fit starts."""

@@ -1,10 +1,10 @@
-"""Aligns the head to the landmarks of the face in the photographs: section 4.2 without clicked points.
+"""Aligns the head to the landmarks of the face in the photographs, instead of the clicked points of the paper's section
+4.2.
 
-In: a face matched over the views, and the model's points that correspond to its landmarks. Out: ``world_from_head`` of
-the mean head, and the same landmarks in the contour solver's form. As for clicked points, the model's covariance of
-these points describes how another head's face may differ; the pose explains the rest. Landmarks that contradict the
-others (an open jaw, a brow under a fringe) lose weight.
-"""
+The input is a face matched over the views, and the model's points that correspond to its landmarks. The output is
+``world_from_head`` of the mean head, and the landmarks in the form that the contour solver uses. As for clicked points,
+the covariance of the model's points describes how faces differ from the mean head; the pose explains all other
+differences. Landmarks that contradict most others (an open jaw, a brow under a fringe) get less weight."""
 
 from dataclasses import dataclass
 
@@ -21,22 +21,22 @@ from pipeline.head_model.model import HeadModel
 from rig.geometry import Similarity
 from rig.rig import Rig
 
-POINTS = 72  # spread over the face: neighbours err alike and tell nothing more
+POINTS = 72  # spread over the face: errors of neighbours are correlated
 ROUNDS = 3  # of reweighting
 FORGIVEN_SIGMAS = 2.5  # a residual of that many deviations has twice its variance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceAlignment:
-    """Holds the pose of the mean head on a face and the landmarks it was fitted to."""
+    """Holds the pose of the mean head on a face, and the landmarks to which it was fitted."""
 
     world_from_head: Similarity
     landmarks: LandmarkObservations
 
 
 def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> FaceAlignment:
-    """Aligns the mean head to the landmarks of a face. ``places`` are the model's points for these landmarks. ``model``
-    must have the modes of the later fit."""
+    """Aligns the mean head to the landmarks of a face. ``places`` are the model's points for the landmarks of the face.
+    ``model`` must have the modes that the later fit uses."""
     which = spread_points(places)
     mean, basis = blended_basis(model, places.rows[which], places.weights[which])
     modes = basis.reshape(len(basis), -1).T.astype(float)
@@ -63,7 +63,8 @@ def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> 
 
 
 def spread_points(places: LandmarkMap) -> Int[np.ndarray, " n"]:
-    """Returns the indices of at most ``POINTS`` landmarks that do not slide, spread evenly over the face."""
+    """Returns the indices of at most ``POINTS`` landmarks that are spread evenly over the face and do not slide along
+    it."""
     rest = np.flatnonzero(~places.slides)
     deviation = np.sqrt((places.deviation_mm**2).sum(axis=1))
     position = point_table().shape_mm

@@ -1,13 +1,12 @@
-"""Checks feature points before a fit: their names, in how many views they are, whether they span a triangle, and
-whether they lie on the face in the photographs. Also suggests points from a detected face, as a start for a person who
-picks them (section 4.2).
+"""Checks feature points before a fit: their names, their number of views, whether they span a triangle, and whether
+they lie on the face in the photographs. Also suggests feature points from a detected face, for a person to correct (the
+paper's section 4.2).
 
-For suggestions, the mean head is aligned to the face and deformed to its landmarks, after the detector's mean error is
-subtracted; landmarks that slide (jaw line, forehead) are left out. A view gets a suggestion if its face was detected
-and the head does not hide the landmark. Suggestions are only as accurate as the detector. On two subjects of the
-simulated studio they were 1 to 3.5 mm off at eyes and mouth, 5 to 6 at the tip of the nose, 1 and 12 (a beard) at the
-chin. A person has to check each point.
-"""
+For suggestions, the mean head is aligned to the face and deformed to its landmarks, after the detector's mean error has
+been subtracted; landmarks that slide along the surface (jaw line, forehead) are ignored. A view gets a suggested point
+if its face was detected and the head does not hide the point. Suggested points are only as accurate as the face
+detector. On two subjects of the simulated studio, their errors were 1 to 3.5 mm at eyes and mouth, 5 to 6 mm at the tip
+of the nose, and 1 and 12 mm (a beard) at the chin. A person therefore has to check each point."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -42,7 +41,8 @@ NAMES_TOLD = 8
 
 
 def feature_faults(features: Features, rig: Rig) -> list[Message]:
-    """Returns the reasons why feature points determine no alignment; an empty list if they do, or if there are none."""
+    """Returns the reasons why feature points determine no alignment; the list is empty if they determine one, or if
+    there are none."""
     if not features:
         return []
     faults = unknown_landmarks(features)
@@ -66,9 +66,8 @@ def feature_faults(features: Features, rig: Rig) -> list[Message]:
 def features_beside_face(
     features: Features, face: MatchedFaces, rig: Rig, model: HeadModel, places: LandmarkMap
 ) -> Message | None:
-    """Returns the fault of feature points if most of them lie more than ``BESIDE_MM`` away from the face in the
-    photographs; None otherwise. Points picked in cropped or resized pictures agree with each other but not with the
-    face."""
+    """Returns a fault if most feature points lie more than ``BESIDE_MM`` away from the face in the photographs; None
+    otherwise. Points picked in cropped or resized pictures agree with each other but not with the face."""
     marks = model.levels["full"].landmarks
     names = [name for name in features if name in marks]
     if not names:
@@ -114,8 +113,8 @@ def unknown_landmarks(features: Features) -> list[Message]:
 def suggest_points(
     face: MatchedFaces, rig: Rig, model: HeadModel, places: LandmarkMap, names: Iterable[str]
 ) -> dict[str, dict[str, Pixels]]:
-    """Suggests pixels for the landmarks ``names`` in each camera, from a face in the photographs. Landmarks that the
-    model lacks or that no view shows are left out."""
+    """Suggests pixels for the landmarks ``names`` in each camera, from the detected face. Landmarks that the model
+    lacks or that no view shows are left out."""
     marks = model.levels["full"].landmarks
     rows = {name: marks[name] for name in names if name in marks}
     positions, world_from_head = locate_landmarks(face, model, places, list(rows.values()))
@@ -133,8 +132,8 @@ def suggest_points(
 def locate_landmarks(
     face: MatchedFaces, model: HeadModel, places: LandmarkMap, rows: list[int]
 ) -> tuple[Float[np.ndarray, "n 3"], Similarity]:
-    """Deforms the mean head to a face. Returns the positions (world, mm) of its vertices ``rows``, and the pose
-    world_from_head of the mean head."""
+    """Deforms the mean head to the landmarks of a face. Returns the positions (world frame, mm) of the vertices
+    ``rows`` of the deformed head, and the pose world_from_head of the mean head."""
     firm = ~places.slides
     mean = model.vertices(np.zeros(0))
     sources = places.points(mean)[firm]
@@ -147,7 +146,7 @@ def locate_landmarks(
 def _are_seen(
     camera: Camera, head_world: Float[np.ndarray, "v 3"], model: HeadModel, rows: list[int]
 ) -> Bool[np.ndarray, " n"]:
-    """Tells which of the vertices ``rows`` the camera sees, not hidden by the mean head itself."""
+    """Returns a mask of the vertices ``rows`` that the camera sees, so that the mean head does not hide them."""
     longest = max(camera.intrinsics.width, camera.intrinsics.height)
     small = replace(camera, intrinsics=camera.intrinsics.scaled(min(1.0, RASTER_PX / longest)))
     surface, _ = depth_map(small, head_world, model.levels["full"].faces)
@@ -160,6 +159,6 @@ def _are_seen(
 
 
 def _are_inside(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Tells which pixels lie inside the camera's picture; NaN lies outside."""
+    """Returns a mask of the pixels that lie inside the camera's picture; NaN counts as outside."""
     size = (camera.intrinsics.width, camera.intrinsics.height)
     return np.asarray(((pixels > -0.5) & (pixels < np.array(size) - 0.5)).all(axis=1))

@@ -1,8 +1,8 @@
-"""Triangulates feature points (section 4.2): from pixels picked in a few images to points in the world.
+"""Triangulates feature points (the paper's section 4.2): computes world points from pixels picked in a few images.
 
-A point may be wrong in one view (right and left confused, a slip). With three views or more, the view that contradicts
-the others is left out; with two views, the whole point is. Everything left out is reported.
-"""
+A picked pixel may be wrong in one view (right and left exchanged, or a slip). With three views or more, the view that
+contradicts the others is left out; with two contradicting views, the whole point is left out. Every omission is
+reported."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from rig.capture import Features
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
-GROSS_NOISE = 3.0  # times the noise of a click: who clicks carelessly is not told that points are another shot's
+GROSS_NOISE = 3.0  # times the noise of a click: careless clicks must not count as points of another shot
 MIN_JUDGED_VIEWS, MIN_JUDGED_POINTS = 3, 3  # of a point, whose contradiction is its own; and points
 WRONG_SHARE, RIGHT_SHARE = 0.6, 0.8  # of the points
 CONTRADICTION = 1e-4  # probability of a misfit this large by chance; one point in 10,000 is lost without need
@@ -24,16 +24,16 @@ CONTRADICTION = 1e-4  # probability of a misfit this large by chance; one point 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedFeatures:
-    """Holds triangulated feature points (world frame) by landmark name, and a remark for each point or view left
-    out."""
+    """Holds triangulated feature points (world frame, mm) by landmark name, and a remark for each omitted point or
+    view."""
 
     points: Mapping[str, TriangulatedPoint]
     remarks: tuple[Message, ...] = ()
 
 
 def locate_features(features: Features, rig: Rig, *, noise_px: float) -> LocatedFeatures:
-    """Triangulates every landmark seen in two views or more. A point that cannot be triangulated is left out with a
-    remark; nothing is raised."""
+    """Triangulates every landmark that was picked in two views or more. A point that cannot be triangulated is left out
+    with a remark; no exception is raised."""
     points, remarks = {}, []
     for name, pixels in features.items():
         known = {camera: pixel for camera, pixel in pixels.items() if camera in rig}
@@ -55,8 +55,8 @@ def locate_features(features: Features, rig: Rig, *, noise_px: float) -> Located
 
 
 def features_as_wholes(features: Features, rig: Rig, *, noise_px: float) -> Message | None:
-    """Returns a fault that most points share: rows and columns exchanged, or points that belong to other pictures. None
-    if most points agree between their views, or if there are too few to judge."""
+    """Returns a fault that most points have in common: rows and columns exchanged, or points that belong to other
+    pictures. Returns None if most points agree between their views, or if there are too few points to judge."""
     grossly = GROSS_NOISE * noise_px
     judged = {name: views for name, views in features.items() if len(views) >= MIN_JUDGED_VIEWS}
     wrong = len(judged) - len(locate_features(judged, rig, noise_px=grossly).points)
@@ -72,8 +72,8 @@ def features_as_wholes(features: Features, rig: Rig, *, noise_px: float) -> Mess
 def _consistent(
     pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig, noise_px: float
 ) -> tuple[TriangulatedPoint | None, str | None]:
-    """Triangulates a point from all views or, if these contradict each other, from all but one; then it also returns
-    the name of that view. Returns (None, None) if that fails too."""
+    """Triangulates a point from all views or, if these contradict each other, from all but one; the second result is
+    the name of the omitted view. Returns (None, None) if no omission of one view helps."""
     point = triangulate(pixels, rig, noise_px=noise_px)
     if _agrees(point, noise_px):
         return point, None

@@ -1,16 +1,16 @@
-"""Aligns the head by feature points (section 4.2): estimates the similarity ``T(x) = s (R x + t')`` from the head frame
-to the world.
+"""Aligns the head to feature points (the paper's section 4.2): estimates the similarity ``T(x) = s (R x + t')`` from
+the head frame to the world.
 
-In: picked points, the rig, the model. Out: world_from_head, and the residual of each point. Step 1 is the paper's: full
-ordinary Procrustes, the minimum of eq. (3), from the mean head's landmarks to the triangulated points. There are two
-departures.
+The input is picked points, the rig and the head model. The output is world_from_head, and the residual of each point.
+Step 1 is the paper's: full ordinary Procrustes analysis from the mean head's landmarks to the triangulated points,
+which minimises eq. (3). The method departs from the paper in two ways.
 
-First, a gross outlier among the points (right and left confused) must not rotate the head. Every triple of points is
-tried; the alignment on which most points agree decides which of them are used.
+First, a gross outlier among the points (right and left exchanged) must not rotate the head. The head is therefore
+aligned to every triple of points, and the alignment with which most points agree decides which points are used.
 
-Second, eq. (3) weights all points alike and assumes that the subject has the mean head's shape. Step 2 weights each
-residual by two covariances, of the triangulated point and of the model's landmarks: a wide jaw is expected together
-with wide cheeks, and must not rotate the head.
+Second, eq. (3) gives all points the same weight and assumes that the subject has the mean head's shape. Step 2
+therefore weights each residual by the covariances of the triangulated point and of the model's landmarks: a wide jaw is
+correlated with wide cheeks, and must not rotate the head.
 
 ``pipeline.geometry.registration.rigid`` computes the paper's alignment.
 """
@@ -36,20 +36,20 @@ from rig.rig import Rig
 Points = Float[np.ndarray, "n 3"]
 
 MIN_POINTS = 3
-MIN_AGREED_SIDES = 0.85  # of all points, that agree where right and left are as they should be
+MIN_AGREED_SIDES = 0.85  # share of points that agree when right and left are correct
 MIN_TRIANGLE_MM = 5.0  # rms distance from the best line; less leaves the turn about that line to the noise
 OUTLIER_SIGMAS = 4.0  # of a point's own expected spread; 1 in 1,000 good points is lost (chi-square, 3 degrees)
 
 
 class WrongFeatures(EigenheadError):
-    """Reports feature points that are wrong as a whole, with the kind of fault."""
+    """Reports feature points of which most are wrong in the same way, with the kind of fault."""
 
     def __init__(self, fault: Message) -> None:
         super().__init__(compose("of-features", fault=fault))
 
 
 class TooFewFeatures(EigenheadError):
-    """Reports feature points that determine no alignment."""
+    """Reports feature points that do not determine an alignment."""
 
     def __init__(self, usable: Mapping[str, TriangulatedPoint], why: Message, remarks: tuple[Message, ...]) -> None:
         counts = [compose("landmark-views", name=n, views=len(point.residuals_px)) for n, point in usable.items()]
@@ -64,7 +64,7 @@ class TooFewFeatures(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureAlignment:
-    """Holds the pose ``world_from_head`` and the points from which it was computed, outliers among them."""
+    """Holds the pose ``world_from_head`` and all points of the alignment, including outliers."""
 
     world_from_head: Similarity
     points: Mapping[str, TriangulatedPoint]
@@ -72,8 +72,8 @@ class FeatureAlignment:
 
 
 def feature_alignment(model: HeadModel, features: Features, rig: Rig) -> FeatureAlignment:
-    """Aligns the mean head to picked feature points: rejects outliers, minimises eq. (3), then weights the points by
-    their covariance. Raises TooFewFeatures or WrongFeatures."""
+    """Aligns the mean head to picked feature points: rejects outliers, minimises the paper's eq. (3), then weights the
+    points by their covariance. Raises TooFewFeatures or WrongFeatures."""
     if features.keys().isdisjoint(NAMES):
         raise WrongFeatures(compose("features-of-no-landmark", names=some_of([*features]), known=SEVEN_POINTS))
     whole = features_as_wholes(features, rig, noise_px=CLICK_NOISE_PX)
@@ -119,7 +119,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig) -> Feature
 def _sides_exchanged(
     model: HeadModel, names: list[str], target: Points, noise: Float[np.ndarray, "n 3 3"], kept: Bool[np.ndarray, " n"]
 ) -> bool:
-    """Tells whether most points agree with the mean head only after right and left are exchanged in all of them."""
+    """Returns whether most points agree with the mean head only after right and left are exchanged in all names."""
     others = [mirrored(name) for name in names]
     if float(kept.mean()) >= MIN_AGREED_SIDES or others == names or not all(name in model.landmarks for name in others):
         return False
@@ -141,12 +141,11 @@ def landmark_statistics(model: HeadModel, names: list[str], noise_mm: float) -> 
 
 
 def consensus(source: Points, target: Points, expected_mm: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"] | None:
-    """Tells which points agree with one rigid alignment; None if no three of them span a triangle.
+    """Returns a mask of the points that agree with one rigid alignment; None if no three points span a triangle.
 
-    The rigid alignment through every three points is tried, and the one with the smallest truncated sum of squared
-    residuals wins. The result is all points within ``OUTLIER_SIGMAS`` of the alignment of the points that agree with
-    it. 26 points make 2,600 triples: 0.3 s.
-    """
+    The rigid alignment of every three points is tried, and the alignment with the smallest truncated sum of squared
+    residuals is chosen. The chosen alignment is refitted to the agreeing points; the result is all points within
+    ``OUTLIER_SIGMAS`` of it. 26 points make 2,600 triples, which take 0.3 s."""
     best, agreed = np.inf, None
     for triple in combinations(range(len(source)), MIN_POINTS):
         chosen = list(triple)
@@ -167,7 +166,7 @@ def consensus(source: Points, target: Points, expected_mm: Float[np.ndarray, " n
 
 
 def flatness(points: Points) -> float:
-    """Returns the RMS distance (mm) of points from the line that fits them best."""
+    """Returns the RMS distance (mm) of points from their best-fitting line."""
     singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return float(np.hypot(singular[1], singular[2]) / np.sqrt(len(points)))
 

@@ -1,16 +1,16 @@
 """Aligns the head without feature points or a detected face, which the paper leaves open (section 6).
 
-In: silhouettes, the rig, and the camera that the subject probably faces. Out: world_from_head of the mean head, and how
-much worse the best other pose is.
+The input is silhouettes, the rig, and the camera that the subject probably faces. The output is world_from_head of the
+mean head, and how much higher the cost of the best other pose is.
 
-The subject's crown and the middle of its head come from the visual hull. Down is the direction in which the body leaves
-the pictures. If it does not leave them, or the views disagree, every quarter turn about the line of sight is tried. If
-cameras stand all around, no front camera can be guessed, and every direction is tried. The axes of the world frame are
-not used. From each start the contour solver fits pose and a few modes on the coarsest mesh, and the best few continue
-on a finer one. The winner is the pose that all eigenheads together explain best: under thick hair, 15 modes cannot
-distinguish the right pose from one that is 50 degrees off. A start that is 10 mm off would end in a local minimum under
-hair (tests/laboratory/notes/robustness.md), so the robust scale begins at 40 px.
-"""
+The crown and the centre of the subject's head are estimated from the visual hull. The downward direction is where the
+body leaves the pictures. If the body leaves no picture, or the views disagree, every quarter turn about the line of
+sight is tried. If the cameras surround the subject, the camera in front of the face is unknown, and every direction is
+tried. The search does not depend on the axes of the world frame. From each start the contour solver fits the pose and a
+few modes on the coarsest mesh, and the best few poses continue on a finer mesh. The chosen pose is the one with the
+least cost after all eigenheads are fitted: under thick hair, 15 modes cannot distinguish the right pose from one with
+an error of 50 degrees. Under hair, a start with an error of 10 mm would end in a local minimum
+(tests/laboratory/notes/robustness.md), so the scale of the robust loss begins at 40 px."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,28 +33,28 @@ from rig.messages.message import compose
 from rig.progress import Progress
 from rig.rig import Rig
 
-SPACING_MM, REACH_MM = 12.0, 264.0  # hull grid about the middle of the rig
+SPACING_MM, REACH_MM = 12.0, 264.0  # step and half width of the hull's grid about the rig's centre
 HEAD_SLAB_MM = (30.0, 150.0)  # below the crown: cranium and face, above any shoulder
-HAIR_MM = 12.0  # what hair adds to the crown, in the middle of what people wear
+HAIR_MM = 12.0  # height that typical hair adds to the crown
 YAWS_DEG, PITCHES_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0), (-15.0, 0.0, 15.0)
 YAWS_AROUND_DEG = tuple(np.arange(-180.0, 180.0, 30.0).tolist())
 ROLLS_DEG = (0.0, 90.0, 180.0, -90.0)
 FINALISTS, MANY_FINALISTS = 4, 8  # of starts about one guess, and of starts all around
 SAME_POSE_DEG, OTHER_POSE_DEG = 10.0, 20.0  # poses nearer than the first are one, beyond the second they are rivals
 MIN_AGREEMENT = 0.5  # of the borders where the body leaves the pictures: 1 where all say the same
-MIN_FAN = 0.3  # a ring has 0, cameras over half a circle 0.64
+MIN_FAN = 0.3  # fan strength: a full ring of cameras has 0, half a circle 0.64
 COARSE = Stage("p99", 6, False, (40.0, 20.0, 10.0), False, True, 4)
 FINE = Stage("p95", 15, False, (20.0, 10.0, 6.0), False, True, 4)
 DEEP = Stage("p95", 60, True, (6.0, 4.0, 2.0), False, True, 4)
-SEEN_SHARE = 0.6  # of the cameras that see the best seen point; above the frame of most, nothing carves the hull
+SEEN_SHARE = 0.6  # of the cameras that see the best seen point: with fewer cameras, the hull is not carved
 RANKED_PX = 6.0  # robust scale at which coarse fits are compared
 JUDGED_PX, JUDGED_MM = 2.0, 1.0  # and finalists, whichever is the larger: a right pose explains much of the outline
 # closely, a wrong one nearly all of it badly, which 6 px took for better in one of fifty draws
-REFERENCE_PX = 3000.0  # outline length that costs are scaled to, so that hiding the rim wins nothing
+REFERENCE_PX = 3000.0  # outline length to which costs are scaled, so that a hidden rim does not lower them
 
 
 class NoSubject(EigenheadError):
-    """Reports that the silhouettes have no common volume near the middle of the rig."""
+    """Reports that the silhouettes have no common volume near the centre of the rig."""
 
     def __init__(self) -> None:
         super().__init__(compose("no-subject"))
@@ -62,8 +62,8 @@ class NoSubject(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class FoundPose:
-    """Holds the pose that the search found. ``rival`` is the extra cost of the best pose in another direction, relative
-    to the found pose's cost; None if there is no such pose."""
+    """Holds the pose that the search chose. ``rival`` is the additional cost of the best pose in another direction,
+    relative to the chosen pose's cost; None if there is no other pose."""
 
     world_from_head: Similarity
     rival: float | None
@@ -79,8 +79,8 @@ def search_alignment(
     stated: bool = False,
     report: Progress,
 ) -> FoundPose:
-    """Finds the pose of the mean head from the silhouettes alone. ``stated`` says that the user named the ``front``
-    camera. Raises NoSubject."""
+    """Finds the pose of the mean head from the silhouettes alone. ``stated`` means that the user named the ``front``
+    camera. Raises NoSubject if the silhouettes have no common volume."""
     starts = list(start_poses(model, silhouettes, rig, front, stated=stated))
     problem = make_problem(model, starts[0], silhouettes, rig, settings.fitting, {}, levels=("p99", "p95"))
     found = []
@@ -105,8 +105,8 @@ def search_alignment(
 def moved_to_hull(
     pose: Similarity, camera: Camera, model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> Similarity:
-    """Returns the pose moved along the camera's line of sight into the visual hull, and scaled so that it looks the
-    same from the camera. It is meant for a pose of unknown distance. Raises NoSubject."""
+    """Returns the pose moved along the camera's line of sight into the visual hull, and scaled so that its image in the
+    camera does not change. The function serves poses whose distance from the camera is unknown. Raises NoSubject."""
     origin = head_origin(model, silhouettes, rig, pose.rotation)
     along = pose.translation - camera.centre_world
     share = float((origin - camera.centre_world) @ along / (along @ along))
@@ -116,8 +116,8 @@ def moved_to_hull(
 def start_poses(
     model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig, front: str, *, stated: bool
 ) -> Iterator[Similarity]:
-    """Yields the poses from which the search starts: upright, or in quarter turns if up is unknown; facing the front
-    camera, or in all directions without one."""
+    """Yields the poses from which the search starts: upright, or in quarter turns if the upward direction is unknown;
+    facing the front camera, or in all directions if it is unknown."""
     forward = rig[front].centre_world - rig.centre_world()
     up = body_up(silhouettes, rig)
     pictures_up = -np.mean([camera.camera_from_world.rotation[1] for camera in rig], axis=0)
@@ -140,8 +140,8 @@ def upright_axes(up_world: Float[np.ndarray, " 3"], forward_world: Float[np.ndar
 
 
 def body_up(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Float[np.ndarray, " 3"] | None:
-    """Returns the upward direction (world), opposite to the direction in which the body leaves the pictures. Returns
-    None if it leaves no picture, or the views disagree."""
+    """Returns the upward direction (unit vector, world frame), opposite to the direction in which the body leaves the
+    pictures. Returns None if the body leaves no picture, or if the views disagree."""
     total, weight = np.zeros(3), 0.0
     for camera in rig:
         silhouette = silhouettes.get(camera.name)
@@ -159,20 +159,20 @@ def body_up(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Float[np.ndarray
 
 
 def fan_strength(rig: Rig) -> float:
-    """Returns how one-sided the cameras stand around the subject: 1 if all are on the same side, 0 if they are evenly
-    all around."""
+    """Returns how one-sided the cameras surround the subject: 1 if all are on the same side, 0 if they are evenly
+    distributed."""
     directions = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     return float(np.linalg.norm((directions / np.linalg.norm(directions, axis=1, keepdims=True)).mean(axis=0)))
 
 
 def turn_between_deg(one: Similarity, other: Similarity) -> float:
-    """Returns the angle (degrees) of the rotation between two poses."""
+    """Returns the angle (degrees) between the rotations of two poses."""
     cosine = (np.trace(one.rotation.T @ other.rotation) - 1.0) / 2.0
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def _differently_turned(states: Sequence[State]) -> list[State]:
-    """Returns at most ``MANY_FINALISTS`` states, best first, that all differ in rotation by more than
+    """Returns at most ``MANY_FINALISTS`` states, best first, whose rotations differ from each other by more than
     ``SAME_POSE_DEG``."""
     chosen: list[State] = []
     for state in states:
@@ -186,8 +186,8 @@ def _differently_turned(states: Sequence[State]) -> list[State]:
 def head_origin(
     model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig, axes: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, " 3"]:
-    """Returns the position (world, mm) of the mean head's origin that matches its crown and the middle of its head to
-    those of the visual hull. Raises NoSubject."""
+    """Returns the position (world frame, mm) of the mean head's origin at which its crown and centre match those of the
+    subject's head in the visual hull. Raises NoSubject."""
     line = np.arange(-REACH_MM, REACH_MM + 1, SPACING_MM)
     grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)  # along the head's axes
     points = rig.centre_world() + grid @ axes.T
@@ -219,7 +219,7 @@ def head_origin(
 
 
 def turned(start: Similarity, yaw_deg: float, pitch_deg: float) -> Similarity:
-    """Returns the pose of the head rotated in its own frame: by the yaw about its vertical axis, and by the pitch."""
+    """Returns the pose after a rotation of the head in its frame: by yaw about its vertical axis, and by the pitch."""
     turn = rotation_from_vector(np.radians([0.0, yaw_deg, 0.0])) @ rotation_from_vector(
         np.radians([pitch_deg, 0.0, 0.0])
     )

@@ -1,4 +1,3 @@
-"""Runs compiled loops, shares them among threads, and caches arrays that depend on the model alone.
+"""Runs compiled loops, divides them among threads, and caches arrays that depend on the head model alone.
 
-It knows nothing of heads or images; every package may use it.
-"""
+This package contains nothing about heads or images; every package may use it."""

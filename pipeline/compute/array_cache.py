@@ -1,12 +1,12 @@
-"""Caches arrays that depend on the head model alone: the first process computes them, and later ones map the file.
+"""Caches arrays that depend on the head model alone: the first process computes them, and later processes map the file
+into memory.
 
-A file in ``cache_folder()/arrays`` holds the arrays of one computation. Its name is the SHA-256 of everything that they
-depend on: the inputs (arrays, settings), the source code, versions, the processor, and the number of BLAS threads (sums
-depend on it, and a head must not depend on who filled the folder). So another model, setting or version of the code
-gives another file, and no file is ever outdated. A file is written atomically with a checksum, and a damaged one is
-made again. If the folder cannot be written, a line says so and each process computes its own arrays. The arrays are
-read-only in every case.
-"""
+Each file in ``cache_folder()/arrays`` holds the arrays of one computation. Its name is the SHA-256 of everything on
+which the arrays depend: the inputs (arrays, settings), the source code, versions, the processor, and the number of BLAS
+threads. (Sums depend on this number, and a head must not depend on which process filled the folder.) Another model,
+setting or version of the code therefore gets another file, and no file becomes outdated. Files are written atomically
+with a checksum, and a damaged file is replaced. If the folder cannot be written, a line in the log says so, and each
+process computes the arrays itself. The arrays are always read-only."""
 
 import contextlib
 import hashlib
@@ -43,8 +43,8 @@ def cached_arrays(
     """Returns the arrays that ``make()`` computes, from a cache file if an earlier process stored them.
 
     Args:
-        name: what the arrays are; the file's name begins with it.
-        inputs: everything that ``make`` starts from: arrays, and values whose ``repr`` identifies them.
+        name: a name for the arrays, with which the file's name begins.
+        inputs: all inputs of ``make``: arrays, and values whose ``repr`` identifies them.
         make: computes the arrays, of numbers or booleans, by name.
         made_by: functions and classes of other modules on which the result depends; when their source changes, the
             arrays are computed again.
@@ -107,7 +107,7 @@ def _packed(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def _read(path: Path) -> dict[str, np.ndarray] | None:
-    """Returns the arrays of a cache file, mapped into memory; None if it is missing or damaged."""
+    """Returns the arrays of a cache file, mapped into memory; None if the file is missing or damaged."""
     try:
         with path.open("rb") as stream:
             data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)

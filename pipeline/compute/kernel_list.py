@@ -1,4 +1,5 @@
-"""Lists the compiled loops that a default job calls, with their argument types, so that they can be compiled ahead.
+"""Lists the compiled loops that a default job calls, with their argument types, so that they can be compiled in
+advance.
 
 ``kernels.txt`` in this folder has a line for each: module and function, then the types of the arguments. First come
 those of a job without dense matching (``--detail photo --surface head``); after an empty line come those that dense
@@ -7,9 +8,9 @@ read-only; ``4*float64`` is a tuple, ``stereo.matching_kernels:Sight{float64[2C]
 recorded, not written by hand: ``python -m tests.tools.kernel_recorder`` runs jobs and writes it. A test runs a job and
 fails if the list lacks a loop.
 
-Signatures in the decorators would be an alternative, but in 105 places, mostly loops that only other loops call, and a
-wrong type there would break a job. Running the whole pipeline during set-up would take as long as a job in one process.
-"""
+The alternative, signatures in the decorators, would be needed in 105 places, mostly for loops that only other loops
+call, and a wrong type in a signature would break a job. Running the whole pipeline during set-up instead would take as
+long as a job in one process."""
 
 import importlib
 import re
@@ -32,14 +33,14 @@ _NAMED = re.compile(r"([\w.]+):(\w+)\{(.*)\}")
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
-    """Holds one compiled function together with the types of its arguments."""
+    """Holds the name of one compiled function and the types of its arguments."""
 
     place: str  # "contour_fit.rim_kernels:see", relative to this package; those of ``rig`` have their room before them
     arguments: tuple[str, ...]
 
     @classmethod
     def from_line(cls, line: str) -> "Kernel":
-        """Reads a kernel from a line of the list: its module and name, then its argument types, separated by spaces."""
+        """Parses a line of the list: a kernel's module and name, then its argument types, separated by spaces."""
         place, *arguments = line.split()
         return cls(place, tuple(arguments))
 
@@ -60,44 +61,44 @@ class Kernel:
         return function if isinstance(function, Dispatcher) else None
 
     def signature(self) -> tuple[types.Type, ...]:
-        """Returns the argument types as Numba's type objects. Raises ValueError for a notation that is not known."""
+        """Returns the argument types as Numba's type objects. Raises ValueError for an unknown notation of a type."""
         return tuple(type_from_text(text) for text in self.arguments)
 
     def is_kept(self) -> bool:
-        """Tells whether the kernel's machine code is in the wheel or in the cache folder. Returns True if loops are not
-        compiled at all (NUMBA_DISABLE_JIT)."""
+        """Returns whether the kernel's machine code is in the wheel or in the cache folder. Returns True if loops are
+        not compiled at all (NUMBA_DISABLE_JIT)."""
         dispatcher = self.dispatcher()
         kept = None if dispatcher is None else getattr(dispatcher, "_cache", None)
         return not isinstance(kept, KeptFunction) or kept.is_kept(self.signature())
 
     def size(self) -> int:
         """Returns the size in bytes of the Python byte code of the kernel and of all functions that it calls. Kernels
-        are compiled in the order of this size, the largest first; 0 if loops are not compiled."""
+        are compiled in order of this size, the largest first; the size is 0 if loops are not compiled."""
         dispatcher = self.dispatcher()
         return 0 if dispatcher is None else code_size(dispatcher)
 
     def compile(self) -> None:
-        """Compiles the loop for its argument types, or loads it from the cache."""
+        """Compiles the kernel for its argument types, or loads it from the cache."""
         dispatcher = self.dispatcher()
         if dispatcher is not None:
             dispatcher.compile(self.signature())
 
 
 def import_kernels(module: str) -> ModuleType:
-    """Returns a module of the list."""
+    """Imports a module that the list names."""
     package = PACKAGE.removesuffix("pipeline") if module.startswith("rig.") else f"{PACKAGE}."
     return importlib.import_module(package + module)
 
 
 def listed_kernels(*, dense: bool = True) -> list[Kernel]:
-    """Returns all kernels of the list; if ``dense`` is False, without those that only dense matching calls."""
+    """Returns all kernels of the list; if ``dense`` is False, without kernels that only dense matching calls."""
     plain, _, added = LIST.read_text(encoding="utf-8").partition("\n\n")
     return [Kernel.from_line(line) for line in (*plain.splitlines(), *(added.splitlines() if dense else ()))]
 
 
 def by_module(kernels: Iterable[Kernel]) -> Iterator[list[Kernel]]:
-    """Yields lists of kernels, one for each module. Kernels of a module call the same inner loops, which two processes
-    would otherwise compile twice."""
+    """Yields lists of kernels, one for each module. Kernels of one module call the same inner loops, which two
+    processes would otherwise compile twice."""
     groups: dict[str, list[Kernel]] = {}
     for kernel in kernels:
         groups.setdefault(kernel.module, []).append(kernel)
@@ -105,7 +106,7 @@ def by_module(kernels: Iterable[Kernel]) -> Iterator[list[Kernel]]:
 
 
 def type_from_text(text: str) -> types.Type:
-    """Returns the Numba type for its notation in the list. Raises ValueError for an unknown notation."""
+    """Returns the Numba type for its notation in the list of kernels. Raises ValueError for an unknown notation."""
     if array := _ARRAY.fullmatch(text):
         dtype, dimensions, layout, readonly = array.groups()
         return types.Array(_scalar(dtype), int(dimensions), layout, readonly=bool(readonly))
@@ -122,7 +123,7 @@ def type_from_text(text: str) -> types.Type:
 
 
 def _members(text: str) -> Iterator[str]:
-    """Yields the parts of the text between semicolons that are not inside braces."""
+    """Yields the parts of a text between semicolons, except semicolons inside braces."""
     depth = start = 0
     for at, sign in enumerate(text):
         depth += (sign == "{") - (sign == "}")

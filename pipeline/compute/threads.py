@@ -1,9 +1,8 @@
-"""Runs slices of compiled loops in threads.
+"""Runs slices of compiled loops in several threads.
 
-Numba's own ``parallel`` compiles five times as long, and its OpenMP threads spin while they wait: while another process
-held one of two cores, a fit took 22 s instead of one. These threads sleep instead, and are reused: starting them anew
-for every loop was a third of a fit.
-"""
+Numba's option ``parallel`` takes five times as long to compile, and its OpenMP threads use CPU time while they wait:
+while another process occupied one of two cores, a fit took 22 s instead of one. This module's threads sleep while they
+wait, and are reused: starting threads for every loop took a third of a fit's time."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -24,8 +23,8 @@ TRACED_THREADS = 16  # for how many threads a trace of one cuts its loops
 
 
 def thread_count() -> int:
-    """Returns how many threads share a loop: EIGENHEAD_THREADS, or else the CPUs that this process may use. Raises
-    WrongVariable."""
+    """Returns how many threads share a loop: the variable EIGENHEAD_THREADS, or else the number of CPUs that this
+    process may use. Raises WrongVariable if the variable is not a valid number."""
     requested = os.environ.get(THREADS, "").strip()
     if not requested:
         return len(os.sched_getaffinity(0))
@@ -35,8 +34,8 @@ def thread_count() -> int:
 
 
 def slice_count(threads: int) -> int:
-    """Returns the greatest number of slices that a loop is cut into for this number of threads. It is a power of two,
-    so that more threads only subdivide the same slices."""
+    """Returns the largest number of slices into which a loop is divided for this number of threads. It is a power of
+    two, so that more threads only subdivide the same slices."""
     return max(SLICES, 1 << (2 * threads - 1).bit_length())
 
 
@@ -44,9 +43,8 @@ def in_threads(count: int, work: Callable[[int, int], None]) -> None:
     """Runs ``work(first, last)`` over slices of ``range(count)`` in several threads. ``work`` is usually a compiled
     loop, which releases Python's interpreter lock.
 
-    The result may not depend on how the range is cut. The calling thread takes slices too. A helper thread that has not
-    begun when no slices remain is cancelled, so nobody waits for it.
-    """
+    The result must not depend on how the range is divided. The calling thread processes slices as well. A helper thread
+    that has not started when no slices remain is cancelled, so that the loop does not wait for it."""
     threads, trace = thread_count(), active_trace()
     if trace is not None:
         _traced(trace, count, work, name_of(work), threads)
@@ -73,13 +71,13 @@ def map_in_threads(work: Callable[[int], Result], count: int) -> list[Result]:
 
 
 def map_strips(work: Callable[[slice], None], size: int, rows: int) -> None:
-    """Runs ``work`` on strips of at most ``rows`` rows of an image that is ``size`` rows high, in several threads."""
+    """Runs ``work`` on strips of at most ``rows`` rows of an image with ``size`` rows, in several threads."""
     map_in_threads(lambda k: work(slice(k * rows, min((k + 1) * rows, size))), -(-size // rows))
 
 
 def cut(count: int, parts: int) -> list[tuple[int, int]]:
-    """Cuts ``range(count)`` into at most ``parts`` slices of nearly equal length. Returns the first index and the index
-    after the last one of each; no slice is empty unless ``count`` is 0."""
+    """Divides ``range(count)`` into at most ``parts`` slices of nearly equal length. Returns each slice's first index
+    and the index after its last one; no slice is empty unless ``count`` is 0."""
     parts = max(1, min(parts, count))
     return list(pairwise(count * k // parts for k in range(parts + 1)))
 
@@ -91,7 +89,7 @@ def _share(slices: list[tuple[int, int]], work: Callable[[int, int], None], thre
         while left:
             try:
                 first, last = left.pop()
-            except IndexError:  # another was quicker
+            except IndexError:  # another thread took the last slice
                 return
             work(first, last)
 
@@ -110,8 +108,8 @@ def _share(slices: list[tuple[int, int]], work: Callable[[int, int], None], thre
 def _traced(
     trace: Trace, count: int, work: Callable[[int, int], None], name: str, threads: int, *, single: bool = False
 ) -> None:
-    """Runs a loop and records spans of it and of its slices. With one thread the loop is cut as finely as for several,
-    so the trace shows how it could be shared."""
+    """Runs a loop and records a trace span for the loop and for each slice. With one thread the loop is divided as
+    finely as for several threads, so that the trace shows how it could be shared."""
     loop = trace.new_loop()
     parts = count if single else slice_count(threads if threads > 1 else TRACED_THREADS)
 
@@ -125,8 +123,8 @@ def _traced(
 
 @contextmanager
 def task_pool(threads: int | None = None) -> Iterator[ThreadPoolExecutor]:
-    """Yields a pool of ``threads`` threads; None means as many as share a loop. An active trace records the tasks as
-    slices of one loop."""
+    """Yields a pool of ``threads`` threads; None means the number of threads that share a loop. An active trace records
+    the tasks as slices of one loop."""
     threads, trace = threads or thread_count(), active_trace()
     if trace is None:
         with ThreadPoolExecutor(threads) as pool:
@@ -138,7 +136,7 @@ def task_pool(threads: int | None = None) -> Iterator[ThreadPoolExecutor]:
 
 
 class TracedPool(ThreadPoolExecutor):
-    """Runs tasks in threads and records each of them in a trace, as a slice of one loop."""
+    """Runs tasks in threads and records each task in a trace, as a slice of one loop."""
 
     def __init__(self, threads: int, trace: Trace, loop: int) -> None:
         super().__init__(threads, thread_name_prefix="tasks")

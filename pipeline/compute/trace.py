@@ -1,10 +1,10 @@
-"""Records what each thread does and when, for Chrome's trace viewer, for Perfetto, and for the laboratory's
-``scaling``.
+"""Records what each thread does and when, for the trace viewers of Chrome and Perfetto, and for the laboratory's
+experiment ``scaling``.
 
-Without an active trace nothing is recorded; the only cost is one test. Stages, parts of stages, shared loops and their
-slices are spans of one thread each; those of one thread nest. A stage in a thread of its own has a ``background`` span;
-the stages that run meanwhile have a ``foreground`` span of the same name. Each span has wall clock time and CPU
-seconds, because on a busy machine only the latter measure the work."""
+Without an active trace nothing is recorded, and a call costs only one comparison. Stages, parts of stages, loops and
+their slices are recorded as spans, each of one thread; spans of the same thread are nested. A stage that runs in a
+separate thread has a ``background`` span; the stages that run at the same time have a ``foreground`` span of the same
+name. Each span has wall clock time and CPU seconds, because on a busy machine only CPU seconds measure the work."""
 
 import functools
 import json
@@ -27,8 +27,8 @@ T = TypeVar("T")
 
 
 class Trace:
-    """Collects spans of all threads of this process, starting at its creation. A span is a named piece of work of one
-    thread with its start and duration."""
+    """Collects the spans of all threads of this process from the trace's creation on. A span is a named piece of work
+    of one thread with its start and duration."""
 
     def __init__(self) -> None:
         self._began = time.perf_counter_ns()
@@ -43,7 +43,7 @@ class Trace:
 
     @contextmanager
     def span(self, kind: Kind, name: str, **arguments: object) -> Iterator[None]:
-        """Records the block as one span of the calling thread, also if it raises.
+        """Records the ``with`` block as one span of the calling thread, also if the block raises an exception.
 
         ``cpu_s`` of the span is the CPU time of that thread. ``process_cpu_s`` is the CPU time of all threads during
         the span; loops and slices have none.
@@ -67,8 +67,8 @@ class Trace:
         self._events.append(event | times | {"args": arguments})
 
     def encoded(self, *, threads: int) -> bytes:
-        """Returns the trace as JSON for Chrome's viewer, one event per line: the threads' names, then the spans by
-        start. ``threads`` is how many threads shared a loop."""
+        """Returns the trace as JSON for Chrome's viewer, one event per line: the names of the threads, then the spans
+        in order of their start. ``threads`` is the number of threads that shared a loop."""
         header = {
             "format": FORMAT,
             "displayTimeUnit": "ms",
@@ -87,7 +87,8 @@ class Trace:
 
 
 def peak_memory_mb() -> float:
-    """Returns the peak memory (MiB) of this process since its program was loaded; NaN if the system does not report it.
+    """Returns the peak memory (MiB) of this process since its program was loaded; NaN if the operating system does not
+    report it.
 
     ``getrusage`` would return more: its maximum survives ``exec``, so a child of a large process begins with the
     parent's (proc(5), ``VmHWM``).
@@ -101,14 +102,14 @@ _active: Trace | None = None
 
 
 def active_trace() -> Trace | None:
-    """Returns the trace that currently records, on any thread; None if there is none."""
+    """Returns the trace that currently records the spans of all threads; None if there is none."""
     return _active
 
 
 @contextmanager
 def recorded(trace: Trace | None) -> Iterator[None]:
-    """Records all spans of the block into ``trace``, as one job; None records nothing. Only one job at a time can be
-    recorded in a process."""
+    """Records all spans of the ``with`` block into ``trace``, as one job; None records nothing. Only one job at a time
+    can be recorded in a process."""
     global _active
     if trace is None:
         yield
@@ -122,7 +123,7 @@ def recorded(trace: Trace | None) -> Iterator[None]:
 
 
 def span(kind: Kind, name: str) -> AbstractContextManager[None]:
-    """Returns a context that records its block as a span if a trace is active."""
+    """Returns a context manager that records its block as a span if a trace is active."""
     return nullcontext() if _active is None else _active.span(kind, name)
 
 

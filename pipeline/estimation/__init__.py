@@ -1,5 +1,5 @@
-"""Holds the project's only estimator: robust least squares over a sum of terms, by Levenberg-Marquardt.
+"""Holds the least-squares estimator that the whole project uses: Levenberg-Marquardt on a sum of robust terms.
 
-In: terms, each with its equation; a start; a function that applies a step to a value. Out: a ``Solution`` with its
-evidence. This package knows nothing of heads, cameras or boards; the caller chooses the estimated type.
-"""
+The input is the terms of the cost, a starting value, and a function that applies a step to a value. The output is a
+``Solution``: the best value, and how the search ended. This package contains nothing about heads or cameras; the caller
+chooses the type of the estimated value."""

@@ -1,4 +1,4 @@
-"""Minimises a quadratic form with bounds on a few of its unknowns."""
+"""Minimises a quadratic form with bounds on a few of the unknowns."""
 
 import numpy as np
 import scipy.linalg
@@ -18,10 +18,9 @@ def least_within(
     """Returns the x that minimises ``x^T M x / 2 + g^T x`` subject to ``lower <= x <= upper``, where ``matrix`` M is
     symmetric and positive definite and ``gradient`` is g.
 
-    Bounds may be infinite. The unbounded unknowns are eliminated first, so that only the few bounded ones need a
-    search. With the unbounded ones in front, the last corner of M's Cholesky factor is the factor of their Schur
-    complement.
-    """
+    Bounds may be infinite. The unbounded unknowns are eliminated first, so that only the few bounded unknowns need a
+    search. If the unbounded unknowns come first, the last corner of M's Cholesky factor is the factor of their Schur
+    complement."""
     tied = np.isfinite(lower) | np.isfinite(upper)
     order = np.concatenate([np.flatnonzero(~tied), np.flatnonzero(tied)])
     first = len(order) - int(np.count_nonzero(tied))
@@ -42,12 +41,13 @@ def _least_in_box(
     lower: Float[np.ndarray, " k"],
     upper: Float[np.ndarray, " k"],
 ) -> Float[np.ndarray, " k"]:
-    """Minimises the same form where every unknown has a bound, by block principal pivoting (Judice and Pires 1994, *A
-    block principal pivoting algorithm for large-scale strictly monotone linear complementarity problems*).
+    """Minimises the quadratic form of ``least_within`` if every unknown has a bound, by block principal pivoting
+    (Judice and Pires 1994, *A block principal pivoting algorithm for large-scale strictly monotone linear
+    complementarity problems*).
 
-    Each unknown is free or at one of its bounds. All unknowns that violate their conditions change together; if that
-    makes no progress, only the last of them changes (Murty's rule, which always ends).
-    """
+    Each unknown is either free or at one of its bounds. All unknowns that violate their optimality conditions change
+    together; if this makes no progress, only the last of these unknowns changes (Murty's rule, which always
+    terminates)."""
     side, fewest, patience = np.zeros(len(gradient), int), len(gradient) + 1, PATIENCE
     slack = ROUNDING * np.where(np.isfinite(upper - lower), upper - lower, 1.0)
     place = np.zeros(len(gradient))

@@ -1,15 +1,16 @@
-"""Implements Levenberg-Marquardt for a sum of robust terms, with one rule for damping and one for stopping.
+"""Implements Levenberg-Marquardt for a sum of robust terms, with one damping rule and one stopping rule.
 
-Each step solves ``(M + lambda diag(M)) step = -gradient`` (Marquardt 1963: steps do not depend on the units of the
-unknowns). A step that lowers the cost is taken, and lambda is divided by ten; otherwise lambda is multiplied by a
-hundred and the step is tried again. The search ends when the predicted decrease is below ``Limits.tolerance``. Costs
-are squared standard deviations: a predicted decrease of f is a step of sqrt(f) standard deviations.
+Each step solves ``(M + lambda diag(M)) step = -gradient`` (Marquardt 1963), so steps do not depend on the units of the
+unknowns. A step that lowers the cost is taken, and lambda is divided by ten; otherwise lambda is multiplied by a
+hundred and the step is computed again. The search ends when the predicted decrease of the cost is below
+``Limits.tolerance``. Costs are in squared standard deviations: a predicted decrease of f is a step of sqrt(f) standard
+deviations.
 
-If unknowns have bounds, the step is the damped model's minimum within them (``bounded``).
+If unknowns have bounds, the step is the minimum of the damped quadratic model within the bounds (``bounded``).
 
-Some costs are not smooth (the rim's samples change as the head moves). For these a step may climb back to the worst of
-the last ``Limits.memory`` costs (Grippo, Lampariello and Lucidi 1986); the best value is returned in any case.
-"""
+Some costs are not smooth, for example because the sample points on a head's rim change as the head moves. The search
+may therefore accept a step up to the highest of the last ``Limits.memory`` costs (Grippo, Lampariello and Lucidi 1986);
+it always returns the best value."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from pipeline.estimation.terms import Linearised, NormalEquations, Problem, Valu
 
 MIN_DAMPING = 1e-7  # after accepted steps; relative to the diagonal, Gauss-Newton to seven digits
 DAMPING_REFUSED = 1e-2  # at least, after a refused step
-MIN_DIAGONAL = 1e-12  # of what nothing determines: damping then keeps it where it is
+MIN_DIAGONAL = 1e-12  # of an undetermined unknown: damping then keeps it constant
 
 Reason = Literal["converged", "no step lowers the cost", "step limit"]
 Solve = Callable[[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]], Float[np.ndarray, " p"]]
@@ -32,8 +33,8 @@ Solve = Callable[[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]], Float[np.n
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Holds the stopping rule of a search, and its first damping. ``tolerance`` (squared standard deviations) is the
-    smallest predicted decrease of the cost for which a step is taken."""
+    """Holds the limits at which a search stops, and its first damping. ``tolerance`` (squared standard deviations) is
+    the smallest predicted decrease of the cost for which a step is taken."""
 
     steps: int = 50
     tolerance: float = 1e-6
@@ -44,7 +45,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Holds how a search ended."""
+    """Holds why a search ended, the number of evaluations and steps, and the final cost."""
 
     termination_reason: Reason
     evaluations: int
@@ -54,8 +55,8 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution(Generic[Value]):
-    """Holds the result of a search: the best value, the problem linearised there (from which a covariance can be
-    computed), and how the search ended."""
+    """Holds the result of a search: the best value, the problem linearised at this value (for computing a covariance),
+    and how the search ended."""
 
     value: Value
     at: Linearised
@@ -63,8 +64,8 @@ class Solution(Generic[Value]):
 
 
 def cholesky_solve(matrix: Float[np.ndarray, "p p"], right: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """Solves a symmetric positive definite system of equations. Raises LinAlgError if the matrix is not positive
-    definite."""
+    """Solves linear equations with a symmetric positive definite matrix. Raises LinAlgError if the matrix is not
+    positive definite."""
     # Not ``solve(assume_a="pos")``: its estimate of the condition warns of unknowns with different units.
     return scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix, check_finite=False), right, check_finite=False)
 
@@ -87,7 +88,7 @@ def minimise(
         limits: when to stop.
         solve: solves a symmetric positive definite system. Where the matrix is not definite it raises LinAlgError; the
             step is then tried again with more damping.
-        least: as ``least_within``, for steps that meet a bound.
+        least: a function like ``least_within``, for steps that reach a bound.
         at_start: the problem linearised at ``start``, if the caller has it already.
         watch: called before every step; an exception that it raises ends the search.
     """
@@ -109,7 +110,7 @@ def minimise(
                     step, predicted = _within(equations, damping, step, problem.room(now.value), least)
                 value, evaluations = problem.after(now.value, step), evaluations + 1
                 tried = _Place(value, there := problem.at(value), there.cost)
-                if tried.cost < max(recent[-limits.memory :]):  # False for the NaN of a value that makes no sense
+                if tried.cost < max(recent[-limits.memory :]):  # False if the cost is NaN
                     accepted = tried
                     break
                 if predicted < limits.tolerance:
@@ -128,7 +129,7 @@ def minimise(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place(Generic[Value]):
-    """Holds a value with the problem linearised there and its cost."""
+    """Holds a value, the problem linearised at this value, and the cost."""
 
     value: Value
     at: Linearised
@@ -136,7 +137,7 @@ class _Place(Generic[Value]):
 
 
 def _damped_step(equations: NormalEquations, damping: float, solve: Solve) -> Float[np.ndarray, " p"] | None:
-    """Returns the step of the damped equations, or None if their matrix is not positive definite."""
+    """Returns the step that solves the damped normal equations, or None if their matrix is not positive definite."""
     try:
         return -solve(_damped(equations, damping), equations.gradient)
     except np.linalg.LinAlgError:
@@ -157,7 +158,8 @@ def _within(
     room: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
     least: Callable[..., Float[np.ndarray, " p"]],
 ) -> tuple[Float[np.ndarray, " p"], float]:
-    """Returns the step limited to its bounds ``room``, and the decrease of the cost that the equations predict."""
+    """Returns the step limited to the bounds ``room``, and the decrease of the cost that the normal equations predict
+    for it."""
     if ((step >= room[0]) & (step <= room[1])).all():
         return step, -float(equations.gradient @ step)
     damped = _damped(equations, damping)

@@ -1,8 +1,7 @@
 """Defines robust losses rho(s) of a squared residual s in units of its variance, and their weights rho'(s).
 
-Triggs, McLauchlan, Hartley and Fitzgibbon, *Bundle Adjustment: A Modern Synthesis*, 2000, section 3.3 (without the
-second-order correction: J^T rho' J is never indefinite).
-"""
+The formulas follow Triggs, McLauchlan, Hartley and Fitzgibbon, *Bundle Adjustment: A Modern Synthesis*, 2000, section
+3.3, without the second-order correction, so that J^T rho' J is never indefinite."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -13,24 +12,24 @@ from jaxtyping import Float
 
 @runtime_checkable
 class Loss(Protocol):
-    """Describes a robust loss rho. Both methods take squared residuals s, in squared standard deviations, and return an
-    array of the same shape."""
+    """Describes a robust loss rho. Both methods take squared residuals s, in squared standard deviations, and return
+    one value for each of them."""
 
     def cost(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Returns rho(s)."""
+        """Returns the loss rho(s) of each squared residual s."""
         ...
 
     def weight(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Returns rho'(s), the weight of each residual: 1 at s = 0, decreasing to almost 0 for gross errors."""
+        """Returns rho'(s), the weight of each residual: 1 at s = 0, and almost 0 for gross errors."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class LeastSquares:
-    """Computes the loss rho(s) = s, which suits Gaussian errors: every residual has full weight."""
+    """Computes the loss rho(s) = s, which suits Gaussian errors."""
 
     def cost(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Returns the squares themselves."""
+        """Returns the squared residuals unchanged."""
         return squares
 
     def weight(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -40,8 +39,8 @@ class LeastSquares:
 
 @dataclass(frozen=True, slots=True)
 class GemanMcClure:
-    """Computes Geman and McClure's loss (1987), rho(s) = s / (1 + s / c^2). It never exceeds c^2, so residuals of many
-    c have almost no weight.
+    """Computes Geman and McClure's loss (1987), rho(s) = s / (1 + s / c^2). The loss never exceeds c^2, so residuals of
+    many c have almost no weight.
 
     ``scale`` is c, in the unit of the unsquared residual; an array gives each residual its own scale.
     """

@@ -1,12 +1,11 @@
-"""Defines the terms of a cost, each with its own residuals, and their sum as a complete problem.
+"""Defines the terms of a least-squares cost, each with its residuals, and the problem that consists of their sum.
 
-A term evaluated at a value has a cost and adds its part to the normal equations
+A term at a given value has a cost and adds its contribution to the normal equations:
 
     matrix += J^T W J,    gradient += J^T W r,
 
-W the information times the robust weight, so the gradient is half of the cost's. ``Residuals`` is the usual form, with
-its Jacobian; a term whose Jacobian is too large to build adds its blocks by itself.
-"""
+Here W is the information times the robust weight; the gradient is half of the cost's gradient. ``Residuals`` is the
+usual form of a term, with a Jacobian; a term whose Jacobian is too large to store adds its blocks directly."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,14 +19,14 @@ from pipeline.estimation.robust import LeastSquares, Loss
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """Holds the matrix J^T W J and the gradient J^T W r over p unknowns."""
+    """Holds the matrix J^T W J and the gradient J^T W r for p unknowns."""
 
     matrix: Float[np.ndarray, "p p"]
     gradient: Float[np.ndarray, " p"]
 
     @classmethod
     def empty(cls, size: int) -> "NormalEquations":
-        """Returns equations of ``size`` unknowns to which no term has been added: all zeros."""
+        """Returns normal equations for ``size`` unknowns that are all zeros, so without any term."""
         return cls(np.zeros((size, size)), np.zeros(size))
 
 
@@ -37,7 +36,7 @@ ValueIn = TypeVar("ValueIn", contravariant=True)
 
 @runtime_checkable
 class Linearised(Protocol):
-    """Describes a term linearised at one value of the unknowns: its cost, and its part of the normal equations."""
+    """Describes a term linearised at one value of the unknowns: its cost and its contribution to normal equations."""
 
     @property
     def cost(self) -> float:
@@ -45,8 +44,8 @@ class Linearised(Protocol):
         ...
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds the term's matrix and gradient to ``equations`` in place, since matrices of a thousand unknowns take 8
-        MB each."""
+        """Adds the term's matrix and gradient to ``equations`` in place, because a matrix of a thousand unknowns takes
+        8 MB."""
         ...
 
 
@@ -79,11 +78,11 @@ class Residuals:
 
     @property
     def cost(self) -> float:
-        """Returns the sum of the robust loss over all residuals."""
+        """Returns the sum of the robust losses of all residuals."""
         return float(self.loss.cost(self.squares).sum())
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds J^T W J and J^T W r in place, where W holds the loss's weight of each residual."""
+        """Adds J^T W J and J^T W r in place, where W holds the robust weight of each residual."""
         root = np.repeat(np.sqrt(self.loss.weight(self.squares)), self.residual.shape[1])
         rows = self.jacobian().reshape(self.residual.size, -1) * root[:, None]
         equations.matrix[...] += rows.T @ rows  # A^T A: half the work of A^T B
@@ -107,8 +106,8 @@ class Linear:
 @dataclass(frozen=True, slots=True, eq=False)
 class Quadratic:
     """Holds the quadratic form ``(x - c)^T M (x - c) - 2 g^T (x - c)`` of a vector x, with ``matrix`` M, ``centre`` c
-    and ``pull`` g (towards the minimum). With g = 0 it is a Gaussian prior. It can also summarise another problem after
-    all unknowns except x have been eliminated."""
+    and ``pull`` g (towards the minimum). With g = 0 it is a Gaussian prior. The form can also represent another problem
+    after all of its unknowns except x have been eliminated."""
 
     matrix: Float[np.ndarray, "p p"]
     centre: Float[np.ndarray, " p"]
@@ -116,25 +115,24 @@ class Quadratic:
 
     @classmethod
     def prior(cls, information: Float[np.ndarray, "p p"], mean: Float[np.ndarray, " p"]) -> "Quadratic":
-        """Returns the form of the Gaussian prior N(mean, information^-1)."""
+        """Returns the quadratic form of the Gaussian prior N(mean, information^-1)."""
         return cls(information, mean, np.zeros(len(mean)))
 
     def at(self, value: Float[np.ndarray, " p"]) -> "LinearisedQuadratic":
-        """Returns the form at the vector ``value``."""
+        """Returns the quadratic form at the vector ``value``."""
         return LinearisedQuadratic(self, value - self.centre)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedQuadratic:
-    """Holds the quadratic form ``term`` at a vector x, where ``away`` is x - c, the vector's offset from the form's
-    centre."""
+    """Holds the quadratic form ``term`` at a vector x, where ``away`` is x - c, the offset from the form's centre."""
 
     term: Quadratic
     away: Float[np.ndarray, " p"]
 
     @property
     def cost(self) -> float:
-        """Returns the value of the form; it is negative where the linear part outweighs the quadratic part."""
+        """Returns the value of the quadratic form; it is negative where the linear part dominates."""
         return float(self.away @ self.term.matrix @ self.away - 2.0 * self.term.pull @ self.away)
 
     def add_to(self, equations: NormalEquations) -> None:
@@ -145,13 +143,13 @@ class LinearisedQuadratic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sum:
-    """Holds several terms at one value, as one term."""
+    """Combines several terms at one value into one term."""
 
     parts: tuple[Linearised, ...]
 
     @property
     def cost(self) -> float:
-        """Returns the sum of the parts' costs."""
+        """Returns the sum of the costs of all parts."""
         return sum(part.cost for part in self.parts)
 
     def add_to(self, equations: NormalEquations) -> None:
@@ -162,8 +160,8 @@ class Sum:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeOnly:
-    """Holds a term restricted to the unknowns that may move. ``free`` has one flag for each of all q unknowns; those
-    whose flag is False stay fixed."""
+    """Holds a term restricted to the unknowns that may change. ``free`` has one flag for each of all q unknowns;
+    unknowns whose flag is False stay constant."""
 
     whole: Linearised
     free: Bool[np.ndarray, " q"]
@@ -174,7 +172,7 @@ class FreeOnly:
         return self.whole.cost
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds the rows and columns of the free unknowns alone, in place. ``equations`` has the size of the free
+        """Adds only the rows and columns of the free unknowns, in place. ``equations`` has the size of the free
         unknowns."""
         everything = NormalEquations.empty(len(self.free))
         self.whole.add_to(everything)

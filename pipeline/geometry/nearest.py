@@ -1,8 +1,7 @@
-"""Finds the nearest of many points, with the threads of compiled loops.
+"""Finds nearest neighbours among many points, with multithreaded compiled loops.
 
-SciPy's tree takes 2 microseconds for a query among 53,000 points; this one, of boxes, takes 0.5. A grid of cubic cells
-lets compiled loops find all neighbours of a point.
-"""
+With 53,000 points, SciPy's KDTree takes 2 microseconds for a query, the tree of bounding boxes in this module 0.5. The
+module also sorts points into cubic grid cells, so that compiled loops can find all neighbours of a point."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,14 +15,14 @@ from pipeline.geometry.nearest_kernels import LEAF, Tree, find_nearest, sort_int
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointTree:
-    """Holds ``points`` of space or of a plane, sorted so that the nearest are found quickly."""
+    """Holds ``points`` in two or three dimensions, sorted into a tree for nearest-neighbour queries."""
 
     points: Float[np.ndarray, "n d"]
     tree: Tree
 
     @classmethod
     def of(cls, points: Float[np.ndarray, "n d"]) -> "PointTree":
-        """Sorts points into a tree."""
+        """Builds the tree of some points."""
         levels = max(0, int(np.ceil(np.log2(max(len(points), 1) / LEAF))))
         placed = _in_space(points)
         row, boxes = sort_into_tree(placed, levels)
@@ -33,12 +32,11 @@ class PointTree:
 def nearest(
     tree: PointTree, places: Float[np.ndarray, "n d"], *, count: int = 1, within: float = np.inf
 ) -> tuple[Float[np.ndarray, "n ..."], Int[np.ndarray, "n ..."]]:
-    """Returns the distances and rows of the ``count`` points of the tree nearest to each place, the nearest first, with
-    an axis for the count if that is more than 1.
+    """Returns the distances and indices of the ``count`` tree points nearest to each query point, sorted by distance;
+    the second axis exists only if ``count`` is more than 1.
 
-    Of equally distant points, the one with the lower row comes first. Where fewer points are nearer than ``within``,
-    the distance is infinite and the row is the number of points.
-    """
+    Of equally distant points, the one with the lower index comes first. If fewer than ``count`` points are nearer than
+    ``within``, the missing distances are infinite and the missing indices are the number of points."""
     distance, row = np.empty((len(places), count)), np.empty((len(places), count), np.int64)
     placed = _in_space(places)
 
@@ -50,16 +48,16 @@ def nearest(
 
 
 def _in_space(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 3"]:
-    """Returns the points as new rows of three numbers; points of a plane get a third coordinate 0."""
+    """Returns the points as new rows of three coordinates; two-dimensional points get a third coordinate 0."""
     placed = np.zeros((len(points), 3))
     placed[:, : points.shape[1]] = points
     return placed
 
 
 class Cells(NamedTuple):
-    """Holds points sorted by the cell of a grid that they lie in. ``order`` sorts the points; ``keys`` are their cells'
-    numbers, sorted; ``spans`` is the number of cells along each axis. Outermost cells are empty, so the neighbours of a
-    cell are at fixed differences in number."""
+    """Holds points sorted by grid cell. ``order`` sorts the points; ``keys`` are the sorted cell numbers of the points;
+    ``spans`` is the number of cells along each axis. The outermost cells are empty, so the numbers of a cell's
+    neighbours differ from its number by constants."""
 
     order: Int64[np.ndarray, " n"]
     keys: Int64[np.ndarray, " n"]
@@ -67,7 +65,7 @@ class Cells(NamedTuple):
 
 
 def sorted_into_cells(points: Float[np.ndarray, "n 3"], wide: float) -> Cells:
-    """Sorts points into cubic cells with edge ``wide``, in the unit of the points."""
+    """Sorts points into cubic cells with edge length ``wide``, in the unit of the points."""
     cell = np.floor((points - points.min(axis=0)) / wide).astype(np.int64) + 1
     spans = cell.max(axis=0) + 2
     keys = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]

@@ -1,5 +1,5 @@
-"""Compiled loops of ``pipeline.geometry.nearest``: a balanced tree of points with its search, and the neighbours of a
-point in a grid of cubic cells."""
+"""Holds the compiled loops of ``pipeline.geometry.nearest``: they build and search a balanced tree of points, and find
+the neighbours of a point in a grid of cubic cells."""
 
 from typing import NamedTuple
 
@@ -13,8 +13,8 @@ DEEPEST = 64  # nodes that wait at once, more than any tree is deep
 
 
 class Tree(NamedTuple):
-    """Holds n points in the order of a balanced tree. Node i has the children 2 i + 1 and 2 i + 2, which share its
-    points in halves; the last ``2**levels`` nodes are leaves."""
+    """Holds n points sorted as a balanced tree. Node i has the children 2 i + 1 and 2 i + 2, each with half of its
+    points; the last ``2**levels`` nodes are leaves."""
 
     points: np.ndarray  # (n, 3), leaf after leaf
     row: np.ndarray  # (n): which of the points given each is
@@ -24,8 +24,8 @@ class Tree(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def sort_into_tree(points: np.ndarray, levels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sorts points (n, 3) into the leaves of a tree: each node's points are halved along the longest side of their box.
-    Returns their rows in the order of the leaves, and the boxes of all nodes."""
+    """Sorts points (n, 3) into the leaves of a tree: each node's points are halved along the longest side of their
+    bounding box. Returns the point indices in the order of the leaves, and the bounding boxes of all nodes."""
     row = np.arange(len(points))
     nodes = 2 ** (levels + 1) - 1
     boxes, spans = np.empty((nodes, 6)), np.empty((nodes, 2), np.int64)
@@ -48,8 +48,8 @@ def sort_into_tree(points: np.ndarray, levels: int) -> tuple[np.ndarray, np.ndar
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def halve(values: np.ndarray, row: np.ndarray, first: int, middle: int, last: int) -> None:
-    """Reorders ``row[first:last]`` so that no value before ``middle`` is greater than any after it (C. A. R. Hoare,
-    *Algorithm 65: Find*, 1961)."""
+    """Reorders ``row[first:last]`` so that no value before ``middle`` is greater than any value after it (C. A. R.
+    Hoare, *Algorithm 65: Find*, 1961)."""
     low, high = first, last - 1
     while low < high:
         pivot = values[row[(low + high) // 2]]
@@ -72,7 +72,7 @@ def halve(values: np.ndarray, row: np.ndarray, first: int, middle: int, last: in
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def square_to_box(x: float, y: float, z: float, box: np.ndarray) -> float:
-    """Returns the squared distance of a place to a box; 0 inside."""
+    """Returns the squared distance of a point to a box; 0 inside the box."""
     dx = max(box[0] - x, x - box[3], 0.0)
     dy = max(box[1] - y, y - box[4], 0.0)
     dz = max(box[2] - z, z - box[5], 0.0)
@@ -83,9 +83,10 @@ def square_to_box(x: float, y: float, z: float, box: np.ndarray) -> float:
 def find_nearest(
     tree: Tree, places: np.ndarray, within: float, distance: np.ndarray, near: np.ndarray, first: int, last: int
 ) -> None:
-    """Finds the points nearest to places ``first`` to ``last`` (n, 3): distances, smallest first, and rows.
-    ``distance`` and ``near`` (n, count) have a column for each. Of equally distant points, the lower row comes first.
-    If fewer are nearer than ``within``, the distance is infinite and the row is the number of points."""
+    """Finds the tree points nearest to the query points ``first`` to ``last`` of ``places`` (n, 3), sorted by distance.
+    Fills ``distance`` and ``near`` (both n, count) with the distances and point indices. Of equally distant points, the
+    lower index comes first. If fewer than the requested points are nearer than ``within``, the missing distances are
+    infinite and the missing indices are the number of points."""
     points, row, boxes, levels = tree
     leaves, total, count = 2**levels - 1, len(points), distance.shape[1]
     node_at, first_at, last_at = np.empty(DEEPEST, np.int64), np.empty(DEEPEST, np.int64), np.empty(DEEPEST, np.int64)
@@ -136,9 +137,9 @@ def find_nearest(
 
 @njit(cache=True, nogil=True)
 def columns_about(cell: int, keys: np.ndarray, spans: np.ndarray, ranges: np.ndarray) -> None:
-    """Fills ``ranges`` (9, 2): where the points of the 27 cells around ``cell`` begin and end in the sorted ``keys``.
-    Three cells that are adjacent in z have consecutive keys, so nine ranges are enough. ``keys`` and ``spans`` are
-    those of ``cells.Cells``."""
+    """Fills ``ranges`` (9, 2) with the first and last positions in the sorted ``keys`` of the points in the 27 cells
+    around ``cell``. Three cells that are adjacent in z have consecutive keys, so nine ranges suffice. ``keys`` and
+    ``spans`` are those of ``nearest.Cells``."""
     for column in range(COLUMNS):
         low = cell + ((column // 3 - 1) * spans[1] + column % 3 - 1) * spans[2] - 1
         ranges[column, 0] = np.searchsorted(keys, low)

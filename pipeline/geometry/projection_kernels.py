@@ -1,10 +1,11 @@
-"""Compiled camera model: world to camera to pixel, the derivatives, and the z-buffer. ``projection`` packs the rows.
+"""Holds the compiled camera model: projection from world to pixel, its derivatives, and the z-buffer. Module
+``projection`` packs the rows that describe cameras.
 
-A camera is a row of numbers. A row called ``pose`` begins with rotation (9, row by row) and translation (3, mm) of
-camera_from_world. If a lens follows, it begins at entry 12: fx fy cx cy (px) and, for a lens that distorts, k1 k2 p1 p2
-k3 and the largest ray radius at which distortion is valid. The helpers are inlined, so they use the calling loop's
-arithmetic, fast or strict. Only ``distorted`` is always fast: strict arithmetic made the visual hull 10 % slower.
-"""
+A camera is a row of numbers. A row named ``pose`` begins with the rotation (9 numbers, row by row) and translation (3,
+mm) of camera_from_world. The lens, if present, begins at entry 12: fx fy cx cy (px) and, if the lens distorts, k1 k2 p1
+p2 k3 and the largest ray radius at which the distortion is valid. The helper functions are inlined, so they use the
+floating-point mode (fast or strict) of the calling loop. Only ``distorted`` always uses fast mode; strict mode made the
+visual hull 10 % slower."""
 
 import numpy as np
 
@@ -17,7 +18,7 @@ NEAREST_MM = 1.0  # nearer, or behind the camera, nothing is seen
 
 @njit(cache=True, nogil=True, inline="always")
 def turned(pose, x, y, z):
-    """Returns a direction (x, y, z) of the world in the camera's frame."""
+    """Rotates a direction (x, y, z) from the world frame to the camera frame."""
     return (
         pose[0] * x + pose[1] * y + pose[2] * z,
         pose[3] * x + pose[4] * y + pose[5] * z,
@@ -27,7 +28,7 @@ def turned(pose, x, y, z):
 
 @njit(cache=True, nogil=True, inline="always")
 def placed(pose, x, y, z):
-    """Returns a point (x, y, z) of the world in the camera's frame, mm."""
+    """Transforms a point (x, y, z) from the world frame to the camera frame, mm."""
     a, b, c = turned(pose, x, y, z)
     return a + pose[9], b + pose[10], c + pose[11]
 
@@ -41,7 +42,7 @@ def pinhole(x, y, lens):
 @njit(cache=True, nogil=True, fastmath=True)
 def distorted(x, y, lens):
     """Returns the pixel (column, row) of the ray (x, y, 1) in the camera's frame, with Brown-Conrady distortion as in
-    ``rig.camera``; NOWHERE beyond the radius at which that is valid."""
+    ``rig.camera``; NOWHERE beyond the radius at which the distortion is valid."""
     r2 = x * x + y * y
     if r2 > lens[9] * lens[9]:
         return NOWHERE, NOWHERE
@@ -53,8 +54,8 @@ def distorted(x, y, lens):
 
 @njit(cache=True, nogil=True, inline="always")
 def distortion_slopes(x, y, lens):
-    """Returns the derivatives of ``distorted``, px for each unit of the ray: of the column by x and by y, of the row by
-    x and by y."""
+    """Returns the derivatives of ``distorted`` (px per unit of the ray): of the column by x and y, of the row by x and
+    y."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
     slope = 2.0 * (lens[4] + r2 * (2.0 * lens[5] + 3.0 * r2 * lens[8]))
@@ -76,7 +77,7 @@ def project(camera, x, y, z):
 
 @njit(cache=True, nogil=True, inline="always")
 def projection_slopes(camera, x, y, z):
-    """Returns the derivatives of ``project`` by the world point (px per mm): three of the column, and three of the
+    """Returns the derivatives of ``project`` by the world point (px per mm): three for the column, and three for the
     row."""
     a, b, depth = placed(camera, x, y, z)
     per = 1.0 / depth
@@ -106,8 +107,8 @@ def project_all(camera: np.ndarray, points: np.ndarray) -> np.ndarray:
 def rasterise(
     pixels: np.ndarray, depths: np.ndarray, faces: np.ndarray, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draws a mesh and returns, for every pixel centre, the depth (height, width; float32, camera z in mm, inf where
-    there is nothing) and the visible face's index (int32, -1 for none).
+    """Draws a mesh and returns, for every pixel centre, the depth (height, width; float32, camera z in mm, inf beside
+    the mesh) and the visible face's index (int32, -1 beside the mesh).
 
     ``pixels`` (v, 2) and ``depths`` (v) are the projected vertices, float64. A triangle with a vertex that is not
     finite or not in front of the camera is left out. Depth is perspective-correct: 1/z is linear in the image.
@@ -141,8 +142,8 @@ def rasterise(
 def interpolate(
     seen: np.ndarray, pixels: np.ndarray, depths: np.ndarray, faces: np.ndarray, values: np.ndarray
 ) -> np.ndarray:
-    """Interpolates values of the vertices (v, c) at every pixel of a mesh that ``rasterise`` drew, perspective-correct.
-    Returns (height, width, c) float32; NaN where no face is ``seen``."""
+    """Interpolates vertex values (v, c) at every pixel of a mesh that ``rasterise`` drew, perspective-correct. Returns
+    (height, width, c) float32; NaN at pixels where ``seen`` holds no face."""
     height, width = seen.shape
     out = np.full((height, width, values.shape[1]), np.nan, np.float32)
     for y in range(height):

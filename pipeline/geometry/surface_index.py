@@ -1,5 +1,5 @@
 """Finds closest points on triangle surfaces, exactly among the triangles near the closest surface samples; also lists
-the faces at each vertex.
+the faces around each vertex.
 
 Lengths are in mm, in any common frame."""
 
@@ -20,15 +20,15 @@ def closest_candidates(
     facing: Float[np.ndarray, "n 3"] | None = None,
     facing_mm: float = 0.0,
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Finds, for each point, the closest of its candidate triangles, and the barycentric coordinates of its closest
-    point.
+    """Finds, for each point, the closest of its candidate triangles, and the barycentric coordinates of the closest
+    point on it.
 
     Args:
         points: the query points.
-        candidates: rows of ``corners`` for each point; of equally close ones the first is taken.
-        corners: of the triangles.
+        candidates: indices into ``corners`` for each point; of equally close triangles the first is chosen.
+        corners: corner positions of all triangles.
         facing: unit normals of the points; a triangle that faces the opposite way counts as ``facing_mm`` farther away.
-        facing_mm: that distance.
+        facing_mm: the additional distance.
     """
     triangle, weights = np.zeros(len(points), np.int64), np.zeros((len(points), 3))
     places, rows = np.ascontiguousarray(points, float), np.ascontiguousarray(candidates, np.int64)
@@ -47,8 +47,8 @@ _CANDIDATES = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """Holds, for each query point, its closest point on the surface, the triangle of that point, barycentric weights
-    there, and the distance."""
+    """Holds, for each query point, its closest point on the surface, the triangle of this point, its barycentric
+    weights, its normal, and the distance."""
 
     points: Float[np.ndarray, "N 3"]
     triangles: Int[np.ndarray, " N"]  # row of ``faces``
@@ -74,8 +74,8 @@ class SurfaceIndex:
         facing: Float[np.ndarray, "N 3"] | None = None,
         facing_mm: float = 10.0,
     ) -> Hits:
-        """Finds the closest surface point of each query point. With unit normals ``facing`` of the points, a triangle
-        that faces the opposite way is chosen only if it is nearer by ``facing_mm``, so that lips that touch are kept
+        """Finds the closest surface point of each query point. If unit normals ``facing`` of the points are given, a
+        triangle that faces the opposite way is chosen only if it is nearer by ``facing_mm``; this keeps touching lips
         apart."""
         count = min(candidates, len(self._owner))
         near = nearest(self._tree, points, count=count)[1].reshape(len(points), count)
@@ -93,7 +93,7 @@ class SurfaceIndex:
 def _samples(
     corners: Float[np.ndarray, "F 3 3"], spacing: float
 ) -> tuple[Float[np.ndarray, "S 3"], Int[np.ndarray, " S"]]:
-    """Returns sample points on the triangles and the triangle of each: the centroid, and more points in large
+    """Returns sample points on the triangles and the triangle of each sample: the centroid, and more points in large
     triangles."""
     longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).max(1)
     parts = np.clip(np.ceil(longest / spacing / 1.5), 1, 12).astype(int)
@@ -110,15 +110,15 @@ def _samples(
 def corners_at_vertices(
     faces: Int[np.ndarray, "f 3"], count: int
 ) -> tuple[Int64[np.ndarray, " v1"], Int64[np.ndarray, " e"]]:
-    """Returns the corners of faces at each of ``count`` vertices as compressed rows, ``start`` and ``corner``: those of
-    vertex i are ``corner[start[i]:start[i + 1]]``. Corner 3 f + k is the k-th of face f."""
+    """Returns the face corners at each of ``count`` vertices in compressed rows: the corners at vertex i are
+    ``corner[start[i]:start[i + 1]]``. Corner 3 f + k is the k-th corner of face f."""
     return sort_corners(np.array(faces, np.int32, order="C"), count)
 
 
 def facing_cosine(
     place: Float[np.ndarray, " 3"], points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns the cosine between the unit normal of each point and the direction from the point to a place."""
+    """Returns the cosine between the unit normal of each point and the direction from the point to another point."""
     return cosines_towards(
         np.ascontiguousarray(place, float), np.ascontiguousarray(points, float), np.ascontiguousarray(normals, float)
     )

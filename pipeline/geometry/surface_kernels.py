@@ -1,4 +1,4 @@
-"""Compiled loops of ``pipeline.geometry.surface_index``, and a search among the triangles of nearby vertices."""
+"""Holds the compiled loops of ``pipeline.geometry.surface_index``, and a search among triangles of nearby vertices."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from rig.jit import njit
 
 
 class FannedMesh(NamedTuple):
-    """Holds a triangle mesh with unit vertex normals. The triangles at vertex v are ``member[start[v]:start[v +
+    """Holds a triangle mesh with unit vertex normals. The triangles around vertex v are ``member[start[v]:start[v +
     1]]``."""
 
     vertices: np.ndarray
@@ -20,8 +20,8 @@ class FannedMesh(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def closest_on_triangle(x, y, z, one, other, third):
-    """Returns the closest point of a triangle to (x, y, z), as barycentric weights of its second and third corner, and
-    the squared distance. After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.5."""
+    """Returns the closest point of a triangle to (x, y, z), as barycentric weights of the second and third corner, and
+    the squared distance. The method is from C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.5."""
     abx, aby, abz = other[0] - one[0], other[1] - one[1], other[2] - one[2]
     acx, acy, acz = third[0] - one[0], third[1] - one[1], third[2] - one[2]
     apx, apy, apz = x - one[0], y - one[1], z - one[2]
@@ -56,12 +56,12 @@ def closest_on_triangle(x, y, z, one, other, third):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def closest_at_vertices(first, last, points, normals, near, surface, min_agreement, triangle, blend, square):
-    """Finds the closest triangle for points ``first`` to ``last`` among those at the vertices ``near`` (n, candidates).
-    A vertex counts only if the cosine between its normal and the point's is at least ``min_agreement``.
+    """Finds the closest triangle for points ``first`` to ``last`` among the triangles around the vertices ``near`` (n,
+    candidates). Vertices are skipped if the cosine between their normal and the point's normal is below
+    ``min_agreement``.
 
-    Fills ``triangle`` (n; -1 if no vertex counts), its barycentric weights ``blend`` (n, 3), and the ``square`` of the
-    distance (n). A row of ``near`` ends at the first entry that equals the number of vertices.
-    """
+    Fills ``triangle`` (n; -1 if all vertices were skipped), its barycentric weights ``blend`` (n, 3), and the
+    ``square`` of the distance (n). A row of ``near`` ends at the first entry that equals the number of vertices."""
     vertices, vertex_normals, faces, start, member = surface
     for p in range(first, last):
         triangle[p] = -1
@@ -92,13 +92,12 @@ def closest_at_vertices(first, last, points, normals, near, surface, min_agreeme
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def closest_of_candidates(first, last, points, candidates, corners, facing, facing_mm, triangle, weights):
-    """Finds the closest of the ``candidates`` (n, k; triangles) for points ``first`` to ``last``. Fills ``triangle``
-    (n) and its barycentric ``weights`` (n, 3).
+    """Finds the closest of the triangles ``candidates`` (n, k) for points ``first`` to ``last``. Fills ``triangle`` (n)
+    and the barycentric ``weights`` of the closest point (n, 3).
 
     If ``facing`` (n, 3; unit normals of the points) is not empty, a triangle that faces the opposite way counts as
-    ``facing_mm`` farther away, and one at a right angle as half of that. ``corners`` (t, 3, 3) are the triangles'
-    corners.
-    """
+    ``facing_mm`` farther away, and a perpendicular one as half of this. ``corners`` (t, 3, 3) are the corner positions
+    of all triangles."""
     for p in range(first, last):
         least = np.inf
         x, y, z = points[p]
@@ -127,7 +126,7 @@ def _cosine(corners, direction):
 @njit(cache=True, nogil=True)
 def sort_corners(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Sorts the corners of faces (f, 3) by vertex (a counting sort). The corners of vertex v are
-    ``corner[start[v]:start[v + 1]]``, in ascending order; a corner's number counts row by row."""
+    ``corner[start[v]:start[v + 1]]``, in ascending order; corner 3 f + k is the k-th corner of face f."""
     start, corner = np.zeros(count + 1, np.int64), np.empty(faces.size, np.int64)
     for f in range(len(faces)):
         for k in range(3):
@@ -145,7 +144,7 @@ def sort_corners(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cosines_towards(place: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Returns the cosine between the unit normal (n, 3) of each of the points (n, 3) and the direction to a place."""
+    """Returns the cosine between the unit normal (n, 3) of each of the points (n, 3) and the direction to one place."""
     cosine = np.empty(len(points))
     for n in range(len(points)):
         x, y, z = place[0] - points[n, 0], place[1] - points[n, 1], place[2] - points[n, 2]

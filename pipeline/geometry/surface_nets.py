@@ -1,10 +1,10 @@
-"""Makes surface nets: a mesh of the zero level of a field on a grid's nodes.
+"""Computes surface nets: a mesh of the zero level of a scalar field on the nodes of a grid.
 
-Gibson, *Constrained elastic surface nets*, 1998, the naive kind: every cell with corners of both signs has a vertex at
-the mean of its edges' zero crossings, and every edge with both signs has a quadrilateral. In: a field, negative inside,
-at the nodes of a sparse grid, positive on the outermost ones. Out: vertices in grid steps, triangles facing outwards.
-The mesh is closed; it is a manifold if the signs are well composed (``pipeline.fusion.grid_kernels``).
-"""
+The method is the naive version of Gibson, *Constrained elastic surface nets*, 1998: every cell with corners of both
+signs gets a vertex at the mean of its edges' zero crossings, and every edge with both signs gets a quadrilateral. The
+input is a field, negative inside, at the nodes of a sparse grid; it must be positive on the outermost nodes. The output
+is vertices in units of the grid step, and triangles that face outwards. The mesh is closed; it is a manifold if the
+field's signs are well composed (``pipeline.fusion.grid_kernels``)."""
 
 from dataclasses import dataclass
 
@@ -16,8 +16,8 @@ from pipeline.geometry.surface_nets_kernels import linked, net_faces, net_vertic
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceNet:
-    """Holds a mesh in units of the grid's step. ``of_cell`` is the vertex in the cell whose lowest corner is the node;
-    -1 if the cell has none."""
+    """Holds a mesh in units of the grid step. ``of_cell`` holds, for each node, the vertex in the cell whose lowest
+    corner is this node; -1 if the cell has no vertex."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int32[np.ndarray, "f 3"]
@@ -25,17 +25,17 @@ class SurfaceNet:
 
 
 def node_keys(index: Int32[np.ndarray, "n 3"], shape: tuple[int, int, int]) -> Int64[np.ndarray, " n"]:
-    """Returns the number of each node in the full box, counted with the last index fastest."""
+    """Returns the number of each node in the full grid, counted with the last index fastest."""
     wide = index.astype(np.int64)
     return (wide[:, 0] * shape[1] + wide[:, 1]) * shape[2] + wide[:, 2]
 
 
 def link_nodes(index: Int32[np.ndarray, "n 3"], shape: tuple[int, int, int]) -> Int32[np.ndarray, "n 6"]:
-    """Returns the rows of each node's neighbours towards -x +x -y +y -z +z, -1 if there is none.
+    """Returns the indices of each node's neighbours in the directions -x +x -y +y -z +z, -1 if there is no neighbour.
 
     Args:
-        index: of the nodes, in the order of ``node_keys``.
-        shape: of the full grid.
+        index: positions of the nodes in the full grid, in the order of ``node_keys``.
+        shape: the number of nodes of the full grid along each axis.
     """
     return linked(index, node_keys(index, shape), shape[1], shape[2])
 
@@ -43,11 +43,11 @@ def link_nodes(index: Int32[np.ndarray, "n 3"], shape: tuple[int, int, int]) -> 
 def surface_net(
     field: Float32[np.ndarray, " n"], index: Int32[np.ndarray, "n 3"], neighbours: Int32[np.ndarray, "n 6"]
 ) -> SurfaceNet:
-    """Builds the mesh of the field's zero on a sparse grid; each quadrilateral is split along its shorter diagonal.
+    """Builds the mesh of a field's zero level on a sparse grid; each quadrilateral is split along its shorter diagonal.
 
     Args:
-        field: at the nodes; negative inside.
-        index: of the nodes in the full grid, in the order of ``node_keys``.
+        field: the field's values at the nodes, negative inside.
+        index: positions of the nodes in the full grid, in the order of ``node_keys``.
         neighbours: the result of ``link_nodes``; every cell with both signs must be complete.
     """
     vertices, of_cell = net_vertices(field, index, neighbours)

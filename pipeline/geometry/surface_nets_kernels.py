@@ -1,5 +1,5 @@
-"""Compiled loops of ``pipeline.geometry.surface_nets``. The nodes of a sparse grid are sorted by their rank in the full
-grid."""
+"""Holds the compiled loops of ``pipeline.geometry.surface_nets``. The nodes of a sparse grid are sorted by their number
+in the full grid."""
 
 import numpy as np
 
@@ -12,9 +12,9 @@ EDGES = np.array(
 
 @njit(cache=True, nogil=True, inline="always")
 def corners_of(n: int, neighbours: np.ndarray, corners: np.ndarray) -> bool:
-    """Fills ``corners`` (8) with the rows of the corners of the cell whose lowest node is ``n``; returns False if a
-    corner is missing from the grid. Corner c has the offset (c >> 2, (c >> 1) & 1, c & 1). ``neighbours`` is the result
-    of ``linked``."""
+    """Fills ``corners`` (8) with the node indices of the cell whose lowest node is ``n``; returns False if the grid
+    lacks a corner. Corner c has the offset (c >> 2, (c >> 1) & 1, c & 1). ``neighbours`` is the result of ``linked``.
+    """
     for c in range(8):
         at = n
         if c & 4:
@@ -31,7 +31,8 @@ def corners_of(n: int, neighbours: np.ndarray, corners: np.ndarray) -> bool:
 
 @njit(cache=True, nogil=True)
 def linked(index: np.ndarray, keys: np.ndarray, ny: int, nz: int) -> np.ndarray:
-    """Returns the rows (n, 6) of the neighbours of every node: below and above along x, then y, then z; -1 for none.
+    """Returns the indices (n, 6) of every node's neighbours: below and above along x, then y, then z; -1 if there is no
+    neighbour.
 
     ``index`` (n, 3) are the nodes' positions, ``keys`` (n, ascending) their ranks in a full grid of ``ny`` by ``nz``
     nodes for each x.
@@ -56,8 +57,8 @@ def linked(index: np.ndarray, keys: np.ndarray, ny: int, nz: int) -> np.ndarray:
 @njit(cache=True, nogil=True)
 def net_vertices(field: np.ndarray, index: np.ndarray, neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the vertices (float64, in grid steps) of the surface net: in each cell that the surface crosses, the mean
-    of the points where it crosses the cell's edges. Also returns the vertex (int32) of each node's cell, -1 for
-    none."""
+    of its crossings with the cell's edges. Also returns the vertex index (int32) of each node's cell, -1 for a cell
+    without a vertex."""
     corners = np.empty(8, np.int64)
     of_cell = np.full(len(field), -1, np.int32)
     vertices = np.empty((len(field), 3))
@@ -86,8 +87,8 @@ def net_vertices(field: np.ndarray, index: np.ndarray, neighbours: np.ndarray) -
 
 @njit(cache=True, nogil=True)
 def net_faces(field: np.ndarray, neighbours: np.ndarray, vertices: np.ndarray, of_cell: np.ndarray) -> np.ndarray:
-    """Returns the triangles (int32, facing outwards) of the surface net: two for every edge of the grid whose ends
-    differ in sign, joining the vertices of the four cells around it. The quadrilateral is split along its shorter
+    """Returns the triangles (int32, facing outwards) of the surface net: two for every grid edge whose ends differ in
+    sign, between the vertices of the four cells around the edge. Each quadrilateral is split along its shorter
     diagonal."""
     faces = np.empty((6 * len(vertices) + 16, 3), np.int32)
     made = 0

@@ -1,1 +1,1 @@
-"""Holds head models (section 3): the mean head, its modes, landmarks, expressions and levels of detail."""
+"""Holds head models (the paper's section 3): mean head, modes, landmarks, expressions and meshes."""

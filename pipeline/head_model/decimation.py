@@ -12,7 +12,7 @@ from rig.mesh import face_normals
 
 
 class _Collapser:
-    """Holds the state of one decimation: triangles by vertex, quadrics, and a lazy heap of half-edge collapses."""
+    """Holds the state of one decimation: triangles around each vertex, quadrics, and a heap of half-edge collapses."""
 
     # Lists of floats, not arrays: on vectors of three numpy's overhead is ten times the arithmetic.
     def __init__(
@@ -42,7 +42,7 @@ class _Collapser:
         return {w for k in self.at[v] for w in self.faces[k]} - {v}
 
     def push_from(self, v: int) -> None:
-        """Adds the collapses of v into each neighbour to the heap."""
+        """Adds the collapses of vertex v into each of its neighbours to the heap."""
         if self.fixed[v]:
             return
         for u in self.ring(v):
@@ -66,7 +66,8 @@ class _Collapser:
         return all(self._survives(k, v, u) for k in self.at[v] - shared)
 
     def _survives(self, k: int, v: int, u: int) -> bool:
-        """Tells whether the triangle neither folds (in surface or chart) nor gets a sliver if corner v moves to u."""
+        """Returns whether triangle k neither folds (in space or in the chart) nor becomes a sliver if its corner v
+        moves to u."""
         corners, moved = self.faces[k], [u if w == v else w for w in self.faces[k]]
         if self.chart is not None and _turn(self.chart, corners) * _turn(self.chart, moved) <= 0:
             return False
@@ -107,13 +108,14 @@ def _squared(a: list[float], b: list[float]) -> float:
 
 
 def _turn(chart: list[list[float]], corners: Sequence[int]) -> float:
-    """Returns twice the triangle's signed area in the chart."""
+    """Returns twice the signed area of a triangle in the chart (texture coordinates)."""
     (ax, ay), (bx, by), (cx, cy) = (chart[w] for w in corners)
     return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
 
 
 def _quadrics(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 10"]:
-    """Returns each vertex's sum of squared plane distances, weighted by area: xx xy xz yy yz zz xd yd zd dd."""
+    """Returns, for each vertex, the quadric that sums its squared plane distances weighted by area: xx xy xz yy yz zz
+    xd yd zd dd."""
     normals = face_normals(vertices, faces)
     area = np.linalg.norm(normals, axis=1)
     x, y, z = (normals / np.maximum(area, 1e-12)[:, None]).T
@@ -134,8 +136,8 @@ def decimate(
     fixed: Bool[np.ndarray, " V"],
     chart: Float[np.ndarray, "V 2"] | None = None,
 ) -> list[tuple[Int[np.ndarray, " _"], Int[np.ndarray, "_ 3"]]]:
-    """Reduces a mesh to each of the decreasing numbers of triangles in ``targets``. Returns, for each, the remaining
-    vertices (indices, ascending) and the triangles among them.
+    """Reduces a mesh to each of the decreasing numbers of triangles in ``targets``. Returns, for each target, the
+    remaining vertices (indices, ascending) and the triangles between them.
 
     ``importance`` multiplies the error of a vertex: where it is high the mesh stays denser. All ``fixed`` vertices
     remain. With a ``chart`` (texture coordinates) no triangle turns over in it. A result has more triangles than its

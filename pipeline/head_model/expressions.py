@@ -1,10 +1,10 @@
-"""Defines the expressions of a head model: displacements in addition to the identity, each with a weight from 0 to 1.
+"""Defines the expressions of a head model: displacements that are added to the identity, each with a weight from 0 to
+1.
 
-A head is ``mean + sum_m z_m modes_m + sum_e w_e shapes_e``: identity is Gaussian, expressions are blendshapes.
-Expressions retain the names of their source. Other programs use Apple's 52 names
-(https://developer.apple.com/documentation/arkit/arfaceanchor/blendshapelocation); ``arkit_parts`` maps these to a
-model's shapes.
-"""
+A head is ``mean + sum_m z_m modes_m + sum_e w_e shapes_e``: the identity coefficients z are Gaussian, the expressions
+are blendshapes with weights w. Expressions keep the names that they have in the model's source. Other programs use
+Apple's 52 names (https://developer.apple.com/documentation/arkit/arfaceanchor/blendshapelocation); ``arkit_parts`` maps
+Apple's names to a model's blendshapes."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -37,8 +37,8 @@ ARKIT = tuple(sorted([*_WHOLE, *(f"{name}{side}" for name in _SIDED for side in 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expressions:
-    """Holds the expressions of a model as displacements of the cage's vertices (head frame). The arrays are
-    read-only."""
+    """Holds the expressions of a model as displacements (mm, head frame) of the vertices of its coarsest mesh, the
+    cage. The arrays are read-only."""
 
     names: tuple[str, ...]
     shapes: Float32[np.ndarray, "E V0 3"]  # mm at weight 1
@@ -47,8 +47,8 @@ class Expressions:
         return len(self.names)
 
     def moved(self, weights: Mapping[str, float]) -> Float[np.ndarray, "V0 3"]:
-        """Returns the displacement of each vertex of the cage (mm) for weights that are named by expression. Raises
-        KeyError for an unknown expression."""
+        """Returns the displacement of each vertex of the coarsest mesh, the cage (mm), for weights indexed by
+        expression name. Raises KeyError for an unknown expression."""
         out = np.zeros(self.shapes.shape[1:])
         for name, weight in weights.items():
             if name not in self.names:
@@ -58,12 +58,12 @@ class Expressions:
 
 
 def no_expressions(vertices: int) -> Expressions:
-    """Returns an empty set of expressions for a cage with this many vertices."""
+    """Returns an empty set of expressions for a mesh with this many vertices."""
     return Expressions((), np.zeros((0, vertices, 3), np.float32))
 
 
 def visible(expressions: Expressions) -> Expressions:
-    """Returns the expressions that move some vertex of the skin by ``MIN_MM`` or more."""
+    """Returns the expressions that move at least one vertex of the skin by ``MIN_MM`` or more."""
     kept = np.linalg.norm(expressions.shapes, axis=2).max(axis=1) >= MIN_MM if len(expressions) else np.zeros(0, bool)
     names = tuple(name for name, keep in zip(expressions.names, kept, strict=True) if keep)
     return Expressions(names, expressions.shapes[kept])
@@ -81,9 +81,9 @@ def words(name: str) -> str:
 
 
 def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    """Returns, for each of Apple's 52 names, the indices of the model's shapes that together correspond to it; empty if
-    none does. That is the shape of the same name. If the model has two shapes for one name, it is both, the left and
-    the right one (ICT-FaceKit's cheekPuff_L and cheekPuff_R)."""
+    """Returns, for each of Apple's 52 names, the indices of the model's blendshapes that together correspond to it;
+    empty if there is none. For most names this is exactly one blendshape, which has the same name. A model may instead
+    have two blendshapes for one name, left and right (ICT-FaceKit's cheekPuff_L and cheekPuff_R)."""
     known = {plain_name(name): k for k, name in enumerate(names)}
     found = {}
     for name in ARKIT:
@@ -93,8 +93,8 @@ def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
 
 
 def weights_from_text(texts: Sequence[str], names: tuple[str, ...]) -> dict[str, float]:
-    """Reads texts such as ``mouthSmile_L=0.5``, and returns the weights by the model's name of the expression. Apple's
-    names are accepted, too. Raises InputError that names every fault."""
+    """Parses texts such as ``mouthSmile_L=0.5``, and returns the weights by the model's expression names. Texts may
+    also use Apple's names. Raises InputError that lists every fault."""
     known = {plain_name(name): name for name in names} | {name: name for name in names}
     found, faults = {}, []
     for text in texts:
@@ -117,7 +117,7 @@ def weights_from_text(texts: Sequence[str], names: tuple[str, ...]) -> dict[str,
 
 
 def closed_lids(weights: Mapping[str, float]) -> dict[str, float]:
-    """Returns how far the blink weights close each eye (``right``, ``left``), from 0 (open) to 1."""
+    """Returns how far the blink weights close each eye (``right``, ``left``), from 0 (open) to 1 (closed)."""
     found: dict[str, float] = dict.fromkeys(("right", "left"), 0.0)
     for name, weight in weights.items():
         side = BLINKS.get(plain_name(name))
@@ -127,8 +127,8 @@ def closed_lids(weights: Mapping[str, float]) -> dict[str, float]:
 
 
 def packed(expressions: Expressions) -> dict[str, np.ndarray]:
-    """Packs expressions into the arrays of a model file: only the vertices that each shape moves, in float16 (an error
-    of 0.004 mm in a centimetre)."""
+    """Packs expressions into the arrays of a model file: only the vertices that each expression moves, in float16
+    (error 0.004 mm for a displacement of 1 cm)."""
     moved = np.abs(expressions.shapes).max(axis=2) > SPARSE_MM
     return {
         "expression_counts": moved.sum(axis=1).astype(np.int32),
@@ -138,8 +138,8 @@ def packed(expressions: Expressions) -> dict[str, np.ndarray]:
 
 
 def unpacked(names: list[str], arrays: Mapping[str, np.ndarray], vertices: int) -> Expressions:
-    """Returns the expressions from arrays that ``packed`` made, for a cage with this many vertices. Raises ValueError
-    if the arrays contradict each other."""
+    """Returns the expressions from arrays made by ``packed``, for a mesh with this many vertices. Raises ValueError if
+    the arrays do not fit each other."""
     counts, rows, moves = (arrays[f"expression_{part}"] for part in ("counts", "vertices", "moves"))
     if len(counts) != len(names) or counts.sum() != len(rows) or moves.shape != (len(rows), 3):
         raise ValueError("its expressions' arrays do not fit each other")
@@ -151,7 +151,7 @@ def unpacked(names: list[str], arrays: Mapping[str, np.ndarray], vertices: int) 
 
 
 def _mixture(**weights: float) -> dict[str, float]:
-    """Returns weights by Apple's names; a name of ``_PAIRS`` stands for both sides."""
+    """Returns weights by Apple's names; a name in ``_PAIRS`` stands for the left and the right expression."""
     out = {}
     for name, weight in weights.items():
         both = [f"{_PAIRS[name]}{side}" for side in ("Left", "Right")] if name in _PAIRS else [name]
@@ -182,7 +182,7 @@ VISEMES: Mapping[str, Mapping[str, float]] = {
 
 
 def mixed(shapes: Mapping[str, Float[np.ndarray, "v 3"]], mixture: Mapping[str, float]) -> Float[np.ndarray, "v 3"]:
-    """Returns the displacement of a mixture; missing shapes contribute nothing."""
+    """Returns the displacement of a weighted sum of blendshapes; missing blendshapes contribute nothing."""
     out = np.zeros_like(next(iter(shapes.values())))
     for name, weight in mixture.items():
         if name in shapes:

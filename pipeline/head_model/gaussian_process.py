@@ -1,17 +1,16 @@
-"""Adds modes that let the solver leave the span of the eigenheads: smooth deformations that need not occur in the
-population.
+"""Adds modes to a head model with which the solver can leave the span of the eigenheads: smooth deformations that need
+not occur in the population.
 
-It is a Gaussian process on the mean surface, as in Gaussian process morphable models (Luethi et al. 2018,
-https://doi.org/10.1109/TPAMI.2017.2739743): displacement along the mean's normal with the covariance
+The modes come from a Gaussian process on the mean surface, as in Gaussian process morphable models (Luethi et al. 2018,
+https://doi.org/10.1109/TPAMI.2017.2739743): displacement along the mean's normal with the covariance k.
 
     k(x, y) = sum_i a_i^2 [ (1 - f) (g_i(x, y) + g_i(x, My)) + f g_i(x, y) ],
     g_i(x, y) = exp(-|x - y|^2 / (2 l_i^2)),
 
-where M mirrors at the median plane: faces deviate from their population mostly symmetrically. Its leading
-eigenfunctions (Nystroem's method on a subset of the cage) are scaled by their standard deviations and appended to the
-eigenheads as modes with unit prior, orthogonal to the span of the eigenheads. They move along the normal only, since
-sliding along the surface changes no silhouette.
-"""
+Here M mirrors at the median plane, because faces deviate from their population mostly symmetrically. The leading
+eigenfunctions of this process are computed by Nystroem's method on a subset of the vertices, scaled by their standard
+deviations and appended to the eigenheads as modes with unit prior, orthogonal to the span of the eigenheads.
+Displacements are along the normal only, because sliding along the surface changes no silhouette."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ KEPT = 0.98  # share of the process's variance that the modes must carry
 
 @dataclass(frozen=True, slots=True)
 class KernelScale:
-    """Holds the length and the amplitude (mm) of one Gaussian in the covariance of the Gaussian process."""
+    """Holds the correlation length and the amplitude (mm) of one Gaussian in the covariance of the Gaussian process."""
 
     length_mm: float
     amplitude_mm: float
@@ -45,9 +44,8 @@ FREE = 0.4  # share of the variance that need not be symmetric
 
 
 def with_kernel(model: HeadModel, count: int, *, most: int = 300) -> HeadModel:
-    """Returns the model with its first ``count`` eigenheads as modes, followed by at most ``most`` modes of the
-    Gaussian process: displacements of the cage's vertices along their normals (mm per standard deviation), orthogonal
-    to the eigenheads."""
+    """Returns the model with its first ``count`` eigenheads, followed by at most ``most`` modes of the Gaussian
+    process."""
     span = with_modes(model, count)
     points = span.mean.astype(float)
     nodes = spread_nodes(points, min(NODES, len(points)))
@@ -60,12 +58,11 @@ def with_kernel(model: HeadModel, count: int, *, most: int = 300) -> HeadModel:
 
 
 def with_fine_kernel(model: HeadModel, *, length_mm: float, amplitude_mm: float) -> HeadModel:
-    """Returns the model with more modes, of a shorter length, that deform the face region only, for solvers that see
-    more of the face than its outline.
+    """Returns the model with additional modes of a shorter correlation length that deform only the face region, for
+    solvers that use more of the face than its outline.
 
-    The modes fade out over half a length beyond the region. They are not orthogonal to the other modes, because the
-    prior variances of all lengths should add up.
-    """
+    The modes fade out over half a correlation length beyond the region. The new modes are not orthogonal to the model's
+    other modes, because the prior variances of all correlation lengths should add up."""
     level = model.levels["cage"]
     points = model.mean.astype(float)
     inside = points[level.face_region]
@@ -85,8 +82,9 @@ def _leading_fields(
     process: Callable[[np.ndarray, np.ndarray], Float[np.ndarray, "_ _"]],
     most: int,
 ) -> Float[np.ndarray, "r v"]:
-    """Returns the leading eigenfunctions, at most so many, of the process with the covariance ``process``, each scaled
-    by its standard deviation. Nystroem: f_k(x) = k(x, nodes) u_k / sqrt(value_k) has covariance sum_k f_k f_k^T ~ k."""
+    """Returns at most ``most`` leading eigenfunctions of the Gaussian process with the covariance ``process``, each
+    scaled by its standard deviation. Nystroem's formula is f_k(x) = k(x, nodes) u_k / sqrt(value_k); its covariance is
+    sum_k f_k f_k^T ~ k."""
     values, vectors = np.linalg.eigh(process(nodes, nodes))
     order = np.argsort(values)[::-1]
     share = np.cumsum(values[order]) / values.sum()
@@ -105,7 +103,7 @@ def _with_more_modes(model: HeadModel, modes: Float[np.ndarray, "r v0 3"]) -> He
 def covariance(
     x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "m 3"], scales: tuple[KernelScale, ...]
 ) -> Float[np.ndarray, "n m"]:
-    """Returns the covariance k(x, y) of the displacements at points x and y (mm^2); positions in mm, head frame."""
+    """Returns the covariance k(x, y) (mm^2) of the displacements at points x and y (head frame, mm)."""
     direct, mirrored = _square_distance(x, y), _square_distance(x, y * (-1.0, 1.0, 1.0))
     total = np.zeros_like(direct)
     for scale in scales:
@@ -121,8 +119,8 @@ def _square_distance(x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "m 3"]) -
 
 
 def spread_nodes(points: Float[np.ndarray, "v 3"], count: int) -> Int[np.ndarray, " n"]:
-    """Chooses ``count`` points that lie far from each other, by farthest-point sampling from the one with the largest
-    z. Returns their indices."""
+    """Chooses ``count`` points that are far from each other, by farthest-point sampling that starts at the point with
+    the largest z. Returns the indices of the chosen points."""
     nodes = np.empty(count, int)
     nodes[0] = int(np.argmax(points[:, 2]))
     distance = np.full(len(points), np.inf)
@@ -134,15 +132,15 @@ def spread_nodes(points: Float[np.ndarray, "v 3"], count: int) -> Int[np.ndarray
 
 def model_basis(model: HeadModel, settings: Settings) -> HeadModel:
     """Returns the model with the modes that the settings require: eigenheads alone or, if the fit may leave their span,
-    eigenheads, modes of the Gaussian process, and expressions."""
+    also modes of the Gaussian process and expressions."""
     within_span = settings.detail == "span" or settings.method == "simplex"
     return basis_of(model, min(settings.fitting.modes, len(model.modes)), kernel=not within_span)
 
 
 @lru_cache(maxsize=2)  # models are few, jobs are many, and others keep what they make of the same model
 def basis_of(model: HeadModel, eigenheads: int, *, kernel: bool) -> HeadModel:
-    """Returns the model with its first ``eigenheads`` modes and, if ``kernel``, the modes of the Gaussian process and
-    the expressions after them."""
+    """Returns the model with its first ``eigenheads`` modes and, if ``kernel``, also the modes of the Gaussian process
+    and the expressions."""
     if not kernel:
         return with_modes(model, eigenheads)
     inputs = (model.mean, model.modes[:eigenheads], model.sigma[:eigenheads], model.levels["cage"].faces)

@@ -1,8 +1,8 @@
-"""Lists the 26 landmarks of section 3.2 by their anthropometric names, and the seven of them that section 4.2 uses.
+"""Lists the 26 landmarks of the paper's section 3.2 by their anthropometric names, and the seven of them that its
+section 4.2 uses.
 
-Right and left are the subject's. The definitions follow Farkas, *Anthropometry of the Head and Face* (1994);
-docs/models.md lists them for people who mark scans.
-"""
+Right and left are the subject's right and left. The definitions follow Farkas, *Anthropometry of the Head and Face*
+(1994); docs/models.md explains the landmarks to people who mark scans."""
 
 from collections.abc import Iterable, Mapping
 
@@ -56,6 +56,6 @@ def mirrored(name: str) -> str:
 
 
 def stacked(points: Mapping[str, Float[np.ndarray, " 3"]], names: Iterable[str] = NAMES) -> Float[np.ndarray, "L 3"]:
-    """Returns the positions of the landmarks ``names`` as rows of an array, in that order. Raises KeyError if one is
-    missing."""
+    """Returns the positions of the landmarks ``names`` as rows of an array, in that order. Raises KeyError if a
+    landmark is missing."""
     return np.array([points[name] for name in names], float).reshape(-1, 3)

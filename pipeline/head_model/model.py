@@ -1,12 +1,14 @@
-"""Defines eigenhead models (section 3.1, eq. 1): a mean head, its modes, and its levels of resolution.
+"""Defines eigenhead models (the paper's section 3.1, eq. 1): a mean head, its modes, and its meshes of several
+resolutions, called levels.
 
-A model is stored as a coarse cage (mean and modes) and a linear operator from cage vertices to each level. The default
-model refines its cage by Loop subdivision to at least 48,000 vertices. An imported model keeps its own vertices. Modes
-are scaled by their standard deviation, so coefficients are N(0, 1) (the paper's alpha_m = sigma_m z_m).
+A model is stored as a coarse control mesh, the cage (mean and modes), and a linear operator from the cage's vertices to
+each level's vertices. The default model is refined from its cage by Loop subdivision to at least 48,000 vertices. An
+imported model has exactly the vertices of its source file. Modes are scaled by their standard deviation, so
+coefficients are N(0, 1) (the paper's alpha_m equals sigma_m z_m).
 
-Memory of a loaded model: 12 (M + 1) V0 bytes for mean and modes (5 MB for the default's 137 modes), plus about 20 bytes
-per stored operator entry (13 MB). ``basis`` of a whole level is cached: 12 M V bytes (36 MB at full, 60 modes).
-"""
+A loaded model takes 12 (M + 1) V0 bytes for mean and modes (5 MB for the default's 137 modes), plus about 20 bytes for
+each entry of an operator (13 MB). ``basis`` caches the modes at all vertices of a level: 12 M V bytes (36 MB for the
+finest mesh and 60 modes)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -27,8 +29,8 @@ MODES_AT_ONCE = 16  # in double precision: they stay in the processor's cache
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """Holds one resolution of a head model. ``vertices_level = operator @ vertices_cage``; faces wind anticlockwise
-    seen from outside."""
+    """Holds one level of a head model, which is a mesh of one resolution. The level's vertices are ``operator @
+    vertices_cage``; faces are anticlockwise seen from outside."""
 
     faces: Int[np.ndarray, "F 3"]
     operator: sparse.csr_array  # (V, V0)
@@ -66,8 +68,8 @@ class HeadModel:
     _bases: dict[tuple[str, int], np.ndarray] = field(default_factory=dict, repr=False)
 
     def cage(self, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, "V0 3"]:
-        """Returns the vertices of the cage (head frame, mm) for the first m coefficients, given in standard deviations.
-        Raises ValueError for more coefficients than modes."""
+        """Returns the vertices of the coarse control mesh, the cage (head frame, mm), for the first m coefficients, in
+        standard deviations. Raises ValueError if there are more coefficients than modes."""
         count = len(coefficients)
         if count > len(self.modes):
             raise ValueError(f"{count} coefficients, but model {self.name} has {len(self.modes)} modes")
@@ -78,25 +80,24 @@ class HeadModel:
         return found.reshape(-1, 3)
 
     def vertices(self, coefficients: Float[np.ndarray, " m"], level: str = "full") -> Float[np.ndarray, "V 3"]:
-        """Returns the vertices of a level (head frame, mm) for the first coefficients, in standard deviations. Raises
-        KeyError for an unknown level."""
+        """Returns the vertices of the mesh ``level`` (head frame, mm) for the first m coefficients, in standard
+        deviations. Raises KeyError for an unknown level."""
         return self.levels[level].operator @ self.cage(coefficients)
 
     def posed_vertices(
         self, coefficients: Float[np.ndarray, " m"], weights: Mapping[str, float], level: str = "full"
     ) -> Float[np.ndarray, "V 3"]:
-        """Returns the vertices of a level (head frame, mm) with expressions added; ``weights`` are by name of
-        expression. Raises KeyError for an unknown level or expression."""
+        """Returns the vertices of the mesh ``level`` (head frame, mm) with expressions added; ``weights`` are indexed
+        by expression name. Raises KeyError for an unknown level or expression."""
         return self.levels[level].operator @ (self.cage(coefficients) + self.expressions.moved(weights))
 
     def basis(
         self, level: str, count: int, vertices: Int[np.ndarray, " S"] | None = None
     ) -> Float32[np.ndarray, "m S 3"]:
-        """Returns the first ``count`` modes at all vertices of a level, or only at ``vertices`` (mm per standard
-        deviation).
+        """Returns the first ``count`` modes at all vertices of the mesh ``level``, or only at the indices ``vertices``
+        (mm per standard deviation).
 
-        The basis of a whole level is cached and read-only; that of a few vertices is computed anew.
-        """
+        The modes at all vertices are cached and read-only; those at a few vertices are computed anew."""
         if vertices is not None:
             return self._rows(self.levels[level].operator[np.asarray(vertices)], count)
         key = (level, count)
@@ -112,8 +113,8 @@ class HeadModel:
 
 
 def assemble(parts: ModelParts, sha256: str) -> HeadModel:
-    """Builds the model in memory from the parts of a model file: operators, borders and landmarks of every level.
-    Arrays become read-only."""
+    """Builds the model in memory from the parts of a model file: operators, borders and landmarks of every mesh. Arrays
+    become read-only."""
     count = len(parts.mean)
     expressions = parts.expressions or no_expressions(count)
     full, full_faces = refine(parts.faces, count, parts.subdivisions)
@@ -168,7 +169,7 @@ def _frozen(array: np.ndarray) -> np.ndarray:
 
 
 def load_model(name_or_path: str | Path = "default") -> HeadModel:
-    """Loads a head model by its name (shipped, or in the user's folder) or from a file. Raises
+    """Loads a head model by its name (shipped with the program, or in the user's folder) or from a file. Raises
     UnknownModel or BadModel."""
     parts, sha256 = read_parts(model_path(name_or_path))
     return assemble(parts, sha256)
@@ -188,8 +189,8 @@ def with_modes(model: HeadModel, count: int) -> HeadModel:
 
 
 def with_expressions(model: HeadModel) -> HeadModel:
-    """Returns the model with its expressions appended as modes, so that their coefficients are the expressions'
-    weights. A model without expressions, or with these modes already, is returned unchanged."""
+    """Returns the model with its expressions appended as modes, whose coefficients are the expression weights. A model
+    without expressions, or with expressions already appended, is returned unchanged."""
     count = len(model.expressions)
     if not count or len(model.posed):
         return model
@@ -204,8 +205,8 @@ def with_expressions(model: HeadModel) -> HeadModel:
 
 
 def model_info(model: HeadModel) -> dict[str, Any]:
-    """Returns the description of a model as JSON types. ``vertices`` and ``faces`` are those of the full level;
-    unmeasured figures are None."""
+    """Returns a description of the model that can be written as JSON. ``vertices`` and ``faces`` are counts of the
+    finest mesh; quality figures that were not measured are None."""
     full = model.levels["full"]
     return {
         "name": model.name,

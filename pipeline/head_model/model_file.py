@@ -1,4 +1,4 @@
-"""Reads and writes head models as files. ``pipeline.head_model.model`` holds a model in memory."""
+"""Reads and writes head models as files; ``pipeline.head_model.model`` holds a model in memory."""
 
 import hashlib
 import json
@@ -20,7 +20,7 @@ READABLE = ("eigenhead-model/1", FORMAT)
 
 
 class BadModel(EigenheadError):
-    """Reports a file that is not a head model of this project, or a damaged one."""
+    """Reports a file that is damaged or is not a head model of this project."""
 
     def __init__(self, path: Path | str, why: str) -> None:
         super().__init__(
@@ -37,8 +37,7 @@ class Damaged(BadModel):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelParts:
-    """Holds the content of a model file. ``pipeline.head_model.model.assemble`` builds the
-    HeadModel from these parts."""
+    """Holds the content of a model file. ``pipeline.head_model.model.assemble`` builds a HeadModel from these parts."""
 
     name: str
     licence: str
@@ -96,7 +95,7 @@ def rounded(values: np.ndarray) -> Float32[np.ndarray, "..."]:
 
 
 def read_parts(path: Path) -> tuple[ModelParts, str]:
-    """Returns the content of a model file and its SHA-256. Raises BadModel."""
+    """Returns the content of a model file and its SHA-256. Raises BadModel if the file cannot be used."""
     try:
         raw = path.read_bytes()
     except OSError as fault:
@@ -115,7 +114,7 @@ def read_parts(path: Path) -> tuple[ModelParts, str]:
 
 
 def expression_names(path: Path) -> tuple[str, ...]:
-    """Returns the names of the expressions in a model file without reading their shapes. Raises BadModel."""
+    """Returns the names of the expressions in a model file without reading their displacements. Raises BadModel."""
     try:
         with open_npz(path) as file:
             return tuple(json.loads(file["meta"].tobytes()).get("expressions", ()))

@@ -1,9 +1,8 @@
-"""Lists the available head models and their files. It loads no model, so the command line can call it quickly.
+"""Lists the available head models and their files. This module loads no model, so the command line can call it quickly.
 
-The data folder is ``--data``, which sets EIGENHEAD_DATA, else EIGENHEAD_DATA, else ``$XDG_DATA_HOME/eigenhead``, else
-~/.local/share/eigenhead. Models lie in its folder ``models``, unless EIGENHEAD_MODELS names another one. The command
-line, the service and its workers share this rule.
-"""
+The data folder is given by the option ``--data``, otherwise by the variable EIGENHEAD_DATA; it is otherwise
+``$XDG_DATA_HOME/eigenhead`` or ~/.local/share/eigenhead. Models are stored in the data folder's subfolder ``models``,
+unless EIGENHEAD_MODELS names another folder. The command line, the service and its workers use the same folders."""
 
 import os
 from functools import lru_cache
@@ -19,7 +18,7 @@ PACK_FILES = {"default": "makehuman.npz", DEFAULT: "makehuman.npz", "makehuman":
 
 
 class UnknownModel(EigenheadError):
-    """Reports a model name that is neither shipped, nor in the user's folder, nor a file."""
+    """Reports a model name that is neither shipped with the program, nor in the user's folder, nor a file."""
 
     def __init__(self, name: str) -> None:
         known = ", ".join(sorted(list_models()))
@@ -46,7 +45,7 @@ def list_models() -> dict[str, Path]:
 
 
 def model_path(name_or_path: str | Path) -> Path:
-    """Returns the file of a head model, from its name or its path. Raises UnknownModel."""
+    """Returns the file of a head model that is given by its name or path. Raises UnknownModel if none exists."""
     name = str(name_or_path)
     if name in PACK_FILES:
         return PACKS / PACK_FILES[name]
@@ -60,7 +59,8 @@ def model_path(name_or_path: str | Path) -> Path:
 
 
 def model_sha256(path: Path) -> str:
-    """Returns the SHA-256 of a model file; results identify their model by it. Raises OSError."""
+    """Returns the SHA-256 of a model file; results state the model that they were made with by this hash. Raises
+    OSError."""
     state = path.stat()
     return _sha256(path, state.st_mtime_ns, state.st_size)
 
@@ -71,7 +71,7 @@ def _sha256(path: Path, changed_ns: int, size: int) -> str:
 
 
 def remove_model(name: str) -> Path:
-    """Removes a head model from the user's folder and returns the path that its file had. Raises UnknownModel, and
+    """Removes a head model from the user's folder and returns the path of the removed file. Raises UnknownModel, and
     ShippedModel for a model that comes with the program."""
     path = models_folder() / f"{name}.npz"
     if path.parent != models_folder() or not path.is_file():
@@ -81,7 +81,7 @@ def remove_model(name: str) -> Path:
 
 
 def data_folder() -> Path:
-    """Returns the folder of captures, results, keys, jobs and models. The folder may not exist yet."""
+    """Returns the data folder, which holds captures, results, keys, jobs and models and may not exist yet."""
     configured = os.environ.get(DATA)
     if configured:
         return Path(configured)
@@ -89,6 +89,6 @@ def data_folder() -> Path:
 
 
 def models_folder() -> Path:
-    """Returns the folder of the user's head models. The folder may not exist yet."""
+    """Returns the folder of the user's head models, which may not exist yet."""
     configured = os.environ.get(MODELS)
     return Path(configured) if configured else data_folder() / "models"

@@ -1,9 +1,8 @@
-"""Aligns corresponded heads and computes their principal components (sections 3.1 and 3.2, last step).
+"""Aligns corresponded heads and computes their principal components (the paper's section 3.1 and the last step of 3.2).
 
-Alignment is a rigid Procrustes analysis *without* scale: rigs are metric, and size is a mode of the population (figure
-2, first mode). Departure from the paper, which leaves this open: the mean is re-estimated until it converges
-(generalised Procrustes, Gower 1975), so that no single head serves as reference.
-"""
+Alignment is a rigid Procrustes analysis *without* scale: rigs measure in mm, and size is a mode of the population (the
+paper's figure 2, first mode). The paper does not state the reference of the alignment; here the mean is re-estimated
+until it converges (generalised Procrustes, Gower 1975), so that no single head is the reference."""
 
 from dataclasses import dataclass
 
@@ -28,7 +27,7 @@ def align(
     heads: Float[np.ndarray, "N V 3"], weights: Float[np.ndarray, " V"], *, rounds: int = 10
 ) -> Float[np.ndarray, "N V 3"]:
     """Returns the heads, each moved rigidly (never scaled) onto their common mean. The mean has the pose and position
-    of the first head; ``weights`` are those of the vertices."""
+    of the first head; ``weights`` are vertex weights."""
     aligned, mean = heads.copy(), heads[0]
     first = heads[0]
     for _ in range(rounds):
@@ -44,8 +43,8 @@ def align(
 
 
 def principal_components(heads: Float[np.ndarray, "N V 3"]) -> Components:
-    """Computes the principal components of N aligned heads, N - 1 at most. The largest entry of each mode is positive,
-    so that repeated builds have the same signs."""
+    """Computes the at most N - 1 principal components of N aligned heads. The largest entry of each mode is made
+    positive, so that repeated builds have the same signs."""
     count, vertices = heads.shape[:2]
     flat = heads.reshape(count, -1).astype(float)
     mean = flat.mean(0)
@@ -63,12 +62,11 @@ def principal_components(heads: Float[np.ndarray, "N V 3"]) -> Components:
 
 
 def orthogonalised(modes: Float[np.ndarray, "M V 3"]) -> tuple[Float[np.ndarray, "K V 3"], Float[np.ndarray, " K"]]:
-    """Returns orthogonal modes for exactly the same Gaussian distribution of heads, and their standard deviations (mm):
-    as many as are independent.
+    """Returns linearly independent orthogonal modes that describe exactly the same Gaussian distribution of heads, and
+    their standard deviations (mm).
 
-    For z ~ N(0, I), heads are mean + A z with A = U S V^T. V^T z is N(0, I) again, so U S describes the same Gaussian
-    along other axes.
-    """
+    For z ~ N(0, I), heads are mean + A z with A = U S V^T. V^T z is N(0, I) again, so the modes U S describe the same
+    distribution."""
     count, vertices = modes.shape[:2]
     flat = modes.reshape(count, -1).astype(float)
     values, vectors = np.linalg.eigh(flat @ flat.T)

@@ -1,7 +1,6 @@
-"""Defines named regions of a head for every model; figures are by region, and the detail differs between regions.
+"""Defines named regions of a head for every head model; error figures and the level of detail are given by region.
 
-Their borders are defined by distances from landmarks on the mean head, so a region is the same part of the head for any
-mesh.
+Regions are defined by distances from landmarks on the mean head, so a region is the same part of the head for any mesh.
 """
 
 from functools import lru_cache
@@ -27,8 +26,8 @@ BRIDGE_HALF_WIDTH_MM, BRIDGE_BELOW_NASION_MM, BRIDGE_DEPTH_MM = 8.0, 12.0, 14.0
 
 @lru_cache(maxsize=2)  # models are few, jobs are many
 def head_regions(model: HeadModel) -> dict[str, Bool[np.ndarray, " v"]]:
-    """Returns which vertices of the full level belong to each region. Eyes, nose and mouth are parts of the face; all
-    other regions are disjoint."""
+    """Returns, for each region, a mask of its vertices in the finest mesh. Eyes, nose and mouth are parts of the face;
+    all other regions do not overlap."""
     vertices, marks = model.vertices(np.zeros(0)), model.landmarks
     at = {name: vertices[row] for name, row in marks.items()}
     face = model.levels["full"].face_region
@@ -57,8 +56,8 @@ def head_regions(model: HeadModel) -> dict[str, Bool[np.ndarray, " v"]]:
 
 
 def halves_of_face(model: HeadModel) -> tuple[Bool[np.ndarray, " v"], Bool[np.ndarray, " v"]]:
-    """Returns which vertices of the full level belong to the face above the nose's base, which the jaw does not move,
-    and which belong to mouth and chin."""
+    """Returns two masks of the finest mesh's vertices: the face above the nose's base, which the jaw does not move, and
+    mouth with chin."""
     vertices, face = model.vertices(np.zeros(0)), model.levels["full"].face_region
     above = vertices[:, 1] - vertices[model.landmarks["subnasale"], 1]
     upper, lower = above > NOSE_BASE_MM, above < -NOSE_BASE_MM
@@ -67,15 +66,15 @@ def halves_of_face(model: HeadModel) -> tuple[Bool[np.ndarray, " v"], Bool[np.nd
 
 @lru_cache(maxsize=2)
 def pinnae(model: HeadModel) -> Bool[np.ndarray, " v"]:
-    """Returns which vertices of the full level protrude from the head at the ears, seen from the side. (The region
-    ``ears`` also contains the scalp around them.)"""
+    """Returns a mask of the finest mesh's vertices that protrude from the head at the ears, seen from the side. (The
+    region ``ears`` also contains the scalp around the ears.)"""
     vertices, ears = model.vertices(np.zeros(0)), head_regions(model)["ears"]
     inputs = (vertices, ears, PINNA_OFF_MM, PINNA_REACH_MM)
     return cached_arrays("pinnae", inputs, lambda: {"pinnae": _standing(vertices, ears)}, made_by=())["pinnae"]
 
 
 def scalp(model: HeadModel) -> Bool[np.ndarray, " v"]:
-    """Returns which vertices of the full level can have hair: cranium and temples, without the pinnae."""
+    """Returns a mask of the finest mesh's vertices that can have hair: cranium and temples, without the pinnae."""
     regions = head_regions(model)
     return (regions["cranium"] | regions["ears"]) & ~pinnae(model)
 
@@ -93,8 +92,9 @@ def _standing(vertices: Float[np.ndarray, "v 3"], ears: Bool[np.ndarray, " v"]) 
 
 
 def stable_region(model: HeadModel) -> Bool[np.ndarray, " v"]:
-    """Returns which vertices of the full level lie over bone that expression, jaw, weight and teeth hardly move: the
-    forehead above the brows and the bridge of the nose. Heads of two visits are aligned on it."""
+    """Returns a mask of the finest mesh's vertices over bone that expression, jaw, weight and teeth hardly move: the
+    forehead above the brows and the bridge of the nose. The heads of two visits are aligned with each other on this
+    region."""
     vertices = model.vertices(np.zeros(0))
     at = {name: vertices[row] for name, row in model.landmarks.items()}
     low, high = at["glabella"][1] + np.array(FOREHEAD_ABOVE_GLABELLA_MM)
@@ -112,7 +112,7 @@ def _within(
 
 
 def _ears(vertices: Float[np.ndarray, "v 3"], at: dict[str, Float[np.ndarray, " 3"]]) -> Bool[np.ndarray, " v"]:
-    """Returns the vertices that protrude from the side of the head around the opening of the ear."""
+    """Returns a mask of the vertices that protrude from the side of the head around the opening of the ear."""
     found = np.zeros(len(vertices), bool)
     for side in ("right", "left"):
         notch = at[f"tragion_{side}"]

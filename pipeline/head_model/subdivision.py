@@ -1,10 +1,9 @@
-"""Computes with triangle surfaces for head models: edges, borders, and Loop subdivision as a sparse operator.
+"""Provides operations on the triangle meshes of head models: edges, borders, and Loop subdivision as a sparse operator.
 
-Subdivision: C. Loop, *Smooth Subdivision Surfaces Based on Triangles* (1987), interior weights after Warren, cubic
-B-spline rule on open borders. It is linear in the vertices, so one operator refines both mean and modes (section 3.1).
-Decimation: half-edge collapses ordered by Garland and Heckbert's quadric error (1997). Half-edge collapses do not move
-the remaining vertices, so a decimated level is a selection of rows of the same operator.
-"""
+Subdivision follows C. Loop, *Smooth Subdivision Surfaces Based on Triangles* (1987), with Warren's interior weights and
+the cubic B-spline rule on open borders. Subdivision is linear in the vertices, so one operator refines mean and modes
+(the paper's section 3.1). Decimation uses half-edge collapses ordered by Garland and Heckbert's quadric error (1997).
+Half-edge collapses do not move the remaining vertices, so a decimated mesh is a selection of the operator's rows."""
 
 from collections.abc import Mapping
 
@@ -20,7 +19,7 @@ MAX_CLOSING = 400  # triangles that close eyes and mouth: 192 of the default mod
 
 
 class NotAManifold(EigenheadError):
-    """Reports a surface on which an edge has more than two triangles, or two with opposite orientation."""
+    """Reports a surface on which an edge has more than two triangles, or two triangles with opposite orientation."""
 
     def __init__(self, count: int, what: str) -> None:
         super().__init__(f"{count} edges {what}; repair the mesh (one consistently wound surface) and try again")
@@ -46,7 +45,7 @@ def check_manifold(faces: Int[np.ndarray, "F 3"]) -> None:
 
 
 def boundary_vertices(faces: Int[np.ndarray, "F 3"], count: int) -> Bool[np.ndarray, " V"]:
-    """Tells which of the ``count`` vertices lie on open edges of the mesh."""
+    """Returns a mask of the vertices that lie on open edges of the mesh."""
     edges, _, uses = edges_of(faces)
     flags = np.zeros(count, bool)
     flags[edges[uses == 1].ravel()] = True
@@ -54,14 +53,14 @@ def boundary_vertices(faces: Int[np.ndarray, "F 3"], count: int) -> Bool[np.ndar
 
 
 def vertex_areas(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, " V"]:
-    """Returns for each vertex a third of the area of the triangles around it (mm²)."""
+    """Returns, for each vertex, a third of the area of the triangles around it (mm²)."""
     area = np.linalg.norm(face_normals(vertices, faces), axis=1) / 6
     return np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
 
 
 def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[list[int]]:
-    """Returns the open borders of a mesh, each as a list of vertices in the direction of its triangles. Raises
-    NotAManifold if a border touches itself."""
+    """Returns the open borders of a mesh, each as a list of vertex indices in the direction of the triangles at the
+    border. Raises NotAManifold if a border touches itself."""
     after: dict[int, int] = {}
     rim = boundary_edges(faces)
     for a, b in rim.tolist():
@@ -80,9 +79,9 @@ def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[list[int]]:
 
 
 def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.ndarray, "T 3"]:
-    """Returns triangles that close a long opening such as a mouth or an eye: a strip from the end with the smallest x
-    to the end with the largest. No vertex is added. The triangles have the orientation of the surface around the
-    opening, if ``loop`` is a result of ``boundary_loops``."""
+    """Returns triangles that close a long opening such as a mouth or an eye: a strip from the border vertex with the
+    smallest x to the one with the largest x. The strip needs no new vertices. The triangles have the orientation of the
+    surface around the opening if ``loop`` is a result of ``boundary_loops``."""
     x = vertices[loop, 0]
     start, end = int(x.argmin()), int(x.argmax())
     ring = loop[start:] + loop[:start]
@@ -102,8 +101,8 @@ def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.nd
 
 
 def opened_faces(levels: Mapping[str, Int[np.ndarray, "F 3"]]) -> Int[np.ndarray, "G 3"]:
-    """Returns the triangles of the level ``full`` without those that close eyes and mouth; all of them if there are
-    none. Those are the last triangles of the level ``cage``; each of its triangles becomes equally many of ``full``."""
+    """Returns the triangles of the finest mesh without those that close eyes and mouth. The closing triangles are the
+    last ones of the coarse mesh ``cage``, and each coarse triangle becomes the same number of fine triangles."""
     cage, full = levels["cage"], levels["full"]
     first, closing = len(cage), MAX_CLOSING if len(boundary_loops(cage)) == 1 else 0
     for count in range(len(cage) - 1, len(cage) - closing, -1):
@@ -119,8 +118,8 @@ def opened_faces(levels: Mapping[str, Int[np.ndarray, "F 3"]]) -> Int[np.ndarray
 
 
 def subdivision(faces: Int[np.ndarray, "F 3"], count: int) -> tuple[sparse.csr_array, Int[np.ndarray, "F4 3"]]:
-    """Computes one step of Loop subdivision: the operator ((V + E) x V) from old vertices to new ones, and the refined
-    triangles. Old vertices come first."""
+    """Computes one step of Loop subdivision: the operator ((V + E) x V) from old vertices to new vertices, and the
+    refined triangles. In the new vertex order, the old vertices come first."""
     edges, opposite_edge, uses = edges_of(faces)
     moved = _even_rule(edges, uses, count)
     fresh = _odd_rule(faces, edges, opposite_edge, uses, count)
@@ -164,8 +163,7 @@ def _odd_rule(
 
 
 def refine(faces: Int[np.ndarray, "F 3"], count: int, steps: int) -> tuple[sparse.csr_array, Int[np.ndarray, "G 3"]]:
-    """Computes ``steps`` steps of Loop subdivision as one operator, the identity for 0 steps, and
-    the refined triangles."""
+    """Computes several steps of Loop subdivision as one operator (the identity for 0 steps), and refined triangles."""
     operator: sparse.csr_array = sparse.csr_array(sparse.identity(count, format="csr"))
     for _ in range(steps):
         step, faces = subdivision(faces, row_count(operator))

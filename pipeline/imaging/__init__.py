@@ -1,1 +1,1 @@
-"""Measures images: silhouettes and distances to them, masks, colour charts, highlights."""
+"""Measures images: silhouettes and distances to their contours, masks, colour charts, highlights."""

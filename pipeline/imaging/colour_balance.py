@@ -1,10 +1,9 @@
-"""Estimates gain and offset of every camera's colours, from vertices that several cameras see.
+"""Estimates the gain and offset of every camera's colours, from head vertices that several cameras see.
 
-A matt point sends the same light in all directions, so ``g_k c_k + b_k`` should agree over the cameras k that see it.
-Each channel is solved by least squares in linear light, with the point's own colour eliminated. Cauchy weights reduce
-the effect of shiny skin and inexact fits. A prior fixes the remaining freedom: gains have the product 1, offsets are
-small.
-"""
+A matt point reflects the same light in all directions, so ``g_k c_k + b_k`` should be equal for all cameras k that see
+it. Each colour channel is solved by least squares in linear light; the unknown true colour of each point is eliminated.
+Cauchy weights reduce the influence of shiny skin and of errors in the fitted surface. Two priors remove the remaining
+ambiguity: the product of all gains is 1, and offsets are small."""
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -21,7 +20,7 @@ def balance(
     weights: Float32[np.ndarray, "k v"], colours: Float32[np.ndarray, "k v 3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
     """Computes a gain and an offset for each camera and channel, so that ``gains * colours + offsets`` agree between
-    cameras. The gains of each channel have the product 1."""
+    cameras. The product of the gains in each channel is 1."""
     cameras = len(weights)
     shared = np.flatnonzero(np.count_nonzero(weights, axis=0) >= 2)
     shared = shared[:: max(1, len(shared) // SAMPLE)]
@@ -30,7 +29,7 @@ def balance(
         return gains, offsets
     w = (weights[:, shared] > 0).astype(float)
     w *= np.sqrt(weights[:, shared] / weights[:, shared].max())
-    w *= (colours[:, shared].max(axis=2) < 0.98) & (colours[:, shared].min(axis=2) > 0.002)  # clipped tells nothing
+    w *= (colours[:, shared].max(axis=2) < 0.98) & (colours[:, shared].min(axis=2) > 0.002)  # not clipped ones
     for channel in range(3):
         values = colours[:, shared, channel].astype(float)
         gains[:, channel], offsets[:, channel] = _solve(values, w)
@@ -62,7 +61,7 @@ def _gauss_newton_step(
     gain: Float[np.ndarray, " k"],
     offset: Float[np.ndarray, " k"],
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Returns the next gains and offsets, from normal equations in which the unknown colour of every point is
+    """Returns the next gains and offsets, from normal equations in which the unknown true colour of every point is
     eliminated: ``P = W - w w^T / sum w``."""
     cameras, points = values.shape
     root = np.sqrt(np.maximum(weights.sum(axis=0), 1e-12))

@@ -1,9 +1,8 @@
 """Finds a colour chart in a photograph (the 24 patches of a ColorChecker Classic, by OpenCV's mcc module), and computes
 a camera's colour correction from it.
 
-Colours here are linear light, 0 to 1, in the picture's own channels. The true colours of the patches are those of
-OpenCV's colour correction model (X-Rite's, in linear sRGB under D65: the white patch is 0.91).
-"""
+Colours in this module are linear light, 0 to 1, in the picture's colour channels. The true colours of the patches come
+from OpenCV's colour correction model (X-Rite's values, in linear sRGB under D65: the white patch is 0.91)."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -23,15 +22,15 @@ MIN_CELLS = 4  # a chart of 50 px in a thousand has 6
 ROWS, COLUMNS = 4, 6
 WIDTHS_PX = (1024, 2048)  # of the picture, as it is searched: finds charts of 90 px and more there, then smaller ones
 INNER = 0.5  # of a patch's sides: its rim is blurred, and its frame black
-CLIPPED = 0.97  # linear: what a sensor no longer tells
+CLIPPED = 0.97  # linear level at which a sensor saturates
 MIN_PATCHES = 18  # that are not clipped, for nine numbers
 MAX_OFF = 0.06  # rms of what the correction leaves of the patches: its own colours in another order leave 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chart:
-    """Holds the middles (px) of the 24 patches, row by row from dark skin to black, and the mean linear colour of each
-    in the photograph."""
+    """Holds the centres (px) of a chart's 24 patches, row by row from dark skin to black, and the mean linear colour of
+    each patch in the photograph."""
 
     centres: Float[np.ndarray, "24 2"]
     colours: Float[np.ndarray, "24 3"]
@@ -39,7 +38,7 @@ class Chart:
 
 @cache
 def true_colours() -> Float[np.ndarray, "24 3"]:
-    """Returns the reference colours of the patches in linear sRGB, D65."""
+    """Returns the true colours of the patches in linear sRGB, D65."""
     any_colours = np.linspace(0.1, 0.9, 24 * 3).reshape(24, 1, 3)
     model = cv2.ccm.ColorCorrectionModel(any_colours, cv2.ccm.COLORCHECKER_MACBETH)
     model.setLinearization(cv2.ccm.LINEARIZATION_IDENTITY)
@@ -50,8 +49,8 @@ def true_colours() -> Float[np.ndarray, "24 3"]:
 
 
 def find_chart(picture: UInt8[np.ndarray, "h w 3"]) -> Chart | None:
-    """Finds the colour chart in an sRGB picture; None if there is none, or if its colours differ too much from the
-    reference."""
+    """Finds the colour chart in an sRGB picture; None if there is no chart, or if its colours differ too much from the
+    true colours."""
     height, width = picture.shape[:2]
     for wanted in WIDTHS_PX:
         scale = wanted / width
@@ -92,8 +91,8 @@ def _mean_colour(picture: UInt8[np.ndarray, "h w 3"], corners: Float[np.ndarray,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChartCorrection:
-    """Holds a colour correction. ``matrix``: linear sRGB = matrix @ linear colour of the camera; ``off``: RMS error of
-    the patches after the correction."""
+    """Holds the colour correction of a camera. The corrected linear sRGB colour is ``matrix`` @ the camera's linear
+    colour; ``off`` is the RMS error of the patches after the correction."""
 
     matrix: Float[np.ndarray, "3 3"]
     off: float
@@ -107,7 +106,7 @@ def chart_correction(charts: list[Chart]) -> ChartCorrection | None:
     kept = (seen < CLIPPED).all(axis=1)
     if kept.sum() < MIN_PATCHES:
         return None
-    # What is dark is to be as right as what is bright, as eyes have it.
+    # Dark patches should be as accurate as bright ones, relative to their brightness.
     weight = 1.0 / (0.1 + true[kept].mean(axis=1, keepdims=True))
     matrix = np.linalg.lstsq(seen[kept] * weight, true[kept] * weight, rcond=None)[0].T
     off = float(np.sqrt(np.mean((seen[kept] @ matrix.T - true[kept]) ** 2)))
@@ -116,7 +115,7 @@ def chart_correction(charts: list[Chart]) -> ChartCorrection | None:
 
 
 def chart_normal(chart: Chart, camera: Camera) -> Float[np.ndarray, " 3"]:
-    """Returns the direction that the chart faces, as a unit vector in the world frame."""
+    """Returns the unit normal of the chart in the world frame."""
     grid = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2).astype(float)
     flat = np.column_stack([grid, np.zeros(len(grid))])
     _, turn, _ = cv2.solvePnP(flat, camera.undistort(chart.centres), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
@@ -126,14 +125,14 @@ def chart_normal(chart: Chart, camera: Camera) -> Float[np.ndarray, " 3"]:
 
 
 def empty_plates(plates: tuple[Plate, ...]) -> tuple[Plate, ...]:
-    """Returns the plates that show no colour chart, or all plates if every one shows a chart."""
+    """Returns the clean plates that show no colour chart, or all plates if every plate shows one."""
     if len(plates) < 2 or not _differ(plates):
         return plates
     return tuple(plate for plate in plates if find_chart(plate) is None) or plates
 
 
 def charts_in(plates: tuple[Plate, ...]) -> list[Chart]:
-    """Finds the colour charts in one camera's plates. If the plates look alike, only the first is searched."""
+    """Finds the colour charts in one camera's clean plates. If the plates are nearly equal, the first is searched."""
     searched = plates if len(plates) > 1 and _differ(plates) else plates[:1]
     return [chart for chart in map(find_chart, searched) if chart is not None]
 

@@ -1,15 +1,15 @@
-"""Removes highlights on skin from photographs, for matching.
+"""Removes highlights on skin from photographs before their views are matched with each other.
 
-A highlight moves with the camera. A matched highlight lies behind a convex surface, by up to half its radius of
-curvature; smooth skin offers nothing else to match. Comparing the views at each point of the fitted head separates a
-highlight: the skin's own light is the same in all views, while a highlight adds the lamp's colour to a few. So each
-view is darkened to the level of the darkest third of the views, by a correction that varies slowly along the surface.
-It applies where the excess is less coloured than the skin (the dichromatic model: Shafer 1985, *Using color to separate
-reflection components*; Lin et al. 2002, *Diffuse-specular separation and depth recovery from image sequences*, compare
-views in the same way). The skin's texture is finer and stays. If views differ by the skin's own colour, the head is
-misplaced, and nothing is removed. Levels are subtracted in sRGB codes instead of linear light, because a camera's tone
-curve for highlights is unknown.
-"""
+A highlight moves over the skin when the camera moves. Matched highlights therefore appear behind a convex surface, by
+up to half its radius of curvature; smooth skin often shows nothing else that could be matched. Comparing the views at
+each point of the fitted head separates the highlight: the light from the skin itself is the same in all views, and a
+highlight adds the lamp's colour in a few views. Each view is therefore darkened to the level of the darkest third of
+the views, by a correction that varies slowly along the surface. The correction applies only where the excess light is
+less coloured than the skin (the dichromatic model: Shafer 1985, *Using color to separate reflection components*; Lin et
+al. 2002, *Diffuse-specular separation and depth recovery from image sequences*, compare views in the same way). The
+skin's texture is finer than the correction and is not changed. If views differ by light of the skin's colour, the
+fitted head is at a wrong position, and nothing is removed. Levels are subtracted in sRGB values instead of linear
+light, because a camera's tone curve for highlights is unknown."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ MIN_COVERAGE = 0.05  # share of a window whose places are known
 MIN_FACING = 0.15  # cosine
 HIDDEN_MM = 1.5  # a nearer surface hides a vertex beyond this
 OUTLINE_MM = 1.5  # nothing is compared nearer to the outline
-MIN_VIEWS = 3  # of a place: of two, nobody knows which shines
+MIN_VIEWS = 3  # of a vertex: with two, the shining view is ambiguous
 DARKEST_SHARE = 1.0 / 3.0  # of the views, whose mean is the skin's own light
 MIN_SHARE = 0.04  # of that light, that a highlight adds at least; it counts whole at twice that. Skin lit evenly and
 # photographed by one kind of camera differs by less
@@ -52,8 +52,8 @@ MIN_GAIN_PLACES = 300  # that a camera shares with others, for its gain
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sight:
-    """Holds the head in one camera: the part of the image with the head, the pixels and depths (mm) of the vertices in
-    it, the triangle at each pixel, and the vertices' colours (linear; NaN where hidden)."""
+    """Holds the head in one camera: the image box that contains it, the pixels and depths (mm) of its vertices, the
+    triangle at each pixel, and the vertices' colours (linear; NaN where hidden)."""
 
     box: tuple[slice, slice]
     pixels: Float[np.ndarray, "v 2"]
@@ -64,23 +64,23 @@ class _Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Excess:
-    """Holds the excess over the skin's own light of each of v vertices in each of k views, as far as the added light is
-    whiter than the skin."""
+    """Holds, for v vertices in k views, the excess over the skin's own light, as far as the additional light is whiter
+    than the skin."""
 
     levels: Float32[np.ndarray, "k v"]  # 0 to 255, as displayed
-    sure: Bool[np.ndarray, "k v"]  # where nothing but a highlight explains it
-    known: Bool[np.ndarray, "k v"]  # where enough views see the place
+    sure: Bool[np.ndarray, "k v"]  # where only a highlight explains the excess
+    known: Bool[np.ndarray, "k v"]  # where enough views see the vertex
 
 
 @traced
 def without_highlights(
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], silhouettes: Mapping[str, Silhouette], rig: Rig, head_world: Mesh
 ) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
-    """Returns the images with the highlights on the head darkened to the skin's own light.
+    """Returns the images with the highlights on the head darkened to the skin's own light level.
 
     Args:
-        images: sRGB, by camera.
-        silhouettes: by camera; a view whose silhouette is not usable is neither compared nor changed.
+        images: sRGB photographs, by camera.
+        silhouettes: silhouettes by camera; a view with an unusable silhouette is neither compared nor changed.
         rig: the cameras.
         head_world: the fitted head, mm.
     """
@@ -103,11 +103,11 @@ def without_highlights(
 
 
 def highlight_levels(colours: Float32[np.ndarray, "k v 3"], faces: Int[np.ndarray, "f 3"]) -> Excess:
-    """Computes the excess over the skin's own light at each vertex in each view, as far as a highlight explains it.
+    """Computes, for each vertex in each view, the excess over the skin's own light that a highlight can explain.
 
     Args:
         colours: linear light of each view at each vertex of the head; NaN where the view does not see it.
-        faces: of the head, which define the neighbours of a vertex.
+        faces: triangles of the head, which define the neighbours of a vertex.
     """
     light = colours @ LIGHT
     seen = np.isfinite(light)
@@ -143,8 +143,8 @@ def highlight_levels(colours: Float32[np.ndarray, "k v 3"], faces: Int[np.ndarra
 
 
 def local_range(values: Float[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " v"]:
-    """Returns the difference between the largest and the smallest value among each vertex and its neighbours, which are
-    about 1 mm away in the face."""
+    """Returns the difference between the largest and the smallest value among each vertex and its mesh neighbours
+    (about 1 mm away in the face)."""
     high, low = values.copy(), values.copy()
     highest, lowest = values[faces].max(axis=1), values[faces].min(axis=1)
     for corner in faces.T:
@@ -178,7 +178,7 @@ def _seen(
 
 
 def _box(pixels: Float[np.ndarray, "v 2"], margin: float, height: int, width: int) -> tuple[slice, slice]:
-    """Returns the rows and columns of the image that hold the pixels and a margin, at least two of each."""
+    """Returns the rows and columns of the image that contain the pixels and a margin, at least two of each."""
     with np.errstate(invalid="ignore"):
         seen = pixels[((pixels > -margin) & (pixels < (width + margin, height + margin))).all(axis=1)]
     low, high = (seen.min(axis=0), seen.max(axis=0)) if len(seen) else (np.zeros(2), np.zeros(2))
@@ -190,8 +190,8 @@ def _box(pixels: Float[np.ndarray, "v 2"], margin: float, height: int, width: in
 def _lowered(
     image: UInt8[np.ndarray, "h w 3"], camera: Camera, sight: _Sight, head_world: Mesh, excess: Excess, view: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns the image minus the view's excess near certain highlights. The excess is smoothed in the image, which
-    also extends it to pixels where it is unknown."""
+    """Returns the image minus the view's excess light near certain highlights. The excess is smoothed in the image,
+    which also extends it to pixels with unknown excess."""
     if not excess.sure[view].any():
         return image
     values = np.stack([excess.levels[view], excess.sure[view], excess.known[view]], axis=1).astype(np.float32)
@@ -208,7 +208,8 @@ def _lowered(
 
 
 def _blurred_widely(values: Float32[np.ndarray, "h w c"], sigma: float) -> Float32[np.ndarray, "h w c"]:
-    """Returns a Gaussian blur of ``sigma`` pixels, computed on an image whose pixels are ``sigma / 4`` wide."""
+    """Returns the image after a Gaussian blur of ``sigma`` pixels, computed on an image reduced to pixels of ``sigma /
+    4``."""
     height, width = values.shape[:2]
     scale = max(int(sigma / 4.0), 1)
     small = cv2.resize(values, (max(width // scale, 1), max(height // scale, 1)), interpolation=cv2.INTER_AREA)

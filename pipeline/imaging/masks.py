@@ -1,5 +1,5 @@
-"""Works on masks: boxes around them, growing and shrinking, holes, spreading values beyond them, and the distance
-to a sub-pixel contour."""
+"""Operates on masks: bounding boxes, growing and shrinking, filling holes, spreading values, and the distance to a
+sub-pixel contour."""
 
 import cv2
 import numpy as np
@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float32, UInt8
 from pipeline.imaging.sampling_kernels import refine_distance, segments_of_level
 
 BAND_PX = 12
-FAR = 0.01  # weight of a window four times as wide, which speaks where the near one holds no pixel
+FAR = 0.01  # weight of a window four times as wide, which counts where the near window is empty
 
 
 def box_around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
-    """Returns the rows and columns of the box around a mask, with a margin; empty slices if the mask is empty."""
+    """Returns the rows and columns of a mask's bounding box with a margin; empty slices if the mask is empty."""
     left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
     if not width:
         return slice(0, 0), slice(0, 0)
@@ -21,7 +21,7 @@ def box_around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice
 
 
 def eroded(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
-    """Returns the mask shrunk by a disc of ``steps`` pixels, but not at the image's border."""
+    """Returns the mask shrunk by a disc of ``steps`` pixels, except at the image's border."""
     return cv2.erode(mask.view(np.uint8), _disc(steps), borderValue=1).view(bool)
 
 
@@ -31,7 +31,7 @@ def dilated(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"
 
 
 def without_holes(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Returns the mask with its holes filled: background that is not connected to the image's border."""
+    """Returns the mask with its holes filled; a hole is background that is not connected to the image's border."""
     _, labels = cv2.connectedComponents((~mask).view(np.uint8), connectivity=4)
     reaching = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     return mask | ~np.isin(labels, reaching)
@@ -40,8 +40,8 @@ def without_holes(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 def spread(
     values: Float32[np.ndarray, "h w c"], weight: Float32[np.ndarray, "h w"], sigma: float
 ) -> Float32[np.ndarray, "h w c"]:
-    """Spreads values from pixels with weight to all pixels: the weighted mean in a Gaussian window or, if that is
-    empty, in a wider one. ``sigma`` is in pixels."""
+    """Spreads values from pixels with a weight to all pixels: the weighted mean in a Gaussian window or, if no such
+    pixel is near, in a wider window. ``sigma`` is in pixels."""
     whole = _carried(weight, sigma)
     return cv2.merge([_carried(plane * weight, sigma) / whole for plane in cv2.split(values)])
 
@@ -60,13 +60,12 @@ def _disc(steps: int) -> UInt8[np.ndarray, "k k"]:
 
 
 def distance_to_level(field: Float32[np.ndarray, "h w"], level: float = 0.5) -> Float32[np.ndarray, "h w"]:
-    """Computes the signed distance (px) to the contour ``field == level``, negative where the field is above it.
-    Without a contour every distance is +-(h + w), a finite value so that slopes can be computed.
+    """Computes the signed distance (px) to the contour ``field == level``, negative where the field exceeds the level.
+    Without a contour every distance is +-(h + w), a finite value with which derivatives can be computed.
 
-    The contour is the one that marching squares draws between pixel centres. Up to ``BAND_PX`` from it, every pixel
-    gets the exact distance to the nearest piece of the contour. Farther away, hundredths of a pixel do not matter: the
-    distance is a 5 x 5 chamfer transform of the mask, exact to half a pixel and 2 %, blended in over the outer third of
-    the band."""
+    The contour is computed by marching squares between pixel centres. Within ``BAND_PX`` of the contour, every pixel
+    gets the exact distance to the nearest contour segment. Farther away, the distance is a 5 x 5 chamfer transform of
+    the mask, exact to half a pixel and 2 %; the two distances are blended over the outer third of the band."""
     above = field > level
     near = box_around(above, BAND_PX + 1)
     segments = segments_of_level(field[near], level)
@@ -79,8 +78,8 @@ def distance_to_level(field: Float32[np.ndarray, "h w"], level: float = 0.5) -> 
 
 
 def chamfer(above: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Computes the signed distance (px) to a mask's edge, negative inside; half a pixel is subtracted because the
-    distance transform ends at pixel centres."""
+    """Computes the signed distance (px) to a mask's edge, negative inside, from distances between pixel centres minus
+    half a pixel."""
     distance = cv2.distanceTransform(1 - above, cv2.DIST_L2, cv2.DIST_MASK_5)
     distance -= np.float32(0.5)
     box = box_around(above.view(bool), 1)

@@ -1,9 +1,8 @@
-"""Bilinear interpolation for compiled loops, and the distance to a contour. The helpers are inlined, so they use the
-calling loop's arithmetic, fast or strict.
+"""Holds bilinear interpolation for compiled loops, and the distance to a contour. The helper functions are inlined, so
+they use the floating-point mode (fast or strict) of the calling loop.
 
-Four neighbouring pixels are named ``a b`` above ``c d``; ``right`` and ``down`` (0 to 1) are the offsets of a point
-from ``a``.
-"""
+Four neighbouring pixels are named ``a b`` (upper row) and ``c d`` (lower row); ``right`` and ``down`` (0 to 1) are the
+offsets of a point from ``a``."""
 
 import numpy as np
 
@@ -14,7 +13,7 @@ INSIDE = 1.001  # px before an image's far edge where places beyond are held: al
 
 @njit(cache=True, nogil=True, inline="always")
 def bilinear(a, b, c, d, right, down):
-    """Returns the value between four neighbouring pixels."""
+    """Returns the bilinear value between four neighbouring pixels."""
     top = a + right * (b - a)
     return top + down * (c + right * (d - c) - top)
 
@@ -27,36 +26,37 @@ def bilinear_slopes(a, b, c, d, right, down):
 
 @njit(cache=True, nogil=True, inline="always")
 def held(at, size):
-    """Returns a coordinate clamped to one side of an image (``size`` pixels)."""
+    """Returns a coordinate clamped to an image that has ``size`` pixels along this axis."""
     return min(max(at, 0.0), size - INSIDE)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def cell(at, size):
-    """Returns the pixel before a coordinate along one side, and the fraction of the way to the next one. Outside the
-    image the outermost two pixels are extrapolated: the fraction is then below 0 or above 1."""
+    """Returns the pixel before a coordinate along one axis, and the fraction of the way to the next pixel. Outside the
+    image, this fraction is below 0 or above 1, so that the outermost two pixels are extrapolated."""
     low = min(max(int(np.floor(at)), 0), size - 2)
     return low, at - low
 
 
 @njit(cache=True, nogil=True, inline="always")
 def sample(image, column, row):
-    """Returns the value of an image (h, w) at a point inside it."""
+    """Returns the bilinear value of an image (h, w) at a point inside it."""
     i, j = int(row), int(column)
     return bilinear(image[i, j], image[i, j + 1], image[i + 1, j], image[i + 1, j + 1], column - j, row - i)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def sample_row(images, at, width, right, down):
-    """Returns the value of an image that is stored row by row in the flat array ``images``. ``at`` is the index of the
-    upper left neighbour, ``width`` the image's width."""
+    """Returns the bilinear value of an image that is stored row by row in the flat array ``images``. ``at`` is the
+    index of the upper left neighbour pixel, ``width`` the image's width."""
     return bilinear(images[at], images[at + 1], images[at + width], images[at + width + 1], right, down)
 
 
 @njit(cache=True, nogil=True)
 def segments_of_level(field: np.ndarray, level: float) -> np.ndarray:
-    """Finds the contour of ``field`` (h, w) at ``level`` by marching squares. Returns its segments as rows (x0, y0, x1,
-    y1, x cell, y cell), px. A cell whose corners allow two contours is split according to their mean."""
+    """Finds the contour of ``field`` (h, w) at ``level`` by marching squares. Returns the contour's segments as rows
+    (x0, y0, x1, y1, x cell, y cell), px. Where the corner values of a cell allow two contours, the mean of all four
+    values decides."""
     height, width = field.shape
     out = np.empty((height * width // 4 + 16, 6), np.float32)
     count = 0
@@ -100,9 +100,9 @@ def segments_of_level(field: np.ndarray, level: float) -> np.ndarray:
 
 @njit(cache=True, nogil=True, fastmath=True)
 def refine_distance(whole: np.ndarray, field: np.ndarray, level: float, segments: np.ndarray, band: int) -> None:
-    """Replaces the signed distances ``whole`` (h, w; px) near the contour, in place, by exact distances to its
-    ``segments``. Replacement is full up to two thirds of ``band`` (px) and fades out to its end. The sign is negative
-    where ``field`` is above ``level``."""
+    """Replaces the signed distances ``whole`` (h, w; px) near the contour, in place, by exact distances to the
+    contour's ``segments``. The exact distance has full weight up to two thirds of ``band`` (px), and weight 0 at its
+    end. The sign is negative where ``field`` is above ``level``."""
     height, width = field.shape
     best = np.full((height, width), np.float32(1e12), np.float32)
     for k in range(len(segments)):

@@ -1,4 +1,4 @@
-"""Defines silhouettes, and the paper's costs for their differences (section 4.3)."""
+"""Defines silhouettes, and the paper's costs for differences between two silhouettes (section 4.3)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -19,7 +19,7 @@ CONTOUR_BLUR_PX = 1.0  # noise of a digital edge falls from 0.29 to 0.1 px; a be
 @dataclass(frozen=True, slots=True)
 class ViewQuality:
     """Holds whether a view's silhouette is usable, and the warnings about it. ``doubts`` are warnings that a clean
-    plate or a mask would resolve; only views without either have them."""
+    plate or a mask would resolve; only views without plate and mask have them."""
 
     usable: bool = True
     contrast: float = float("inf")  # subject against background, in standard deviations of the noise
@@ -41,7 +41,7 @@ class Silhouette:
     quality: ViewQuality = ViewQuality()
 
     def judged(self, **quality: Any) -> "Silhouette":
-        """Returns the silhouette with other values of these attributes of its quality."""
+        """Returns the silhouette with some attributes of its quality replaced."""
         return replace(self, quality=replace(self.quality, **quality))
 
 
@@ -51,13 +51,13 @@ def silhouette_from_mask(mask: Mask) -> Silhouette:
 
 
 def signed_distance(mask: Mask) -> Float32[np.ndarray, "h w"]:
-    """Returns the sub-pixel signed distance (px) to the contour of a binary mask, negative inside. Without a contour it
-    is +-(h + w), farther than any pixel.
+    """Returns the sub-pixel signed distance (px) to the contour of a binary mask, negative inside. Without a contour
+    the distance is +-(h + w), farther than any pixel.
 
-    Far from the contour it is the Euclidean distance to the nearest pixel *centre* on the other side, minus half a
-    pixel. Within two pixels that transform's steps would leave 0.3 px of noise. There the mask is blurred by a
-    Gaussian: a straight edge at distance d becomes ``Phi(-d / s)``, which is solved for d.
-    """
+    Far from the contour it is the Euclidean distance to the nearest pixel *centre* on the other side of the contour,
+    minus half a pixel. Within two pixels of the contour, this distance would be wrong by 0.3 px, because the mask has
+    steps. There the distance d is computed from the mask after a Gaussian blur, which turns a straight edge into
+    ``Phi(-d / s)``."""
     inside, outside = _distance_transforms(mask)
     far = float(sum(mask.shape))
     distance = np.clip(np.where(mask, 0.5 - inside, outside - 0.5), -far, far)
@@ -71,28 +71,30 @@ def signed_distance(mask: Mask) -> Float32[np.ndarray, "h w"]:
 
 
 def _distance_transforms(mask: Mask) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Returns the distance transforms ``D(S)`` and ``D(~S)`` of a mask S (px); each is zero outside its set."""
+    """Returns the distance transforms ``D(S)`` and ``D(~S)`` of a mask S (px); ``D(S)`` is zero outside S, ``D(~S)``
+    inside."""
     return _distance_transform(mask), _distance_transform(~mask)
 
 
 def _distance_transform(mask: Mask) -> Float32[np.ndarray, "h w"]:
-    """Computes ``D(S)`` exactly, with the same result in every call. OpenCV's result can differ in the last bit between
-    calls, for pictures of less than 16384 pixels on one core (where it calls IPP). Squared distances between pixels are
-    integers, so rounding the squares gives exact values, up to 1400 px."""
+    """Computes the distance transform ``D(S)`` of a mask exactly, with the same result in every call. OpenCV's result
+    can differ in the last bit between calls for pictures of less than 16384 pixels on one core, where it uses the
+    library IPP. Squared distances between pixels are integers, so rounding the squared results gives exact values, up
+    to 1400 px."""
     distance = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     squares = np.square(distance, dtype=np.float64)
     return np.sqrt(np.rint(squares, out=squares), out=squares).astype(np.float32)
 
 
 def boundary_weights(observed: Mask) -> Float32[np.ndarray, "h w"]:
-    """Returns the weights ``1 / d(i, j)^2`` of eq. (5), where ``d = D(S) + D(~S)`` is the distance (px) from the
-    observed contour."""
+    """Returns the weights ``1 / d(i, j)^2`` of the paper's eq. (5), where ``d = D(S) + D(~S)`` is the distance (px)
+    from the observed contour."""
     inside, outside = _distance_transforms(observed)
     # One of the two is zero at every pixel, the other at least one; a mask without a contour has no boundary at all.
     return (1.0 / np.maximum(inside + outside, 1.0) ** 2).astype(np.float32)
 
 
 def boundary_weighted_xor(observed: Mask, model: Mask, weights: Float[np.ndarray, "h w"]) -> float:
-    """Computes the paper's eq. (5): the sum of ``weights`` over the pixels in which two masks differ; see
-    ``boundary_weights``."""
+    """Computes the paper's eq. (5): the sum of ``weights`` (from ``boundary_weights``) over the pixels in which two
+    masks differ."""
     return float(weights[observed ^ model].sum(dtype=np.float64))

@@ -1,5 +1,5 @@
-"""Computes with several calibrated views at once: points (section 4.2), the visual hull, epipolar tangencies, and the
-upward direction.
+"""Computes with several calibrated views at once: triangulation (the paper's section 4.2), visual hull, epipolar
+tangencies, and the upward direction.
 
-In: rays or silhouettes and the rig. Out: points, volumes and distances in mm of the world frame.
-"""
+The input is image points or silhouettes, and the rig. The output is points, volumes and distances in mm in the world
+frame."""

@@ -1,11 +1,11 @@
-"""Finds points of the subject in three or more neighbouring views, to a fraction of a pixel, with cameras that are
-nearly known.
+"""Finds points of the subject in three or more neighbouring views with sub-pixel accuracy, when the cameras are nearly
+known.
 
-Two views cannot show an error along the epipolar line; three can. SIFT keypoints are compared near that line only, so
-many more are accepted than by similarity alone. (``find_scene_points`` uses similarity alone; its points have two
-neighbouring views each, and separate near from far where colours do not.)
+Two views cannot reveal an error along the epipolar line; three views can. SIFT keypoints are compared only near the
+epipolar line, so many more matches are accepted than by similarity alone. (``find_scene_points`` uses similarity alone;
+each of its points has two neighbouring views, and they separate near from far objects where colours do not.)
 
-In: photographs, silhouettes and the rig. Out: pixels by point and view, and the errors of their rays.
+The input is photographs, silhouettes and the rig. The output is pixels by point and view, and the reprojection errors.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,20 +27,20 @@ NEIGHBOURS, MAX_ANGLE_DEG, MIN_ANGLE_DEG = 4, 50.0, 1.5  # of the rays at the su
 MUTUAL_RATIO = 0.75  # of the best match's distance to the second's (Lowe 2004 has 0.8)
 MAX_MISS_PX = 1.5  # of the reduced picture
 MAX_KEYPOINTS = 2500  # of a subject
-CONTRAST = 0.004  # of SIFT's peaks, a tenth of what is usual: skin has faint ones, and the cameras tell which are right
+CONTRAST = 0.004  # of SIFT's peaks, a tenth of the usual: skin has faint peaks, and epipolar lines reject wrong ones
 MAX_WIDTH = 1400  # px: larger pictures are reduced
-INSET_PX = 4.0  # from the outline, where a keypoint is of the backdrop, too
+INSET_PX = 4.0  # from the outline: nearer keypoints contain backdrop
 BAND = 0.004  # of the picture's width beside the line that the other camera allows: 4 px
 RATIO, MAX_DISTANCE = 0.85, 0.6  # of descriptors: to the second best, and at all
-MIN_LIKENESS = 1.0 - 0.5 * (MAX_DISTANCE / RATIO) ** 2  # of a second best that could put the best one in doubt
-MIN_VIEWS = 3  # of a point; with 2 there are more points, and each says less
+MIN_LIKENESS = 1.0 - 0.5 * (MAX_DISTANCE / RATIO) ** 2  # of a second match that makes the best one ambiguous
+MIN_VIEWS = 3  # of a point; with 2 there are more but less informative points
 MAX_MISS = 0.005  # of the picture's width: more is a wrong match
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScenePoints:
-    """Holds points of the scene (world, mm) with their pixels. For each view, ``pixels`` lists the pixels of the points
-    that it shows, and ``rows`` the indices of these points."""
+    """Holds points of the scene (world frame, mm) with their pixels. For each view, ``pixels`` holds the pixels of the
+    visible points, and ``rows`` the indices of these points."""
 
     points: Float[np.ndarray, "n 3"]
     pixels: Mapping[str, Float[np.ndarray, "_ 2"]]
@@ -50,7 +50,7 @@ class ScenePoints:
 def find_scene_points(
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], rig: Rig, *, report: Callable[[float], None] = lambda share: None
 ) -> ScenePoints:
-    """Finds points of the scene by matching keypoints between every two neighbouring views. ``images`` are RGB, by
+    """Finds points of the scene by matching keypoints between all pairs of neighbouring views. ``images`` are RGB, by
     camera name; ``report`` is called with the finished fraction."""
     seen = {}
     for count, camera in enumerate(rig):
@@ -94,7 +94,7 @@ def neighbouring_pairs(rig: Rig) -> list[tuple[str, str]]:
 
 
 def _all_keypoints(image: UInt8[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the pixels of keypoints in the full image, and their descriptors."""
+    """Returns the pixels of keypoints in the whole image, and their descriptors."""
     scale = min(1.0, MAX_WIDTH / max(image.shape[:2]))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
     found, descriptors = cv2.SIFT.create(nfeatures=MAX_OF_PICTURE).detectAndCompute(
@@ -125,7 +125,8 @@ def _mutual_matches(
 def _where_rays_pass(
     a: Camera, first: Float[np.ndarray, "n 2"], b: Camera, second: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 3"], np.ndarray]:
-    """Returns the points halfway between the rays of two matched pixels, and which of them project near both pixels."""
+    """Returns the points halfway between the rays of two matched pixels, and a mask of the points that project near
+    both pixels."""
     if not len(first):
         return np.zeros((0, 3)), np.zeros(0, bool)
     u, v = a.rays_world(first), b.rays_world(second)
@@ -145,8 +146,8 @@ def _where_rays_pass(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneTracks:
-    """Holds n observations of points in several views: the camera of index ``cameras[i]`` in the rig sees the point of
-    index ``points[i]`` at ``pixels[i]``."""
+    """Holds n observations of points in several views: camera ``cameras[i]`` (its index in the rig) sees point
+    ``points[i]`` at ``pixels[i]``."""
 
     points: Int[np.ndarray, " n"]
     cameras: Int[np.ndarray, " n"]
@@ -159,7 +160,7 @@ class SceneTracks:
         return int(self.points.max()) + 1 if len(self.points) else 0
 
     def chosen(self, good: Bool[np.ndarray, " n"]) -> "SceneTracks":
-        """Returns the observations marked ``good``; points with fewer than ``min_views`` of them are removed."""
+        """Returns only the observations marked ``good``; points with fewer than ``min_views`` of these are removed."""
         left = good & (np.bincount(self.points[good], minlength=self.count)[self.points] >= self.min_views)
         _, numbers = np.unique(self.points[left], return_inverse=True)
         return SceneTracks(numbers, self.cameras[left], self.pixels[left], self.min_views)
@@ -168,8 +169,8 @@ class SceneTracks:
 def find_tracks(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], rig: Rig, *, min_views: int = MIN_VIEWS
 ) -> SceneTracks:
-    """Finds points of the subject in all views of the rig; each has at least ``min_views`` views, whose rays nearly
-    meet."""
+    """Finds points of the subject in all views of the rig; each point has at least ``min_views`` views, whose rays
+    nearly meet."""
     names = rig.names
     seen = map_in_threads(lambda k: _keypoints(images[names[k]], silhouettes[names[k]]), len(rig))
     numbers = {name: k for k, name in enumerate(names)}
@@ -189,8 +190,8 @@ def find_tracks(
 
 
 def misses_px(tracks: SceneTracks, rig: Rig) -> Float[np.ndarray, "n 2"]:
-    """Returns the reprojection error of each observation, measured minus projected, for the point nearest to all its
-    rays. The error is NaN where a pixel lies outside the lens's valid area."""
+    """Returns the reprojection error of each observation (measured minus projected, px) for the point nearest to all
+    its rays. The error is NaN for pixels outside the valid area of the lens model."""
     rays, weights = np.zeros((len(rig), tracks.count, 3)), np.zeros((len(rig), tracks.count))
     for number, camera in enumerate(rig):
         observed = tracks.cameras == number
@@ -209,7 +210,7 @@ Keypoints = tuple[Float[np.ndarray, "_ 2"], Float32[np.ndarray, "_ 128"]]
 
 
 def _keypoints(image: ImageRgb, silhouette: Silhouette) -> Keypoints:
-    """Returns the pixels of keypoints on the subject, and the square roots of their descriptors."""
+    """Returns the pixels of keypoints on the subject, and the element-wise square roots of their descriptors."""
     inside = silhouette.distance < -INSET_PX
     if not inside.any():
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
@@ -250,7 +251,7 @@ def _matches(one: Camera, first: Keypoints, two: Camera, second: Keypoints) -> I
 def _near_lines(
     one: Camera, first: Float[np.ndarray, "n 2"], two: Camera, second: Float[np.ndarray, "m 2"]
 ) -> Bool[np.ndarray, "n m"]:
-    """Tells which pixels of two views are within ``BAND`` of each other's epipolar lines."""
+    """Returns a matrix that marks which pixels of two views lie within ``BAND`` of each other's epipolar lines."""
     relative = two.camera_from_world @ one.camera_from_world.inverse()
     x, y, z = relative.translation / np.linalg.norm(relative.translation)
     essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ relative.rotation
@@ -265,7 +266,7 @@ def _near_lines(
 def _joined(
     pairs: list[tuple[int, int]], matched: list[Int[np.ndarray, "_ 2"]], seen: list[Keypoints], min_views: int
 ) -> SceneTracks:
-    """Joins chains of matches to points; a chain with two pixels in one view is left out."""
+    """Joins chains of pairwise matches to points; a chain with two pixels in one view is left out."""
     from scipy.sparse import coo_array  # a tenth of a second
     from scipy.sparse.csgraph import connected_components
 

@@ -1,8 +1,8 @@
-"""Finds epipolar tangencies: a plane through two camera centres that touches one silhouette also touches the other.
+"""Finds epipolar tangencies: a plane through two camera centres that touches the subject's silhouette in one view also
+touches it in the other view.
 
-In: two silhouettes and their cameras. Out: pairs of contour points that one plane should touch, and their error (Wong
-and Cipolla, *Structure and motion from silhouettes*, ICCV 2001).
-"""
+The input is two silhouettes and their cameras. The output is pairs of contour points that one plane should touch, and
+their error (Wong and Cipolla, *Structure and motion from silhouettes*, ICCV 2001)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,16 +20,16 @@ from rig.rig import Rig
 Vector = Float[np.ndarray, " 3"]
 
 BORDER_PX = 4.0  # a tangent this near the image border may belong to what the border has cut off
-LONGEST_SPAN = 2.0  # rad of a silhouette about the line of two centres: beyond, the epipole lies in or near it
+LONGEST_SPAN = 2.0  # angle (rad) of a silhouette about the baseline: beyond, the epipole lies in or near it
 MIN_SLOPE = 1e-9  # rad a pixel: at the epipole a plane has no direction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tangency:
-    """Holds one tangent plane of two cameras, with two values of each attribute, one for each camera.
+    """Holds one tangent plane of two cameras; each attribute has one value for each camera.
 
     Attributes:
-        cameras: their names.
+        cameras: names of the cameras.
         pixels: the point of the outline that the plane touches.
         steepness: how much the plane turns about the line through both centres for each pixel across the epipolar line,
             rad.
@@ -47,8 +47,8 @@ class Tangency:
 
 
 def find_tangencies(silhouettes: Mapping[str, Silhouette], rig: Rig, inset_mm: float = 0.0) -> list[Tangency]:
-    """Finds the outer tangent planes of every two cameras, where both images contain the whole subject on that side.
-    With ``inset_mm``, the planes touch curves at that distance (at the subject) inside the outlines."""
+    """Finds the outer tangent planes of every two cameras, on each side where both images contain the whole subject.
+    With ``inset_mm``, the planes touch curves inside the outlines, at this distance measured at the subject."""
     middle = rig.centre_world()
     insets_px = {camera.name: inset_mm / pixel_mm(camera, middle) if inset_mm else 0.0 for camera in rig}
     outlines = {camera.name: _Outline.of(camera, silhouettes[camera.name], insets_px[camera.name]) for camera in rig}
@@ -66,7 +66,7 @@ def pixel_mm(camera: Camera, place_world: Vector) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Outline:
-    """Holds the convex hull of a mask, since outer tangents touch nothing else."""
+    """Holds the convex hull of a mask, because outer tangents touch nothing else."""
 
     pixels: Float[np.ndarray, "n 2"]
     rays: Float[np.ndarray, "n 3"]
@@ -83,11 +83,10 @@ class _Outline:
 
 
 def outer_hull(silhouette: Silhouette, inset_px: float = 0.0) -> Float[np.ndarray, "n 2"]:
-    """Returns the corners (px) of the convex hull of a mask, to a fraction of a pixel; empty for an empty mask.
+    """Returns the corners (px) of the convex hull of a mask with sub-pixel accuracy; empty for an empty mask.
 
-    With ``inset_px``, the hull is that of a curve at this distance inside the contour. Strands and specks thinner than
-    twice ``inset_px`` do not reach that curve.
-    """
+    With ``inset_px``, the hull is that of a curve inside the contour at this distance. This curve excludes strands and
+    specks thinner than twice ``inset_px``."""
     inside = silhouette.distance < -inset_px if inset_px else silhouette.mask
     contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
@@ -97,7 +96,8 @@ def outer_hull(silhouette: Silhouette, inset_px: float = 0.0) -> Float[np.ndarra
 
 
 def on_contour(pixels: Float[np.ndarray, "n 2"], distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"]:
-    """Returns pixel centres at the mask's edge, moved along the gradient of the signed distance onto the contour."""
+    """Returns the pixel centres at the mask's edge after moving them along the gradient of the signed distance onto the
+    contour."""
     height, width = distance.shape
     x, y = pixels.astype(int).T
     left, right = np.maximum(x - 1, 0), np.minimum(x + 1, width - 1)
@@ -128,8 +128,8 @@ def _pair(first: _Outline, second: _Outline, one: Camera, two: Camera) -> list[T
 
 
 def epipolar_plane_axes(one: Camera, two: Camera, towards: Vector) -> tuple[Vector, Vector]:
-    """Returns two unit vectors u, v (world) perpendicular to the line through both camera centres. The plane through
-    this line and a ray has the angle ``arctan2(ray @ v, ray @ u)``, counted from the direction ``towards``."""
+    """Returns two unit vectors u, v (world) perpendicular to the line through both camera centres. A plane through this
+    line and a ray has the angle ``arctan2(ray @ v, ray @ u)``, measured from the direction ``towards``."""
     axis = two.centre_world - one.centre_world
     axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
     u = towards - axis * (towards @ axis)
@@ -138,15 +138,15 @@ def epipolar_plane_axes(one: Camera, two: Camera, towards: Vector) -> tuple[Vect
 
 
 def rays_about(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 4 3"]:
-    """Returns the unit rays (world) through the four pixels to the right and left of, below and above each given
+    """Returns the unit rays (world frame) through the four pixels to the right and left of, below and above each given
     pixel."""
     around = pixels[..., None, :] + np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     return camera.rays_world(around.reshape(-1, 2)).reshape(*around.shape[:-1], 3)
 
 
 def angle_slopes(around: Float[np.ndarray, "*n 4 3"], u: Vector, v: Vector) -> Float[np.ndarray, "*n 2"]:
-    """Returns how much the angle of the epipolar plane through a pixel changes for each pixel (rad), by x and by y.
-    ``around`` is the result of ``rays_about``; ``u`` and ``v`` are those of ``epipolar_plane_axes``."""
+    """Returns the derivatives of the epipolar plane's angle by a pixel's position (rad per px), by x and by y.
+    ``around`` comes from ``rays_about``; ``u`` and ``v`` come from ``epipolar_plane_axes``."""
     angle = np.arctan2(around @ v, around @ u)
     return np.stack([angle[..., 0] - angle[..., 1], angle[..., 2] - angle[..., 3]], axis=-1) / 2.0
 
@@ -158,13 +158,13 @@ def tangency(
     difference: float,
     outward: float,
 ) -> Tangency:
-    """Builds the tangency of two contour points that one plane should touch.
+    """Builds the tangency of two contour points that the same plane should touch.
 
     Args:
-        cameras: their names.
+        cameras: names of the cameras.
         pixels: the contour point in each image.
         slopes: ``angle_slopes`` at both points.
-        difference: angle of the plane through the first point less that through the second, rad.
+        difference: angle of the plane through the first point minus that through the second, rad.
         outward: 1.0 if the angle grows out of the subject, else -1.0.
     """
     steepness = float(np.linalg.norm(slopes[0])), float(np.linalg.norm(slopes[1]))

@@ -1,7 +1,8 @@
-"""Computes a point from its pixels in several views (section 4.2), by Gauss-Newton steps on the reprojection error.
+"""Triangulates points from their pixels in several views (the paper's section 4.2), by Gauss-Newton steps on the
+reprojection error.
 
-In: one pixel per camera. Out: the world point with its covariance. The search starts at the point nearest to all rays
-(linear least squares). The projection includes lens distortion, so no undistortion is needed first.
+The input is one pixel per camera. The output is the world point with its covariance. The search starts at the point
+nearest to all rays (linear least squares). The projection includes lens distortion, so pixels need not be undistorted.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,10 +18,10 @@ from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 USUAL = 0.70  # of eleven cameras around a face: median over its patches, 0.69 to 0.70 on five captures of two renderers
-MIN_PARALLAX = 0.1  # cameras that stand nearer together say nothing of depth
+MIN_PARALLAX = 0.1  # with less parallax, depth is unknown
 CLICK_NOISE_PX = 1.5  # of a person's click; measured on captures rendered by another program
 STEPS = 10  # three are usual
-SETTLED = 1e-9  # share of the misfit that a last step still takes away
+SETTLED = 1e-9  # relative decrease of the misfit at which the iteration ends
 MIN_RAYS_APART = 1e-4  # rad; between rays closer to parallel, 0.1 px at f = 1500 px, depth is unknown
 
 
@@ -33,8 +34,8 @@ class NoPoint(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangulatedPoint:
-    """Holds a triangulated point (world, mm), its covariance (mm^2), and the residual of each view (measured minus
-    projected, px)."""
+    """Holds a triangulated point (world frame, mm), its covariance (mm^2), and the residual in each view (measured
+    minus projected, px)."""
 
     position_world: Float[np.ndarray, " 3"]
     covariance: Float[np.ndarray, "3 3"]
@@ -54,8 +55,7 @@ def triangulate(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig, *, nois
         rig: the cameras.
         noise_px: standard deviation of each coordinate of a picked pixel, to which the covariance scales.
 
-    Raises NoPoint like ``triangulate_many``, and for fewer than two views.
-    """
+    Raises NoPoint like ``triangulate_many``, and if there are fewer than two views."""
     if len(pixels) < 2:
         raise NoPoint(compose("point-in-few-views", count=len(pixels)))
     picked = np.array([np.asarray(pixel, float) for pixel in pixels.values()])[:, None]
@@ -66,8 +66,8 @@ def triangulate(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig, *, nois
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangulatedPoints:
-    """Holds n triangulated points (world, mm), their covariances (mm^2), and the residuals of each view (measured minus
-    projected, px)."""
+    """Holds n triangulated points (world frame, mm), their covariances (mm^2), and the residuals in each view (measured
+    minus projected, px)."""
 
     positions_world: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]
@@ -81,16 +81,16 @@ def triangulate_many(
     *,
     start: Float[np.ndarray, "n 3"] | None = None,
 ) -> TriangulatedPoints:
-    """Triangulates many points, each seen by every camera.
+    """Triangulates many points, each visible in every camera.
 
     Args:
-        pixels: of each point in each view.
-        cameras: of the views.
+        pixels: the pixel of each point in each view.
+        cameras: the cameras of the views.
         noise_px: standard deviation of each coordinate of a pixel; infinite where a view does not count for a point.
         start: points near the result, if known; parallel rays are then not reported.
 
-    Raises NoPoint if a point's rays are parallel, if it lies behind a camera, or if a pixel lies outside its lens.
-    """
+    Raises NoPoint if a point's rays are parallel, if it lies behind a camera, or if a pixel lies outside the valid area
+    of the lens model."""
     if start is None:
         rays = np.stack([camera.rays_world(seen) for camera, seen in zip(cameras, pixels, strict=True)])
         shares = 1.0 / noise_px**2
@@ -127,8 +127,8 @@ def _nearest_to_rays(
     rays_world: Float[np.ndarray, "v n 3"],
     weights: Float[np.ndarray, "v n"] | None = None,
 ) -> Float[np.ndarray, "n 3"]:
-    """Returns, for each point, the place with the least weighted sum of squared distances to its rays. Raises
-    NoPoint."""
+    """Returns, for each point, the position with the least weighted sum of squared distances to its rays. Raises
+    NoPoint if the rays are parallel."""
     if not np.isfinite(rays_world).all():
         raise NoPoint(compose("point-outside-lens"))
     matrix, right = ray_equations(centres_world, rays_world, weights)
@@ -143,8 +143,8 @@ def _whitened(
     cameras: Sequence[Camera],
     weights: Float[np.ndarray, "v n 1"],
 ) -> tuple[Float[np.ndarray, "v n 2"], Float[np.ndarray, "v n 2 3"]]:
-    """Returns the residuals ``(projected - measured) / noise`` and their derivatives; infinite for points behind a
-    camera, 0 where the weight is 0."""
+    """Returns the residuals ``(projected - measured) / noise`` and their derivatives; residuals are infinite for points
+    behind a camera, and 0 where the weight is 0."""
     projected, slopes = zip(*(camera.project_with_jacobian(points) for camera in cameras), strict=True)
     counts = weights > 0.0
     residual = np.where(counts, weights * (np.stack(projected) - pixels), 0.0)
@@ -159,10 +159,10 @@ def parallax(
     view: Int[np.ndarray, "n v"],
     value: Float[np.ndarray, "n v"],
 ) -> Float[np.ndarray, " n"]:
-    """Returns the parallax of points on a surface: the shift of two views against each other along the surface, for
-    each millimetre that the surface moves along its normal. It is the root mean square over all pairs of views,
-    weighted. An error in an image (noise, a highlight, the calibration) is a shift of some pixels; divided by the
-    parallax it is the error in depth.
+    """Returns the parallax of points on a surface: the displacement of two views' images against each other, measured
+    along the surface, for each millimetre that the surface moves along its normal. The result is the weighted root mean
+    square over all pairs of views. Noise, highlights and calibration errors displace an image; this displacement
+    divided by the parallax is the error in depth.
 
     ``points``: points on a surface, mm. ``normals``: unit normals of the surface there. ``centres``: camera centres, in
     the same frame. ``view``: the cameras that compare each point; -1 for none. ``value``: their weights; 0 for none.
@@ -177,7 +177,7 @@ def parallax(
 
 
 def depth_factor(found: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns the ratio of the depth error to that with the usual rig (eleven cameras around a face, parallax
-    ``USUAL``), for the same error in the images: the ratio of the parallaxes, at least 1. ``found`` is the parallax of
+    """Returns the ratio between the depth errors of this rig and of the usual rig (eleven cameras around a face,
+    parallax ``USUAL``) for equal image errors: the ratio of the parallaxes, at least 1. ``found`` is the parallax of
     each point with this rig."""
     return USUAL / np.clip(found, MIN_PARALLAX, USUAL)

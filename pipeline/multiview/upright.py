@@ -1,8 +1,7 @@
-"""Estimates which way is up, from cameras that were held upright, on their side or upside down.
+"""Estimates the upward direction from the poses of cameras that were held upright, on their side or upside down.
 
-If a camera is rolled by quarter turns only, up is nearly along one of its image axes and at right angles to the other.
-This is a guess from the poses alone; the pictures are not examined.
-"""
+If a camera is rolled only by quarter turns, the upward direction is nearly along one of its image axes and
+perpendicular to the other axis. The estimate uses the poses alone and does not examine the pictures."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,19 +16,19 @@ def quarter_turns(rig: Rig) -> Int[np.ndarray, " c"]:
 
 
 def guessed_up(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """Returns the upward direction (unit, world): the mean over the photographs, each turned upright."""
+    """Returns the upward direction (unit vector, world frame): the mean over all photographs, each rotated upright."""
     downs = _downs(_image_axes(rig))[np.arange(len(rig)), quarter_turns(rig)]
     up = -downs.mean(axis=0)
     return up / max(float(np.linalg.norm(up)), 1e-9)
 
 
 def _image_axes(rig: Rig) -> Float[np.ndarray, "c 2 3"]:
-    """Returns the x and y axes of each image as directions in the world."""
+    """Returns the x and y axes of each image as unit vectors in the world frame."""
     return np.stack([camera.camera_from_world.rotation[:2] for camera in rig])
 
 
 def _downs(axes: Float[np.ndarray, "c 2 3"]) -> Float[np.ndarray, "c 4 3"]:
-    """Returns the downward axis of each image (world) after 0, 1, 2 and 3 quarter turns."""
+    """Returns the downward axis of each image (world frame) after 0, 1, 2 and 3 quarter turns."""
     return np.stack([axes[:, 1], axes[:, 0], -axes[:, 1], -axes[:, 0]], axis=1)
 
 

@@ -1,4 +1,4 @@
-"""Finds the extent of the visual hull: a cube around the subject in the silhouettes."""
+"""Computes the extent of the visual hull: a cube that contains the subject in all silhouettes."""
 
 from collections.abc import Mapping
 
@@ -14,18 +14,18 @@ Vector = Float[np.ndarray, " 3"]
 
 
 def hull_extent(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Vector, float]:
-    """Returns centre (world, mm) and edge length (mm) of a cube that contains the subject: ``mask_extent`` of the
-    usable silhouettes."""
+    """Returns the centre (world frame, mm) and edge length (mm) of a cube that contains the subject, from the usable
+    silhouettes."""
     return mask_extent({camera.name: silhouettes[camera.name].mask for camera in usable_cameras(silhouettes, rig)}, rig)
 
 
 def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple[Vector, float]:
-    """Returns the centre (world, mm) and edge length (mm) of a cube that contains the masked object. Masks may be
-    smaller than the images.
+    """Returns the centre (world frame, mm) and edge length (mm) of a cube that contains the masked object. Masks may
+    have a lower resolution than the images.
 
-    The centre is the point nearest to the rays through the masks' middles; the edge is the largest diagonal of a mask
-    at that depth. Without any mask, the centre is the point that the cameras are directed at, and the edge 400 mm.
-    """
+    The cube's centre is the point nearest to the rays through the masks' centres; its edge is the largest diagonal of a
+    mask at that depth. Without any mask, the centre is the point at which the cameras are directed, and the edge is 400
+    mm."""
     views, rays = [], []
     for name, mask in masks.items():
         camera = rig[name]
@@ -41,7 +41,7 @@ def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple
 
 
 def depth_of(camera: Camera, point: Vector) -> float:
-    """Returns the distance (mm) of a point along the camera's z axis, at least 1 mm."""
+    """Returns the depth (mm) of a point along the camera's z axis, at least 1 mm."""
     return max(1.0, float(camera.camera_from_world.apply(point)[2]))
 
 

@@ -1,5 +1,4 @@
 """Labels every pixel of the subject as skin, hair or clothes.
 
-In: photographs, silhouettes and the head fitted to its outlines. Out: probabilities of the parts at each pixel, for the
-photometric fit, the detail and the bust.
-"""
+The input is photographs, silhouettes and the head fitted to its outlines. The output is the probability of each label
+at each pixel, for the photometric fit, the head's detail and the bust."""

@@ -1,7 +1,7 @@
-"""Computes features that distinguish the parts, on a coarse grid of every photograph: colour, fine structure, and
-position on the head.
+"""Computes features that distinguish skin, hair and clothes on a coarse grid of every photograph: colour, fine
+structure, and position on the head.
 
-A cell is a square of pixels, about two millimetres wide on the subject whatever the camera's resolution.
+A cell of this grid is a square of pixels, about two millimetres wide on the subject for any resolution of the camera.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ from rig.rig import Rig
 
 Vector = Float[np.ndarray, " 3"]
 
-BALANCE_VERTICES = 3000  # of the face, enough to tell the cameras' gains
+BALANCE_VERTICES = 3000  # vertices of the face that estimate the cameras' gains
 CHEEK_INSIDE_MM, CHEEK_MARGIN_MM = 12.0, 3.0  # from the border of the face, and above the nose's lower end
 DOWNWARD = (-0.25, -0.5)  # cosine between normal and up: below jaw and chin, where light from above leaves skin dark
 MIN_FACING = 0.5  # cosine: flatter skin shines
@@ -35,9 +35,9 @@ DETAIL_BLUR_CELLS = 1.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadGuide:
-    """Holds the position of each vertex of a fitted head: its signed distance (mm) from the border of the face region,
-    positive inside, and its height (mm) above the chin along the head's upward axis; also which vertices are cheeks,
-    features, or the underside of the jaw."""
+    """Holds, for each vertex of a fitted head, its signed distance (mm) from the border of the face region, positive
+    inside, its height (mm) above the chin along the head's upward axis, and whether it belongs to a cheek, a facial
+    feature, or the underside of the jaw."""
 
     mesh: Mesh  # world frame
     into_face_mm: Float[np.ndarray, " v"]
@@ -52,15 +52,15 @@ class HeadGuide:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """Holds one view's coarse grid of cells. The position of a cell (``into_face_mm``, ``above_chin_mm``) is that of
-    the fitted head's surface where the head covers the cell. Elsewhere it is that of the plane through the head's
-    middle that faces the camera."""
+    """Holds a coarse grid of cells over one view. Where the head covers a cell, the cell's position (``into_face_mm``,
+    ``above_chin_mm``) is that of the fitted head's surface. Elsewhere it is the position on the plane through the
+    head's centre that faces the camera."""
 
     camera: Camera
     size_px: int
     colour: Float32[np.ndarray, "r c 3"]  # log red / green, log blue / green, log luminance; gains taken out
     detail: Float32[np.ndarray, "r c"]  # log of fine structure against the mean
-    grey: Float32[np.ndarray, "r c"]  # as displayed, 0 to 1: what edges are seen in
+    grey: Float32[np.ndarray, "r c"]  # sRGB, 0 to 1; its edges guide the smoothing of labels
     inside: Float32[np.ndarray, "r c"]  # share of the cell in the silhouette
     on_head: Bool[np.ndarray, "r c"]
     into_face_mm: Float32[np.ndarray, "r c"]
@@ -72,8 +72,8 @@ class Cells:
 
 
 def head_guide(mesh: Mesh, face_region: Bool[np.ndarray, " v"], landmarks: Mapping[str, Vector]) -> HeadGuide:
-    """Computes the guide of a fitted head. ``landmarks`` (world) must hold the corners of eyes and mouth, glabella,
-    subnasale, stomion and gnathion."""
+    """Computes the position of each vertex of a fitted head on the head. ``landmarks`` (world frame, mm) must contain
+    the corners of eyes and mouth, glabella, subnasale, stomion and gnathion."""
     vertices, chin = mesh.vertices, landmarks["gnathion"]
     eyes = (landmarks["exocanthion_right"] + landmarks["exocanthion_left"]) / 2
     left = landmarks["exocanthion_left"] - landmarks["exocanthion_right"]
@@ -128,7 +128,7 @@ def make_cells(
     head: HeadGuide,
     cell_mm: float,
 ) -> list[Cells]:
-    """Computes the cells of every view that has a photograph, with the colours of all cameras balanced."""
+    """Computes the cells of every view that has a photograph, after balancing the colours of all cameras."""
     cameras = [camera for camera in rig if camera.name in images]
     sizes = [_cell_px(camera, head.middle, cell_mm) for camera in cameras]
     shots = [images[camera.name] for camera in cameras]
@@ -154,13 +154,13 @@ def _cell_px(camera: Camera, at_world: Vector, cell_mm: float) -> int:
 
 
 def _linear(image: UInt8[np.ndarray, "h w 3"], size: int) -> Float32[np.ndarray, "r c 3"]:
-    """Returns the mean linear colour of every whole cell."""
+    """Returns the mean linear colour of every complete cell."""
     table = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
     return _means(cv2.LUT(image, table), size)
 
 
 def _grid(values: np.ndarray, size: int) -> tuple[int, int]:
-    """Returns the number of rows and columns of whole cells."""
+    """Returns the number of rows and columns of complete cells."""
     return values.shape[0] // size, values.shape[1] // size
 
 
@@ -173,7 +173,7 @@ def _means(values: np.ndarray, size: int) -> np.ndarray:
 def _seen(
     camera: Camera, size: int, head: HeadGuide, shape: tuple[int, int]
 ) -> tuple[Float32[np.ndarray, "r c"], Float32[np.ndarray, "r c 5"]]:
-    """Returns the depth of the head (mm) at every cell's centre, inf outside the head, and the guide's values there."""
+    """Returns the head's depth (mm) at every cell's centre, inf beside the head, and the position values there."""
     pixels = (camera.project(head.mesh.vertices) - (size - 1) / 2) / size
     depths = camera_depths(camera, head.mesh.vertices)
     depth, face = rasterise(pixels, depths, head.mesh.faces, *shape)
@@ -245,8 +245,8 @@ def _cells(
 
 
 def _height_beside(camera: Camera, size: int, shape: tuple[int, int], head: HeadGuide) -> Float[np.ndarray, "r c"]:
-    """Returns the height (mm) above the chin where each cell's ray meets the plane through the head's middle that faces
-    the camera. This height is nearly affine in the image, so it is fitted to a 3 x 3 grid of rays."""
+    """Returns the height (mm) above the chin at which each cell's ray meets the plane through the head's centre that
+    faces the camera. This height is nearly affine in the image, so it is interpolated from a 3 x 3 grid of rays."""
     row, column = np.meshgrid(np.linspace(0, shape[0] - 1, 3), np.linspace(0, shape[1] - 1, 3), indexing="ij")
     pixels = np.stack([column.ravel(), row.ravel()], axis=1) * size + (size - 1) / 2
     rays = camera.rays_world(pixels)
@@ -260,13 +260,13 @@ def _height_beside(camera: Camera, size: int, shape: tuple[int, int], head: Head
 
 
 def grey_of(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """Returns the photograph in grey (sRGB codes scaled to 0 to 1)."""
+    """Returns the photograph in grey (sRGB values scaled to 0 to 1)."""
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.float32) / np.float32(255.0)
 
 
 def _detail(image: UInt8[np.ndarray, "h w 3"], size: int) -> Float32[np.ndarray, "r c"]:
-    """Returns the log of the standard deviation of fine structure within and around each cell, divided by the mean
-    grey."""
+    """Returns, for each cell, the logarithm of the standard deviation of fine structure within and around the cell,
+    divided by the mean grey value."""
     grey = 255.0 * grey_of(image)
     fine = cv2.GaussianBlur(grey, (0, 0), 0.8) - cv2.GaussianBlur(grey, (0, 0), 0.6 * size)
     square, mean = _means(fine * fine, size), _means(grey, size)

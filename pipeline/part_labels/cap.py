@@ -1,11 +1,10 @@
-"""Finds a thin swim or wig cap of a stated colour on the head, in every photograph.
+"""Finds a thin swim cap or wig cap of a known colour on the head, in every photograph.
 
-Colours are compared by chromaticity, which shading does not change. A coloured cap is compared by hue alone: sheen only
-pales its colour, and its colour may be stated by a name. Grey caps are compared by luminance, with a wide tolerance.
-Then the cap's colour in this capture decides: the median of the pixels above the brows that resemble the stated colour.
-Cells nearer to the cheeks' colour are skin. Each view's cap is the largest connected piece, with highlights and seams
-filled, if most of it lies above the brows.
-"""
+Colours are compared by chromaticity, which shading does not change. A coloured cap is compared by hue alone, because
+sheen changes only saturation, and because the user may give the colour by a name. Grey caps are compared by luminance,
+with a wide tolerance. Then the cap's colour is measured in this capture: the median of the pixels above the brows that
+resemble the given colour. Cells whose colour is nearer to that of the cheeks are labelled skin. In each view, the cap
+is the largest connected set of cells, with highlights and seams filled, if most of it lies above the brows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,21 +18,21 @@ from rig.mesh import Mesh
 from rig.rig import Rig
 
 CELL_MM = 1.2  # edge of a cell: three pixels of the usual rig
-STATED_DEG, OWN_DEG = 32.0, 18.0  # how far hues of a cap lie from the stated one, and from the capture's own
+STATED_DEG, OWN_DEG = 32.0, 18.0  # largest hue difference from the stated colour, and from the measured one
 PALEST = 0.3  # of a cap's saturation: sheen leaves no less
 NEUTRAL = 0.12  # saturation (white 0, a primary 1) below which a cap has no hue; skin has 0.2 to 0.3
 LIGHT_RANGE = 2.2  # log luminance of a cap without hue, in shadow and in light
 ABOVE_BROWS_MM = 30.0  # where a cap covers the head, whoever wears it
-MIN_SHARE = 0.35  # of what all views show there
-MIN_VIEW_SHARE = 0.2  # of what one view shows there
+MIN_SHARE = 0.35  # of the head above the brows, over all views
+MIN_VIEW_SHARE = 0.2  # of the head above the brows, in one view
 MIN_ABOVE = 0.4  # of a piece, above the brows: from behind, a cap reaches down to the neck
 CLOSED_MM = 7.0  # highlights and seams of that width are filled
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cap:
-    """Holds the pixels that show the cap, by camera, and its thickness. ``share`` is the fraction of the visible head
-    well above the brows that it covers."""
+    """Holds the pixels that show the cap, by camera, and the cap's thickness. ``share`` is the fraction of the visible
+    head well above the brows that the cap covers."""
 
     masks: Mapping[str, Bool[np.ndarray, "_ _"]]
     thickness_mm: float
@@ -41,7 +40,7 @@ class Cap:
 
     @property
     def is_found(self) -> bool:
-        """Tells whether the cap was found at all."""
+        """Returns whether the cap was found in any view."""
         return bool(self.masks)
 
 
@@ -60,7 +59,7 @@ def find_cap(
 
     ``images``: sRGB photographs by camera. ``masks``: of the subject, by camera. ``rig``: the cameras as calibrated.
     ``head_world``: a head at the subject's pose, such as the mean head (mm). ``face_region``: its vertices.
-    ``landmarks_world``: its landmarks (mm). ``colour``: of the cap, about, linear RGB. ``thickness_mm``: the cap's.
+    ``landmarks_world``: its landmarks (mm). ``colour``: the cap's approximate linear RGB. ``thickness_mm``: the cap's.
     """
     guide = head_guide(head_world, face_region, landmarks_world)
     used = rig.subset(name for name in rig.names if name in masks and name in images)
@@ -77,7 +76,7 @@ def find_cap(
 
 
 def colour_of(linear: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-    """Converts a linear RGB colour to the form of the cells: log red / green, log blue / green, log luminance."""
+    """Converts a linear RGB colour to the form that cells use: log red / green, log blue / green, log luminance."""
     red, green, blue = np.log(linear + DARKEST)
     return np.array([red - green, blue - green, np.log(linear @ (0.2126, 0.7152, 0.0722) + DARKEST)])
 
@@ -85,10 +84,10 @@ def colour_of(linear: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
 def cap_cells(
     cells: Sequence[Cells], brows_mm: float, stated: Float[np.ndarray, " 3"]
 ) -> tuple[dict[str, Bool[np.ndarray, "_ _"]], float]:
-    """Returns the cap's cells in the views that show it, and the fraction of the head above the brows that they cover.
+    """Returns the cells that show the cap, by camera, and the fraction of the head above the brows that they cover.
 
     Args:
-        cells: of each view.
+        cells: the cells of each view.
         brows_mm: height of the brows above the chin.
         stated: the cap's colour, as ``colour_of`` returns it.
     """
@@ -119,8 +118,8 @@ def _gathered(cells: Sequence[Cells], chosen: Sequence[Bool[np.ndarray, "_ _"]])
 
 
 def chromaticity(colour: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-    """Returns the chromaticity of the cells' colours: white is the origin; red, green and blue have length 1 at 0, 120
-    and 240 degrees."""
+    """Returns the chromaticity of colours: white is the origin; red, green and blue have length 1 at 0, 120 and 240
+    degrees."""
     red, blue = np.exp(colour[..., 0]), np.exp(colour[..., 1])
     total = red + 1.0 + blue
     return np.stack([(red - 0.5 * (1.0 + blue)) / total, np.sqrt(0.75) * (1.0 - blue) / total], axis=-1)
@@ -129,7 +128,8 @@ def chromaticity(colour: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]
 def _resembles(
     colour: Float32[np.ndarray, "*n 3"], cap: Float[np.ndarray, " 3"], cheeks: Float[np.ndarray, " 3"], hue_deg: float
 ) -> Bool[np.ndarray, "*n"]:
-    """Tells which colours are the cap's, apart from shading and sheen, and nearer to it than to the cheeks' colour."""
+    """Returns a mask of the colours that match the cap's except for shading and sheen, and are not nearer to the
+    cheeks'."""
     seen, worn, skin = chromaticity(colour), chromaticity(cap), chromaticity(cheeks)
     saturation = float(np.linalg.norm(worn))
     if saturation < NEUTRAL:
@@ -144,7 +144,7 @@ def _resembles(
 
 
 def _piece(view: Cells, like: Bool[np.ndarray, "r c"], brows_mm: float) -> Bool[np.ndarray, "r c"]:
-    """Returns the largest connected piece of the cells that lies mostly above the brows, its holes filled."""
+    """Returns the largest connected set of the cells that lies mostly above the brows, with its holes filled."""
     wide = max(3, 2 * round(0.5 * CLOSED_MM / CELL_MM) + 1)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
     closed = np.asarray(cv2.morphologyEx(like.astype(np.uint8), cv2.MORPH_CLOSE, disc), np.uint8)
@@ -165,7 +165,7 @@ def _piece(view: Cells, like: Bool[np.ndarray, "r c"], brows_mm: float) -> Bool[
 
 
 def _at_pixels(cells: Bool[np.ndarray, "r c"], size_px: int, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Returns the subject's pixels in the cells and, up to the outline, within a cell's edge length of them."""
+    """Returns a mask of the subject's pixels in the cells and, up to the outline, within one cell width of them."""
     whole = np.zeros(mask.shape, np.uint8)
     grown = np.repeat(np.repeat(cells, size_px, axis=0), size_px, axis=1)
     whole[: grown.shape[0], : grown.shape[1]] = grown

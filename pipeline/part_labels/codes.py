@@ -1,9 +1,8 @@
-"""Defines the parts that a surface shows, as ``bust.ply`` stores them, and the channel of each in a map of
+"""Defines the labels skin, hair and clothes (parts), their codes in ``bust.ply``, and their channels in a map of
 probabilities.
 
-The last axis of a map holds skin, hair and clothes; there is no channel for unseen surface. All conversions between
-codes and channels are here.
-"""
+A map's last axis holds skin, hair and clothes; there is no channel for surface that no camera sees. This module
+contains all conversions between codes and channels."""
 
 from enum import IntEnum
 
@@ -12,8 +11,8 @@ from jaxtyping import Int, UInt8
 
 
 class Part(IntEnum):
-    """Names the part of the subject at a vertex or a point of the surface. The numbers are stored in files and never
-    change."""
+    """Names the label (skin, hair or clothes) of a vertex or surface point. The numbers are stored in files and must
+    not change."""
 
     UNSEEN = 0
     SKIN = 1
@@ -22,7 +21,7 @@ class Part(IntEnum):
 
     @property
     def channel(self) -> int:
-        """Returns the part's index along the last axis of probabilities. Raises ValueError for UNSEEN."""
+        """Returns the label's index along the last axis of a map of probabilities. Raises ValueError for UNSEEN."""
         return CHANNELS.index(self)
 
 
@@ -31,5 +30,5 @@ CHANNELS = (Part.SKIN, Part.HAIR, Part.CLOTHES)
 
 
 def codes_from_channels(channels: Int[np.ndarray, " n"]) -> UInt8[np.ndarray, " n"]:
-    """Returns the code of the part that belongs to each channel."""
+    """Returns the label's code for each channel of a map of probabilities."""
     return np.array(CHANNELS, np.uint8)[channels]

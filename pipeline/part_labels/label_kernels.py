@@ -1,4 +1,4 @@
-"""Compiled loop that interpolates the part probabilities of cells to the pixels of a photograph."""
+"""Holds the compiled loop that interpolates label probabilities from cells to the pixels of a photograph."""
 
 import numpy as np
 
@@ -7,11 +7,12 @@ from rig.jit import njit
 
 @njit(cache=True, nogil=True, fastmath=True)
 def spread_parts(slope, offset, size_px, grey, mask, out):
-    """Fills ``out`` (h, w, 3; uint8) with the probabilities of the three parts, in 255ths, at the pixels of ``mask``
-    (h, w). They are ``slope * grey + offset``, clipped to 0 to 1 and to a sum of at most 1. Other pixels do not change.
+    """Fills ``out`` (h, w, 3; uint8) with the probabilities of skin, hair and clothes, in 255ths, at the pixels of
+    ``mask`` (h, w). The probabilities are ``slope * grey + offset``, clipped to 0 to 1 and to a sum of at most 1.
+    Pixels outside ``mask`` do not change.
 
     ``slope`` and ``offset`` (r, c, 3) are interpolated between the middles of cells of ``size_px`` pixels, and constant
-    beyond the outermost ones; ``grey`` (h, w) is 0 to 255, and counts as 0 to 1.
+    beyond the outermost cells; ``grey`` (h, w) is 0 to 255, and is scaled to 0 to 1.
     """
     rows, columns = slope.shape[:2]
     one, per = np.float32(1.0), np.float32(1.0 / 255.0)

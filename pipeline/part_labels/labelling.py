@@ -1,12 +1,12 @@
-"""Labels every pixel of the subject as skin, hair or clothes, by models learnt from the capture itself.
+"""Labels every pixel of the subject as skin, hair or clothes, with models learnt from the same capture.
 
-The middle of the fitted face is skin. Pixels beside the head above the chin are hair, unless they look like that skin
-(a bald crown). Pixels below are clothes, unless they look like skin. From this start, expectation maximisation
-(Dempster, Laird and Rubin 1977) learns the appearance of each part in this capture: histograms of colour and fine
-structure over all views, after the cameras' gains are removed. The position on the head is the prior. A filter that
-preserves the edges of the photograph smooths the labels (He, Sun and Tang 2010, guided image filtering,
-https://doi.org/10.1007/978-3-642-15549-9_1). A cap is distinguished from hair only if it looks like the clothes below;
-both hide skin."""
+The labelling starts from positions: the middle of the fitted face is skin. Pixels beside the head and above the chin
+are hair, unless they resemble that skin (a bald crown). Pixels below the chin are clothes, unless they resemble that
+skin. Expectation maximisation (Dempster, Laird and Rubin 1977) then learns the appearance of each label in this
+capture: histograms of colour and fine structure over all views, with the cameras' colours balanced. The prior
+probability depends on the position on the head. A filter that preserves edges of the photograph smooths the
+probabilities (He, Sun and Tang 2010, guided image filtering, https://doi.org/10.1007/978-3-642-15549-9_1). A cap is
+labelled as clothes if it resembles the clothes, and as hair otherwise; both hide skin."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,35 +38,35 @@ CHROMA_BLUR, LIGHT_BLUR, DETAIL_BLUR = 0.9, 1.6, 1.2  # bins; light falls off wi
 SHADE_SHARE, SHADE_BLUR = 0.4, 4.0  # of a part's looks: its colours in light that only others of them have; bins
 OUTLIER = 0.02  # share of what belongs to no part
 BARE_PRIOR, BEARD_PRIOR = (0.8, 0.17), (0.3, 0.67)  # of skin and hair on a lower face without a beard, and with one
-BEARD_SHARE = (0.2, 0.45)  # of the lower face that looks otherwise than the cheeks: no beard, a beard for certain
-CONFIDENT = 0.8  # only cells so probable teach how their part looks: others would pull all parts together
-MIN_PRESENT = 1e-3  # share of a part's sure places that do not look like skin: a bald head has no hair
-SKIN_RATIO = 0.15  # looks that skin has so much less often than the whole subject are half not skin's
+BEARD_SHARE = (0.2, 0.45)  # share of the lower face that differs from the cheeks: no beard, certain beard
+CONFIDENT = 0.8  # only cells this probable train their label: others would make all labels alike
+MIN_PRESENT = 1e-3  # share of cells certain by position that differ from skin: a bald head has no hair
+SKIN_RATIO = 0.15  # ratio of frequencies (skin to subject) at which an appearance is half skin
 OUTLIER_BINS = RED_BINS * BLUE_BINS * LIGHT_BINS * DETAIL_BINS / 50.0  # that a part of its own would fill evenly
 PLAIN = 0.1  # a cell that is less of a feature or underside than this is plain skin, or a beard
-FLOOR = 0.02  # of a part's looks that its histogram has not shown
+FLOOR = 0.02  # probability of appearances that a label's histogram lacks
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartMap:
-    """Holds one view's probabilities of skin, hair and clothes at each pixel of the photograph, in 255ths: a byte each,
-    since a view has millions. If they sum to less than 255, the remainder is unknown; outside the subject all of it
-    is."""
+    """Holds one view's probabilities of skin, hair and clothes at each pixel of the photograph, in 255ths: one byte
+    each, because a view has millions of pixels. The sum is at most 255, and the remainder is unknown; outside the
+    subject all probabilities are 0."""
 
     camera: str
     of_255: UInt8[np.ndarray, "h w 3"]
 
     @property
     def probability(self) -> Float32[np.ndarray, "h w 3"]:
-        """Returns all probabilities, 0 to 1."""
+        """Returns the probabilities of skin, hair and clothes, 0 to 1."""
         return self.of_255 * np.float32(1 / 255)
 
     def probability_of(self, part: Part) -> Float32[np.ndarray, "h w"]:
-        """Returns the probability of one part at every pixel."""
+        """Returns the probability of one label at every pixel."""
         return self.of_255[..., part.channel] * np.float32(1 / 255)
 
     def with_clothes(self, mask: Bool[np.ndarray, "h w"]) -> "PartMap":
-        """Returns the map with clothes for certain where ``mask`` is true."""
+        """Returns the map with the probability of clothes set to 1 where ``mask`` is true."""
         clothes = np.zeros(3, np.uint8)
         clothes[CLOTHES_CHANNEL] = 255
         return PartMap(self.camera, np.where(mask[..., None], clothes, self.of_255))
@@ -86,7 +86,7 @@ def classify_parts(
 
     Args:
         images: sRGB photographs by camera.
-        silhouettes: of the subject, by camera; views that are not usable are left out.
+        silhouettes: silhouettes of the subject, by camera; unusable views are left out.
         rig: the cameras as calibrated.
         head_world: the fitted head without hair (mm).
         face_region: its vertices from ear to ear and from the lower forehead to under the chin.
@@ -94,7 +94,7 @@ def classify_parts(
         report: progress.
 
     Returns:
-        A map for each view that takes part.
+        A map for each usable view with a photograph.
     """
     masks = {n: s.mask for n, s in silhouettes.items() if s.quality.usable and n in images and n in rig.names}
     used = rig.subset(name for name in rig.names if name in masks)
@@ -131,7 +131,7 @@ def classify_parts(
 
 
 def bins(view: Cells) -> Int[np.ndarray, "r c 2"]:
-    """Returns the histogram bins of every cell: the bin of its colour, and that of its fine structure."""
+    """Returns two histogram bins for every cell: one for its colour, and one for its fine structure."""
     red, blue, light = np.moveaxis(view.colour, 2, 0)
     a, b = _bin(red, RED_RANGE, RED_BINS), _bin(blue, BLUE_RANGE, BLUE_BINS)
     colour = (a * BLUE_BINS + b) * LIGHT_BINS + _bin(light, LIGHT_RANGE, LIGHT_BINS)
@@ -143,11 +143,11 @@ def _bin(values: Float32[np.ndarray, "r c"], span: tuple[float, float], count: i
 
 
 def starts(view: Cells) -> Float32[np.ndarray, "r c 3"]:
-    """Marks cells (1, else 0) that are almost certainly skin, hair or clothes by their position, one channel each.
+    """Returns masks (1 or 0) of the cells that are almost certainly skin, hair or clothes because of their position,
+    one channel for each label.
 
-    Skin: cheeks and nose. Hair: the cranium far from the face, and cells beside the head above the ears. Clothes: cells
-    well below the chin and beside the neck.
-    """
+    Cheeks and nose count as skin. The cranium far from the face counts as hair, and so do cells beside the head above
+    the ears. Cells well below the chin and beside the neck count as clothes."""
     skin = view.cheek > 0.5
     beside = ~view.on_head & (view.outside_mm > 3.0)
     hair = (beside | (view.into_face_mm < -45.0)) & (view.above_chin_mm > 70.0)
@@ -156,27 +156,27 @@ def starts(view: Cells) -> Float32[np.ndarray, "r c 3"]:
 
 
 def beard_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Marks the cells of jaw, chin and upper lip."""
+    """Returns a mask of the cells on jaw, chin and upper lip."""
     low = (view.above_chin_mm > -20.0) & (view.above_chin_mm < 50.0)
     return view.on_head & low & (view.into_face_mm > -15.0)
 
 
 def sideburn_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Marks the cells above the beard zone, between cheeks and ears, where hair other than a beard does not occur."""
+    """Returns a mask of the cells above the beard zone, between cheeks and ears, where only a beard can grow."""
     above = (view.above_chin_mm >= 50.0) & (view.above_chin_mm < 80.0)
     return view.on_head & above & (view.into_face_mm > -15.0) & (view.cheek < 0.5)
 
 
 def beard_evidence(unlikeness: Float[np.ndarray, " n"], lower: Bool[np.ndarray, " n"]) -> float:
-    """Returns a number from 0 (no beard) to 1 (beard), from the mean difference (``unlikeness``) of the lower face from
-    cheeks and nose: below 0.12 without a beard, above 0.9 with one."""
+    """Returns a number from 0 (no beard) to 1 (beard), from the mean difference (``unlikeness``) between the lower face
+    and cheeks with nose: below 0.12 without a beard, above 0.9 with one."""
     share = float(unlikeness[lower].mean()) if lower.any() else 0.0
     return float(_ramp(np.full((1, 1), share, np.float32), *BEARD_SHARE)[0, 0])
 
 
 def place_prior(view: Cells, bearded: float = 0.0) -> Float32[np.ndarray, "r c 4"]:
-    """Returns the prior probability of skin, hair, clothes, and none of them in each cell, from its position and from
-    ``beard_evidence`` alone."""
+    """Returns the prior probability of skin, hair, clothes, and none of them in each cell, from the cell's position and
+    ``beard_evidence``."""
     face = _ramp(view.into_face_mm, -25.0, 15.0)
     upper = np.where(view.on_head, _ramp(view.above_chin_mm, -15.0, 45.0), _ramp(view.above_chin_mm, -45.0, 25.0))
     skin_above = np.where(view.on_head, 0.15 + 0.8 * face, 0.12)
@@ -207,9 +207,9 @@ def _ramp(values: Float32[np.ndarray, "r c"], low: float, high: float) -> Float3
 def unlike_cheeks(
     appearance: Int[np.ndarray, "n 2"], cheeks: Float32[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Returns the difference (0 to 1) of every cell from the cells ``cheeks``, which are certainly skin: by colour
-    alone, and by colour and fine structure. Fine structure separates a blond beard from skin, but also reacts to the
-    borders of shadows."""
+    """Returns how much every cell differs (0 to 1) from the cells ``cheeks``, which are certainly skin: by colour
+    alone, and by colour and fine structure. Fine structure separates a blond beard from skin, but it is also high at
+    the borders of shadows."""
     everything = np.ones(len(appearance), np.float32)
     colour, detail = (
         (of(which, cheeks) / of(which, everything))[which]
@@ -226,12 +226,12 @@ def fit_appearance(
     lower: Bool[np.ndarray, " n"],
     unlikeness: Float[np.ndarray, " n"],
 ) -> Float32[np.ndarray, "n 4"]:
-    """Learns the appearance of the parts by expectation maximisation. Returns the log likelihood of every cell under
-    skin, hair, clothes and an outlier class, plus the evidence that this subject shows the part at all.
+    """Learns the appearance of skin, hair and clothes by expectation maximisation. Returns the log likelihood of every
+    cell under skin, hair, clothes and an outlier class, plus the logarithm of the probability that the subject shows
+    this label at all.
 
-    It starts from the cells whose position decides their part; those of hair and clothes count less the more they look
-    like skin.
-    """
+    It starts from the cells whose position decides their label; cells of hair and clothes have less weight the more
+    they resemble skin."""
     colour, detail = appearance.T
     share = start.copy()
     share[:, HAIR_CHANNEL] = np.maximum(share[:, HAIR_CHANNEL], lower) * unlikeness
@@ -252,20 +252,20 @@ def fit_appearance(
 def _presence(
     unlikeness: Float[np.ndarray, " n"], start: Float32[np.ndarray, "n 3"], lower: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, " 3"]:
-    """Returns the probability that the subject shows each part at all: for hair and clothes, the mean unlikeness to
-    skin of their certain cells. A beard counts as hair."""
+    """Returns the probability that the subject shows each label at all: for hair and clothes, how much the cells whose
+    position decides this label differ from skin on average. A beard counts as hair."""
     shares = [float(unlikeness[place > 0].mean()) if place.any() else 0.0 for place in (*start.T, lower)]
     return np.maximum([1.0, max(shares[HAIR_CHANNEL], shares[3]), shares[CLOTHES_CHANNEL]], MIN_PRESENT)
 
 
 def posterior(logs: Float32[np.ndarray, "n 4"], prior: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
-    """Returns the probability of skin, hair and clothes in each cell; the rest to 1 belongs to the outlier class."""
+    """Returns the probability of skin, hair and clothes in each cell; the remainder to 1 is for outliers."""
     share = prior * np.exp(logs - logs.max(axis=1, keepdims=True))
     return share[:, :3] / share.sum(axis=1, keepdims=True)
 
 
 def colour_histogram(colour: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"]) -> Float[np.ndarray, " b"]:
-    """Returns the probability of every bin of colour, smoothed, nowhere zero."""
+    """Returns the smoothed probability of every colour bin, which is nowhere zero."""
     shape = (RED_BINS, BLUE_BINS, LIGHT_BINS)
     counts = np.bincount(colour, weight, np.prod(shape)).astype(np.float32)
     counts = counts.reshape(RED_BINS, BLUE_BINS * LIGHT_BINS)
@@ -278,7 +278,7 @@ def colour_histogram(colour: Int[np.ndarray, " n"], weight: Float32[np.ndarray, 
 
 
 def detail_histogram(detail: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"]) -> Float[np.ndarray, " d"]:
-    """Returns the probability of every bin of fine structure, smoothed, nowhere zero."""
+    """Returns the smoothed probability of every fine-structure bin, which is nowhere zero."""
     counts = np.bincount(detail, weight, DETAIL_BINS).astype(np.float32)[None]
     return _proper(cv2.GaussianBlur(counts, (0, 0), sigmaX=DETAIL_BLUR, sigmaY=0.1).ravel().astype(float))
 
@@ -295,7 +295,7 @@ def upsample_guided(
     image: UInt8[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns the cells' probabilities (255ths) at each pixel of the photograph, smooth except at its edges."""
+    """Returns the cells' probabilities (255ths) at each pixel, smooth except at the photograph's edges."""
     grid = np.zeros((*inside.shape, 3), np.float32)
     grid[inside] = share
     radius = max(1, round(0.5 * SMOOTH_MM / CELL_MM))
@@ -313,8 +313,8 @@ def guided(
     edge: float,
 ) -> tuple[Float32[np.ndarray, "r c p"], Float32[np.ndarray, "r c p"]]:
     """Returns slope and offset of the guided filter: ``slope guide + offset`` is the smoothed value (He, Sun and Tang
-    2010, eqs. 5, 6 and 8). ``weight`` is 0 where values are unknown; ``edge`` is the contrast of the guide across which
-    values are not smoothed."""
+    2010, eqs. 5, 6 and 8). ``weight`` is 0 where values are unknown; ``edge`` is the contrast of the guide image across
+    which values are not smoothed."""
 
     def mean(field: np.ndarray) -> np.ndarray:
         return cv2.blur(field, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_CONSTANT)

@@ -1,7 +1,7 @@
-"""Combines the part maps of all views on the surface: it is divided into small cells, and the views of a cell vote.
+"""Combines the label probabilities of all views on the surface, which is divided into small cubic cells: the views of a
+cell are averaged.
 
-One pixel may be a freckle or a gap between strands, and an oblique view of a point is less reliable.
-"""
+A single pixel may show a freckle or a gap between strands, and a label from an oblique view is less reliable."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ CELL_MM = 4.0  # edge of a cell
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartVotes:
-    """Holds small cells of the visible surface, each with its mean point (world, mm) and the mean probabilities of
-    skin, hair and clothes."""
+    """Holds small cubic cells of the visible surface, each with its mean point (world frame, mm) and the mean
+    probabilities of skin, hair and clothes."""
 
     corner: Float[np.ndarray, " 3"]
     size: Int[np.ndarray, " 3"]  # cells along each axis
@@ -37,7 +37,8 @@ class PartVotes:
 
 @traced
 def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig: Rig) -> PartVotes | None:
-    """Averages the part probabilities of all views' pixels in cells of ``CELL_MM``, where depth and parts are known.
+    """Averages the label probabilities of all views' pixels in cubic cells of ``CELL_MM``, where depth and labels are
+    known.
 
     Args:
         depth_maps: the depth map of each view.
@@ -73,7 +74,7 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
 
 
 def parts_shown(points: Float[np.ndarray, "n 3"], part: PartMap, camera: Camera) -> Float[np.ndarray, "n 3"]:
-    """Returns the probabilities of skin, hair and clothes at the pixel of each point (world, mm); 0 outside the
+    """Returns the probabilities of skin, hair and clothes at the pixel of each point (world frame, mm); 0 outside the
     picture."""
     height, width = part.of_255.shape[:2]
     column, row = np.rint(np.nan_to_num(project_points(camera, points), nan=-1.0)).astype(int).T
@@ -86,14 +87,14 @@ def _keys(cell: Int[np.ndarray, "n 3"], size: Int[np.ndarray, " 3"]) -> Int[np.n
 
 
 def part_codes(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
-    """Returns the most probable part (a code of ``Part``) at each point, from the cell that holds the point or else the
-    nearest one."""
+    """Returns the code of the most probable label (``Part``) at each point, from the cell that contains the point or
+    else the nearest cell."""
     return codes_from_channels(part_shares(votes, points).argmax(axis=1))
 
 
 def part_shares(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Returns the probabilities of skin, hair and clothes at each point, from the cell that holds the point or else the
-    nearest one."""
+    """Returns the probabilities of skin, hair and clothes at each point, from the cell that contains the point or else
+    the nearest cell."""
     cell = np.floor((points - votes.corner) / CELL_MM).astype(np.int64)
     inside = ((cell >= 0) & (cell < votes.size)).all(axis=1)
     keys = np.where(inside, _keys(cell, votes.size), -1)

@@ -1,5 +1,4 @@
-"""Fits the head to the photographs inside the outline.
+"""Fits the head to the photographs inside the outline, which the paper does not do.
 
-In: a solved contour problem and the photographs. Out: the same problem with a finer basis and with observations of the
-surface, solved again. The paper does not do this.
-"""
+The input is a solved contour problem and the photographs. The output is the same problem with more modes and with
+observations of the surface, solved again."""

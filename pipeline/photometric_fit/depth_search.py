@@ -1,23 +1,25 @@
-"""Finds the position along its normal at which each patch of the surface looks alike in its views (photo-consistency).
+"""Finds, for each patch of the surface, the position along its normal at which the patch looks most alike in its views
+(photo-consistency).
 
-The variance of the depth is that of a shift between two signals of correlation rho,
+The variance of this position is that of a shift between two signals with correlation rho:
 
     variance = floor^2 + noise area / window area * (1 - rho) / |d^2 rho / d shift^2|,
 
-so that texture, noise, defocus and grazing views all have their effect. Gain and offset of a camera have no effect.
+It therefore depends on texture, noise, defocus and oblique views. Gain and offset of a camera have no effect on the
+correlation.
 
-The same patches tell by how much the image of each view should shift. At the depth where a patch's views correlate
-best, the mean correlation is the least-squares problem ``sum_k v_k |f_k - T|^2``. Here f_k are the patch's grey values
-in view k, centred and of unit norm, and T is their mean with the weights v_k. That eliminates the unknown texture
-exactly, and also sliding along the surface. Linear in the image shifts delta_k (px) of the views,
+The same patches also determine by how much the image of each view should shift. Where a patch's views correlate best,
+the negative mean correlation equals, up to constants, the least-squares cost ``sum_k v_k |f_k - T|^2``. Here f_k are
+the patch's grey values in view k, centred and of unit norm, v_k is the view's weight, and T is the weighted mean of all
+f_k. Taking T as the mean eliminates the unknown texture exactly, and also any sliding along the surface. Linearised in
+the image shifts delta_k (px) of the views, this cost has the second derivatives H and the gradient
 
     H_kl = v_k [k = l] <g_k, g_k> - v_k v_l / V <g_k, g_l>,   gradient_k = v_k <g_k, f_k - T>,
 
-where g_k are the images' slopes and V is the sum of the weights. A displacement u along the normal and camera
-corrections c_k make ``delta_k = p_k u + C_k c_k``. Eliminating u leaves two results: the derivative of the patch's
-depth by the cameras' poses, and a quadratic form in the cameras alone (shifts that no surface explains). A camera error
-of 0.2 px is visible in thousands of patches.
-"""
+Here g_k are the image derivatives and V is the sum of the weights. A displacement u along the normal and camera
+corrections c_k cause the image shifts ``delta_k = p_k u + C_k c_k``. Eliminating u leaves two results: the derivative
+of the patch's depth by the cameras' poses, and a quadratic form in the camera corrections alone, for image shifts that
+no surface explains. Thousands of patches together reveal a camera error of 0.2 px."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -50,7 +52,7 @@ from rig.camera import Camera
 from rig.geometry import RigidTransform, second_difference, vertex_offset
 from rig.mesh import Mesh
 
-MIN_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
+MIN_VIEW = 0.08  # least squared cosine of a view that is used: 73 degrees
 
 CENTRE_MM = 3.0  # distance of patches
 MAX_VIEWS = 5  # most frontal views between which a patch is compared
@@ -66,13 +68,13 @@ MIN_FACING = 0.2  # cosine: at a flatter angle than 78 degrees a pixel smears ov
 EDGE_PX = 4  # nothing is read nearer to the image's edge
 WINDOW_PX = 3  # around a sample in which a nearer surface may blur over it
 FLATTEST = 1e-6  # curvature of correlation by a step squared: below it a peak has no place of its own
-BOUND_HEIGHT = 0.9  # correlation from which on hair says where it is
+BOUND_HEIGHT = 0.9  # correlation from which on a patch of hair gives its position
 SLOPE_SLACK = 1.5 * 1.414 * WINDOW_PX  # how much nearer its own slope may bring a surface within the window
 
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Holds the lengths (mm) of one search of all patches along their normals."""
+    """Holds the settings of one search of all patches along their normals (lengths in mm)."""
 
     window_mm: float  # standard deviation of the patch's window
     blur_mm: float  # of the images, on the head
@@ -83,8 +85,8 @@ class Round:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampleVisibility:
-    """Holds the head at the current state and, for each camera, which samples of its surface are visible, at which
-    pixel, and how frontally."""
+    """Holds the head at the current state and, for each camera, which surface samples are visible, at which pixel, and
+    the cosine between normal and line of sight."""
 
     cameras: tuple[Camera, ...]  # where the state has them
     vertices: Float[np.ndarray, "v 3"]  # full level, world
@@ -98,13 +100,13 @@ class SampleVisibility:
 def sample_visibility(
     problem: ContourProblem, state: State, patches: Patches, speaks: Bool[np.ndarray, " k"]
 ) -> SampleVisibility:
-    """Finds which samples each camera sees on the head of ``state``, by drawing the head's depth in every view."""
+    """Finds which surface samples each camera sees on the head of ``state``, from the head's depth maps."""
     head, coarse = head_of(problem, state), head_of(problem, state, DEPTH_LEVEL)
     return visibility_of(head, coarse, moved_cameras(problem, state), problem.views, patches, speaks)
 
 
 def head_of(problem: ContourProblem, state: State, level: str = "full") -> Mesh:
-    """Returns the head that ``state`` describes, on the given mesh level, world frame, mm."""
+    """Returns the head that ``state`` describes, as the mesh ``level`` of the head model, world frame, mm."""
     laid = problem.model.levels[level]
     return Mesh(state.world_from_head.apply(laid.operator @ problem.model.cage(state.coefficients)), laid.faces)
 
@@ -117,11 +119,12 @@ def visibility_of(
     patches: Patches,
     speaks: Bool[np.ndarray, " k"],
 ) -> SampleVisibility:
-    """Finds which samples of a head each camera sees. A coarser mesh of the same surface decides which are hidden.
+    """Finds which surface samples of a head each camera sees. A coarser mesh of the same surface decides which samples
+    are hidden.
 
     ``head_world``: the mesh that the patches belong to, mm. ``coarse_world``: the same surface with fewer triangles.
     ``cameras``: cameras of the views, at their current poses. ``views``: the silhouettes. ``patches``: the patches to
-    test. ``speaks``: which views have a photograph with texture; the others see nothing.
+    test. ``speaks``: which views have a photograph with texture; other views are ignored.
     """
     normals = head_world.normals()
     points, outward = patches.points(head_world.vertices), patches.normals(normals)
@@ -146,7 +149,7 @@ def visibility_of(
 
 
 def moved_cameras(problem: ContourProblem, state: State) -> tuple[Camera, ...]:
-    """Returns the cameras with the corrections of ``state`` applied."""
+    """Returns the cameras with the pose corrections of ``state`` applied."""
     views = moved_views(problem, state)
     return tuple(
         replace(camera, camera_from_world=RigidTransform(rotation, translation))
@@ -161,7 +164,7 @@ def facing_of(
     depth: Float32[np.ndarray, "h w"],
     distance: Float32[np.ndarray, "h w"],
 ) -> Float32[np.ndarray, " s"]:
-    """Returns the cosine between normal and line of sight for every sample that the camera sees; 0 for hidden samples.
+    """Returns the cosine between normal and line of sight for each sample that the camera sees; 0 for hidden samples.
 
     ``points``: the samples, world, mm. ``normals``: unit, world. ``camera``: the camera at its current pose. ``depth``:
     z-buffer (mm) of the head in this camera. ``distance``: signed distance (px) to the silhouette.
@@ -195,8 +198,8 @@ def observe(
     basis: Float32[np.ndarray, "m c 3"],
     each: Round,
 ) -> tuple[SurfaceObservations, Int[np.ndarray, " u"]]:
-    """Measures the surface at the patches' centres. Returns the observations, and the vertices of patches that several
-    cameras see but whose views do not match.
+    """Measures the position of the surface at the patches' centres. Returns the observations, and the centre vertices
+    of patches that several cameras see but whose views do not match.
 
     ``problem``: problem of the contour solver. ``state``: the current head and cameras. ``photographs``: photographs of
     the views. ``patches``: the patches to measure. ``visibility``: of the patches' samples at ``state``. ``hair``:
@@ -207,7 +210,7 @@ def observe(
     found = find_places(photographs, patches, visibility, problem.views, scale, each=each)
     several, clear, view, value = found.several, found.clear, found.view, found.value
     kept = np.flatnonzero(several & clear & (~hair | ((found.place < 0.0) & (found.height > BOUND_HEIGHT))))
-    # Patches overlap: what they say together is worth their area, not their number.
+    # Patches overlap, so their information is proportional to their area, not to their number.
     overlap = max(1.0, 4.0 * np.pi * each.window_mm**2 / CENTRE_MM**2)
     information = 1.0 / (overlap * found.variance[kept])
     rows, place = patches.centre[kept], found.place[kept]
@@ -239,8 +242,8 @@ def observe(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """Holds, for c patches, the position along its normal at which each looks most alike in its views, and the data
-    behind it."""
+    """Holds, for c patches, the position along the normal at which the views of each patch correlate best, and the
+    values from which this position was computed."""
 
     place: Float[np.ndarray, " c"]  # mm along the normal
     height: Float[np.ndarray, " c"]  # the correlation there
@@ -284,8 +287,8 @@ def find_places(
 
 
 def head_depth_factor(head_world: Mesh, face: Int[np.ndarray, " n"], cameras: Sequence[Camera]) -> float:
-    """Returns the median of ``depth_factor`` over the vertices ``face`` of a head (mm). Each vertex counts as seen by
-    its ``MAX_VIEWS`` most frontal cameras; occlusion is ignored. Returns 1 if no vertex faces two cameras."""
+    """Returns the median of ``depth_factor`` over the head's vertices ``face`` (vertices in mm). Each vertex is assumed
+    to be visible in its ``MAX_VIEWS`` most frontal cameras. Returns 1 if no vertex faces two cameras."""
     points, normals = head_world.vertices[face], head_world.normals()[face]
     centres = np.array([camera.centre_world for camera in cameras])
     towards = centres[None] - points[:, None]
@@ -299,12 +302,11 @@ def head_depth_factor(head_world: Mesh, face: Int[np.ndarray, " n"], cameras: Se
 
 
 def metric_rig(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "c c"]:
-    """Returns the information (inverse covariance, over all cameras' corrections) that prevents the rig from shrinking
-    or growing: a common relative change of all distances to the head has the standard deviation ``RIG_SCALE_SPREAD``.
+    """Returns an information matrix (inverse covariance of all cameras' corrections) that keeps the rig's size: a
+    common relative change of all camera distances to the head has the standard deviation ``RIG_SCALE_SPREAD``.
 
-    All distances come from one calibration board of known size. Images alone cannot determine them: a contour a tenth
-    of a pixel too far out would move every camera and the surface closer.
-    """
+    The rig's size comes from one calibration board of known size. Images alone cannot determine it: outlines that are a
+    tenth of a pixel too wide would move every camera and the surface closer."""
     depth = np.array([camera.camera_from_world.apply(at_world)[2] for camera in cameras])
     nearer = np.zeros((len(depth), 6))
     nearer[:, 5] = 1.0 / (len(depth) * depth)
@@ -312,13 +314,13 @@ def metric_rig(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -
 
 
 def pixels_per_mm(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " k"]:
-    """Returns how many pixels of each camera cover a millimetre at ``at_world``."""
+    """Returns how many pixels of each camera a length of 1 mm at ``at_world`` covers."""
     return np.array([c.intrinsics.fx / c.camera_from_world.apply(at_world)[2] for c in cameras])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Peaks:
-    """Holds the peak of each patch's correlation along its normal."""
+    """Holds the maximum of each patch's correlation along its normal."""
 
     place: Float[np.ndarray, " c"]  # mm along the normal
     height: Float[np.ndarray, " c"]
@@ -327,7 +329,7 @@ class Peaks:
 
 
 def find_peaks(score: Float32[np.ndarray, "c d"], steps: Float[np.ndarray, " d"]) -> Peaks:
-    """Finds the peak of each patch's correlation, from a parabola through the highest step and the steps beside it."""
+    """Finds the maximum of each patch's correlation, by a parabola through the highest value and its two neighbours."""
     best = score.argmax(axis=1)
     middle = np.clip(best, 1, len(steps) - 2)
     rows, step = np.arange(len(score)), steps[1] - steps[0]
@@ -345,9 +347,9 @@ def find_peaks(score: Float32[np.ndarray, "c d"], steps: Float[np.ndarray, " d"]
 def choose_views(
     patches: Patches, weights: Float[np.ndarray, " e"], facing: Float32[np.ndarray, "k s"], least_seen: float, most: int
 ) -> tuple[Int[np.ndarray, "c n"], Float[np.ndarray, "c n"]]:
-    """Chooses the views that compare each patch: at most ``most`` of those that see it most frontally and nearly whole
-    (at least the fraction ``least_seen``). Returns them with their weights, the squared cosine between normal and line
-    of sight; missing ones are -1 with weight 0."""
+    """Chooses the views in which each patch is compared: at most ``most`` of the most frontal views that show at least
+    the fraction ``least_seen`` of the patch. Returns view indices with weights, the squared cosine between normal and
+    line of sight; missing views are -1 with weight 0."""
     total = patches.sums(weights, np.ones((facing.shape[1], 1)))
     seen = patches.sums(weights, (facing > 0).T.astype(float))
     cosine = patches.sums(weights, facing.T.astype(float)) / np.maximum(seen, 1e-9)
@@ -359,7 +361,7 @@ def choose_views(
 
 
 def sweep(samples: Samples, pictures: Pictures, steps: Float[np.ndarray, " d"]) -> Float32[np.ndarray, "s k d"]:
-    """Returns each camera's grey value for every sample after it is moved along its normal by each of ``steps``
+    """Returns each camera's grey value at every sample after the sample is moved along its normal by each of ``steps``
     (mm)."""
     cameras, count = samples.seen.shape
     out = np.zeros((count, cameras, len(steps)), np.float32)
@@ -377,13 +379,12 @@ def correlate(
     grey: Float32[np.ndarray, "s k d"],
     noise: Float[np.ndarray, " k"],
 ) -> Float32[np.ndarray, "c d"]:
-    """Returns the mean normalised cross-correlation over the pairs of each patch's chosen views, for every step along
-    the normal; 0 if there is no pair.
+    """Returns, for each patch and each step along its normal, the mean normalised cross-correlation over all pairs of
+    the patch's views; 0 if there is no pair.
 
-    Gain and offset of a view have no effect. ``noise``, the standard deviation of each camera's grey values, is part of
-    the norm, so patches without texture correlate with nothing. ``view`` and ``value`` are the results of
-    ``choose_views``, ``grey`` that of ``sweep``.
-    """
+    Gain and offset of a view do not change the correlation. ``noise``, the standard deviation of each camera's grey
+    values, is part of the norm, so the correlation of a patch without texture is near 0. ``view`` and ``value`` come
+    from ``choose_views``, ``grey`` from ``sweep``."""
     score = np.zeros((len(patches.centre), grey.shape[2]), np.float32)
     members = Members(patches.start, patches.member, weights)
     in_threads(len(score), lambda a, b: correlate_views(a, b, members, view, value, seen, grey, noise, score))
@@ -392,8 +393,8 @@ def correlate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraSensitivity:
-    """Holds, for n patches, how the depth of each depends on the cameras' poses, and the quadratic form in the cameras
-    that remains when depth is eliminated. v is the number of views of a patch, a = 2 v their image axes."""
+    """Holds, for n patches, the derivative of each patch's depth by the cameras' poses, and the quadratic form in the
+    camera corrections that remains when the depth is eliminated."""
 
     by_camera: Float[np.ndarray, "n c"]  # d(place, mm along the normal) / d(cameras), c = 6 K
     view: Int[np.ndarray, "n v"]
@@ -402,8 +403,8 @@ class CameraSensitivity:
     slides: Float[np.ndarray, "n a 6"]  # d(image shifts of a view) / d(its camera)
 
     def cameras(self, information: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
-        """Returns the sum of all patches' quadratic forms: its matrix, and its gradient towards the minimum, over the
-        corrections of all cameras (rad, mm). Each patch is weighted by its ``information`` (mm^-2)."""
+        """Returns the sum of all patches' quadratic forms in the camera corrections (rad, mm): its matrix, and its
+        negative gradient. Each patch is weighted by its ``information`` (mm^-2)."""
         size = self.by_camera.shape[1]
         matrix, gradient = np.zeros((size, size)), np.zeros(size)
         add_cameras(self.view, self.stiff, self.slope, self.slides, information, matrix, gradient)
@@ -460,8 +461,8 @@ def gram_matrices(
     samples: Samples,
     pictures: Pictures,
 ) -> tuple[Float[np.ndarray, "n a a"], Float[np.ndarray, "n a v"]]:
-    """Computes two sets of inner products for the ``chosen`` patches, with the surface moved by ``shifts`` (mm along
-    the normals): of the image slopes of its views with each other (two axes for each view), and of the slopes with the
+    """Computes inner products for the ``chosen`` patches, with the surface moved by ``shifts`` (mm along the normals):
+    between the image derivatives of a patch's views (two axes for each view), and between these derivatives and the
     grey values."""
     count, views = view.shape
     slopes, mixed = np.zeros((count, 2 * views, 2 * views)), np.zeros((count, 2 * views, views))

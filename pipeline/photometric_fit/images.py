@@ -1,9 +1,9 @@
-"""Prepares the photographs for photo-consistency: grey, with a noise level, with or without shading, and blurred.
+"""Prepares the photographs for photo-consistency: converts them to grey, measures noise, removes shading where
+required, and blurs.
 
-Shading varies slowly, and its glossy part moves with the camera. Matching it gives a surface behind a convex one and in
-front of a concave one: by 3 to 5 mm on oily skin, with cameras 12 degrees apart. Pores, moles and lashes are fine and
-fixed to the skin.
-"""
+Shading varies slowly over the face, and its glossy part moves with the camera. Matching glossy shading puts the surface
+behind a convex surface and in front of a concave one: by 3 to 5 mm on oily skin, with cameras 12 degrees apart. Pores,
+moles and lashes are small and do not move on the skin."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ MIN_COVERAGE = 1e-3  # share of a window inside the silhouette
 @dataclass(frozen=True, slots=True, eq=False)
 class Photographs:
     """Holds, for each view of the solver, the grey photograph, its noise (standard deviation, grey levels), and whether
-    it shows any texture (``speaks``). A view without a photograph is black."""
+    it contains texture (``speaks``). A view without a photograph is black."""
 
     grey: tuple[Float32[np.ndarray, "_ _"], ...]
     noise: Float[np.ndarray, " k"]
@@ -33,8 +33,8 @@ class Photographs:
 
 
 def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Views) -> Photographs:
-    """Converts the views' photographs to grey and measures their noise. ``speaks`` is False for a view without a
-    photograph, or without texture inside its silhouette."""
+    """Converts the photographs to grey and measures their noise. ``speaks`` is False for a view without a photograph,
+    or without texture inside its silhouette."""
 
     def load(k: int) -> tuple[Float32[np.ndarray, "h w"], float, bool]:
         width, height = views.size[k]
@@ -48,8 +48,8 @@ def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Vi
 
 
 def fine_texture(photographs: Photographs, views: Views, px_per_mm: Float[np.ndarray, " k"]) -> Photographs:
-    """Returns the photographs without shading. ``px_per_mm`` is the number of pixels that a millimetre on the head
-    covers in each view."""
+    """Returns the photographs without shading, so that fine texture remains. ``px_per_mm`` is the number of pixels that
+    a millimetre on the head covers in each view."""
 
     def fine(k: int) -> Float32[np.ndarray, "h w"]:
         return without_shading(photographs.grey[k], views.distance_map(k) < 0.0, SHADING_MM * float(px_per_mm[k]))
@@ -60,8 +60,7 @@ def fine_texture(photographs: Photographs, views: Views, px_per_mm: Float[np.nda
 def without_shading(
     grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"], sigma_px: float
 ) -> Float32[np.ndarray, "h w"]:
-    """Returns the difference between an image and its mean over a Gaussian window that ignores the background; 0
-    outside the silhouette."""
+    """Returns the difference between an image and its Gaussian mean over the silhouette; 0 outside the silhouette."""
     out = np.zeros_like(grey)
     rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
     if not len(rows):
@@ -75,8 +74,8 @@ def without_shading(
 
 
 def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"], noise: float) -> bool:
-    """Tells whether the pixels inside the silhouette vary by more than noise, and more than half of them are neither
-    overexposed nor black. A mask supplied as a photograph fails, because it is constant there."""
+    """Returns whether the pixels inside the silhouette vary by more than noise, and more than half of them are neither
+    overexposed nor black. A mask that was supplied in place of a photograph is constant there and gives False."""
     if not inside.any():
         return False
     smooth = cv2.GaussianBlur(grey, (0, 0), TEXTURE_BLUR_PX)[inside]
@@ -89,8 +88,8 @@ def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h 
 def blurred(
     photographs: Photographs, sigma_px: Float[np.ndarray, " k"]
 ) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
-    """Blurs each image with its ``sigma_px``. Returns all images in sequence in a flat array, and the remaining noise
-    of each: a blur divides white noise by 2 sqrt(pi) sigma."""
+    """Blurs each image with its standard deviation ``sigma_px``. Returns all images one after another in a flat array,
+    and the remaining noise of each image: a blur divides white noise by 2 sqrt(pi) sigma."""
     sigma = np.maximum(sigma_px, MIN_BLUR_PX)
     grey = photographs.grey
     smooth = map_in_threads(lambda k: cv2.GaussianBlur(grey[k], (0, 0), float(sigma[k])).ravel(), len(grey))

@@ -1,8 +1,8 @@
-"""Compiled loops of photo-consistency: the views' grey values along the normals, their correlation, and the rows of the
-camera term (``depth_search`` has the equations). Threads share out the samples or patches.
+"""Holds the compiled loops of photo-consistency: grey values of the views along the normals, their correlation, and the
+matrices for the camera corrections (``depth_search`` has the equations). Each thread processes a range of samples or
+patches.
 
-Shapes in the camera term: n patches, v views of each, a = 2 v image axes.
-"""
+Shapes are named as follows: n patches, v views of each patch, a = 2 v image axes."""
 
 from typing import NamedTuple
 
@@ -15,8 +15,8 @@ from rig.jit import njit
 
 
 class Samples(NamedTuple):
-    """Holds the pixel at which each of k cameras sees each of s samples, its motion for a step along the sample's
-    normal (px per mm), and whether the camera sees the sample."""
+    """Holds, for k cameras and s samples, the pixel at which a camera sees a sample, the pixel's motion for a step
+    along the sample's normal (px per mm), and whether the camera sees the sample."""
 
     pixel: Float[np.ndarray, "k s 2"]
     along: Float[np.ndarray, "k s 2"]
@@ -24,7 +24,7 @@ class Samples(NamedTuple):
 
 
 class Pictures(NamedTuple):
-    """Holds the grey images of all cameras in sequence in one flat array, row by row."""
+    """Holds the grey images of all cameras one after another in a flat array, row by row."""
 
     size: Int[np.ndarray, "k 2"]  # width, height
     offset: Int[np.ndarray, " k"]
@@ -33,8 +33,8 @@ class Pictures(NamedTuple):
 
 
 class Members(NamedTuple):
-    """Holds the samples of each patch, with their weights in its window. Those of patch p are ``member[start[p]:start[p
-    + 1]]``."""
+    """Holds the samples that belong to each patch, with their weights in the patch's window. The samples of patch p are
+    ``member[start[p]:start[p + 1]]``."""
 
     start: np.ndarray
     member: np.ndarray
@@ -43,8 +43,8 @@ class Members(NamedTuple):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def read(image, start, width, height, x, y):
-    """Returns the bilinear value of an image at (x, y), clamped to the image. The image begins at index ``start`` of
-    the flat array ``image``."""
+    """Returns the bilinear value of an image at (x, y), clamped to the image's border. The image begins at index
+    ``start`` of the flat array ``image``."""
     x, y = held(x, width), held(y, height)
     column, row = int(x), int(y)
     return sample_row(image, start + row * width + column, width, np.float32(x - column), np.float32(y - row))
@@ -52,8 +52,8 @@ def read(image, start, width, height, x, y):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def sweep_pictures(first, last, samples, pictures, steps, out):
-    """Fills ``out`` (s, k, d) for samples ``first`` to ``last``: camera k's grey value for a sample moved along its
-    normal by each of ``steps`` (d; mm). Entries of cameras that do not see the sample are left as they are."""
+    """Fills ``out`` (s, k, d) for samples ``first`` to ``last``: camera k's grey value at a sample moved along its
+    normal by each of ``steps`` (d; mm). Entries of cameras that do not see the sample are not changed."""
     pixel, along, seen = samples
     size, offset, image, _ = pictures
     for s in range(first, last):
@@ -68,15 +68,14 @@ def sweep_pictures(first, last, samples, pictures, steps, out):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def correlate_views(first, last, members, view, value, seen, grey, noise, score):
-    """Fills ``score`` (c, d) for patches ``first`` to ``last``: the mean normalised cross-correlation of each patch's
-    views over all their pairs, weighted, at each of d steps along the normal. Patches with fewer than two views are
-    left as they are.
+    """Fills ``score`` (c, d) for patches ``first`` to ``last``: the weighted mean normalised cross-correlation over all
+    pairs of a patch's views, at each of d steps along the normal. Entries of patches with fewer than two views are not
+    changed.
 
-    With f the centred grey values of a view and v its weight, the squared norm of ``sum v f / |f|`` counts every pair
-    twice, and each view with itself; the latter part is subtracted. ``view`` and ``value`` (c, n) are the views of each
-    patch (-1 for none) and their weights; ``grey`` (s, k, d) is the result of ``sweep_pictures``; ``noise`` (k) is part
-    of the norm.
-    """
+    With f the centred grey values of a view and v its weight, the squared norm of ``sum v f / |f|`` contains every pair
+    of views twice, and each view with itself once; the latter terms are subtracted. ``view`` and ``value`` (c, n) are
+    the views of each patch (-1 for none) and their weights; ``grey`` (s, k, d) is the result of ``sweep_pictures``;
+    ``noise`` (k) is part of the norm."""
     start, member, weight = members
     steps = grey.shape[2]
     mean, energy, factor = np.empty(steps, np.float32), np.empty(steps, np.float32), np.empty(steps, np.float32)
@@ -131,9 +130,9 @@ def correlate_views(first, last, members, view, value, seen, grey, noise, score)
 
 @njit(cache=True, nogil=True, fastmath=True)
 def write_image_motion(view, places, axes, cameras, ahead, slides):
-    """Fills the motion of each patch's image in each of its views: ``ahead`` (n, a; px per mm) when the patch moves
-    along its axis, and ``slides`` (n, a, 6; px per rad and mm) when the camera is corrected (rotation, translation,
-    applied to camera_from_world on the left).
+    """Fills the derivatives of each patch's pixel position in each of its views: ``ahead`` (n, a; px per mm) by a
+    motion of the patch along its axis, and ``slides`` (n, a, 6; px per rad and mm) by a correction of the camera
+    (rotation, translation, applied to camera_from_world on the left).
 
     ``view`` (n, v) are the views, -1 for none; ``places`` and ``axes`` (n, 3) are in the world frame, mm; ``cameras``
     are rows of ``packed_camera``.
@@ -158,9 +157,9 @@ def write_image_motion(view, places, axes, cameras, ahead, slides):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def add_by_camera(view, pull, slides, by_camera):
-    """Fills the derivative of each patch's depth by the cameras: adds ``pull * slides``, summed over the image axes of
-    each view, to the six columns of the view's camera in ``by_camera`` (n, 6 k), in place. ``pull`` (n, a) is the
-    derivative of the depth by an image shift, ``slides`` (n, a, 6) that of the shift by the camera."""
+    """Fills the derivative of each patch's depth by the camera corrections: adds ``pull * slides``, summed over the
+    image axes of each view, to the six columns of the view's camera in ``by_camera`` (n, 6 k), in place. ``pull`` (n,
+    a) is the derivative of the depth by an image shift, ``slides`` (n, a, 6) that of the shift by the correction."""
     for n in range(len(view)):
         for row in range(pull.shape[1]):
             first = 6 * view[n, row // 2]
@@ -172,8 +171,8 @@ def add_by_camera(view, pull, slides, by_camera):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def add_cameras(view, stiff, slope, slides, information, matrix, gradient):
-    """Sums up, over all patches, the quadratic form in the cameras' corrections: adds ``slides^T stiff slides`` to
-    ``matrix`` (6 k, 6 k) and ``-slides^T slope`` to ``gradient`` (6 k), in place, for k cameras.
+    """Sums the quadratic forms in the camera corrections over all patches: adds ``slides^T stiff slides`` to ``matrix``
+    (6 k, 6 k) and ``-slides^T slope`` to ``gradient`` (6 k), in place, for k cameras.
 
     ``stiff`` (n, a, a) and ``slope`` (n, a) are the second and first derivatives of a patch's cost by its image shifts,
     ``slides`` (n, a, 6) the derivatives of these shifts by their camera, ``information`` (n) the weight of the patch,
@@ -201,13 +200,11 @@ def add_cameras(view, stiff, slope, slides, information, matrix, gradient):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def write_grams(first, last, chosen, members, view, shifts, samples, pictures, slopes, mixed):
-    """Fills the inner products of patches ``first`` to ``last`` of ``chosen``: ``slopes`` (n, a, a) of the image slopes
-    of their views with each other, and ``mixed`` (n, a, v) of the slopes with the grey values.
+    """Fills the inner products of patches ``first`` to ``last`` of ``chosen``: ``slopes`` (n, a, a) between the image
+    derivatives of their views, and ``mixed`` (n, a, v) between these derivatives and the grey values.
 
-    Grey values are read with the surface moved by ``shifts`` (n; mm along the normals), weighted with the members'
-    weights, centred and scaled to unit norm, with the noise as part of the norm. The slopes are the derivatives of
-    these values (per px).
-    """
+    Grey values are read with the surface moved by ``shifts`` (n; mm along the normals), weighted, centred and scaled to
+    unit norm; the norm includes the noise. The image derivatives (per px) are those of these normalised grey values."""
     start, member, weight = members
     pixel, along, seen = samples
     size, offset, image, noise = pictures
@@ -272,8 +269,8 @@ def _product(one, other, count):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def read_with_slopes(image, start, width, height, x, y):
-    """Returns the bilinear value of an image at (x, y) and its central differences (per px) along x and y. The image
-    begins at index ``start`` of the flat array ``image``."""
+    """Returns the bilinear value of an image at (x, y) and its derivatives (per px) along x and y as central
+    differences. The image begins at index ``start`` of the flat array ``image``."""
     if not (1.0 <= x < width - 3.0 and 1.0 <= y < height - 3.0):
         across = read(image, start, width, height, x + 1.0, y) - read(image, start, width, height, x - 1.0, y)
         down = read(image, start, width, height, x, y + 1.0) - read(image, start, width, height, x, y - 1.0)

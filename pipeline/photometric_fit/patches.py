@@ -1,9 +1,9 @@
-"""Chooses where photographs are compared: samples over the face region, and patches of samples around chosen vertices.
+"""Chooses where photographs are compared: sample points over the face region, and patches of samples around chosen
+vertices.
 
-A patch is a piece of the current surface, neither a square of an image nor a tangent plane. Its samples move with the
-head during the fit, so the surface warps a patch into all its views, lens distortion included. Overlapping patches
-share samples, so every image is read once per sample, whatever the size of the patches.
-"""
+A patch is a piece of the curved surface of the current head, not a square of an image or a tangent plane. A patch's
+samples move with the head during the fit and are projected into each view, with lens distortion. Overlapping patches
+share samples, so every image is read once per sample for any size of the patches."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -24,8 +24,8 @@ HairProbability = Mapping[str, Float32[np.ndarray, "_ _"]]  # by camera, on the 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Holds s samples on triangles of the full level, and c patches. A sample is a point inside a triangle; a patch is
-    the set of samples around a vertex.
+    """Holds s sample points on triangles of the head model's finest mesh, and c patches. A sample is a point inside a
+    triangle; a patch is the set of samples around a vertex.
 
     ``corners`` and ``shares`` are the triangle and barycentric coordinates of each sample. Patch i consists of the
     samples ``member[start[i]:start[i + 1]]``; e counts all members.
@@ -40,32 +40,32 @@ class Patches:
     agreement: Float[np.ndarray, " e"]  # cosine between the normals: nothing across a fold
 
     def points(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "s 3"]:
-        """Returns the positions of the samples on the full level with these vertices."""
+        """Returns the positions of the samples for the given vertices of the finest mesh."""
         return _mixed(vertices, self.corners, self.shares)
 
     def mixed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " s"]:
-        """Interpolates values at the vertices of the full level to the samples."""
+        """Interpolates values at the vertices of the finest mesh to the samples."""
         return np.einsum("sk,sk->s", self.shares, values[self.corners])
 
     def normals(self, vertex_normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "s 3"]:
-        """Returns the unit normal at each sample, interpolated from those of the vertices."""
+        """Returns the unit normal at each sample, interpolated from the vertex normals."""
         mixed = _mixed(vertex_normals, self.corners, self.shares)
         return mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
 
     def sums(self, weights: Float[np.ndarray, " e"], values: Float[np.ndarray, "s n"]) -> Float[np.ndarray, "c n"]:
-        """Returns, for each patch, the sum of ``values`` over its samples, with a weight for each member."""
+        """Returns, for each patch, the sum of ``values`` over its samples, weighted by ``weights``."""
         shape = (len(self.centre), len(self.corners))
         return sparse.csr_array((weights, self.member, self.start), shape=shape) @ values
 
     def weights(self, size_mm: float) -> Float[np.ndarray, " e"]:
-        """Returns the weight of each member of each patch: a Gaussian of its distance to the patch's centre with
+        """Returns the weight of each sample in each patch: a Gaussian of the distance to the patch's centre with
         standard deviation ``size_mm``, times the agreement of the normals."""
         return np.exp(-0.5 * self.square_mm2 / size_mm**2) * self.agreement
 
 
 def make_patches(model: HeadModel, *, sample_mm: float, centre_mm: float, radius_mm: float) -> Patches:
-    """Spreads samples about ``sample_mm`` apart over the face region of the mean head, and patches about ``centre_mm``
-    apart. A patch holds all samples within ``radius_mm`` of its centre."""
+    """Spreads samples about ``sample_mm`` apart over the face region of the mean head, and patch centres about
+    ``centre_mm`` apart. A patch consists of all samples within ``radius_mm`` of its centre."""
     level = model.levels["full"]
     vertices = model.vertices(np.zeros(0))
     normals = vertex_normals(vertices, level.faces)
@@ -89,9 +89,9 @@ def arrays_of(patches: Patches) -> dict[str, np.ndarray]:
 def spread_samples(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], spacing_mm: float
 ) -> tuple[Int32[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
-    """Spreads points over triangles, about one for each square with an edge of ``spacing_mm``. Returns the triangle's
-    three vertices and the barycentric coordinates of each. A large triangle gets several points; small triangles share
-    one."""
+    """Spreads sample points over triangles, about one for each square with an edge of ``spacing_mm``. Returns, for each
+    sample, the three vertices of its triangle and its barycentric coordinates. A large triangle gets several samples;
+    several small triangles share one sample."""
     a, b, c = (vertices[faces[:, j]] for j in range(3))
     wanted = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1) / spacing_mm**2
     splits = np.maximum(np.round(np.sqrt(wanted)), 1).astype(int)
@@ -107,7 +107,7 @@ def spread_samples(
 
 
 def _centroids(k: int) -> Float[np.ndarray, "n 3"]:
-    """Returns the barycentric centres of the k^2 equal triangles that a triangle splits into."""
+    """Returns the barycentric coordinates of the centroids when a triangle is divided into k^2 equal triangles."""
     upward = [(i + 1 / 3, j + 1 / 3) for i in range(k) for j in range(k - i)]
     downward = [(i + 2 / 3, j + 2 / 3) for i in range(k) for j in range(k - 1 - i)]
     found = np.array(upward + downward) / k
@@ -117,8 +117,8 @@ def _centroids(k: int) -> Float[np.ndarray, "n 3"]:
 def thinned(
     vertices: Float[np.ndarray, "v 3"], rows: Int[np.ndarray, " n"], spacing_mm: float
 ) -> Int[np.ndarray, " c"]:
-    """Thins out the vertices ``rows`` to one for each cube with an edge of ``spacing_mm``, the one nearest to its
-    middle."""
+    """Returns one of the vertices ``rows`` for each cube with an edge of ``spacing_mm``: the vertex nearest to the
+    cube's centre."""
     scaled = vertices[rows] / spacing_mm
     cell = np.floor(scaled).astype(np.int64)
     _, cube = np.unique(cell, axis=0, return_inverse=True)
@@ -140,8 +140,8 @@ def under_hair(
     seen: Bool[np.ndarray, "k s"],
     centres: Float[np.ndarray, "c 3"],
 ) -> Bool[np.ndarray, " c"]:
-    """Tells which patches show hair or lie within ``REACH_MM`` of one that does: their windows include hair, which lies
-    above the skin. Hair matches well in photographs, but its surface is not the head's.
+    """Returns a mask of the patches that show hair or lie within ``REACH_MM`` of a patch that does, because their
+    windows include hair. Hair matches well between photographs, but its surface lies above the skin.
 
     ``patches``: samples of the face and patches of them. ``hair``: probability that a pixel shows hair, by camera;
     cameras without a map are ignored. ``names``: names of the k cameras. ``pixel``: the pixel at which each camera sees

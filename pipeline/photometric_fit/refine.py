@@ -1,13 +1,14 @@
-"""Refines a fit to outlines with the photographs inside them, in the contour solver's own problem.
+"""Refines a fit to outlines with the photographs inside the outlines, by solving the contour solver's least-squares
+problem again.
 
-In: a solved contour problem and the photographs. Out: the same problem, solved again with finer modes and with
-observations of the surface. There are three rounds, from coarse to fine. Each patch of the current surface
-(``patches``) is moved along its normal through the images of the cameras that see it. The surface is observed where its
-views look most alike; the remaining shifts between the views correct the cameras (``depth_search``). Two kinds of
-patches are left out: those whose best match is weak or at the end of the search (hidden, glossy, without texture), and
-those of hair (``under_hair``). The observations enter the normal equations together with rims, features and priors
-(``surface_term``), robustly; without observations, the kernels continue the surface smoothly.
-"""
+The input is a solved contour problem and the photographs. The output is the same problem, solved again with finer modes
+and with observations of the surface. The search runs in three rounds, from coarse to fine. Each patch of the current
+surface (``patches``) is moved along its normal, and its images are compared in the cameras that see it. The position
+with the best correlation is an observation of the surface; the remaining image shifts between the views correct the
+cameras (``depth_search``). Patches are left out if their best match is weak or at the end of the search range (hidden,
+glossy, without texture), or if they show hair (``under_hair``). The observations are robust terms of the normal
+equations, together with rims, feature points and priors (``surface_term``); where there are no observations, the prior
+continues the surface smoothly."""
 
 import math
 from collections.abc import Mapping
@@ -51,7 +52,7 @@ LEVEL, STEPS = "p95", 3  # the rim needs no more there, and the surface term is 
 MIN_VIEWS = 3
 NEIGHBOURS, NEAR_MM = 24, 4.0  # patches about a vertex: two windows
 HAIR_REACH_MM = 4.0  # patches are 3 mm apart
-LOST_MM = 2.5  # off by at least that where nothing matches: what two photographs still recognise
+LOST_MM = 2.5  # assumed distance where no views match: the largest at which two photographs still match
 MISFIT_FACTOR, MISFIT_LOCAL = 1.2, 0.6  # the latter is the share of a place's own misfit: its few patches know their
 # variance badly, all of them together well. So 95 % intervals hold 91 to 98 % of a scan and four draws
 
@@ -109,13 +110,13 @@ def refine_with_photographs(
 
 
 def rounds_of_rig(factor: float) -> tuple[Round, ...]:
-    """Returns the rounds of the search for a rig whose depths are ``factor`` times less precise than the usual rig's (1
-    or more).
+    """Returns the rounds of the search for a rig whose depths are ``factor`` times (1 or more) less precise than those
+    of the usual rig.
 
-    Each round has as many steps as usual, over a range ``factor`` times as wide. For each doubling of the factor, the
-    last round is repeated once, and once more over half its range: with three cameras in front, outlines leave the
-    middle of a face undetermined by 8 mm, and large errors converge slowly. Shading is then removed in the last rounds
-    as well, because gloss looks like depth."""
+    Each round has the usual number of steps, over a range ``factor`` times as wide. For each doubling of the factor,
+    the last round is repeated once, and then once more over half its range, because with only three cameras in front,
+    outlines leave the middle of a face undetermined by 8 mm. Shading is also removed in the last rounds, because gloss
+    looks like a change of depth."""
     more = round(math.log2(factor))
     wider = [replace(each, reach_mm=factor * each.reach_mm) for each in ROUNDS]
     wider[-1] = replace(wider[-1], with_shading=not more)
@@ -125,8 +126,8 @@ def rounds_of_rig(factor: float) -> tuple[Round, ...]:
 
 @lru_cache(maxsize=1)  # 150 MB; studios work with one model
 def finer(model: HeadModel) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
-    """Returns the model with the fine kernel's modes added, its patches, and its modes at the patches' centres. All of
-    it depends on the model alone, and is cached."""
+    """Returns the model with additional fine modes, its patches, and its modes at the patches' centres. The result
+    depends on the model alone and is cached."""
     length, amplitude = FINE_LENGTH_MM, FINE_AMPLITUDE_MM
     sizes = {
         "sample_mm": SAMPLE_MM,
@@ -155,8 +156,9 @@ def finer(model: HeadModel) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m 
 
 
 def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " v"]:
-    """Tells which vertices of the rim's mesh level lie near ``hair``, the full level's vertices under hair. The outline
-    there is that of hair: a fit to contours alone bulged into the hair at its border with the face."""
+    """Returns a mask of the vertices near ``hair`` in the mesh that the contour fit uses; ``hair`` are the finest
+    mesh's vertices under hair. The outline at these vertices is that of hair, and a fit to contours alone bulged into
+    the hair."""
     mean = model.vertices(np.zeros(0))
     if not len(hair):
         return np.zeros(model.levels[LEVEL].count, bool)
@@ -166,11 +168,13 @@ def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray,
 def local_misfit_mm(
     model: HeadModel, seen: SurfaceObservations, state: State, lost: Int[np.ndarray, " u"]
 ) -> Float[np.ndarray, " v0"]:
-    """Returns, around each cage vertex, the RMS distance (mm) between the photographed surface and the fitted one.
+    """Returns, around each vertex of the coarsest mesh, the RMS distance (mm) between the photographed surface and the
+    fitted surface.
 
-    Several cameras see the vertices ``lost``, but find no match within the search; their distance is set to
-    ``LOST_MM``. An example is an eye that is open in the model and closed in the photographs. They affect only the
-    surface around them. Away from the patches the misfit fades to 0."""
+    Several cameras see the vertices ``lost``, but their views do not match within the search range; the distance of
+    these vertices is set to ``LOST_MM``. An example is an eye that is open in the fitted head and closed in the
+    photographs. The vertices ``lost`` affect only the surface around them. The misfit fades to 0 away from the patches.
+    """
     skin = ~seen.bound
     off = surface_residual(seen, state.coefficients, state.world_from_head, state.camera_shift)[0][skin]
     full, cage = model.vertices(np.zeros(0)), model.mean.astype(float)

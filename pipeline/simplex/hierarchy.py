@@ -1,10 +1,9 @@
-"""Runs the paper's fit (sections 4.4 and 5.1): the downhill simplex, first on a coarse level, then on the working
-level.
+"""Runs the paper's fit (sections 4.4 and 5.1): the downhill simplex, first on a coarse mesh, then on a finer one.
 
-In: the aligned model and the silhouettes. Out: coefficients, which are valid for the full mesh. The pose remains that
-of the alignment, as in the paper. The result of the coarse level is the start p_0 of the working level, and both levels
-begin with p_i = p_0 + mu_i e_i, mu_i = 3 sigma_i (three standard deviations, the unit of our coefficients).
-"""
+The input is the aligned model and the silhouettes. The output is shape coefficients, which are valid for the finest
+mesh. The pose stays that of the alignment, as in the paper. The result on the coarse mesh is the start p_0 on the finer
+mesh, and both searches begin with p_i = p_0 + mu_i e_i, where mu_i = 3 sigma_i (three standard deviations, the unit of
+this project's coefficients)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ LIMIT = 3500  # evaluations a level: 60 modes have converged or will not
 
 @dataclass(frozen=True, slots=True)
 class HierarchyLevel:
-    """Holds one level of the hierarchy: the decimation of its mesh, and the scale of its images."""
+    """Holds one step of the hierarchy: the name of its decimated mesh, and the scale of its images."""
 
     mesh: str
     image_scale: float
@@ -52,11 +51,11 @@ def fit_simplex(
     speaking: Literal["face", "all"] = "face",
     weighted: bool = True,
 ) -> Fit:
-    """Finds the coefficients that minimise the paper's eq. (2), starting from the mean head.
+    """Finds the shape coefficients that minimise the paper's eq. (2), starting from the mean head.
 
     Cameras without a silhouette are left out. ``report("fit", fraction)`` may raise Cancelled. ``speaking`` selects the
-    pixels that count ("all", or those near the face); ``weighted`` selects eq. (5) instead of eq. (4).
-    """
+    pixels that count ("all", or "face" for pixels near the face); ``weighted`` selects the paper's eq. (5) instead of
+    eq. (4)."""
     rig = rig.subset(name for name in silhouettes if silhouettes[name].quality.usable)
     coefficients = np.zeros(min(settings.modes, len(model.modes)))
     evaluations, reasons = 0, []

@@ -1,9 +1,9 @@
-"""Minimises a function without derivatives by the downhill simplex (section 4.4): Nelder and Mead 1965, as described by
-Press et al., Numerical Recipes, section 10.4. This module knows nothing of heads.
+"""Minimises a function without derivatives by the downhill simplex of the paper's section 4.4: Nelder and Mead 1965, as
+described by Press et al., Numerical Recipes, section 10.4. This module contains nothing about heads.
 
-Other values are those of Numerical Recipes: reflection 1, expansion 2, contraction 1/2, shrinking 1/2 towards the best
-point. The search ends at a small relative spread ``2 |f_high - f_low| / (|f_high| + |f_low|)`` of the values.
-"""
+The factors are those of Numerical Recipes: reflection 1, expansion 2, contraction 1/2, shrinking 1/2 towards the best
+point. The search ends at a small relative spread ``2 |f_high - f_low| / (|f_high| + |f_low|)`` of the function's
+values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ SPREAD_TINY = 1e-30  # keeps the relative spread defined at a minimum of exactly
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Holds the best point (``value``) with the function's value there (``cost``), why the search ended (``result``),
-    and how often the function was called."""
+    """Holds the best point (``value``), the function's value there (``cost``), why the search ended (``result``), and
+    the number of function calls (``evaluations``)."""
 
     value: Float[np.ndarray, " n"]
     result: Literal["converged", "evaluation limit"]
@@ -40,10 +40,10 @@ def minimise(
 ) -> Solution:
     """Searches for a local minimum of ``function`` by the downhill simplex.
 
-    The initial simplex is ``p_0 = start`` and ``p_i = p_0 + steps[i] e_i`` (section 4.4). It ends when the relative
-    spread falls below ``tolerance``, or after the first move that reaches ``limit`` evaluations (a shrink may overrun
-    it by n + 1). ``watch(evaluations, least value)`` is called after every move and may raise to stop the search.
-    """
+    The initial simplex is ``p_0 = start`` and ``p_i = p_0 + steps[i] e_i`` (the paper's section 4.4). The search ends
+    when the relative spread falls below ``tolerance``, or after the first move that reaches ``limit`` evaluations (a
+    shrink may exceed it by n + 1). ``watch(evaluations, least value)`` is called after every move and may raise an
+    exception to stop the search."""
     points = np.vstack([start, start + np.diag(steps)])
     values = np.array([function(point) for point in points])
     evaluations = len(values)
@@ -61,12 +61,12 @@ def minimise(
 
 
 def _move(function: Function, points: Float[np.ndarray, "n1 n"], values: Float[np.ndarray, " n1"]) -> int:
-    """Replaces the worst point of the sorted simplex, or shrinks the simplex, in place. Returns the number of
+    """Replaces the worst point of the sorted simplex, or shrinks the simplex, in place. Returns the number of function
     evaluations."""
     centre = points[:-1].mean(axis=0)
 
     def try_at(factor: float) -> tuple[Float[np.ndarray, " n"], float]:
-        """Returns the point at ``factor`` times the worst point's offset from the centre of the others."""
+        """Returns the point at ``factor`` times the worst point's offset from the others' centroid, and its value."""
         point = centre + factor * (points[-1] - centre)
         return point, function(point)
 

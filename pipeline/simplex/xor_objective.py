@@ -1,19 +1,20 @@
 """Computes the paper's objective (eqs. 2 and 5): the boundary-weighted XOR of input and model silhouettes, over all
 cameras.
 
-Enters: coefficients. Out: one number, which the renderer draws and sums; no image is read back.
+The input is shape coefficients. The output is one number; the renderer draws and sums the pixels, so no image is read
+back.
 
-Not every pixel counts. In eq. (5) a mismatch far from the input contour has hardly any weight. That handles parts
-*inside* the outline that the model lacks, but not parts of the input that no model can have. Below the cut through the
-neck the input continues into shoulders; every pixel by which the open edge of the mesh moves down would reduce the
-cost, and the head would grow a neck. Hair would likewise make an enlarged skull cheaper. So a pixel counts only if the
-nearest part of the aligned head's outline belongs to the face region (ear to ear, forehead to chin); all others have
-weight zero. The pixels are chosen once for each level, from the head at its start, so that within a level the cost is a
-fixed function of the coefficients: eq. (5) with some weights zero. ``speaking="all"`` is exactly the paper's cost.
+Some pixels get no weight. In eq. (5) a mismatch far from the input contour has hardly any weight. This suffices for
+parts *inside* the outline that the model lacks, but not for parts of the input outside it that no model can reproduce.
+Below the model's cut through the neck, the input silhouette continues into shoulders; every pixel by which the mesh's
+open edge moves down would reduce the cost, and the head would grow a neck. Hair would likewise reward an enlarged
+skull. A pixel therefore counts only if the nearest part of the aligned head's outline belongs to the face region (ear
+to ear, forehead to chin); all other pixels have weight zero. The pixels are chosen once for each mesh, from the head at
+the start of its search, so that the cost during the search is a fixed function of the coefficients: eq. (5) with some
+weights zero. ``speaking="all"`` gives exactly the paper's cost.
 
-The cut through the neck does not count, so a lid closes it and back faces need not be drawn; that saves 5 of 19 ms for
-each evaluation. If the cut is not flat, the lid adds a thousandth of the area, all of it at the cut.
-"""
+The cut through the neck has no weight, so triangles close it and back faces need not be drawn, which saves 5 of 19 ms
+in each evaluation. If the neck's cut is not flat, the closing triangles add a thousandth of the silhouette's area."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -35,8 +36,8 @@ OUTLINE_PX = 2.0  # a vertex this near to the model's outline names the region o
 
 
 class SilhouetteObjective:
-    """Computes eq. (2) at one level of the hierarchy, with the renderer's buffers for it. Call ``close`` after use, or
-    use ``with``."""
+    """Computes the paper's eq. (2) at one step of the hierarchy, with the renderer's buffers for this step. The caller
+    must call ``close`` after use, or use ``with``."""
 
     def __init__(
         self,
@@ -52,8 +53,8 @@ class SilhouetteObjective:
         speaking: Literal["face", "all"] = "face",
         weighted: bool = True,
     ) -> None:
-        """Takes a ``level`` of the model and a ``scale`` of the images (0.5: half the width); ``start`` decides which
-        pixels count. ``weighted`` selects eq. (5); otherwise it is eq. (4), in which all pixels have equal weight."""
+        """Takes a mesh ``level`` of the model and a ``scale`` of the images (0.5 is half the width); the head at
+        ``start`` decides which pixels count. ``weighted`` selects the paper's eq. (5), otherwise eq. (4)."""
         self._turn = world_from_head.scale * world_from_head.rotation
         mean = model.levels[level].operator @ model.mean
         self._mean_world = world_from_head.apply(mean.astype(np.float64))
@@ -83,18 +84,18 @@ class SilhouetteObjective:
         self._drawn.close()
 
     def __call__(self, coefficients: Float[np.ndarray, " m"]) -> float:
-        """Returns E of eq. (2) at ``coefficients`` (standard deviations), in units of pixels on the contour."""
+        """Returns the cost E of the paper's eq. (2) at ``coefficients`` (standard deviations), in contour pixels."""
         return float(self._drawn.xor_costs(self.vertices_world(coefficients)).sum())
 
     def vertices_world(self, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, "v 3"]:
-        """Returns the level's vertices for these coefficients, in the world frame, mm: the paper's T(H(alpha))."""
+        """Returns the mesh's vertices for these coefficients (world frame, mm), which is T(H(alpha)) in the paper."""
         moved = (np.asarray(coefficients, np.float32) @ self._basis).reshape(-1, 3)
         return self._mean_world + moved @ self._turn.T
 
 
 def lidded(faces: Int[np.ndarray, "f 3"], face_region: Bool[np.ndarray, " v"]) -> Int[np.ndarray, "g 3"]:
     """Closes every hole of a mesh with a fan of triangles, so that each edge belongs to two triangles. Returns the
-    triangles unchanged if a hole reaches the face region, whose outline counts, or if two holes meet."""
+    triangles unchanged if a hole reaches the face region, whose outline has weight, or if two holes touch."""
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()
     edges = {(a, b) for a, b in directed}
     rim = [(a, b) for a, b in edges if (b, a) not in edges]
@@ -113,13 +114,12 @@ def lidded(faces: Int[np.ndarray, "f 3"], face_region: Bool[np.ndarray, " v"]) -
 
 
 def mask_at_scale(distance: Float[np.ndarray, "h w"], scale: float) -> Bool[np.ndarray, "_ _"]:
-    """Returns the mask at another resolution: True where a pixel's centre lies inside the contour, as the renderer
-    draws.
+    """Returns the mask at another resolution: True where a pixel's centre lies inside the contour, as in the renderer.
 
-    It is computed from the signed distance (px, negative inside), averaged over the pixel. The contour of a binary mask
-    often runs exactly through a larger pixel's centre. If all these ties were decided alike, the contour would move by
-    0.15 px all around (0.3 px where the mask's pixels are counted); so they alternate like the squares of a chessboard.
-    """
+    The mask is computed from the signed distance (px, negative inside), averaged over each larger pixel. The contour of
+    a binary mask often passes exactly through a larger pixel's centre. If all such pixels had the same value, the
+    contour would move by 0.15 px everywhere (0.3 px if the mask's pixels were counted), so their values alternate like
+    a chessboard."""
     height, width = distance.shape
     smaller = cv2.resize(distance, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
     rows, columns = np.ogrid[: smaller.shape[0], : smaller.shape[1]]
@@ -129,9 +129,9 @@ def mask_at_scale(distance: Float[np.ndarray, "h w"], scale: float) -> Bool[np.n
 def face_pixels(
     outline_mask: Bool[np.ndarray, "h w"], pixels: Float[np.ndarray, "v 2"], face_region: Bool[np.ndarray, " v"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Tells for which pixels the nearest part of the model's outline belongs to the face region. ``pixels`` are the
-    model's vertices in this view; those near the edge of ``outline_mask`` decide which part of the outline belongs to
-    the face."""
+    """Returns a mask of the pixels whose nearest part of the model's outline belongs to the face region. ``pixels`` are
+    the model's vertices in this view; vertices near the edge of ``outline_mask`` decide which part of the outline
+    belongs to the face."""
     height, width = outline_mask.shape
     with np.errstate(invalid="ignore"):
         nearest = np.round(pixels)

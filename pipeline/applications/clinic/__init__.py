@@ -1,4 +1,4 @@
-"""Prepares finished heads for clinics: a patient's axes, two visits compared, a head registered to the surface of a CT.
+"""Prepares finished heads for clinics: export to a patient's axes, comparison of visits, registration to a CT surface.
 
-In: result folders, and meshes of other programs in mm. Out: meshes, landmarks, tables and pictures.
+The input is result folders, and meshes of other programs in mm. The output is meshes, landmarks, tables and pictures.
 """

@@ -1,11 +1,10 @@
-"""Moves a head to LPS or RAS axes, with the orientation of the head frame or of the Frankfurt plane.
+"""Moves a head to LPS or RAS axes, oriented like the head frame or by the Frankfurt plane.
 
-The Frankfurt plane passes through both porions (the upper edges of the ears' openings) and both orbitalia (the lowest
-points of the orbits' rims). Both are points of bone, which photographs do not show. Unmarked points are substituted, as
-``AnatomicalFrame.sources`` records: tragion for porion, as ISO 7250-1 does on the living, and for orbitale a point
-``ORBITALE_BELOW_EYE_MM`` below the middle between the eye's corners. The plane's origin is midway between the porions;
-its x axis is the line through them.
-"""
+The Frankfurt plane passes through both porions (the upper edges of the ear openings) and both orbitalia (the lowest
+points of the eye sockets' rims). Porions and orbitalia are points on bone, which photographs do not show. Unmarked
+points are replaced, as ``AnatomicalFrame.sources`` records: the porion by the tragion, as ISO 7250-1 does on living
+people, and the orbitale by a point ``ORBITALE_BELOW_EYE_MM`` below the midpoint between the eye's corners. The origin
+is midway between the porions; the x axis is the line through them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,11 +32,11 @@ TRAGION_STD_MM = 3.0  # of the tragion above or below the porion
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnatomicalFrame:
-    """Holds the motion into a patient's axes.
+    """Holds the rigid transform of a head into a patient's axes.
 
-    ``sources`` tells, for each point of the Frankfurt plane, whether it was marked or what replaces it. ``tilt_deg`` is
+    ``sources`` states for each point of the Frankfurt plane whether it was marked or what replaces it. ``tilt_deg`` is
     the angle between the head frame's horizontal plane and the Frankfurt plane, about the line through the ears,
-    positive where the nose rises; ``tilt_std_deg`` is its standard deviation. Without a plane both are None.
+    positive if the nose rises; ``tilt_std_deg`` is its standard deviation. Both are None without a plane.
     """
 
     axes: Axes
@@ -49,18 +48,19 @@ class AnatomicalFrame:
 
 
 def head_axes(measured: Measured, axes: Axes) -> AnatomicalFrame:
-    """Returns the patient's axes with the head frame's own orientation and origin."""
+    """Returns the patient's axes with the orientation and origin of the head frame."""
     turn = RigidTransform(axes_turn(axes, "LPS") @ LPS_FROM_HEAD, np.zeros(3))
     return AnatomicalFrame(axes, "head", turn @ measured.head_from_world, {})
 
 
 def frankfurt_axes(measured: Measured, axes: Axes, marked: Mapping[str, Vector] | None = None) -> AnatomicalFrame:
-    """Returns the patient's axes in the Frankfurt plane. Raises InputError if points lie where no head has such points.
+    """Returns the patient's axes aligned with the Frankfurt plane. Raises InputError if marked points are not where a
+    head can have them.
 
     Args:
-        measured: the result.
+        measured: the head and its landmarks.
         axes: LPS or RAS.
-        marked: any of ``POINTS`` (world frame, mm) that were marked; the others are substituted.
+        marked: any of ``POINTS`` (world frame, mm) that were marked; all others are replaced.
     """
     points, sources = _plane_points(measured, marked or {})
     right, left = points["porion_right"], points["porion_left"]
@@ -93,8 +93,8 @@ def frankfurt_axes(measured: Measured, axes: Axes, marked: Mapping[str, Vector] 
 
 
 def _plane_points(measured: Measured, marked: Mapping[str, Vector]) -> tuple[dict[str, Vector], dict[str, str]]:
-    """Returns the four points (world frame) and the source of each. Raises InputError for heads without the landmarks
-    that replace unmarked points."""
+    """Returns the four points of the Frankfurt plane (world frame) and the source of each. Raises InputError if the
+    head lacks landmarks that replace unmarked points."""
     points, sources = dict(marked), dict.fromkeys(marked, "marked")
     needed = {"porion": ("tragion",), "orbitale": ("exocanthion", "endocanthion")}
     lacking = [
@@ -118,7 +118,7 @@ def _plane_points(measured: Measured, marked: Mapping[str, Vector]) -> tuple[dic
 
 
 def _below_eye(measured: Measured, side: str) -> Vector:
-    """Returns the point straight below an eye in the head frame, at the depth of the skin there (world frame)."""
+    """Returns the point on the skin straight below an eye in the head frame (returned in the world frame)."""
     corners = [measured.landmarks[f"{corner}_{side}"] for corner in ("exocanthion", "endocanthion")]
     target = measured.head_from_world.apply(np.mean(corners, axis=0)) - (0.0, ORBITALE_BELOW_EYE_MM, 0.0)
     head = measured.head_from_world.apply(measured.mesh_world.vertices)

@@ -1,15 +1,14 @@
 """Compares two visits of one person: computes where the head changed by more than the uncertainty of both results, and
-writes files about it.
+writes the comparison files.
 
 The later head is aligned rigidly to the earlier one on the forehead and the bridge of the nose, which neither
-expression nor jaw moves. Then each vertex of the earlier head gets its signed distance (mm) to the later surface,
-positive where the later surface lies outside. A change is significant if it exceeds ``SURE`` times the combined
-standard deviation: that of both surfaces there and of the alignment, as independent errors.
+expression nor jaw moves. Then each vertex of the earlier head gets its signed distance (mm) to the later head's
+surface, positive if the later surface lies outside. A change is significant if it exceeds ``SURE`` standard deviations,
+which combine the errors of both surfaces and of the alignment as independent errors.
 
-The files are compare.json, tables, the map of differences as PLY and GLB, pictures, and a PDF.
+The files are compare.json, tables, the map of changes as PLY and GLB, pictures, and a PDF.
 
-Colours: red where the later head lies outside, blue where it lies inside, grey where the difference is not significant.
-"""
+In the map, red means that the later head lies outside, blue inside, and grey that the change is not significant."""
 
 import csv
 import io
@@ -44,8 +43,8 @@ from rig.messages.message import Message, compose
 
 SURE = 2.0  # combined standard deviations
 SHARE = 0.8  # of the stable region that must agree: the rest may be hair or a scar
-FAR_MM = 25.0  # beyond it there is no counterpart
-FACING = 0.3  # cosine between the normals of counterparts
+FAR_MM = 25.0  # beyond it there is no match
+FACING = 0.3  # least cosine between matched normals
 START_NAMES = (
     "glabella",
     "nasion",
@@ -56,7 +55,7 @@ START_NAMES = (
     ),
 )
 MIN_MARKS = 3
-MAX_STABLE_CHANGED = 0.05  # share of what no growth moves: two deviations leave as much to chance
+MAX_STABLE_CHANGED = 0.05  # share of the stable region: two deviations leave as much to chance
 NOT_THIS_MM = 1.5  # scatter on bone: one person has 0.02 to 0.3 mm, others 0.8 to 2.7; hair may be in the way
 PANEL_MM = 50.0  # width of a picture: three rows leave room for the notes
 NOTES = (
@@ -85,21 +84,21 @@ FILES = (
 
 @dataclass(frozen=True, slots=True)
 class RegionChange:
-    """Holds the change (mm) of a region, weighted by area. ``changed_share`` is the fraction of the area with a
-    significant change; ``volume_ml`` is the volume between the surfaces there, positive where it grew."""
+    """Holds the statistics of the change (mm) in a region, weighted by area. ``changed_share`` is the fraction of the
+    area with a significant change; ``volume_ml`` is the volume between both surfaces, positive if the head grew."""
 
     mean_mm: float
     median_mm: float  # of the distances, as ``p95_mm``
     p95_mm: float
-    largest_mm: float  # of what changed for sure, with its sign; 0 where nothing did
+    largest_mm: float  # largest significant change, signed; 0 if there is none
     changed_share: float
     volume_ml: float
 
 
 @dataclass(frozen=True, slots=True)
 class LengthChange:
-    """Holds a measurement of both visits, and its change (later minus earlier) with its standard deviation (mm; None
-    where a result has none)."""
+    """Holds a measurement in both visits, and its change (later minus earlier) with its standard deviation (mm; None if
+    a result has no standard deviation)."""
 
     earlier: Measurement
     later: Measurement
@@ -108,14 +107,14 @@ class LengthChange:
 
     @property
     def is_sure(self) -> bool:
-        """Tells whether the measurement changed by more than ``SURE`` standard deviations."""
+        """Returns whether the measurement changed by more than ``SURE`` standard deviations."""
         return self.std_mm is not None and abs(self.change_mm) > SURE * self.std_mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Holds the differences between two visits. Rows are vertices of the earlier head; ``distance_mm`` is NaN where the
-    later head has no counterpart."""
+    """Holds the differences between two visits. Arrays are indexed by the earlier head's vertices; ``distance_mm`` is
+    NaN where the later head lacks a corresponding surface point."""
 
     earlier: Visit
     later: Visit
@@ -127,24 +126,24 @@ class Comparison:
 
     @property
     def changed(self) -> Bool[np.ndarray, " v"]:
-        """Tells where the surface changed significantly."""
+        """Returns a mask of the vertices where the surface changed significantly."""
         return np.abs(np.nan_to_num(self.distance_mm)) > SURE * self.std_mm
 
     @property
     def sure_mm(self) -> Float[np.ndarray, " v"]:
-        """Returns the distances, with NaN where the change is not significant."""
+        """Returns the distances (mm), with NaN where the change is not significant."""
         return np.where(self.changed, self.distance_mm, np.nan)
 
     @property
     def warnings(self) -> tuple[Message, ...]:
-        """Returns what makes the comparison doubtful: warnings of either head, and a significant difference of forehead
-        and bridge of the nose."""
+        """Returns the reasons to doubt the comparison: warnings of both results, and a significant change of the
+        forehead and the bridge of the nose."""
         share, doubts = self.regions["stable"].changed_share, (*self.earlier.warnings, *self.later.warnings)
         return (*doubts, compose("maybe-other-person", share=share)) if share > MAX_STABLE_CHANGED else doubts
 
 
 def compare(earlier: Visit, later: Visit) -> Comparison:
-    """Compares two visits. Raises InputError if the later result is no head of the same person."""
+    """Compares two visits of one person. Raises InputError if the later result is not a head of the same person."""
     head, surface = earlier.measured, Reference.of(later.measured.mesh_world, {}, later.measured.name)
     normals = head.mesh_world.normals()
     stable = earlier.stable & (earlier.views > 0)
@@ -169,7 +168,7 @@ def compare(earlier: Visit, later: Visit) -> Comparison:
 
 
 def length_changes(earlier: Visit, later: Visit) -> dict[str, LengthChange]:
-    """Returns the change of every measurement that both results have."""
+    """Returns the change of every measurement that both results contain."""
     found = {}
     for name, before in earlier.measurements.items():
         after = later.measurements.get(name)
@@ -183,7 +182,7 @@ def length_changes(earlier: Visit, later: Visit) -> dict[str, LengthChange]:
 
 
 def _start(earlier: Visit, later: Visit) -> RigidTransform:
-    """Returns later_from_earlier by the landmarks that both have; without any, by the two head frames."""
+    """Returns later_from_earlier, computed from common landmarks or, without any, from the two head frames."""
     marks = earlier.measured.landmarks, later.measured.landmarks
     names = [name for name in START_NAMES if all(name in of for of in marks)]
     if len(names) < MIN_MARKS:
@@ -215,8 +214,8 @@ def _regions(
 
 
 def write_comparison(folder: Path, comparison: Comparison, date: str) -> dict[str, Any]:
-    """Writes all ``FILES``, compare.json last, and returns the content of compare.json; ``date`` (ISO) is that of the
-    comparison. Raises OSError."""
+    """Writes all ``FILES``, compare.json last, and returns the content of compare.json; ``date`` (ISO) is the date of
+    the comparison. Raises OSError."""
     document = comparison_document(comparison, date)
     end_mm = document["scale_end_mm"]
     colours = heat_colours(comparison.sure_mm, end_mm)
@@ -266,7 +265,7 @@ def comparison_document(comparison: Comparison, date: str) -> dict[str, Any]:
 
 
 def pictures(comparison: Comparison, colours: UInt8[np.ndarray, "v 3"]) -> list[tuple[str, list[Resized]]]:
-    """Draws the earlier head, the aligned later one, and the differences, each from ``AZIMUTHS_DEG``."""
+    """Draws the earlier head, the aligned later head, and the changes, each from the directions ``AZIMUTHS_DEG``."""
     before, after = comparison.earlier.measured, comparison.later.measured
     head = before.head_from_world.apply(before.mesh_world.vertices)
     back = before.head_from_world @ comparison.fit.motion.inverse()
@@ -284,7 +283,7 @@ def pictures(comparison: Comparison, colours: UInt8[np.ndarray, "v 3"]) -> list[
 
 
 def write_table(path: Path, rows: Mapping[str, Mapping[str, Any]], first: str) -> None:
-    """Writes rows by name as CSV; None is an empty cell."""
+    """Writes a table with named rows as CSV; None becomes an empty cell."""
     text = io.StringIO()
     columns = list(next(iter(rows.values()), {}))
     writer = csv.writer(text, lineterminator="\n")
@@ -325,11 +324,11 @@ def _write_meshes(folder: Path, comparison: Comparison, colours: UInt8[np.ndarra
 
 
 def comparison_pdf(document: Mapping[str, Any], rows: Sequence[tuple[str, Sequence[Resized]]]) -> bytes:
-    """Returns the PDF. The same document and pictures give the same bytes.
+    """Returns the comparison as PDF. The same document and pictures give the same bytes.
 
     Args:
-        document: what compare.json says.
-        rows: of pictures, with their titles.
+        document: the content of compare.json.
+        rows: titles, each with a row of pictures.
     """
     pdf = PdfPage("eigenhead: comparison of two visits", document["date"])
     pdf.add_page()

@@ -1,22 +1,24 @@
-"""Measures a delivered head for the fitting of helmets, masks and spectacles, with standard deviations. Also chooses a
-size of such a product: it computes each size's probability from the measure and its standard deviation.
+"""Measures a finished head for the fitting of helmets, masks and spectacles, with standard deviations. Also chooses the
+size of such a product: it computes the probability of each size from a measure and its standard deviation.
 
-Names are those of ISO 7250-1 and ISO 8559-1, if these define one (``ISO_NAMES``). Measures are taken with the Frankfurt
-plane level (``anatomical_frame``), as a person holds the head:
+Measures have the names of ISO 7250-1 and ISO 8559-1 where these standards define one (``ISO_NAMES``). Before measuring,
+the head is turned until its Frankfurt plane is horizontal (``anatomical_frame``), as people hold their heads:
 
-- head circumference: the tape around the section through glabella and opisthocranion that is level from side to side;
-  it lies on the section's convex hull, without ears;
-- nose-bridge width: in the level section ``BRIDGE_BELOW_NASION_MM`` below nasion, at the depth ``PAD_DEPTH_MM`` behind
-  its crest, where the pads of spectacles lie. Splay angle: between each flank there and straight ahead. Frontal angle:
-  between each flank and the vertical, from the widths at two heights;
-- frame angle: between the vertical and the line that touches brow and cheek in front of each eye, positive where the
-  lower rim of spectacles comes nearer to the face (pantoscopic).
+- The head circumference is the length of a tape along the convex hull of a section without the ears; the section passes
+  through glabella and opisthocranion and is horizontal from side to side.
+- The nose-bridge width is measured in the horizontal section ``BRIDGE_BELOW_NASION_MM`` below nasion, at the depth
+  ``PAD_DEPTH_MM`` behind its front, where the pads of spectacles lie. The splay angle is measured in the same section
+  between each flank of the nose and straight ahead. The frontal angle is the angle between each flank of the nose and
+  the vertical, computed from the widths at two heights.
+- The frame angle (pantoscopic) is the angle between the vertical and the line that touches brow and cheek in front of
+  each eye, positive if the lower rim of spectacles comes nearer to the face.
 
-Standard deviations come from ``DRAWS`` random heads: the result's standard deviation along the normals (``quality`` of
-head.ply), times a smooth random field with the correlation of the head models (``gaussian_process.SCALES``). The frame
-angle's also includes the plane's own tilt, and that of lengths the cameras' scale.
+Standard deviations come from ``DRAWS`` random heads: vertices move along their normals by the result's standard
+deviation (``quality`` of head.ply), times a smooth random field with the correlation of the head models
+(``gaussian_process.SCALES``). The frame angle's standard deviation also contains the error of the Frankfurt plane's
+tilt; those of lengths also contain the error of the cameras' scale.
 
-A table of sizes is a TOML file:
+Sizes are read from a TOML file:
 
     format = "eigenhead-sizes/1"
 
@@ -26,8 +28,7 @@ A table of sizes is a TOML file:
     allowance = 6.0                     # added to the measure: padding, hair; 0 without it
     sizes = { S = [520, 550], M = [550, 580], L = [580, 610] }
 
-Limits are in the measure's unit (mm, or degrees), the lower one inclusive.
-"""
+Limits of a size have the unit of its measure (mm, or degrees); the lower limit belongs to the size."""
 
 import tomllib
 from collections.abc import Callable, Mapping, Set
@@ -74,7 +75,7 @@ Points = Float[np.ndarray, "_ 3"]
 
 @dataclass(frozen=True, slots=True)
 class SizeTable:
-    """Holds the limits of each size of a product, in the unit of its measure."""
+    """Holds the limits of each size of a product, in the unit of the measure that decides the size."""
 
     name: str
     measure: str
@@ -84,8 +85,7 @@ class SizeTable:
 
 @dataclass(frozen=True, slots=True)
 class SizeChoice:
-    """Holds the probability of each size of a table. ``best`` is the most probable size; ``none`` is the probability
-    that no size fits."""
+    """Holds the probability that each size of a table fits, and the probability ``none`` that no size fits."""
 
     table: str
     measure: str
@@ -99,7 +99,7 @@ class SizeChoice:
 
 
 def read_size_tables(path: Path, measures: Set[str]) -> list[SizeTable]:
-    """Reads a file of size tables for these measures. Raises InputError naming every fault."""
+    """Reads a TOML file of size tables, each for one of the ``measures``. Raises InputError that lists every fault."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:
@@ -128,7 +128,7 @@ def read_size_tables(path: Path, measures: Set[str]) -> list[SizeTable]:
 
 
 def choose_size(table: SizeTable, value: float, std: float) -> SizeChoice:
-    """Returns the probability that each size of a table fits a measure with a normal error."""
+    """Returns the probability that each size of a table fits, for a measure with a normally distributed error."""
     wanted, spread = value + table.allowance, max(std, MIN_STD)
     found = {
         size: float(ndtr((high - wanted) / spread) - ndtr((low - wanted) / spread))
@@ -138,7 +138,7 @@ def choose_size(table: SizeTable, value: float, std: float) -> SizeChoice:
 
 
 def _faults(number: int, entry: Any) -> list[Message]:
-    """Returns the faults of one table of the file."""
+    """Returns the faults of one table in the file of sizes."""
     if not isinstance(entry, dict):
         return [compose("size-key-wrong", number=number, key="table")]
     wrong = [key for key in ("name", "measure") if not isinstance(entry.get(key), str) or not entry[key]]
@@ -183,7 +183,7 @@ class Fitted:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UprightHead:
-    """Holds a head in RAS axes of the Frankfurt plane (mm), its landmarks, and which vertices are ears."""
+    """Holds a head in RAS axes of the Frankfurt plane (mm), its landmarks, and a mask of the ears' vertices."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: np.ndarray
@@ -192,7 +192,7 @@ class UprightHead:
 
 
 def fitting_measures(visit: Visit) -> dict[str, Fitted]:
-    """Returns every measure that the head permits. Raises InputError for heads without the landmarks of the plane."""
+    """Returns all measures of a head by name. Raises InputError if landmarks of the Frankfurt plane are missing."""
     measured = visit.measured
     frame = frankfurt_axes(measured, "RAS")
     motion = frame.patient_from_world
@@ -224,7 +224,7 @@ def _all(head: UprightHead) -> dict[str, float | None]:
 
 
 def head_circumference(head: UprightHead) -> float | None:
-    """Returns the length of a tape around the head, mm; None for heads without a cranium."""
+    """Returns the length (mm) of a tape around the head; None for heads without a cranium."""
     front = head.marks["glabella"]
     middle = (np.abs(head.vertices[:, 0] - front[0]) < 5.0) & (head.vertices[:, 2] > 0.0)
     middle &= head.vertices[:, 1] < -CRANIUM_BEHIND_MM
@@ -241,12 +241,12 @@ def head_circumference(head: UprightHead) -> float | None:
 
 
 def bridge_width(head: UprightHead) -> float | None:
-    """Returns the width of the nose's bridge at the pads of spectacles, mm."""
+    """Returns the width (mm) of the nose's bridge where the pads of spectacles lie."""
     return _width(head, BRIDGE_BELOW_NASION_MM, PAD_DEPTH_MM)
 
 
 def splay_angle(head: UprightHead) -> float | None:
-    """Returns the mean angle between the bridge's flanks and straight ahead, degrees."""
+    """Returns the mean angle (degrees) between the flanks of the nose's bridge and straight ahead."""
     narrow, wide = (_width(head, BRIDGE_BELOW_NASION_MM, depth) for depth in FLANK_DEPTHS_MM)
     return (
         None if narrow is None or wide is None else _half_angle(wide - narrow, FLANK_DEPTHS_MM[1] - FLANK_DEPTHS_MM[0])
@@ -254,7 +254,7 @@ def splay_angle(head: UprightHead) -> float | None:
 
 
 def frontal_angle(head: UprightHead) -> float | None:
-    """Returns the mean angle between the bridge's flanks and the vertical, degrees; positive if it widens downwards."""
+    """Returns the mean angle (degrees) of the bridge's flanks to the vertical; positive if they widen downwards."""
     crest = _crest(head, FLANK_HEIGHTS_MM[0])
     if crest is None:
         return None
@@ -264,7 +264,7 @@ def frontal_angle(head: UprightHead) -> float | None:
 
 
 def frame_angle(head: UprightHead) -> float | None:
-    """Returns the mean tilt of the lines that touch brow and cheek in front of both eyes, degrees."""
+    """Returns the mean tilt (degrees) of the lines that touch brow and cheek in front of each eye."""
     found = [_brow_to_cheek(head, side) for side in ("right", "left")]
     return None if None in found else float(np.mean([angle for angle in found if angle is not None]))
 
@@ -279,7 +279,7 @@ MEASURES: Mapping[str, Callable[[UprightHead], float | None]] = {
 
 
 def section(vertices: Points, faces: np.ndarray, origin: Float[np.ndarray, " 3"], normal: np.ndarray) -> Points:
-    """Returns the points where edges of triangles cross a plane."""
+    """Returns the points where the triangles' edges cross a plane."""
     height = (vertices - origin) @ normal
     above = height > 0.0
     first, second, third = (above[faces[:, corner]] for corner in range(3))
@@ -292,7 +292,7 @@ def section(vertices: Points, faces: np.ndarray, origin: Float[np.ndarray, " 3"]
 
 
 def hull_perimeter(points: Float[np.ndarray, "n 2"]) -> float | None:
-    """Returns the length of a tape around points of a plane; None if they lie on a line."""
+    """Returns the perimeter of the convex hull of points in a plane; None if the points lie on a line."""
     try:
         return float(ConvexHull(points).area)  # the length of the border, in two dimensions
     except (QhullError, ValueError):
@@ -300,7 +300,7 @@ def hull_perimeter(points: Float[np.ndarray, "n 2"]) -> float | None:
 
 
 def _nose_section(head: UprightHead, below_mm: float) -> Points:
-    """Returns the level section of the nose at a height below nasion, from right to left (mm)."""
+    """Returns the points of the nose's horizontal section at a height below nasion, from right to left (mm)."""
     nasion = head.marks["nasion"]
     reach = np.abs(head.marks["endocanthion_right"][0] - head.marks["endocanthion_left"][0]) / 2.0
     off = head.vertices - nasion
@@ -318,7 +318,7 @@ def _crest(head: UprightHead, below_mm: float) -> float | None:
 
 
 def _width(head: UprightHead, below_mm: float, depth_mm: float | None, plane: float | None = None) -> float | None:
-    """Returns the distance between the flanks of a section, at a depth behind its crest or in an upright plane."""
+    """Returns the nose's width in a horizontal section, at a depth behind its front or in a given vertical plane."""
     points = _nose_section(head, below_mm)
     if len(points) < 4:
         return None
@@ -340,7 +340,7 @@ def _half_angle(wider_mm: float, length_mm: float) -> float:
 
 
 def _brow_to_cheek(head: UprightHead, side: str) -> float | None:
-    """Returns the tilt of the line that touches the face above and below an eye, degrees."""
+    """Returns the tilt (degrees) of the line that touches the face above and below an eye."""
     eye = 0.5 * (head.marks[f"exocanthion_{side}"] + head.marks[f"endocanthion_{side}"])
     off = head.vertices - eye
     near = (np.abs(off[:, 0]) < EYE_HALF_WIDTH_MM) & (off[:, 1] > -25.0)
@@ -358,7 +358,7 @@ def _brow_to_cheek(head: UprightHead, side: str) -> float | None:
 
 
 def _fields(vertices: Points) -> list[Float[np.ndarray, " v"]]:
-    """Returns smooth random fields of unit variance over a surface: sums of waves with the spectrum of the kernel."""
+    """Returns smooth random fields of unit variance over a surface: sums of waves with the head models' spectrum."""
     rng = np.random.default_rng(0)
     weights = np.array([scale.amplitude_mm**2 for scale in SCALES])
     lengths = np.array([scale.length_mm for scale in SCALES])

@@ -1,9 +1,9 @@
-"""Writes a head for a hospital's programs, without name and date: a closed STL in a DICOM object, or a NIfTI mask.
+"""Writes a head for a hospital's programs, without the patient's name and without date: a closed STL in a DICOM object,
+or a NIfTI mask.
 
-DICOM: PS3.3 A.85.1 (Encapsulated STL), LPS, mm. The face stays recognisable, and the object declares that; the patient
-has a pseudonym chosen by the caller. NIfTI-1: RAS, mm, 1 in the head and 0 outside. The same head always gives the same
-bytes.
-"""
+DICOM objects follow PS3.3 A.85.1 (Encapsulated STL), in LPS axes, mm. The face stays recognisable, and the DICOM object
+says so; the patient has a pseudonym that the caller chooses. NIfTI-1 masks are in RAS axes, mm; voxels are 1 in the
+head and 0 outside. Repeated exports of the same head give the same bytes."""
 
 import gzip
 import hashlib
@@ -34,14 +34,14 @@ OFF_GRID = (0.00071, 0.00037)  # voxels: so that no ray meets an edge or a verte
 
 
 class NoClinic(EigenheadError):
-    """Reports that the extra ``clinic`` is not installed."""
+    """Reports that the optional packages of the extra ``clinic`` are not installed."""
 
     def __init__(self) -> None:
         super().__init__(compose("clinic-not-installed", remedy=how_to_install("clinic")))
 
 
 def clinic_module(name: str) -> Any:
-    """Imports ``pydicom`` or ``nibabel`` as Any, since their types are incomplete. Raises NoClinic."""
+    """Imports ``pydicom`` or ``nibabel`` as Any, because their type annotations are incomplete. Raises NoClinic."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -51,8 +51,8 @@ def clinic_module(name: str) -> Any:
 def write_hospital_files(
     folder: Path, visit: Visit, frame: AnatomicalFrame, form: HospitalFormat, patient: str
 ) -> dict[str, Any]:
-    """Writes head.dcm, or a mask with a BIDS name, and frame.json; returns the content of frame.json. ``frame`` is in
-    the format's axes; ``patient`` consists of letters and digits. Raises NoClinic, NotAManifold and OSError."""
+    """Writes head.dcm or a NIfTI mask, and frame.json; returns the content of frame.json. ``frame`` must have the axes
+    of the format; ``patient`` consists of letters and digits. Raises NoClinic, NotAManifold and OSError."""
     if form == "dicom":
         write_atomically(folder / "head.dcm", dicom_bytes(visit, frame, patient))
     else:
@@ -72,8 +72,8 @@ def close_head(visit: Visit, frame: AnatomicalFrame) -> Mesh:
 
 
 def dicom_bytes(visit: Visit, frame: AnatomicalFrame, patient: str) -> bytes:
-    """Returns the head as a DICOM object of a patient with the pseudonym ``patient``. Its identifiers follow from the
-    surface and the pseudonym. Raises NoClinic and NotAManifold."""
+    """Returns the head as a DICOM object of a patient with the pseudonym ``patient``. The object's identifiers are
+    computed from the surface and the pseudonym. Raises NoClinic and NotAManifold."""
     pydicom, uids = clinic_module("pydicom"), clinic_module("pydicom.uid")
     surface = stl_bytes(close_head(visit, frame))
     digest = hashlib.sha256(patient.encode() + surface).hexdigest()
@@ -126,7 +126,7 @@ def dicom_bytes(visit: Visit, frame: AnatomicalFrame, patient: str) -> bytes:
 
 
 def nifti_bytes(visit: Visit, frame: AnatomicalFrame) -> bytes:
-    """Returns the head as a mask (.nii.gz). Raises NoClinic and NotAManifold."""
+    """Returns the head as a compressed NIfTI mask (.nii.gz). Raises NoClinic and NotAManifold."""
     nibabel = clinic_module("nibabel")
     mask, affine = fill_voxels(close_head(visit, frame))
     image = nibabel.Nifti1Image(mask, affine)
@@ -135,10 +135,10 @@ def nifti_bytes(visit: Visit, frame: AnatomicalFrame) -> bytes:
 
 
 def fill_voxels(closed: Mesh) -> tuple[UInt8[np.ndarray, "x y z"], Float[np.ndarray, "4 4"]]:
-    """Returns which voxels have their centre within a closed mesh (mm), and the affine from voxels to mm.
+    """Returns a mask of the voxels whose centre lies within a closed mesh (mm), and the affine transform from voxels to
+    mm.
 
-    Along each upward row of voxels, a centre is inside after an odd number of surfaces.
-    """
+    A centre is inside if a vertical ray from below crosses the mesh an odd number of times up to the centre."""
     low = np.floor(closed.vertices.min(axis=0) / VOXEL_MM) - 1.0
     size = (np.ceil(closed.vertices.max(axis=0) / VOXEL_MM) - low + 2.0).astype(int)
     corners = (closed.vertices / VOXEL_MM - low)[closed.faces]
@@ -163,5 +163,5 @@ def fill_voxels(closed: Mesh) -> tuple[UInt8[np.ndarray, "x y z"], Float[np.ndar
 
 
 def _cross(one: Float[np.ndarray, "n _"], other: Float[np.ndarray, "n _"]) -> Float[np.ndarray, " n"]:
-    """Returns the third component of the cross product of the first two."""
+    """Returns the third component of the cross product of two sets of vectors."""
     return one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]

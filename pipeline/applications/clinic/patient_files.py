@@ -1,8 +1,7 @@
 """Writes a head in a patient's axes: head.ply with ``SPACE`` in its header, landmarks.mrk.json and frame.json.
 
-3D Slicer reads ``SPACE=LPS`` or ``SPACE=RAS`` from a comment of the PLY, and the list's own ``coordinateSystem``; so
-both overlay each other and volumes in the same axes.
-"""
+3D Slicer reads the axes from the comment ``SPACE=LPS`` or ``SPACE=RAS`` in the PLY and from ``coordinateSystem`` in the
+landmark list, so head, landmarks and volumes overlay each other."""
 
 import json
 from collections.abc import Mapping
@@ -30,7 +29,7 @@ GREY = 200
 
 
 def write_patient_files(folder: Path, visit: Visit, frame: AnatomicalFrame) -> dict[str, Any]:
-    """Writes the three files, and returns the content of frame.json. Raises OSError."""
+    """Writes head.ply, landmarks.mrk.json and frame.json, and returns the content of frame.json. Raises OSError."""
     write_patient_mesh(folder / HEAD_FILE, visit, frame.patient_from_world, frame.axes)
     write_json(folder / LANDMARK_FILE, patient_landmarks(visit, frame.patient_from_world, frame.axes))
     document = frame_document(visit, frame)
@@ -54,12 +53,12 @@ def frame_document(visit: Visit, frame: AnatomicalFrame) -> dict[str, Any]:
 
 
 def matrix_document(motion: RigidTransform) -> list[list[float]]:
-    """Returns a motion as the four rows of its matrix, for column vectors in mm."""
+    """Returns a rigid transform as the four rows of its matrix, for column vectors in mm."""
     return [*np.column_stack([motion.rotation, motion.translation]).tolist(), [0.0, 0.0, 0.0, 1.0]]
 
 
 def patient_landmarks(visit: Visit, patient_from_world: RigidTransform, axes: Axes) -> dict[str, Any]:
-    """Returns the landmarks as a point list in ``axes``."""
+    """Returns the landmarks as a 3D Slicer point list in ``axes``."""
     points = {
         name: MarkupPoint(patient_from_world.apply(point), uncertainty(visit.landmark_std_mm.get(name)))
         for name, point in visit.measured.landmarks.items()
@@ -77,7 +76,7 @@ def write_patient_mesh(
     quality: Float[np.ndarray, " v"] | None = None,
     comments: tuple[str, ...] = (),
 ) -> None:
-    """Writes the head in a patient's axes, with the result's colours and standard deviations or with others."""
+    """Writes the head in a patient's axes, with the given or else the result's colours and standard deviations."""
     mesh = visit.measured.mesh_world
     moved = Mesh(patient_from_world.apply(mesh.vertices), mesh.faces)
     base = np.full(mesh.vertices.shape, GREY, np.uint8) if mesh.colours is None else mesh.colours
@@ -93,8 +92,8 @@ def write_patient_mesh(
 
 
 def marked_points(path: Path | None, visit: Visit, axes: Axes) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns those points of the Frankfurt plane that a point list marks, in the world frame. The list's coordinates
-    are those of head.ply in an export without a plane. Raises InputError."""
+    """Returns the points of the Frankfurt plane that a point list contains, in the world frame. The list's coordinates
+    are those of head.ply in an export without the Frankfurt plane. Raises InputError if the list cannot be used."""
     if path is None:
         return {}
     world_from_patient = head_axes(visit.measured, axes).patient_from_world.inverse()
@@ -103,7 +102,7 @@ def marked_points(path: Path | None, visit: Visit, axes: Axes) -> dict[str, Floa
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Writes a document, under a temporary name first."""
+    """Writes a JSON document, under a temporary name first."""
     write_atomically(path, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
 
 
@@ -113,7 +112,8 @@ COLOUR_END_MM = 2.0  # distance at which a colour of residual.ply is full
 
 
 def write_registration(folder: Path, found: Registration) -> dict[str, Any]:
-    """Writes head.ply, residual.ply, landmarks.mrk.json and registration.json; returns that report. Raises OSError."""
+    """Writes head.ply, residual.ply, landmarks.mrk.json and registration.json; returns the content of
+    registration.json. Raises OSError."""
     motion, axes = found.fit.motion, found.surface.axes
     write_patient_mesh(folder / HEAD_FILE, found.visit, motion, axes)
     write_patient_mesh(

@@ -1,17 +1,16 @@
-"""Registers a head to the surface of the same person's CT or CBCT, a mesh in mm in LPS or RAS, with or without skull
-and airways in it.
+"""Registers a head to the surface of the same person's CT or CBCT: a mesh in mm in LPS or RAS axes that may contain
+skull and airways.
 
-The motion is rigid: photographs and CT both measure millimetres, and a scale would hide errors that should be visible.
-It starts from landmarks if the surface has some. Otherwise it starts from the head in the Frankfurt plane, because
-patients are upright in a scanner within some tens of degrees: rotated by up to ``TURNS_DEG``, with the face at many
-places of the surface. The best starts are completed by a trimmed, robust fit of the face. The winner is the one with
-most of the face on the surface, because the rest may disagree: soft tissue of another day, a chin rest, a field of view
-that ends at the forehead, surfaces of skull and airways.
+The motion is rigid: photographs and CT both measure in millimetres, and a scale would hide errors that should be
+visible. If the CT surface has landmarks, the search starts from them. Otherwise the search starts from the head in the
+Frankfurt plane, rotated by up to ``TURNS_DEG``, with the face at many places of the surface, because patients lie in a
+scanner upright within some tens of degrees. From the best starts, a trimmed robust fit of the face is computed. The
+result is the fit with the largest part of the face on the CT surface. Parts outside the face may differ: soft tissue on
+another day, a chin rest, a field of view that ends at the forehead, surfaces of skull and airways.
 
-Of the points with a counterpart the nearest ``share`` counts (trimmed ICP, Chetverikov et al. 2002), and Tukey's
-biweight removes outliers among these. A surface that faces the other way, like those of airways and skull below the
-skin, is no counterpart.
-"""
+Only the fraction ``share`` of the matched points, the nearest ones, enters the fit (trimmed ICP, Chetverikov et al.
+2002), and Tukey's biweight removes outliers among them. Points are not matched with a surface that faces the other way,
+such as airways and skull below the skin."""
 
 import hashlib
 from collections.abc import Callable, Mapping
@@ -50,8 +49,8 @@ PointFlags = Bool[np.ndarray, " n"]
 
 TUKEY = 4.685  # standard deviations at which a point no longer counts: 95 % efficient with normal errors
 MIN_STD_MM = 0.01
-MAX_REACH_MM, MIN_REACH_MM = 20.0, 2.0  # of counterparts, at first and in the end
-FACING = 0.5  # cosine between the normals of counterparts
+MAX_REACH_MM, MIN_REACH_MM = 20.0, 2.0  # of matches, in the first and in the last step
+FACING = 0.5  # least cosine between matched normals
 FACING_MM = 10.0
 STEPS = 60
 STILL_MM = 1e-5
@@ -62,12 +61,12 @@ PLACES = 12  # of the surface's parts that look forward, at which the face may b
 FORWARD = 0.2  # cosine to the front from which a surface looks forward
 SHARE = 0.8  # of the face with a counterpart that must agree
 POINTS = 2500
-FEW = 600  # of these, for telling starts apart
+FEW = 600  # of these, to compare starts
 STARTS = 5
 MIN_MARKS = 3
 MIN_KEPT = 0.3  # share of the face, below which it is not this head
 NOT_THIS_MM = 2.0
-SAME_MM = 1.0  # near enough to the surface to count for a start
+SAME_MM = 1.0  # distance within which a point supports a start
 HEADER_BYTES = 4096  # in which SPACE stands: a comment of a PLY or OBJ, the 80 bytes of an STL
 
 
@@ -82,9 +81,9 @@ class Patch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrimmedFit:
-    """Holds the motion onto a surface.
+    """Holds the rigid motion of a patch onto a surface, with residuals and covariance.
 
-    ``residual_mm`` is each point's signed distance along the surface's normal, NaN without a counterpart; ``weights``
+    ``residual_mm`` is each point's signed distance along the surface's normal, NaN without a match; ``weights``
     are 0 for outliers. ``covariance`` (6 x 6: rotation about ``centre`` in rad, shift in mm) follows from the scatter;
     the number of independent errors is the number of patches of ``CORRELATED_MM`` in the area.
     """
@@ -98,11 +97,11 @@ class TrimmedFit:
 
     @property
     def kept_share(self) -> float:
-        """Returns the fraction of the points that count."""
+        """Returns the fraction of the points that have a positive weight."""
         return float(np.mean(self.weights > 0.0))
 
     def std_along(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> PerPoint:
-        """Returns the displacement of surface points along normals by the motion's error: standard deviations, mm."""
+        """Returns the standard deviation (mm) with which the motion's error displaces surface points along normals."""
         jacobian = motion_columns(points - self.centre, normals)
         return np.sqrt(np.einsum("np,pq,nq->n", jacobian, self.covariance, jacobian))
 
@@ -110,14 +109,15 @@ class TrimmedFit:
 def trimmed_fit(
     patch: Patch, surface: SurfaceIndex, start: RigidTransform, *, share: float, beside: Callable[[Hits], PointFlags]
 ) -> TrimmedFit | None:
-    """Returns the motion that fits a patch to a surface; None if fewer than ``MIN_POINTS`` have a counterpart there.
+    """Returns the motion that fits a patch to a surface; None if fewer than ``MIN_POINTS`` points have a match on the
+    surface.
 
     Args:
-        patch: of the head, in any frame.
-        surface: that is met.
-        start: the motion to begin with.
-        share: of the points with a counterpart, the nearest, that count.
-        beside: tells which closest points lie on an open edge of the surface.
+        patch: points of the head, in any frame.
+        surface: the surface to which the patch is fitted.
+        start: the starting motion.
+        share: the fraction of the matched points, the nearest ones, that get a weight.
+        beside: returns which closest points lie on an open edge of the surface.
     """
     reached = MAX_REACH_MM
 
@@ -151,8 +151,8 @@ def trimmed_fit(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Met:
-    """Holds the closest points of a surface, which of them are counterparts, their signed distances along the surface's
-    normals (positive if the points lie outside), the weights, and the standard deviation of points that count."""
+    """Holds each point's closest surface point, whether this is a valid match, the signed distance along the surface's
+    normal (positive if the point lies outside), the weight, and the standard deviation of the weighted points."""
 
     hits: Hits
     valid: PointFlags
@@ -171,7 +171,7 @@ def _met(
     share: float,
     beside: Callable[[Hits], PointFlags],
 ) -> _Met | None:
-    """Returns the counterparts of the moved points; None if fewer than ``MIN_POINTS`` have one."""
+    """Returns the closest surface points of the moved patch; None if fewer than ``MIN_POINTS`` are valid matches."""
     normals = patch.normals @ motion.rotation.T
     hits = surface.closest(there, facing=normals, facing_mm=FACING_MM)
     alike = np.einsum("nx,nx->n", normals, hits.normals) > FACING
@@ -183,7 +183,7 @@ def _met(
 
 
 def _weights(residual: PerPoint, valid: PointFlags, share: float) -> tuple[PerPoint, float]:
-    """Returns a weight for each point, and the standard deviation (mm) of those that count."""
+    """Returns a weight for each point, and the standard deviation (mm) of the points with a positive weight."""
     away = np.abs(residual)
     kept = valid & (away <= np.quantile(away[valid], share))
     normal = float(ndtri(0.5 + share / 4.0))  # where the middle of the nearest share of normal errors lies
@@ -194,7 +194,7 @@ def _weights(residual: PerPoint, valid: PointFlags, share: float) -> tuple[PerPo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatientSurface:
-    """Holds the surface and the axes of its coordinates. ``stated`` tells whether its file states them."""
+    """Holds a CT surface and the axes of its coordinates. ``stated`` is whether the surface's file states its axes."""
 
     reference: Reference
     axes: Axes
@@ -202,8 +202,8 @@ class PatientSurface:
 
 
 def read_surface(path: Path, axes: Axes | None = None) -> PatientSurface:
-    """Reads a .ply, .obj, .glb or .stl. Axes are ``axes``, else those that the file's header states (``SPACE=RAS``, as
-    3D Slicer writes it), else LPS. Raises InputError naming every fault."""
+    """Reads a CT surface from a .ply, .obj, .glb or .stl file. Its axes are ``axes`` or, without them, those in the
+    file's header (``SPACE=RAS``, as 3D Slicer writes it), otherwise LPS. Raises InputError that lists every fault."""
     mesh, _ = welded(read_mesh(path, SURFACE_ENDINGS))
     data = path.read_bytes()
     found: Axes | None = next((stated for stated in AXES if f"SPACE={stated}".encode() in data[:HEADER_BYTES]), None)
@@ -213,8 +213,8 @@ def read_surface(path: Path, axes: Axes | None = None) -> PatientSurface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """Holds the motion of a head onto a surface. ``distance_mm`` is each vertex's signed distance (positive outside the
-    surface), NaN without a counterpart; ``start`` is "landmarks" or "frankfurt"."""
+    """Holds the rigid motion of a head onto a CT surface. ``distance_mm`` is each vertex's signed distance (positive
+    outside the CT surface), NaN without a match; ``start`` is "landmarks" or "frankfurt"."""
 
     visit: Visit
     surface: PatientSurface
@@ -223,7 +223,7 @@ class Registration:
     distance_mm: Float[np.ndarray, " v"]
 
     def figures(self) -> dict[str, float]:
-        """Returns the remaining distances between head and surface (mm), over the face."""
+        """Returns statistics of the distances (mm) between head and CT surface that remain on the face."""
         face = self.visit.measured.regions["face"]
         known = face & np.isfinite(self.distance_mm)
         away, areas = np.abs(self.distance_mm[known]), self.visit.measured.areas
@@ -240,12 +240,13 @@ class Registration:
 def register(
     visit: Visit, surface: PatientSurface, landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None
 ) -> Registration:
-    """Finds the motion of a head onto a surface. Raises InputError if the surface is not that of this head.
+    """Finds the rigid motion of a head onto a CT surface. Raises InputError if the surface is not that of the same
+    head.
 
     Args:
         visit: the head.
-        surface: of the patient.
-        landmarks: of the surface, in its frame, three or more of the 26; or none.
+        surface: the CT surface of the patient.
+        landmarks: three or more of the 26 landmarks on the surface (its frame, mm), or None.
     """
     measured = visit.measured
     rng = np.random.default_rng(0)
@@ -268,7 +269,7 @@ def register(
 
 
 def _searched(visit: Visit, surface: PatientSurface, patch: Patch, rng: np.random.Generator) -> list[RigidTransform]:
-    """Returns starting motions: the head in the Frankfurt plane, slightly rotated, with its face on parts of the
+    """Returns starting motions: the head in the Frankfurt plane, slightly rotated, with its face on parts of the CT
     surface that face forward."""
     upright = frankfurt_axes(visit.measured, surface.axes).patient_from_world
     forward = np.array([0.0, -1.0 if surface.axes == "LPS" else 1.0, 0.0])
@@ -287,7 +288,7 @@ def _searched(visit: Visit, surface: PatientSurface, patch: Patch, rng: np.rando
 
 
 def _best(patch: Patch, surface: PatientSurface, starts: list[RigidTransform]) -> TrimmedFit | None:
-    """Returns the completed fit with the largest part of the face on the surface."""
+    """Returns the fit with the largest part of the face on the CT surface."""
     reference = surface.reference
     few = Patch(patch.points[:FEW], patch.normals[:FEW], patch.areas[:FEW])
     if len(starts) > 1:
@@ -306,7 +307,7 @@ def _best(patch: Patch, surface: PatientSurface, starts: list[RigidTransform]) -
 def _distances(
     visit: Visit, surface: PatientSurface, motion: RigidTransform, normals: Float[np.ndarray, "v 3"]
 ) -> Float[np.ndarray, " v"]:
-    """Returns the signed distance of every vertex to the surface, NaN where the surface has no part of the head."""
+    """Returns the signed distance of every vertex to the CT surface, NaN where the surface lacks that part."""
     there, facing = motion.apply(visit.measured.mesh_world.vertices), normals @ motion.rotation.T
     hits = surface.reference.index.closest(there, facing=facing)
     alike: Bool[np.ndarray, " v"] = np.einsum("nx,nx->n", facing, hits.normals) > 0.3
@@ -316,8 +317,8 @@ def _distances(
 
 
 def read_surface_landmarks(path: Path, axes: Axes) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns landmarks by this project's names, in the surface's axes. A .mrk.json states its own axes; other forms
-    are in the surface's. Raises InputError, also if fewer than ``MIN_MARKS`` names are known."""
+    """Returns landmarks by this project's names, in the CT surface's axes. A .mrk.json file states its own axes; other
+    files use the surface's axes. Raises InputError, also if fewer than ``MIN_MARKS`` names are known."""
     known = read_landmarks(path, axes)
     if len(known) < MIN_MARKS:
         raise InputError(path.name, [compose("marks-too-few", found=len(known), needed=MIN_MARKS)])

@@ -1,4 +1,4 @@
-"""Reads one visit of a patient: a result folder's head, landmarks and measurements with their standard deviations."""
+"""Reads one visit of a patient from a result folder: head, landmarks and measurements with standard deviations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from rig.messages.message import Message, compose, read_message
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visit:
-    """Holds a result: its head, and its report's landmarks and measurements with standard deviations."""
+    """Holds one visit: the head, and the landmarks and measurements of its report with standard deviations."""
 
     measured: Measured
     views: UInt8[np.ndarray, " v"]  # images that coloured each vertex; 0 where it was filled
@@ -38,8 +38,8 @@ class Visit:
 
 
 def read_visit(folder: Path, model: str | None = None) -> Visit:
-    """Reads a result folder; ``model`` is a name or file in place of the model that its report names. Raises
-    InputError, also if that model is not installed."""
+    """Reads a result folder; ``model`` (a name or file) replaces the head model that its report names. Raises
+    InputError if the folder cannot be used or the model is not installed."""
     identity = identity_of(folder)
     head_model = load_model(model or identity.model)
     measured = read_measured(folder, head_model, folder.resolve().name)

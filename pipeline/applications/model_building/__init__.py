@@ -1,4 +1,4 @@
-"""Builds head models (section 3): brings scans into correspondence, trains models, and imports models of other sources.
-No stage of a job needs it.
+"""Builds head models (the paper's section 3): brings scans into correspondence, trains models, and imports models of
+other sources. Reconstruction jobs do not use this package.
 
-In: raw scans (mm) with landmarks, or models in other formats. Out: a model file's content."""
+The input is raw scans (mm) with landmarks, or models in other formats. The output is the content of a model file."""

@@ -1,2 +1,2 @@
-"""Solves several shots of one person together. A *moment* is one synchronised set of pictures; a *take* is a set of
-moments of one person with different expressions. They share one identity: the head's shape without expression."""
+"""Reconstructs several captures of one person together. A *moment* is one capture; a *take* is several captures with
+different expressions, which share one identity: the head's shape without expression."""

@@ -1,7 +1,6 @@
-"""Animates a binary glTF of one node: the node's pose, and the weights of its morph targets.
+"""Adds an animation of the node's pose and its morph targets' weights to a binary glTF file with one node.
 
-https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations
-"""
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations"""
 
 import json
 import struct
@@ -20,8 +19,8 @@ HEADER, CHUNK = 12, 8  # bytes of the file's header and of a chunk's
 def animated(
     glb: bytes, times_s: Float[np.ndarray, " t"], weights: Float[np.ndarray, "t m"], poses: Sequence[RigidTransform]
 ) -> bytes:
-    """Returns the file with an animation of its first node. ``weights`` are for the mesh's morph targets in their
-    order; ``poses`` are in mm."""
+    """Returns the glTF file with an animation of its first node. ``weights`` are those of the mesh's morph targets, in
+    their order; ``poses`` are in mm."""
     (length,) = struct.unpack_from("<I", glb, HEADER)
     document = json.loads(glb[HEADER + CHUNK : HEADER + CHUNK + length])
     payload = bytearray(glb[HEADER + CHUNK + length + CHUNK :])

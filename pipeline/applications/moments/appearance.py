@@ -1,10 +1,9 @@
-"""Models the appearance of a person's skin in a sequence: the fine texture at samples of the surface, by camera.
+"""Models the fine texture of a person's skin in a sequence, at sample points of the surface and for each camera.
 
-The texture of a picture is the logarithm of its grey values minus their local mean, so neither a camera's gain nor
-shading changes it. A sample's reference in a camera is its mean over the frames from which the person was estimated; in
-a camera that saw it in none of them, the mean over all cameras. A frame is compared with the reference alone, never
-with the previous frame, so errors do not accumulate.
-"""
+The texture of a picture is the logarithm of its grey values minus their local mean, so camera gain and shading do not
+change it. The reference of a sample in a camera is its mean texture over the frames from which the person was
+estimated; a camera that never saw the sample uses the mean over all cameras. Each frame is compared with the reference
+and never with the previous frame, so errors do not accumulate."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -38,8 +37,8 @@ EDGE_PX = 5  # nothing is read nearer to the head's outline, half-size pixels
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Holds s samples on the face of a person: their triangles' vertices, their barycentric coordinates, and the head's
-    expressions there (mm at weight 1)."""
+    """Holds s sample points on a person's face: the vertices of their triangles, their barycentric coordinates, their
+    neutral positions and their displacement by each expression (mm at weight 1)."""
 
     corners: Int[np.ndarray, "s 3"]
     shares: Float[np.ndarray, "s 3"]
@@ -47,12 +46,12 @@ class Samples:
     shapes: Float32[np.ndarray, "s 3 e"]
 
     def points(self, weights: Float[np.ndarray, " e"]) -> Float[np.ndarray, "s 3"]:
-        """Returns the samples of the head with an expression, head frame, mm."""
+        """Returns the sample points for given expression weights, head frame, mm."""
         return self.neutral + self.shapes @ weights.astype(np.float32)
 
 
 def spread(person: SequencePerson) -> Samples:
-    """Spreads samples over the person's face except the lids, which may cover the eyeball instead of skin."""
+    """Returns sample points spread over the person's face without the lids, which may show the eyeball, not skin."""
     level, lids = person.model.levels["full"], lid_motion_mm(person) > LID_MM
     skin = level.face_region & ~lids
     corners, shares = spread_samples(person.neutral, level.faces[skin[level.faces].all(axis=1)], SAMPLE_MM)
@@ -62,20 +61,20 @@ def spread(person: SequencePerson) -> Samples:
 
 
 def lid_motion_mm(person: SequencePerson) -> Float[np.ndarray, " v"]:
-    """Returns the displacement of each vertex by a blink."""
+    """Returns the distance (mm) that each vertex moves in a blink."""
     blinks = [k for k, name in enumerate(person.names) if plain_name(name) in BLINKS]
     return np.linalg.norm(person.shapes[blinks], axis=2).max(axis=0, initial=0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texture:
-    """Holds the fine texture of a picture and its slopes along x and y per pixel, at a ``reduced`` size."""
+    """Holds the fine texture of a picture and its derivatives by x and y (per px), reduced by a factor ``reduced``."""
 
     image: Float32[np.ndarray, "h w 3"]
     reduced: int
 
     def read(self, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-        """Returns texture and slopes at pixels of the full-size picture, and which of them lie inside it."""
+        """Returns texture and derivatives at pixels of the full-size picture, and a mask of the pixels inside it."""
         height, width = self.image.shape[:2]
         scaled = (pixels + 0.5) / self.reduced - 0.5
         inside = np.all((scaled >= 0.0) & (scaled < (width - 1.001, height - 1.001)), axis=1)  # False for NaN
@@ -104,7 +103,7 @@ def texture_of(grey: Float32[np.ndarray, "h w"], reduced: int) -> Texture:
 
 
 def textures(pictures: Pictures, rig: Rig, reduced: int) -> list[Texture | None]:
-    """Returns the textures of a frame in the order of the cameras; None for a camera without a picture."""
+    """Returns the fine texture of each camera's picture in one frame; None for a camera without a picture."""
 
     def one(k: int) -> Texture | None:
         image = pictures.get(rig.names[k])
@@ -114,7 +113,7 @@ def textures(pictures: Pictures, rig: Rig, reduced: int) -> list[Texture | None]
 
 
 def visible(person: SequencePerson, samples: Samples, motion: Motion) -> list[Int[np.ndarray, " n"]]:
-    """Returns the samples that each camera sees, away from the outline of the head."""
+    """Returns the indices of the sample points that each camera sees, without those near the outline of the head."""
     pose, level = motion.world_from_head, person.model.levels["p95"]
     head = person.head(motion.weights)
     coarse = pose.apply(head[level.rows])
@@ -150,8 +149,8 @@ def _seen(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Appearance:
-    """Holds the reference texture of every sample in every camera (NaN where no frame showed it in any camera), and the
-    standard deviation of a frame's texture from it."""
+    """Holds the reference texture of every sample point in every camera (NaN if no camera ever saw the point), and the
+    standard deviation of a frame's texture from the reference."""
 
     reference: Float32[np.ndarray, "k s"]
     deviation: float
@@ -160,7 +159,7 @@ class Appearance:
 def observe(
     person: SequencePerson, samples: Samples, shown: Iterable[tuple[Pictures, Motion]], reduced: int
 ) -> Appearance:
-    """Returns the appearance of a person in some frames with known motions."""
+    """Computes the reference texture of a person from frames with known motions."""
     shape = (len(person.rig), len(samples.neutral))
     total, count, squares = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for pictures, motion in shown:

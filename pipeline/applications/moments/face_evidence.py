@@ -1,8 +1,8 @@
-"""Runs the face networks on a frame: landmarks and the openings of the lids, in the cameras that see the face best.
+"""Runs the face networks on a frame, in the cameras that see the face best, and returns landmarks and how far the lids
+are open.
 
-The networks search where the previous frames predict the face. The frames from which the person was estimated also give
-the bias of each landmark in each camera, and the opening of open eyes.
-"""
+The networks search the face where the previous frames predict it. The frames from which the person was estimated also
+give the networks' bias for each landmark in each camera, and the measured lid opening of open eyes."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,18 +27,18 @@ from pipeline.head_model.expressions import BLINKS, plain_name
 from rig.geometry import Similarity
 from rig.rig import Rig
 
-VIEWS = 3  # that the networks look at
+VIEWS = 3  # in which the networks search
 MIN_FACING = 0.5  # cosine between where a face looks and the camera
 CLOSED_OPENING = 0.045  # of lids that meet, as ``faces.eyes`` measures it on drawn heads and on people
 CLOSURE_SIGMA = 0.1  # of a closure, 0 to 1, by one frame: 0.05 on drawn heads
-ALIKE = 12.0  # landmarks that err alike
+ALIKE = 12.0  # number of landmarks with correlated errors
 FORGIVEN = 3.0  # deviations of a landmark
 MIN_SIGMA_PX = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """Holds the networks' results in a frame: pixels of the landmarks by camera, and each eye's opening."""
+    """Holds the networks' results in a frame: pixels of the 468 landmarks by camera, and the lid opening by eye."""
 
     pixels: Mapping[str, Float[np.ndarray, "468 2"]]
     openings: Mapping[str, float]
@@ -46,7 +46,7 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceReference:
-    """Holds the landmarks' positions on the person, and the networks' results in its first frames."""
+    """Holds the landmarks' positions on the person's head, and statistics of the networks' results on this person."""
 
     which: Int[np.ndarray, " n"]  # of the 468
     neutral: Float[np.ndarray, "n 3"]
@@ -57,7 +57,7 @@ class FaceReference:
     closing: Mapping[str, Float[np.ndarray, " e"]]  # by side: how far each expression closes the eye; a blink is 1
 
     def points(self, weights: Float[np.ndarray, " e"]) -> Float[np.ndarray, "n 3"]:
-        """Returns the landmarks of the head with an expression, head frame, mm."""
+        """Returns the landmarks for given expression weights, head frame, mm."""
         return self.neutral + self.shapes @ weights.astype(np.float32)
 
 
@@ -71,8 +71,9 @@ def sight(
     eyes: int | None = None,
     points: Float[np.ndarray, "468 3"] | None = None,
 ) -> Sighting:
-    """Searches the face where ``motion`` predicts it, in the ``views`` cameras that see it best, and the lids in the
-    first ``eyes`` of them (None: in all). ``points``: the predicted landmarks, if known (world, mm)."""
+    """Searches the face where ``motion`` predicts it, in the ``views`` cameras that see it best, and measures the lids
+    in the first ``eyes`` of these cameras (None: in all). ``points`` are the predicted landmarks, if known (world, mm).
+    """
     placed = Similarity.from_rigid(motion.world_from_head)
     facing = {
         name: float(direction_from_face(placed, person.rig[name])[2]) for name in person.rig.names if name in pictures
@@ -102,7 +103,7 @@ def sight(
 
 
 def landmarks_of(person: SequencePerson, weights: Float[np.ndarray, " e"]) -> Float[np.ndarray, "468 3"]:
-    """Returns the 468 landmarks of the head with an expression, head frame, mm."""
+    """Returns the 468 landmarks for given expression weights, head frame, mm."""
     places = landmark_map(person.model)
     rows = np.unique(places.rows)
     vertices = np.zeros_like(person.neutral)
@@ -111,7 +112,7 @@ def landmarks_of(person: SequencePerson, weights: Float[np.ndarray, " e"]) -> Fl
 
 
 def refer(person: SequencePerson, networks: FaceNetworks, shown: Iterable[tuple[Pictures, Motion]]) -> FaceReference:
-    """Collects the networks' results in frames with known motions."""
+    """Computes the networks' statistics from their results in frames with known motions."""
     places = landmark_map(person.model)
     which = spread_points(places)
     still = places.points(np.repeat(lid_motion_mm(person)[:, None], 3, axis=1))[which, 0] < LID_MM
@@ -135,8 +136,8 @@ def refer(person: SequencePerson, networks: FaceNetworks, shown: Iterable[tuple[
 
 
 def closing_of(person: SequencePerson) -> dict[str, Float[np.ndarray, " e"]]:
-    """Returns, for each eye, how much every expression closes it; a blink counts 1. An eye without a blink is left
-    out."""
+    """Returns, for each eye, how much each expression closes it, relative to a full blink. An eye for which the head
+    model has no blink is left out."""
     places, right = landmark_map(person.model), np.array(RIGHT_EYE_OUTLINE)
     outline = {"right": right, "left": point_table().mirror_images[right]}
     names, found = [plain_name(name) for name in person.names], {}
@@ -151,7 +152,7 @@ def closing_of(person: SequencePerson) -> dict[str, Float[np.ndarray, " e"]]:
 
 
 def terms_of(reference: FaceReference, rig: Rig, found: Sighting) -> Sequence[Term[Motion]]:
-    """Returns the cost terms of the networks' results in a frame."""
+    """Returns the cost terms of the networks' landmarks and lid openings in a frame."""
     terms: list[Term[Motion]] = []
     seen = {name: pixels[reference.which] for name, pixels in found.pixels.items()}
     if seen:
@@ -169,14 +170,14 @@ def terms_of(reference: FaceReference, rig: Rig, found: Sighting) -> Sequence[Te
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkTerm:
-    """Computes the cost of the landmarks' pixels after their bias is subtracted."""
+    """Computes the cost of the detected landmark pixels after the networks' bias has been removed."""
 
     reference: FaceReference
     rig: Rig
     pixels: Mapping[str, Float[np.ndarray, "n 2"]]
 
     def at(self, motion: Motion) -> Residuals:
-        """Returns the differences between projected and detected landmarks, in standard deviations."""
+        """Returns the residuals between projected and detected landmarks, in standard deviations."""
         pose, reference = motion.world_from_head, self.reference
         world = pose.apply(reference.points(motion.weights))
         none, sigma = np.zeros((len(world), 2)), reference.sigma_px * np.sqrt(ALIKE)
@@ -198,12 +199,12 @@ class LandmarkTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidTerm:
-    """Computes the cost of the eyes' closures, which are a linear function of the weights."""
+    """Computes the cost of the eyes' closures, which are linear in the expression weights."""
 
     columns: Float[np.ndarray, "s e"]
     observed: Float[np.ndarray, " s"]
 
     def at(self, motion: Motion) -> Residuals:
-        """Returns the differences between modelled and observed closures, in standard deviations."""
+        """Returns the residuals between modelled and observed closures, in standard deviations."""
         whole = np.concatenate([np.zeros((len(self.observed), POSE)), self.columns], axis=1)
         return Linear(whole, self.observed).at(np.concatenate([np.zeros(POSE), motion.weights]))

@@ -1,10 +1,9 @@
-"""Reads a sequence: cameras.json, and either ``images/<camera>/<frame>.<ext>`` or ``videos/<camera>.<ext>``.
+"""Reads a sequence folder: cameras.json, and either ``images/<camera>/<frame>.<ext>`` or ``videos/<camera>.<ext>``.
 
-Beside them may lie clean plates (``background/``, as in a capture), masks (``masks/<camera>/<frame>.<ext>``),
-``times.csv`` with the columns frame and time_s, and ``clock.json`` of `eigenhead clock`. Without times, frames follow
-each other at the videos' rate or at ``FPS``; numbers that are left out are frames that a recorder dropped. Frames are
-read small, one after another, for tracking; single ones also as a capture, at the size of a single job.
-"""
+The folder may also hold clean plates (``background/``), masks (``masks/<camera>/<frame>.<ext>``), ``times.csv`` with
+the columns frame and time_s, and ``clock.json``, which `eigenhead clock` writes. Without times.csv, frames follow each
+other at the videos' rate or at ``FPS``; a gap in the frame numbers counts as dropped frames. For tracking, frames are
+read one after another at reduced size; a single frame can also be read as a capture at full size."""
 
 import csv
 import json
@@ -40,8 +39,8 @@ Pictures = Mapping[str, ImageRgb]  # by camera; one that lacks the frame is left
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footage:
-    """Holds the location of a sequence's pictures. ``rig`` are the cameras of the files, ``work`` those of the reduced
-    pictures. A camera has either ``files`` by frame, or a video of its own."""
+    """Holds where the pictures of a sequence are stored. ``rig`` holds the cameras for full-size pictures, ``work``
+    those for reduced pictures. Each camera has either ``files`` by frame or one video."""
 
     folder: Path
     rig: Rig
@@ -53,8 +52,8 @@ class Footage:
     spread_s: float = 0.0  # between the first and the last camera's exposure of a frame; 0 without clock.json
 
     def read(self, first: int = 0, cameras: Sequence[str] = ()) -> Iterator[Pictures]:
-        """Yields the reduced pictures of every frame from ``first`` on, of all ``cameras`` if none is named. A picture
-        that is missing or damaged is left out."""
+        """Yields the reduced pictures of every frame from ``first`` on; without ``cameras``, of all cameras. Missing
+        and damaged pictures are left out."""
         names = cameras or self.rig.names
         with ExitStack() as stack:
             of_names = {name: path for name, path in self.videos.items() if name in names}
@@ -76,7 +75,7 @@ class Footage:
 
     @contextmanager
     def capture(self, number: int) -> Iterator[tuple[Capture, Rig]]:
-        """Yields a frame as a capture with its plates and masks, together with its cameras. Raises InputError."""
+        """Yields one frame as a capture with its plates and masks, and the full-size cameras. Raises InputError."""
         with tempfile.TemporaryDirectory() as scratch:
             folder, frame = Path(scratch), self.frames[number]
             rig_file = find_rig_file(self.folder)
@@ -116,7 +115,7 @@ class Footage:
 
 
 def open_footage(folder: Path) -> Footage:
-    """Finds the pictures of a sequence. Raises InputError that names every fault."""
+    """Finds the pictures of a sequence in its folder. Raises InputError that lists every fault of the folder."""
     folder = capture_root(folder)
     rig_file = find_rig_file(folder)
     if rig_file is None:
@@ -158,7 +157,7 @@ def open_footage(folder: Path) -> Footage:
 
 
 def _spread(path: Path, rig: Rig) -> float:
-    """Returns how much later (s) the last camera exposes than the first. Raises InputError."""
+    """Returns how much later (s) the last camera exposes than the first, from clock.json. Raises InputError."""
     if not path.is_file():
         return 0.0
     try:
@@ -170,7 +169,7 @@ def _spread(path: Path, rig: Rig) -> float:
 
 
 def _times(path: Path, frames: tuple[str, ...], rate: float) -> Float[np.ndarray, " n"]:
-    """Returns when each frame was taken (s). Raises InputError if times.csv lacks some frames, or if times decrease."""
+    """Returns the time of each frame (s). Raises InputError if times.csv lacks some frames, or if times decrease."""
     if not path.is_file():
         numbers = np.array([_in_order(frame)[0] for frame in frames])
         steps = np.diff(numbers)
@@ -188,7 +187,7 @@ def _times(path: Path, frames: tuple[str, ...], rate: float) -> Float[np.ndarray
 
 
 def _in_order(frame: str) -> tuple[int, str]:
-    """Sorts numbers by their value, and names after them."""
+    """Returns a sort key that orders frame names that are numbers by value, before all other names."""
     digits = "".join(filter(str.isdecimal, frame))
     return (int(digits) if digits else -1, frame)
 

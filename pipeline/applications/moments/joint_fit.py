@@ -1,16 +1,18 @@
-"""Solves for the one identity of several moments, together with pose, expression and cameras of each moment.
+"""Estimates one identity common to several captures, together with the pose, expression and cameras of each capture.
 
-In: the contour solver's solution of every moment, fitted to outlines or photographs. Out: the same solutions with one
-identity. The identity's coefficients and the log of scale are shared; all other unknowns belong to one moment. The
-equations therefore form an arrow (``arrow``). The cost is the sum of the moments' costs.
+The input is the contour solver's solution for every capture, fitted to outlines or photographs. The output is the same
+solutions with one common identity. The identity's coefficients and the logarithm of scale are shared; each other
+unknown belongs to one capture. The normal equations therefore have the form of an arrow: a shared block, and one block
+for each capture (module ``arrow``).
 
-Each of these costs contains the prior of the shared unknowns. With independent errors it would count once. But cameras,
-light, hair and the misfit of the model are the same in all moments. If the fraction ``COMMON`` of the error variance is
-common, K moments are worth K / (1 + COMMON (K - 1)) independent ones; so the prior counts 1 + COMMON (K - 1) times.
-Counted once, it left the joint head of eight moments from three cameras no better than the mean of their own heads.
+The cost is the sum of the captures' costs. Each capture's cost contains the prior of the shared unknowns, so the sum
+contains this prior K times for K captures. With independent errors, the prior should count once. However, the errors of
+cameras, light, hair and head model are the same in all captures. If the fraction ``COMMON`` of the error variance is
+common, K captures are worth K / (1 + COMMON (K - 1)) independent ones; the prior should therefore count 1 + COMMON
+(K - 1) times. When the prior counted once, the joint head of eight captures from three cameras was no better than the
+mean of the separate heads.
 
-A moment whose photographs show too little has no fine modes; it contributes only to the modes that it has.
-"""
+A capture whose photographs lack detail has no fine modes; it contributes only to the modes that it has."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +31,7 @@ from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.positive_definite import inverse
 from pipeline.estimation.terms import Linearised, NormalEquations, Problem, Sum
 
-COMMON = 0.5  # share of the variance of evidence that all moments have in common
+COMMON = 0.5  # share of the error variance that all captures have in common
 STEPS = 12  # Levenberg-Marquardt steps at most
 States = tuple[State, ...]
 Rows = Int[np.ndarray, "_"]
@@ -37,8 +39,8 @@ Rows = Int[np.ndarray, "_"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Holds the position of each moment's unknowns among all unknowns: those of the identity first, then the log of
-    scale, then each moment's own."""
+    """Holds the index of each capture's unknowns in the vector of all unknowns: identity coefficients first, then the
+    logarithm of scale, then each capture's remaining unknowns."""
 
     identity: int  # coefficients
     places: tuple[Rows, ...]  # by moment: the row of each of its unknowns
@@ -48,17 +50,17 @@ class Layout:
 
     @property
     def arrow(self) -> Arrow:
-        """Returns the arrow: its shaft is the shared unknowns and the expression weights."""
+        """Returns the arrow structure, in which the shared unknowns and the expression weights are not eliminated."""
         return Arrow(self.size, self.free)
 
 
 def identity_of(solved: ContourSolution, state: State) -> Float[np.ndarray, " i"]:
-    """Returns the coefficients of a moment's head without expression weights."""
+    """Returns the coefficients of a capture's head without expression weights."""
     return np.delete(state.coefficients, np.asarray(solved.problem.model.posed, int))
 
 
 def lay_out(solutions: Sequence[ContourSolution], problems: Sequence[Problem[State]]) -> Layout:
-    """Returns the layout of the moments' unknowns."""
+    """Returns the layout of all captures' unknowns in one vector."""
     identity = max(len(identity_of(each, each.state)) for each in solutions)
     places, weights, free, size = [], [], [], identity + 1
     for solved, problem in zip(solutions, problems, strict=True):
@@ -76,8 +78,8 @@ def lay_out(solutions: Sequence[ContourSolution], problems: Sequence[Problem[Sta
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointTerm:
-    """Computes the cost of all moments, each by its own problem. The prior of the shared unknowns counts ``1 + common
-    (K - 1)`` times for K moments."""
+    """Computes the sum of the costs of all captures. For K captures, the prior of the shared unknowns is multiplied by
+    ``1 + common (K - 1)``."""
 
     problems: tuple[Problem[State], ...]
     solutions: tuple[ContourSolution, ...]
@@ -85,7 +87,7 @@ class JointTerm:
     common: float
 
     def at(self, states: States) -> "LinearisedJointTerm":
-        """Returns the linearised term; ``states`` has one state for each moment."""
+        """Returns the linearised term; ``states`` has one state for each capture."""
         parts = tuple(problem.at(state) for problem, state in zip(self.problems, states, strict=True))
         counts = np.zeros(self.layout.identity + 1)  # priors too many
         values = np.zeros(self.layout.identity + 1)
@@ -100,8 +102,8 @@ class JointTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedJointTerm:
-    """Holds the moments' linearised costs, and what is subtracted: the information of the ``repeated`` priors, at the
-    shared ``values``."""
+    """Holds the captures' linearised costs, and the information matrix of the superfluous copies of the prior, which is
+    subtracted at the shared ``values``."""
 
     term: JointTerm
     parts: tuple[Linearised, ...]
@@ -110,11 +112,11 @@ class LinearisedJointTerm:
 
     @property
     def cost(self) -> float:
-        """Returns the sum of the moments' costs, without the repeated priors."""
+        """Returns the sum of the captures' costs, without the superfluous copies of the prior."""
         return sum(part.cost for part in self.parts) - float(self.repeated @ self.values**2)
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds each moment's equations at its rows, in place."""
+        """Adds each capture's normal equations at its indices, in place."""
         layout = self.term.layout
         for part, problem, rows in zip(self.parts, self.term.problems, layout.places, strict=True):
             local = problem.equations(part)
@@ -126,7 +128,7 @@ class LinearisedJointTerm:
 
 
 def joint_problem(solutions: Sequence[ContourSolution], common: float = COMMON) -> tuple[Problem[States], Layout]:
-    """Builds the least-squares problem of all moments, from the last stage of each one's solution."""
+    """Builds the least-squares problem of all captures, from the last stage of each capture's solution."""
     problems = tuple(last_problem(each)[0] for each in solutions)
     layout = lay_out(solutions, problems)
     term = JointTerm(problems, tuple(solutions), layout, common)
@@ -147,8 +149,8 @@ def joint_problem(solutions: Sequence[ContourSolution], common: float = COMMON) 
 
 
 def start_at_mean(solutions: Sequence[ContourSolution]) -> States:
-    """Returns each moment's state with the mean identity and scale of all. For a mode that some moments lack, it is the
-    mean of the others."""
+    """Returns each capture's state with its identity and scale replaced by the mean over all captures. For a mode that
+    some captures lack, the mean is taken over the others."""
     identities = [identity_of(each, each.state) for each in solutions]
     stacked = np.full((len(solutions), max(map(len, identities))), np.nan)
     for row, identity in zip(stacked, identities, strict=True):
@@ -159,7 +161,7 @@ def start_at_mean(solutions: Sequence[ContourSolution]) -> States:
 
 
 def with_identity(solved: ContourSolution, state: State, identity: Float[np.ndarray, " i"], scale: float) -> State:
-    """Returns a moment's state with another identity (truncated to the moment's modes) and scale."""
+    """Returns a capture's state with the given identity (truncated to the capture's modes) and scale."""
     coefficients, posed = state.coefficients.copy(), np.asarray(solved.problem.model.posed, int)
     rows = np.setdiff1d(np.arange(len(coefficients)), posed)
     coefficients[rows] = identity[: len(rows)]
@@ -170,11 +172,11 @@ def with_identity(solved: ContourSolution, state: State, identity: Float[np.ndar
 def fit_jointly(
     solutions: Sequence[ContourSolution], eigenheads: int, *, watch: Callable[[], None] = lambda: None
 ) -> tuple[ContourSolution, ...]:
-    """Returns the solutions at the one identity that explains all moments best.
+    """Returns the captures' solutions after a joint fit that gives all of them the same identity.
 
     Args:
-        solutions: of at least two moments, with models of one mesh and one basis; some may have fine modes, too.
-        eigenheads: how many of the modes, the first ones, are eigenheads.
+        solutions: those of at least two captures, with the same mesh and basis; some may also have fine modes.
+        eigenheads: the number of eigenheads, which are the first modes.
         watch: called before every step; an exception that it raises ends the fit.
     """
     problem, layout = joint_problem(solutions)
@@ -200,8 +202,8 @@ def _with_evidence(
     here: Linearised,
     eigenheads: int,
 ) -> States:
-    """Solves once more for shape and expressions, as ``expression_evidence`` does for one moment; the prior variance of
-    each group of modes is estimated from all moments."""
+    """Estimates the prior variance of each group of modes from all captures and solves once more for shape and
+    expressions, as ``expression_evidence`` does for one capture."""
     longest = max(range(len(states)), key=lambda k: len(states[k].coefficients))
     posed = solutions[longest].problem.model.posed
     identity = identity_of(solutions[longest], states[longest])
@@ -210,7 +212,7 @@ def _with_evidence(
     equations = problem.equations(here)
     matrix, gradient = equations.matrix, equations.gradient
     priors = 1.0 + COMMON * (len(states) - 1)
-    matrix[diagonal, diagonal] -= priors  # what the evidence says without the priors
+    matrix[diagonal, diagonal] -= priors  # the information without the priors
     gradient[diagonal] -= priors * identity
     before = [
         state.coefficients[solved.problem.model.posed.start : solved.problem.model.posed.stop]
@@ -235,9 +237,9 @@ def _with_evidence(
 
 
 def joint_covariances(solutions: Sequence[ContourSolution]) -> Iterator[Float[np.ndarray, "p p"]]:
-    """Yields the covariance of each moment's coefficients, rotation, translation and log scale, given the evidence of
-    all moments. The independent part follows from the joint normal matrix, with the prior once; the fraction ``COMMON``
-    keeps the covariance of the single moment. Weights at bounds are treated as in ``finish``."""
+    """Yields the covariance of each capture's coefficients, rotation, translation and log scale after the joint fit.
+    The independent part of the errors follows from the joint normal matrix; the common part, the fraction ``COMMON``,
+    keeps the covariance of the capture's separate fit. Weights at bounds get the variance that ``finish`` defines."""
     problem, layout = joint_problem(solutions, common=0.0)
     here = problem.at(tuple(each.state for each in solutions))
     assert isinstance(here, Sum)

@@ -1,13 +1,13 @@
-"""Tracks the head of the person in front of the cameras, by the face's landmarks in small pictures: fast, not precise.
+"""Tracks the head of a person in front of the cameras from face landmarks in small pictures; speed matters more than
+precision.
 
-In: the current pictures of all cameras, and the previous head. Out: the head with its pose, its expression and its
-landmarks in each camera.
+The input is the current picture of each camera and the previous head. The output is the head's pose, its expression and
+its landmarks in each camera.
 
-At first the face is searched in all views, and the model's shape is fitted to its triangulated landmarks. The result is
-the person of a sequence (``sequence_person``), without outlines and texture. From then on the network searches at the
-previous position, and the sequence's own terms (``face_evidence``) fit pose and weights, starting from the previous
-ones. If the head moved far, the network searches again at the new position.
-"""
+In the first pictures, the face is searched in all views, and the head model is fitted to the triangulated landmarks.
+The fitted head has the form of a recorded sequence's head (``sequence_person``), without outlines and texture. In later
+pictures the network searches at the previous position, and the cost terms of ``face_evidence`` fit pose and weights,
+starting from the previous values. If the head has moved far, the network searches again at the new position."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -37,23 +37,23 @@ from rig.capture import ImageRgb
 from rig.geometry import RigidTransform, Similarity, vector_from_rotation
 from rig.rig import Rig
 
-MODES = 40  # of the shape; landmarks tell nothing of finer ones
+MODES = 40  # of the shape; landmarks do not determine finer modes
 SHAPE_LIMITS, MOTION_LIMITS = Limits(8, 0.1), Limits(4, 0.05)
 MIN_VIEWS = 2
-EYES = 3  # cameras in which lids are looked at
-LOOKS = 3  # at one moment, each from where the one before has found the head
+EYES = 3  # cameras in which lids are measured
+LOOKS = 3  # searches for one set of pictures, each from the previous result
 FAR_DEG, FAR_MM = 4.0, 12.0  # of a motion: a crop so far off misplaces the landmarks
 COARSE = 8.0  # of the landmarks' deviation, for a head that may have moved far
 OPEN = 0.18  # an open eye's opening, at least (``faces.eyes``): the first look may have met closed ones
 MAX_MISFIT = 0.08  # RMS by the face's size in the picture: beyond it the landmarks are another face's
 NEAR = 0.03  # the same of a head that has hardly moved, in every camera
-MESH = "p99"  # the level that is shown
+MESH = "p99"  # the mesh that is displayed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LivePerson:
-    """Holds everything constant over time: the person, its ``scale`` relative to the model, the networks' reference
-    values, the vertices of the small mesh and then the 468 landmarks, with their expressions (head frame, mm)."""
+    """Holds everything that does not change over time: the person, the head's ``scale`` relative to the head model,
+    reference values of the networks, and a small mesh and the 468 landmarks with their expressions (head frame, mm)."""
 
     person: SequencePerson
     scale: float
@@ -64,14 +64,14 @@ class LivePerson:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveHead:
-    """Holds the head at one moment.
+    """Holds the tracked head in the current pictures.
 
     Attributes:
         who: the person.
         motion: pose and weights.
         sighting: pixels of the landmarks by camera, and the openings of the lids.
-        facing: cosine between where the face looks and each camera.
-        strangers: cameras that show landmarks where this head has none.
+        facing: cosine between the direction of the face and that to each camera.
+        strangers: cameras in which the detected landmarks belong to another head.
         points_world: the vertices of the small mesh, then the 468 landmarks (mm).
     """
 
@@ -84,19 +84,19 @@ class LiveHead:
 
     @property
     def vertices_world(self) -> Float[np.ndarray, "v 3"]:
-        """Returns the vertices of the small mesh (mm)."""
+        """Returns the vertices of the small mesh (world frame, mm)."""
         return self.points_world[:-LANDMARKS]
 
     @property
     def landmarks_world(self) -> Float[np.ndarray, "468 3"]:
-        """Returns the 468 landmarks on the head (mm)."""
+        """Returns the 468 landmarks on the head (world frame, mm)."""
         return self.points_world[-LANDMARKS:]
 
 
 def meet(
     model: HeadModel, face: MatchedFaces, pictures: Mapping[str, ImageRgb], rig: Rig, networks: FaceNetworks
 ) -> LiveHead | None:
-    """Builds the person whose face was found in the pictures. Returns None if the pictures do not confirm the face."""
+    """Builds the head of a person whose face was detected in the pictures. Returns None if a second detection fails."""
     alignment = align_to_face(model, face, landmark_map(model))
     state = _shaped(alignment.landmarks, alignment.world_from_head, min(MODES, len(model.modes)))
     scale, names = state.world_from_head.scale, tracked_names(model)
@@ -118,7 +118,7 @@ def meet(
 
 
 def _shaped(observed: LandmarkObservations, start: Similarity, modes: int) -> State:
-    """Fits the first modes and the pose of the model to triangulated landmarks."""
+    """Fits the head model's first modes and its pose to triangulated face landmarks."""
     stage = Stage("full", modes, False, (), False, False, 0)
     rows = np.eye(modes + 1, modes + POSE_WITH_SCALE)
     rows[modes, [modes, modes + LOG_SCALE]] = 0.0, 1.0 / SCALE_SPREAD
@@ -129,12 +129,12 @@ def _shaped(observed: LandmarkObservations, start: Similarity, modes: int) -> St
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapePrior:
-    """Computes the prior of coefficients and scale, as ``contour_fit.prior_term`` for a whole problem."""
+    """Computes the prior of shape coefficients and scale, like ``contour_fit.prior_term``."""
 
     rows: Float[np.ndarray, "n p"]  # by coefficients and pose, in deviations
 
     def at(self, state: State) -> Residuals:
-        """Returns the coefficients, and the log of scale divided by its standard deviation."""
+        """Returns the coefficients, and the logarithm of scale divided by its standard deviation."""
         residual = np.append(state.coefficients, np.log(state.world_from_head.scale) / SCALE_SPREAD)
         return Residuals(residual[:, None], lambda: self.rows[:, None])
 
@@ -174,7 +174,7 @@ def _fitted(who: LivePerson, found: Sighting, start: Motion) -> Motion:
 
 
 def _misfits(who: LivePerson, found: Sighting, motion: Motion) -> dict[str, float]:
-    """Returns the RMS distance of each camera's landmarks from the head's, relative to the face's size there."""
+    """Returns, by camera, the RMS distance between detected and projected landmarks, relative to the face's size."""
     reference, misfits = who.reference, {}
     world = motion.world_from_head.apply(reference.points(motion.weights))
     for name, pixels in found.pixels.items():

@@ -1,14 +1,14 @@
-"""Estimates the neutral head and the person's own shapes from the heads of a take.
+"""Estimates a person's neutral head and personal blendshapes from heads of the same person with different expressions.
 
-At each vertex, the head of moment k is the model's prediction plus what the model does not explain,
+At each vertex, y_k is the difference between the head of capture k and the head model's prediction:
 
     y_k = u + sum_e w_ke d_e + noise,    u ~ N(0, r^2),    d_e ~ N(0, (OWN |S_e|)^2)
 
-with u the relief common to all moments, d_e the difference of the person's shape e from the model's S_e, and w_ke the
-weights. The noise is each head's standard deviation. A fraction ``COMMON`` of its variance is the same in all moments
-(cameras, hair, light); more moments do not reduce it. Vertices are independent of each other: neighbours agree because
-the heads are smooth. Everything is Gaussian, so the K x K covariance of the y_k at each vertex is enough.
-"""
+Here the relief u is common to all captures, d_e is the difference between the person's blendshape e and the head
+model's S_e, and w_ke are the expression weights. The noise has the standard deviation that the fit of each head states.
+Cameras, hair and light make a fraction ``COMMON`` of the noise variance the same in all captures; averaging over
+captures does not reduce this fraction. Each vertex is computed separately; the results are smooth because the heads are
+smooth. All distributions are Gaussian, so the K x K covariance of the y_k at each vertex suffices."""
 
 from dataclasses import dataclass
 
@@ -20,14 +20,14 @@ from pipeline.head_model.model import HeadModel
 
 RELIEF_MM = 1.0  # r: deviation of what the heads have beyond the model's modes
 OWN = 0.3  # deviation of a person's shape from the model's, as a share of its displacement
-SHOWN = 0.1  # least weight in some moment of a shape that the take shows
+SHOWN = 0.1  # least weight of a shape, in some capture, that occurs in the take
 COMMON = 0.5  # share of the variance that a take's heads have in common
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OwnShapes:
-    """Holds a person's neutral head (head frame, mm) with Apple's 52 shapes in that person's form. ``shown`` are the
-    names that occur in the take; all other shapes are the model's own."""
+    """Holds a person's neutral head (head frame, mm) and the person's 52 blendshapes under Apple's names. ``shown``
+    lists the blendshapes that occur in the take; all others are copied from the head model."""
 
     neutral: Float[np.ndarray, "v 3"]
     deviation_mm: Float[np.ndarray, " v"]
@@ -44,15 +44,15 @@ def estimate_own_shapes(
     heads: Float[np.ndarray, "k v 3"],
     deviation_mm: Float[np.ndarray, "k v"],
 ) -> OwnShapes:
-    """Returns the neutral head and shapes that explain the heads of a take.
+    """Estimates the neutral head and blendshapes that best explain several heads of one person.
 
     Args:
         model: the head model, with its expressions.
-        neutral: the modelled neutral head that all moments share, full level, head frame, mm.
-        scale: of the subject, by which the model's shapes are multiplied.
-        weights: of the model's expressions in each moment, 0 to 1.
-        heads: each moment's head, full level, head frame, mm.
-        deviation_mm: of each moment's vertices along their normals.
+        neutral: the head model's neutral head for all captures, finest mesh, head frame, mm.
+        scale: the subject's scale, by which the model's blendshapes are multiplied.
+        weights: the weights of the model's expressions in each capture, 0 to 1.
+        heads: each capture's head, finest mesh, head frame, mm.
+        deviation_mm: the standard deviation of each capture's vertices along their normals.
     """
     operator, names = model.levels["full"].operator, model.expressions.names
     full = np.zeros((len(names), *neutral.shape), np.float32)
@@ -72,7 +72,7 @@ def estimate_own_shapes(
     moved = np.einsum("ve,ke,vkc->evc", prior, weights, pulled, optimize=True)
     explained = np.einsum("ke,vkj,je->ve", weights, known, weights, optimize=True)
     variance = np.maximum(prior - prior**2 * explained, 0.0).T
-    # What the model itself leaves open of the neutral head is in all of the heads alike.
+    # The model's own error of the neutral head is the same in all heads.
     common = COMMON * sigma.min(axis=1) ** 2
     rows = arkit_parts(names)
     shapes = np.stack([(full + moved)[list(rows[name])].sum(axis=0) for name in ARKIT])

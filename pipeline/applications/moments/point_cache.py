@@ -1,7 +1,7 @@
-"""Writes a moving mesh as a point cache of OpenUSD (the extra ``usd``): the points of every frame, in one layer.
+"""Writes a moving mesh as a point cache of OpenUSD (package extra ``usd``), with the points of every frame in one
+layer.
 
-https://openusd.org/release/api/class_usd_geom_point_based.html
-"""
+https://openusd.org/release/api/class_usd_geom_point_based.html"""
 
 import tempfile
 from collections.abc import Sequence
@@ -19,8 +19,8 @@ from rig.mesh import Mesh, vertex_normals
 def write_point_cache(
     path: Path, frames: Sequence[Float[np.ndarray, "v 3"]], faces: Int32[np.ndarray, "f 3"], times_s: np.ndarray
 ) -> None:
-    """Writes the vertices (mm) of ``frames`` to ``path`` (.usdc), y up, in metres. Their times are ``times_s``; the
-    unit of time codes is the median interval. Raises NoUsd and OSError."""
+    """Writes the vertices (mm) of ``frames`` to ``path`` (.usdc), y up, in metres. The frames' times are ``times_s``;
+    the unit of USD's time codes is the median interval. Raises NoUsd and OSError."""
     check_usd()
     Usd, UsdGeom = map(openusd_module, ("Usd", "UsdGeom"))
     codes = (times_s - times_s[0]) / np.median(np.diff(times_s))

@@ -1,8 +1,8 @@
-"""Measures the time offsets between unsynchronised cameras, by a clock on a screen that all of them see.
+"""Measures the time offsets between unsynchronised cameras with a clock on a screen that all cameras see.
 
-The screen shows a row of ``SLOTS`` ArUco markers. At refresh n only the marker n % SLOTS changes. So every picture
-shows most markers sharply; the ones that changed during the exposure are blended and not read. The markers read give
-the middle of the exposure, to one refresh of the screen; the mean of many shots is more precise.
+The screen shows a row of ``SLOTS`` ArUco markers. At refresh n only the marker n % SLOTS changes. Every picture
+therefore shows most markers sharply; markers that changed during the exposure are blurred and not decoded. The decoded
+markers give the middle of the exposure with a resolution of one screen refresh; the mean of many shots is more precise.
 """
 
 import json
@@ -59,8 +59,8 @@ requestAnimationFrame(next);
 
 @dataclass(frozen=True, slots=True)
 class Skew:
-    """Holds how much later a camera exposes than the mean of all (ms), the scatter from shot to shot, and the standard
-    deviation of the mean."""
+    """Holds how much later a camera exposes than the mean of all cameras (ms), this offset's scatter over shots, and
+    the standard deviation of the mean offset."""
 
     shots: int
     mean_ms: float
@@ -69,7 +69,7 @@ class Skew:
 
 
 def clock_page() -> str:
-    """Returns a self-contained page that shows the clock in a browser, and the screen's rate."""
+    """Returns a self-contained HTML page that shows the clock and the screen's refresh rate in a browser."""
     bits = [_bits(code) for code in range(PERIOD)]
     page = PAGE.replace("CODES", json.dumps(["".join(map(str, of.ravel().tolist())) for of in bits]))
     for name, value in (("SLOTS", SLOTS), ("TURNS", TURNS), ("CELLS", CELLS), ("GAP", GAP)):
@@ -78,7 +78,7 @@ def clock_page() -> str:
 
 
 def draw_row(refresh: int) -> UInt8[np.ndarray, "h w"]:
-    """Draws the screen's row after its refresh ``refresh``, one pixel for each cell."""
+    """Draws the screen's row of markers after refresh number ``refresh``, one pixel for each marker cell."""
     row = np.full((CELLS + GAP, SLOTS * (CELLS + GAP)), 255, np.uint8)
     for slot in range(SLOTS):
         changed = refresh - (refresh - slot) % SLOTS
@@ -94,8 +94,8 @@ def _bits(code: int) -> UInt8[np.ndarray, "4 4"]:
 
 
 def read_refresh(image: Grey) -> float | None:
-    """Returns the middle of a picture's exposure in refreshes of the screen, 0 to ``PERIOD``; None if the row cannot be
-    read."""
+    """Returns the middle of a picture's exposure in screen refreshes, 0 to ``PERIOD``; None if the markers cannot be
+    decoded."""
     _, found, _ = cv2.aruco.ArucoDetector(DICTIONARY).detectMarkers(image)
     if found is None or len(found) < MIN_READ:
         return None
@@ -110,14 +110,13 @@ def read_refresh(image: Grey) -> float | None:
 
 
 def measure_skews(refreshes: Mapping[str, Float[np.ndarray, " n"]], rate_hz: float) -> dict[str, Skew]:
-    """Measures the skew of each camera.
+    """Measures the time offset of each camera.
 
     Args:
-        refreshes: by camera, of each shot what ``read_refresh`` says; NaN where it is unknown.
-        rate_hz: refreshes of the screen in a second.
+        refreshes: by camera, the result of ``read_refresh`` for each shot; NaN if it is unknown.
+        rate_hz: the screen's refresh rate.
 
-    Returns only cameras that share shots with others.
-    """
+    Returns only cameras that have shots in common with other cameras."""
     rows = np.array([*refreshes.values()])
     apart = (rows[:, None] - rows[None] + PERIOD / 2.0) % PERIOD - PERIOD / 2.0  # of each from each, in every shot
     read = np.isfinite(rows)
@@ -136,8 +135,8 @@ def measure_skews(refreshes: Mapping[str, Float[np.ndarray, " n"]], rate_hz: flo
 
 
 def measure_shots(pictures: Mapping[str, Mapping[str, Path]], rate_hz: float) -> dict[str, Skew]:
-    """Measures the skew of cameras whose shots are files. Raises InputError that names every picture that cannot be
-    decoded, and every camera that never shows the clock."""
+    """Measures the time offsets of cameras whose shots are picture files. Raises InputError that lists every picture
+    that cannot be decoded, and every camera that never shows the clock."""
     shots = sorted({shot for of in pictures.values() for shot in of})
     rows, faults = dict[str, Float[np.ndarray, " n"]](), list[Message]()
     for name, of in pictures.items():

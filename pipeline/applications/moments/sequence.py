@@ -1,11 +1,12 @@
-"""Tracks a head through a sequence: one identity, and the pose and expression of every frame.
+"""Tracks a head through a sequence: estimates one identity, and the pose and expression of every frame.
 
-The identity is estimated from the sharpest frames of the first second (``sequence_person``). Then each frame is fitted
-from the previous frame's state, extrapolated by the motion (``track_frame``). A lost head is searched anew; if that
-fails too, the frame has failed and is interpolated. At the end all is smoothed over time (``smoothing``).
+The identity is estimated from the sharpest frames of the first second (``sequence_person``). Then each frame is fitted,
+starting from the motion extrapolated from the previous frames (``track_frame``). A lost head is searched in the whole
+pictures; if no head is found, the frame counts as failed and is interpolated. At the end, pose and weights are smoothed
+over time (``smoothing``).
 
-What is found is kept in chunks, each written under a temporary name first. No chunk needs the one before: a run that
-was killed makes those that are missing, several processes share them, and all find the same.
+Results are stored in chunks of frames, each written under a temporary name first. No chunk depends on another one: a
+run after an interruption computes only the missing chunks, and several processes can divide them with the same result.
 """
 
 import hashlib
@@ -37,17 +38,17 @@ from rig.progress import Progress
 from rig.render.renderer import Renderer
 
 INPUTS = "inputs.json"
-CHUNK = 25  # frames that are kept together
+CHUNK = 25  # frames of a stored chunk
 MIN_ALIKE = 0.5  # correlation of a frame's texture with the reference: .8 to .97 on drawn heads, .1 where it is lost
-KEPT = 0.5  # with all of it, an error along what pictures tell least grew from frame to frame
-SHARE = 0.1  # of the work, that finds the person
+KEPT = 0.5  # with 1.0, errors in poorly observed directions grew from frame to frame
+SHARE = 0.1  # share of the work that estimates the person
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """Holds what was found frame by frame: weights of the model's expressions, pose (world_from_head), deviations of
-    rotation (rad), translation (mm) and weights, the correlation of the texture, which frames have failed, and which
-    cameras had a picture."""
+    """Holds the tracking results by frame: expression weights, pose (world_from_head), standard deviations of rotation
+    (rad), translation (mm) and weights, correlation of the texture, which frames failed, and which cameras had a
+    picture."""
 
     weights: Float[np.ndarray, "t e"]
     rotations: Float[np.ndarray, "t 3 3"]
@@ -67,7 +68,7 @@ class Course:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracker:
-    """Holds everything that is constant over the frames."""
+    """Holds what the tracking of all frames has in common: person, sample points, reference texture, face networks."""
 
     person: SequencePerson
     samples: Samples
@@ -76,7 +77,7 @@ class Tracker:
     networks: FaceNetworks
 
     def track(self, pictures: Pictures, start: Motion) -> Tracked | None:
-        """Fits one frame. Returns None if the head is not found."""
+        """Fits one frame, starting from a predicted motion. Returns None if the head is not found."""
         if len(pictures) < MIN_VIEWS:
             return None
         found = self.fit(pictures, start)
@@ -87,12 +88,12 @@ class Tracker:
         return found if found is not None and found.alike >= MIN_ALIKE else None
 
     def begin(self, pictures: Pictures) -> Tracked | None:
-        """Fits a frame without a last one: from far away, and once more from what that finds."""
+        """Fits a frame without a previous frame, in two rounds: the second starts from the result of the first."""
         found = self.track(pictures, self.person.motions[0])
         return None if found is None else self.track(pictures, found.motion)
 
     def fit(self, pictures: Pictures, start: Motion) -> Tracked:
-        """Fits one frame from a nearby motion."""
+        """Fits one frame, starting from a motion near the solution."""
         found = sight(self.person, self.networks, pictures, start)
         terms = terms_of(self.reference, self.person.rig, found)
         return fit_frame(self.person, self.samples, self.levels, pictures, start, terms)
@@ -106,12 +107,12 @@ class Tracker:
 
 
 def make_tracker(footage: Footage, person: SequencePerson) -> Tracker:
-    """Learns the person's appearance from the frames from which the person was estimated."""
+    """Computes the person's reference appearance from the frames from which the person was estimated."""
     networks, samples = load_networks(), spread(person)
     shown = [(next(footage.read(key)), motion) for key, motion in zip(person.keys, person.motions, strict=True)]
     tracker = _learn(person, samples, networks, shown)
     shown = [(pictures, tracker.fit(pictures, motion).motion) for pictures, motion in shown]
-    return _learn(person, samples, networks, shown)  # they agree on the skin once each is fitted to all of them
+    return _learn(person, samples, networks, shown)  # refitting each frame to all of them makes their textures agree
 
 
 def _learn(
@@ -125,9 +126,9 @@ def track_sequence(
     footage: Footage, model: HeadModel, settings: Settings, kept: Path, *, renderer: Renderer, report: Progress,
     share: tuple[int, int] = (1, 1),
 ) -> tuple[SequencePerson, Course | None]:  # fmt: skip
-    """Tracks a head through all frames. ``kept`` is the folder of what an earlier run has found. ``share``: which of
-    how many parts of the film is tracked, from 1. Returns the person and the courses as measured; None while other
-    shares lack some. Raises what ``find_person`` raises."""
+    """Tracks a head through all frames of a sequence. ``kept`` is the folder that stores finished chunks. ``share`` (k,
+    n) tracks only part k of n of the sequence, k from 1. Returns the person and the unsmoothed course; the course is
+    None while chunks of other shares are missing. Raises the errors of ``find_person``."""
     inputs = json.dumps(inputs_of(footage, model, settings)).encode()
     if not (kept / INPUTS).is_file() or (kept / INPUTS).read_bytes() != inputs:
         for path in kept.glob("*.npz"):
@@ -136,7 +137,7 @@ def track_sequence(
     person = _kept_person(kept / "person.npz", footage, model)
     if person is None:
         found = find_person(footage, model, settings, renderer, lambda done: report("identity", SHARE * done))
-        if not (kept / "person.npz").is_file():  # else another share was earlier
+        if not (kept / "person.npz").is_file():  # another share may have written it
             _keep_person(kept / "person.npz", found)
         person = _kept_person(kept / "person.npz", footage, model)
         assert person is not None
@@ -152,7 +153,7 @@ def track_sequence(
 
 
 def _track_chunks(footage: Footage, person: SequencePerson, missing: Mapping[int, Path], report: Progress) -> None:
-    """Tracks the chunks that begin at some frames, and keeps each."""
+    """Tracks the missing chunks and writes each to its file."""
     tracker, count = make_tracker(footage, person), len(footage.frames)
     at, pictures = -1, iter(())
     for first, path in missing.items():
@@ -164,7 +165,7 @@ def _track_chunks(footage: Footage, person: SequencePerson, missing: Mapping[int
 
 
 def _track_chunk(tracker: Tracker, pictures: Iterator[Pictures], frames: range, count: int, report: Progress) -> Course:
-    """Tracks the next pictures, which are those of ``frames`` of a film of ``count``."""
+    """Tracks the pictures of one chunk, whose frame numbers are ``frames``, in a sequence of ``count`` frames."""
     found, shown, last = list[Tracked | None](), list[list[bool]](), list[Motion]()
     for number, taken in zip(frames, pictures, strict=False):  # takes no picture after the last frame
         report(f"frame {number + 1} of {count}", SHARE + (1.0 - SHARE) * number / count)
@@ -188,7 +189,7 @@ def _track_chunk(tracker: Tracker, pictures: Iterator[Pictures], frames: range, 
 
 
 def moved_on(last: list[Motion]) -> Motion:
-    """Extrapolates the last two motions; the head keeps the fraction ``KEPT`` of its speed."""
+    """Extrapolates the head's motion from the last two frames; the head keeps the fraction ``KEPT`` of its speed."""
     if len(last) < 2:
         return last[-1]
     before, now = (each.world_from_head for each in last)
@@ -198,7 +199,7 @@ def moved_on(last: list[Motion]) -> Motion:
 
 
 def smoothed(course: Course) -> Course:
-    """Returns the courses smoothed, with a pose and standard deviations for failed frames as well."""
+    """Returns the course smoothed over time; failed frames get a pose and standard deviations by interpolation."""
     if course.failed.all():
         return course
     middle = course.rotations[np.flatnonzero(~course.failed)[0]]
@@ -216,8 +217,8 @@ def smoothed(course: Course) -> Course:
 
 
 def inputs_of(footage: Footage, model: HeadModel, settings: Settings) -> dict[str, Any]:
-    """Returns what a sequence's result follows from: its files by name, size and time, the model, the settings, and
-    what of it is kept together."""
+    """Returns what a sequence's result depends on: its files by name, size and time, the head model, the settings, the
+    number of frames in a chunk, and the program's version."""
     digest, paths = hashlib.sha256(), sorted(path for path in footage.folder.rglob("*") if path.is_file())
     for path in paths:
         status = path.stat()

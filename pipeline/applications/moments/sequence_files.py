@@ -1,16 +1,16 @@
-"""Tracks a sequence from its folder, and writes the result.
+"""Tracks a sequence from its folder, and writes the result files.
 
-sequence.npz    frames (t), times_s, expressions (e), weights and weight_deviations (t e), rotations (t 3 3),
-                translations (t 3, mm; world_from_head), pose_deviations (t 6: rad, mm), alike (t: correlation of the
-                skin's texture), failed (t), skew_mm (t: how far the face moves between the first and the last
-                camera's exposure, by clock.json); all smoothed
-person.npz      names (e), neutral (v 3, head frame, mm), shapes (e v 3, mm at weight 1), the corrected cameras; the
-                head of a frame is rotation (neutral + sum of weights times shapes) + translation
-sequence.glb    the head, animated: its expressions as morph targets, its pose relative to the first frame
-sequence.usdc   the same as a point cache of OpenUSD, where it is asked for
-preview.mp4     the front camera's pictures beside the head in clay
-report.json     what was found, written last
-.chunks/        what a run that was killed goes on from
+``sequence.npz``   frames (t), times_s, expressions (e), weights and weight_deviations (t e), rotations (t 3 3),
+                   translations (t 3, mm; world_from_head), pose_deviations (t 6: rad, mm), alike (t: correlation of the
+                   skin's texture with its reference), failed (t), skew_mm (t: how far the face moves between the first
+                   and the last camera's exposure, by clock.json); all are smoothed over time
+``person.npz``     names (e), neutral (v 3, head frame, mm), shapes (e v 3, mm at weight 1), the corrected cameras; the
+                   head of a frame is rotation (neutral + sum of weights times shapes) + translation
+``sequence.glb``   the animated head: expressions as morph targets, pose relative to the first frame
+``sequence.usdc``  the same as a point cache of OpenUSD, if requested
+``preview.mp4``    the front camera's pictures beside the rendered head
+``report.json``    the report, written last
+``.chunks/``       stored chunks, with which a run continues after an interruption
 """
 
 import json
@@ -58,9 +58,9 @@ def make_sequence(
     folder: Path, out: Path, *, model: str, settings: Settings, report: Progress, usd: bool = False,
     share: tuple[int, int] = (1, 1),
 ) -> dict[str, Any] | None:  # fmt: skip
-    """Tracks the head of a sequence and writes the ``FILES`` into ``out``, with ``usd`` sequence.usdc, too. Returns the
-    content of report.json. With a ``share`` (which, of how many) it tracks that part of the frames, and returns None
-    where others lack some still. Raises InputError for a wrong folder, what the identity's single jobs raise,
+    """Tracks the head of a sequence and writes the ``FILES`` into ``out``; with ``usd``, also sequence.usdc. Returns
+    the content of report.json. With a ``share`` (k, n) it tracks part k of n of the frames, and returns None while
+    frames of other shares are missing. Raises InputError for an invalid folder, every error of ``reconstruct``,
     UnknownModel or BadModel, NoUsd, and OSError."""
     if usd:
         check_usd()
@@ -104,7 +104,7 @@ def make_sequence(
 
 
 def skew_mm(person: SequencePerson, footage: Footage, course: Course) -> Float[np.ndarray, " t"]:
-    """Returns the mean displacement of landmarks, in each frame, between the first and the last camera's exposure."""
+    """Returns, for each frame, the landmarks' mean motion (mm) between the first and the last camera's exposure."""
     rows = list(person.model.landmarks.values())
     moved = person.neutral[rows] + np.einsum("te,emx->tmx", course.weights, person.shapes[:, rows])
     places = np.einsum("txy,tmy->tmx", course.rotations, moved) + course.translations[:, None]
@@ -146,7 +146,7 @@ def document_of(person: SequencePerson, footage: Footage, course: Course) -> dic
 
 
 def animation_of(person: SequencePerson, footage: Footage, course: Course) -> bytes:
-    """Returns sequence.glb."""
+    """Returns the bytes of sequence.glb, the animated head."""
     used = np.flatnonzero(course.weights.max(axis=0) > USED)
     faces = person.model.levels["full"].faces
     shapes = {plain_name(person.names[row]): person.shapes[row].astype(float) for row in used}
@@ -156,13 +156,13 @@ def animation_of(person: SequencePerson, footage: Footage, course: Course) -> by
 
 
 def poses_from_first(course: Course) -> list[RigidTransform]:
-    """Returns the head's pose in every frame, relative to the first one."""
+    """Returns the head's pose in every frame, relative to its pose in the first frame."""
     first = RigidTransform(course.rotations[0], course.translations[0]).inverse()
     return [first @ RigidTransform(*pose) for pose in zip(course.rotations, course.translations, strict=True)]
 
 
 def write_preview(path: Path, person: SequencePerson, footage: Footage, course: Course, report: Progress) -> None:
-    """Writes preview.mp4. Shares that end together may both do so."""
+    """Writes preview.mp4, the front camera's pictures beside the rendered head. Several shares may each write it."""
     name, count = person.rig.front_camera(), len(course)
     camera = person.rig[name]
     size = 2 * camera.intrinsics.width, camera.intrinsics.height
@@ -182,14 +182,14 @@ def write_preview(path: Path, person: SequencePerson, footage: Footage, course: 
 
 
 def draw_clay(person: SequencePerson, camera: Camera, motion: Motion) -> UInt8[np.ndarray, "h w 3"]:
-    """Draws the head of a frame in clay, in the view of a camera."""
+    """Draws the head of a frame as grey clay, in the view of a camera."""
     faces = person.model.levels["full"].faces
     head = motion.world_from_head.apply(person.head(motion.weights))
     return picture(camera, head, faces, clay_colours(vertex_normals(head, faces), camera), (255, 255, 255))
 
 
 def clay_colours(normals: Float[np.ndarray, "v 3"], camera: Camera) -> UInt8[np.ndarray, "v 3"]:
-    """Returns the colours of clay under a lamp at the camera, by unit normals in the world frame."""
+    """Returns vertex colours of grey clay under a lamp at the camera, from unit normals in the world frame."""
     towards = camera.camera_from_world.rotation.T @ (LIGHT * (1.0, -1.0, -1.0))
     shade = 0.25 + 0.75 * np.clip(normals @ towards / np.linalg.norm(LIGHT), 0.0, 1.0)
     return np.clip(CLAY * shade[:, None] * 1.2, 0, 255).astype(np.uint8)

@@ -1,8 +1,7 @@
-"""Finds the person of a sequence: one head for its first second, solved as a take.
+"""Estimates the head of the person in a sequence jointly from several frames of the first second.
 
-Enters: the footage. Out: the neutral head with the model's expressions at its vertices, the cameras with the mean
-correction of these frames, and the pose and weights of each frame.
-"""
+The input is the sequence's footage. The output is the neutral head, the displacements of its vertices by each
+expression, the corrected cameras, and the pose and weights in each frame used."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -33,8 +32,8 @@ FIRST_S, KEYS = 1.0, 5  # the identity's frames: the sharpest of each fifth of t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Holds the values that change from frame to frame: the pose of the head (its scale is in its vertices), and the
-    weights of the model's expressions."""
+    """Holds the values that change from frame to frame: the head's pose and its expression weights; the head's scale is
+    contained in its vertices."""
 
     world_from_head: RigidTransform
     weights: Float[np.ndarray, " e"]
@@ -42,28 +41,28 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequencePerson:
-    """Holds the head of a sequence. Vertices and shapes are those of the full level, head frame, mm; ``rig`` are the
-    corrected cameras of the reduced pictures."""
+    """Holds the head of a person in a sequence. Vertices and shapes belong to the head model's finest mesh, head frame,
+    mm; ``rig`` holds the corrected cameras of the reduced pictures."""
 
     model: HeadModel
     names: tuple[str, ...]  # of the expressions that are tracked: the model's for Apple's names
     neutral: Float[np.ndarray, "v 3"]
     shapes: Float32[np.ndarray, "e v 3"]  # mm at weight 1
     rig: Rig
-    keys: tuple[int, ...]  # frames by which the identity was found ...
-    motions: tuple[Motion, ...]  # ... and what the head does there
+    keys: tuple[int, ...]  # frames from which the identity was estimated ...
+    motions: tuple[Motion, ...]  # ... and the head's motion in them
     warnings: tuple[Message, ...] = ()  # of these frames' fits, one of each code
 
     def head(self, weights: Float[np.ndarray, " e"]) -> Float[np.ndarray, "v 3"]:
-        """Returns the head with an expression."""
+        """Returns the vertices of the head for given expression weights."""
         return self.neutral + np.tensordot(weights.astype(np.float32), self.shapes, axes=1)
 
 
 def find_person(
     footage: Footage, model: HeadModel, settings: Settings, renderer: Renderer, report: Callable[[float], None]
 ) -> SequencePerson:
-    """Solves the best frames of the first second as a take, without those that show no head. Raises what
-    ``reconstruct`` raises where none does, with the first one's name, and InputError for the method simplex."""
+    """Estimates one head jointly from the best frames of the first second; frames that show no head are left out.
+    Raises the first frame's error if no frame shows a head, and InputError for the method simplex."""
     keys, solved, refused = best_frames(footage), dict[int, ContourSolution](), list[EigenheadError]()
     warnings: dict[str, Message] = {}
     for done, key in enumerate(keys):
@@ -89,7 +88,7 @@ def find_person(
 
 
 def best_frames(footage: Footage) -> tuple[int, ...]:
-    """Returns the sharpest frame of each part of the first second."""
+    """Returns the sharpest frame of each equal part of the first second."""
     count = int(np.searchsorted(footage.times_s, footage.times_s[0] + FIRST_S, side="right"))
     sharpness = []
     for number, pictures in zip(range(count), footage.read(), strict=False):
@@ -102,7 +101,7 @@ def best_frames(footage: Footage) -> tuple[int, ...]:
 def person_of(
     footage: Footage, model: HeadModel, keys: tuple[int, ...], joint: tuple[ContourSolution, ...]
 ) -> SequencePerson:
-    """Returns the head that the solutions of the frames ``keys`` have in common."""
+    """Builds the person from the joint solutions of the frames ``keys``."""
     longest = max(joint, key=lambda each: len(each.state.coefficients))
     fitted, scale = longest.problem.model, longest.state.world_from_head.scale
     coefficients = longest.state.coefficients.copy()
@@ -121,8 +120,8 @@ def person_of(
 
 
 def tracked_names(model: HeadModel) -> tuple[str, ...]:
-    """Returns the model's expressions that belong to Apple's 52 names. The other expressions largely repeat these, and
-    all together could imitate a shift of the whole head."""
+    """Returns the head model's expressions that have one of Apple's 52 names. The head model's other expressions
+    largely repeat the named ones, and together they could imitate a shift of the whole head."""
     parts = arkit_parts(model.expressions.names)
     return tuple(model.expressions.names[row] for row in sorted({row for of in parts.values() for row in of}))
 
@@ -130,7 +129,7 @@ def tracked_names(model: HeadModel) -> tuple[str, ...]:
 def weights_alone(
     shapes: Float32[np.ndarray, "n v 3"], weights: Float[np.ndarray, " n"], rows: list[int]
 ) -> Float[np.ndarray, " e"]:
-    """Returns weights of the shapes ``rows`` alone that move the head as nearly as possible as all ``weights`` do."""
+    """Returns weights for only the shapes ``rows`` that move the head as nearly as possible like all ``weights``."""
     flat = shapes.reshape(len(shapes), -1)
     alone = flat[rows]
     matrix = (alone @ alone.T).astype(float)
@@ -140,7 +139,7 @@ def weights_alone(
 
 
 def _corrected(rig: Rig, joint: tuple[ContourSolution, ...]) -> Rig:
-    """Returns the cameras with the mean of the frames' corrections, since they do not move."""
+    """Returns the cameras after the mean correction over all frames, because the cameras do not move."""
     shifts: dict[str, list[np.ndarray]] = {name: [] for name in rig.names}
     for each in joint:
         for name, shift in zip(each.problem.views.names, each.state.camera_shift, strict=True):

@@ -1,14 +1,15 @@
-"""Smooths each unknown of a sequence over time, forward and backward, as strongly as its noise requires.
+"""Smooths each unknown of a sequence over time, using earlier and later frames, as strongly as its noise requires.
 
-For every unknown x, measured as y with standard deviation s at each of T frames, the smooth course minimises
+For an unknown x, measured as y_t with standard deviation s_t in each of T frames, the smooth course minimises this
+cost:
 
     sum_t (x_t - y_t)^2 / s_t^2 + sum_t log(q^2 + a_t^2) ,    a_t = x_t+1 - 2 x_t + x_t-1
 
-where q is a multiple of its noise. The logarithm suppresses accelerations that noise explains, and tolerates larger
-ones: a blink stays as it is. The unknowns of a group (a rotation's three) accelerate together. It is solved by repeated
-weighted least squares, with a Cholesky factor of five diagonals for all unknowns at once; the same factor gives the
-standard deviations. A frame without a measurement is interpolated, with accelerations typical of the sequence.
-"""
+Here q is a multiple of the noise in the acceleration a_t. The logarithm suppresses accelerations that noise can explain
+and hardly changes larger ones, so blinks are not flattened. The unknowns of a group, such as the three rotation angles,
+share one weight for their accelerations. The minimum is found by iteratively reweighted least squares with a
+pentadiagonal Cholesky factor, which also gives the standard deviations. A frame without a measurement is interpolated,
+assuming accelerations typical of the sequence."""
 
 from collections.abc import Sequence
 
@@ -28,13 +29,13 @@ Courses = Float[np.ndarray, "t p"]
 def smooth(
     measured: Courses, deviation: Courses, failed: Bool[np.ndarray, " t"], groups: Sequence[Int[np.ndarray, " g"]]
 ) -> tuple[Courses, Courses]:
-    """Returns the smooth courses and their standard deviations.
+    """Returns the smoothed courses and their standard deviations.
 
     Args:
-        measured: the courses; what stands at failed frames does not matter.
-        deviation: of each measurement, by all that is unknown of it.
-        failed: frames without a measurement.
-        groups: unknowns that accelerate together; all must be in one.
+        measured: the measured courses; values at failed frames are ignored.
+        deviation: the standard deviation of each measurement, from all sources of error.
+        failed: a mask of the frames without a measurement.
+        groups: groups of unknowns that accelerate together; each unknown must be in one group.
     """
     known = np.flatnonzero(~failed)
     if len(measured) < 3 or len(known) < 2:
@@ -54,7 +55,7 @@ def smooth(
     near = failed[:-2] | failed[1:-1] | failed[2:]
     held = np.where(near[:, None], np.minimum(held, 1.0 / (least + usual)), held)
     variance = _inverse_diagonal(_factor(information, held))
-    lasting = np.where(failed[:, None], spread**2, np.maximum(spread**2 - noise**2, 0.0))  # what no smoothing removes
+    lasting = np.where(failed[:, None], spread**2, np.maximum(spread**2 - noise**2, 0.0))  # cannot be smoothed
     return found, np.sqrt(lasting + variance)
 
 

@@ -1,9 +1,8 @@
-"""Reconstructs a take: several captures of one person, solved as one.
+"""Reconstructs a take (several captures of one person) with one common identity.
 
-Each moment runs the stages of a single job up to the fit to its photographs. Then one fit of all moments estimates
-their common identity (``joint_fit``); from there each moment continues to its fine surface, colours and evidence. The
-heads of all moments have the same vertices; the neutral head and the person's own shapes follow from them
-(``own_shapes``).
+Each capture runs the stages of a single job up to the fit to photographs. Then one joint fit estimates the common
+identity (``joint_fit``); afterwards each capture continues to its fine surface, colours and evidence. The heads of all
+captures have corresponding vertices; the person's neutral head and blendshapes are computed from them (``own_shapes``).
 """
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -33,7 +32,7 @@ from rig.messages.message import Message, compose
 from rig.progress import Progress, discard_progress
 
 MIN_MOMENTS = 2
-OTHER_PERSON = 3.0  # RMS of the eigenheads' differences in standard deviations, beyond which a moment is another's
+OTHER_PERSON = 3.0  # RMS difference of the eigenheads (standard deviations) beyond which the person is another
 OBSERVED = ("segmentation", "faces", "alignment", "fit", "parts")
 DELIVERED = ("depth", "fine", "texture", "evidence", "bust")
 JOINT = "identity"  # the stage that solves for it
@@ -42,22 +41,22 @@ SHARES = (0.45, 0.55)  # of a take's time, at which the joint fit begins and end
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """Holds a take's results of a moment. Arrays are by the model's expressions and the full level's vertices."""
+    """Holds the result of one capture of a take. Arrays are indexed by expression or by vertex of the finest mesh."""
 
     name: str
-    detail: str  # the level that was reached
+    detail: str  # the level of detail
     weights: Float[np.ndarray, " e"]
     weight_deviation: Float[np.ndarray, " e"]
     world_from_head: Similarity
     head: Float[np.ndarray, "v 3"]  # head frame, mm
     deviation_mm: Float[np.ndarray, " v"]
-    apart: float  # RMS of its own identity's differences from that of all, in standard deviations
+    apart: float  # RMS difference of its separate identity from the joint one, in standard deviations
     warnings: tuple[ReportWarning, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Take:
-    """Holds the person of a take: the neutral head with its shapes, and the moments."""
+    """Holds the result of a take: the person's neutral head and blendshapes, and each capture's result."""
 
     model: HeadModel
     person: OwnShapes
@@ -77,16 +76,15 @@ def reconstruct_take(
     *,
     report: Progress = discard_progress,
 ) -> Take:
-    """Reconstructs the moments of one person, by their names.
+    """Reconstructs the captures of one person; ``contexts`` is indexed by the captures' names.
 
     Args:
-        contexts: a capture each, with the same model and settings.
-        deliver: receives each moment's finished result, which is not kept.
-        report: receives the progress of the whole; raises Cancelled to stop. The contexts' own hooks are not called.
+        contexts: one for each capture, all with the same model and settings.
+        deliver: receives each capture's finished result, which is then discarded.
+        report: receives the overall progress; raises Cancelled to stop. The contexts' hooks are not called.
 
-    Raises InputError for fewer than two moments or the method ``simplex``, and the errors of ``reconstruct`` with the
-    moment's name.
-    """
+    Raises InputError for fewer than two captures or the method ``simplex``, and the errors of ``reconstruct`` with the
+    capture's name."""
     check_count(len(contexts))
     progress, fitted = _Advance(report, len(contexts)), dict[str, tuple[Generator[Any, HeadFit, None], HeadFit]]()
     for k, (name, context) in enumerate(contexts.items()):
@@ -114,7 +112,7 @@ def reconstruct_take(
 
 
 def joined(head: HeadFit, solved: ContourSolution, covariance: Float[np.ndarray, "p p"], eigenheads: int) -> HeadFit:
-    """Returns a moment's fitted head according to the joint solution, with that solution's uncertainty."""
+    """Returns a capture's fitted head with the joint solution and its covariance."""
     state, level = solved.state, head.detail.level
     fit = replace(
         head.fit,
@@ -132,15 +130,15 @@ def joined(head: HeadFit, solved: ContourSolution, covariance: Float[np.ndarray,
 
 
 def differ_by(alone: Fit, joint: ContourSolution, eigenheads: int) -> float:
-    """Returns the difference between a moment's own identity and the joint one: the RMS over the eigenheads, in
-    standard deviations of the moment's own posterior."""
+    """Returns the difference between a capture's separately estimated identity and the joint identity: the RMS over the
+    eigenheads, in standard deviations of the capture's separate posterior."""
     assert alone.covariance is not None
     apart = (alone.coefficients - joint.state.coefficients[: len(alone.coefficients)])[:eigenheads]
     return float(np.sqrt(apart @ np.linalg.solve(alone.covariance[:eigenheads, :eigenheads], apart) / eigenheads))
 
 
 def solution_of(head: HeadFit) -> ContourSolution:
-    """Returns the contour solution behind a moment's fit. Raises InputError for a fit by the simplex method."""
+    """Returns the contour solver's solution in a capture's fit. Raises InputError for a fit by the simplex method."""
     if head.solution is None:
         raise InputError("take", [compose("take-needs-contour")])
     return head.solution
@@ -148,7 +146,7 @@ def solution_of(head: HeadFit) -> ContourSolution:
 
 @contextmanager
 def named(name: str) -> Iterator[None]:
-    """Puts the moment's name in front of refusals in the block."""
+    """Prefixes the messages of errors in the ``with`` block with the capture's name."""
     try:
         yield
     except Cancelled:
@@ -191,13 +189,13 @@ def _own_shapes(model: HeadModel, joint: Sequence[ContourSolution], moments: Seq
 
 
 class _Advance:
-    """Converts progress of the moments' stages to that of the take, which never decreases."""
+    """Converts the progress of each capture's stages to the progress of the take, which never decreases."""
 
     def __init__(self, report: Progress, count: int) -> None:
         self._report, self._count, self._most = report, count, 0.0
 
     def of(self, name: str, number: int) -> Progress:
-        """Returns the progress function for the moment ``number`` (0 for the first)."""
+        """Returns the progress function for the capture ``number`` (0 for the first)."""
 
         def tell(stage: str, fraction: float) -> None:
             for stages, (first, last) in ((OBSERVED, (0.0, SHARES[0])), (DELIVERED, (SHARES[1], 1.0))):

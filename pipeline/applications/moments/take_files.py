@@ -1,12 +1,12 @@
-"""Reconstructs a take from its captures, and writes the result.
+"""Reconstructs a take from its captures, and writes the result files.
 
-neutral.ply           the person's head without expression: head frame, mm; quality is its standard deviation
-neutral.glb           the same in metres, with the person's own shapes as morph targets under Apple's 52 names
-shapes.npz            names (n), shapes (n v 3, mm at weight 1) and deviations (n v, mm), in the order of the vertices
-take.npz              moments (k), expressions (e), weights and weight_deviations (k e), rotations (k 3 3),
-                      translations (k 3, mm), scale, heads (k v 3, head frame, mm) and deviations (k v, mm)
-moments/<name>/       the result folder of each moment, with vertices in one order
-report.json           what was found, written last
+``neutral.ply``      the person's head without expression: head frame, mm; quality is its standard deviation
+``neutral.glb``      the same in metres, with the person's blendshapes as morph targets under Apple's 52 names
+``shapes.npz``       names (n), shapes (n v 3, mm at weight 1) and deviations (n v, mm), in vertex order
+``take.npz``         moments (k), expressions (e), weights and weight_deviations (k e), rotations (k 3 3),
+                     translations (k 3, mm), scale, heads (k v 3, head frame, mm) and deviations (k v, mm)
+``moments/<name>/``  the result folder of each moment, all with the same vertex order
+``report.json``      the report, written last
 """
 
 import io
@@ -43,7 +43,7 @@ TOLD = 0.02  # a smaller weight is left out of report.json
 
 
 class Shot(NamedTuple):
-    """Holds a capture of a take, and the function that computes its silhouettes."""
+    """Holds a capture, and the function that computes its silhouettes."""
 
     capture: Capture
     rig: Rig
@@ -53,8 +53,8 @@ class Shot(NamedTuple):
 def make_take(
     folder: Path, shots: Mapping[str, Shot], *, model: str, settings: Settings, report: Progress
 ) -> dict[str, Any]:
-    """Reconstructs a take from its captures, by the moments' names, and writes it into ``folder``. Returns the content
-    of report.json. Raises like ``reconstruct_take``, also UnknownModel or BadModel, and OSError."""
+    """Reconstructs a take from its captures and writes it into ``folder``; ``shots`` are indexed by capture. Returns
+    the content of report.json. Raises the errors of ``reconstruct_take``, UnknownModel or BadModel, and OSError."""
     head_model, colours = load_model(model), Colours()
 
     def deliver(name: str, result: Reconstruction) -> None:
@@ -72,7 +72,7 @@ def make_take(
 
 
 def warning_lines(document: Mapping[str, Any]) -> list[str]:
-    """Returns the warnings of a take's report.json as lines for people, those of moments with their names."""
+    """Returns the warnings in a take's report.json as lines of text; those of a capture begin with its name."""
     lines = [f"{each['code']}: {each['message']}" for each in document["warnings"]]
     for moment in document["moments"]:
         lines += [f"{moment['name']}: {each['code']}: {each['message']}" for each in moment["warnings"]]
@@ -80,7 +80,7 @@ def warning_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 class Colours:
-    """Collects the colours of the neutral head: each vertex gets them from the moment in which most images coloured
+    """Collects the colours of the neutral head: each vertex gets its colour from the capture in which most images show
     it."""
 
     def __init__(self) -> None:
@@ -88,7 +88,7 @@ class Colours:
         self.views: UInt8[np.ndarray, " v"] | None = None
 
     def take_over(self, result: Reconstruction) -> None:
-        """Takes the colours of a moment at vertices that more of its images coloured."""
+        """Copies a capture's colours at vertices that more of its images show than in earlier captures."""
         found = result.texturing.vertices
         if self.colours is None or self.views is None:
             self.colours, self.views = found.colours.copy(), found.views.copy()
@@ -98,8 +98,8 @@ class Colours:
 
 
 def write_take(folder: Path, take: Take, colours: Colours, digests: Mapping[str, str]) -> dict[str, Any]:
-    """Writes the files of a take next to its moments' folders, each under a temporary name first, report.json last.
-    Returns the content of report.json. ``digests``: SHA-256 of each moment's inputs. Raises OSError."""
+    """Writes the files of a take next to its captures' folders, each under a temporary name first, report.json last.
+    Returns the content of report.json. ``digests`` are the SHA-256 of each capture's inputs. Raises OSError."""
     person, model = take.person, take.model
     assert colours.colours is not None
     assert colours.views is not None

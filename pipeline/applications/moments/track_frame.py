@@ -1,8 +1,9 @@
-"""Fits one frame of a sequence: the pose of a known head and the weights of its expressions, from the previous ones.
+"""Fits one frame of a sequence: the pose of a known head and its expression weights, starting from those of the
+previous frame.
 
-One least-squares problem combines three kinds of evidence: the face network's landmarks in the cameras in front of the
-face, which find a head that moved far; the openings of its lids; and the texture of the skin against its reference
-(``appearance``), which is precise. The prior of the weights is that of a single job (``contour_fit.prior_term``).
+One least-squares problem combines three residuals: face landmarks, lid openings, and the difference between skin
+texture and its reference (``appearance``). Landmarks find a head that moved far; texture is the most precise. The prior
+of the weights is that of a job with one capture (``contour_fit.prior_term``).
 
     r_texture = (T_k(pi_k(R x_s(w) + t)) - reference_ks) / sigma
     r_landmark = (pi_k(R x_i(w) + t) + bias_ki - found_ki) / sigma_px
@@ -28,13 +29,13 @@ from rig.rig import Rig
 
 POSE = 6  # rotation (rad), translation (mm)
 SCALES = {2: 6.0, 1: 3.0}  # Geman-McClure, in deviations, by how much pictures are reduced
-ALIKE = 25.0  # samples that err alike: neighbours share pixels, and the head's own error
+ALIKE = 25.0  # samples with correlated errors: neighbours share pixels and the head's error
 STEPS, TOLERANCE = {2: 3, 1: 4}, 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TextureTerm:
-    """Computes the cost of the skin's texture in all cameras."""
+    """Computes the cost of the skin texture in all cameras."""
 
     samples: Samples
     rig: Rig
@@ -44,7 +45,7 @@ class TextureTerm:
     scale: float
 
     def at(self, motion: Motion) -> Residuals:
-        """Returns the differences from the reference, in standard deviations."""
+        """Returns the residuals between texture and reference, in standard deviations."""
         pose, head = motion.world_from_head, self.samples.points(motion.weights)
         world, rows, parts = pose.apply(head), [], []
         sigma = np.float32(self.appearance.deviation * np.sqrt(ALIKE))
@@ -65,7 +66,7 @@ class TextureTerm:
         )
 
     def correlation(self, motion: Motion) -> float:
-        """Returns the correlation of all samples with their reference; 0 without any."""
+        """Returns the correlation of the texture with its reference over all samples; 0 without any sample."""
         world = motion.world_from_head.apply(self.samples.points(motion.weights))
         pairs = [np.zeros((0, 2))]
         for k, image in enumerate(self.images):
@@ -93,7 +94,7 @@ def derivatives(
     pose: RigidTransform,
     shapes: Float32[np.ndarray, "n 3 e"],
 ) -> Float32[np.ndarray, "n p"]:
-    """Returns derivatives by pose and weights, from the derivatives of the same values by their world points."""
+    """Converts derivatives of values by world points to derivatives by pose and expression weights."""
     out = np.empty((len(world), POSE + shapes.shape[2]), np.float32)
     out[:, :3], out[:, 3:POSE] = np.cross(world - pose.translation, by_world), by_world
     turned = (by_world @ pose.rotation).astype(np.float32)
@@ -103,33 +104,33 @@ def derivatives(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeightPrior:
-    """Computes the prior of the weights: most are small, a few are large."""
+    """Computes the prior of the expression weights: most are small, a few are large."""
 
     def at(self, motion: Motion) -> "LinearisedWeightPrior":
-        """Returns the prior at a motion."""
+        """Returns the prior linearised at a motion's weights."""
         return LinearisedWeightPrior(motion.weights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedWeightPrior:
-    """Holds the prior linearised at some weights."""
+    """Holds the prior linearised at some expression weights."""
 
     weights: Float[np.ndarray, " e"]
 
     @property
     def cost(self) -> float:
-        """Returns minus twice the logarithm of the density."""
+        """Returns minus twice the logarithm of the prior density."""
         return float((self.weights**2).sum() + 2.0 * TAIL * np.log1p(self.weights / EXPRESSION_MEDIAN).sum())
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds the prior's part in place."""
+        """Adds the prior to the normal equations, in place."""
         rows = np.arange(POSE, POSE + len(self.weights))
         equations.matrix[rows, rows] += 1.0
         equations.gradient[rows] += self.weights + weight_slope(np.maximum(self.weights, 0.0))
 
 
 def after(motion: Motion, step: Float[np.ndarray, " p"]) -> Motion:
-    """Returns a motion after a step of its unknowns."""
+    """Returns a motion after a step of its pose and weights."""
     pose = motion.world_from_head
     turned = rotation_from_vector(step[:3]) @ pose.rotation
     weights = np.clip(motion.weights + step[POSE:], 0.0, 1.0)
@@ -137,15 +138,15 @@ def after(motion: Motion, step: Float[np.ndarray, " p"]) -> Motion:
 
 
 def room(motion: Motion) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Returns the bounds of a step: weights stay between 0 and 1."""
+    """Returns the lower and upper bounds of a step: weights stay between 0 and 1."""
     free = np.full(POSE, np.inf)
     return np.concatenate([-free, -motion.weights]), np.concatenate([free, 1.0 - motion.weights])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
-    """Holds a fitted frame: its motion, the standard deviations of its unknowns (rad, mm, weights), and the correlation
-    of its texture with the reference."""
+    """Holds the fit of a frame: its motion, the standard deviations of pose and weights (rad, mm, 1), and the
+    correlation of its texture with the reference."""
 
     motion: Motion
     deviation: Float[np.ndarray, " p"]
@@ -160,7 +161,7 @@ def fit_frame(
     start: Motion,
     terms: Sequence[Term[Motion]] = (),
 ) -> Tracked:
-    """Fits a frame to its texture, from coarse to fine, and to other evidence."""
+    """Fits a frame to its skin texture, from coarse to fine resolution, and to the additional cost ``terms``."""
     seen, motion, weights = visible(person, samples, start), start, len(start.weights)
 
     def problem_at(reduced: int) -> tuple[Problem[Motion], TextureTerm]:

@@ -1,2 +1,2 @@
-"""Writes results in the vertex order of another mesh, the template. A template is registered to a head model once, and
-then deforms with every fitted head."""
+"""Writes fitted heads in the vertex order of another mesh, which is called the template. A template is registered to a
+head model once, and then deforms with every head that is fitted with this model."""

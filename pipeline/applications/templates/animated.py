@@ -1,19 +1,19 @@
-"""Builds a head for animation, in a registered mesh or in the model's own: Apple's 52 shapes, pivots, and, if the mesh
-lacks them, eyeballs behind open eyes and teeth and a tongue behind lips that part. A registered mesh also gets visemes,
-and shapes without crossing triangles.
+"""Builds a head for animation, either in a template's vertex order or in the head model's. The head gets Apple's 52
+blendshapes, rotation centres (pivots) and, if its mesh lacks them, eyeballs, teeth and tongue. A template also gets
+visemes and blendshapes without crossing triangles.
 
-The lips of a fitted head may be some tenths of a millimetre apart, and teeth would show through: photographs of shut
-lips show a dark line, and the surface there comes from the model. Such lips are shut; a wider gap is an open mouth, and
-stays. The inner edge of an open mouth is smoothed.
+The lips of a fitted head may be some tenths of a millimetre apart, and teeth would show through the gap. A gap of this
+size is closed; a wider gap counts as an open mouth and does not change. The inner edge of open lips is smoothed.
 
-A model's expressions move a registered mesh as follows: the skin moves as it is attached (``carrying``). Deeper
-vertices are attached as well, if the mesh connects them to the skin over vertices that move alike. (An expression parts
-lips that touch; a smooth map in space would tear the inside of one lip along with the other.) Vertices that cannot be
-attached move with their neighbours on the mesh. Separate parts, not connected to the skin, are
+A head model's expressions move a template as follows: each skin vertex moves with the head model's triangle to which it
+is attached (``carrying``). Vertices below the skin are attached too if mesh edges connect them to the skin over
+vertices with similar displacements. A smooth map of space would not suffice: where an expression parts two touching
+lips, it would tear the inside of one lip along with the other lip. Vertices that cannot be attached get the mean
+displacement of their neighbours in the mesh. Parts of the mesh that no edge connects to the skin belong to three kinds:
 
-- round and closed: eyeballs, which no shape moves (rotate them about their pivots);
-- at the skin: lashes and brows, which stand on the skin's triangle at their roots and rotate with it;
-- inside: teeth and tongue, which move with the jaw below the line of the lips, and else stay with the skull.
+- Eyeballs are round and closed, and no blendshape moves them: an animator rotates them about their pivots.
+- Lashes and brows stand on the skin, and rotate with the skin triangle at their roots.
+- Teeth and tongue lie inside the head. Below the line between the lips they move with the jaw, above it with the skull.
 """
 
 from collections.abc import Mapping
@@ -37,7 +37,7 @@ from pipeline.head_model.subdivision import boundary_loops
 from rig.geometry import RigidTransform
 from rig.mesh import vertex_normals
 
-LIDS = "eye"  # what the names of shapes that close or move lids begin with
+LIDS = "eye"  # how names of shapes that close or move lids begin
 PARTED_MM = 1.5  # lips further apart are open
 PRESS_MM = 0.1  # by which shut lips overlap, so that no slit is left between the corners of their triangles
 LIP_MM = 14.0  # from the inner edge over a lip to its skin
@@ -47,16 +47,16 @@ SPREAD_COLUMNS = 5  # over which the widest gap counts: a triangle of a lip is a
 SMOOTH_ROUNDS = 12  # of the inner edge; they take out scallops of four edges' length
 Places = Float[np.ndarray, "t 3"]
 
-OFF_MM, FACING = 1.5, 0.4  # as the registration has it: what is farther off, or faces away, lies deeper
+OFF_MM, FACING = 1.5, 0.4  # as in the registration: vertices farther off, or facing away, lie deeper
 ALIKE = 2.0  # millimetres that neighbours may part by, a millimetre between them: 99 % of the models' own do by less
 ALIKE_MM = 0.5
-ROOT_MM = 3.0  # a part that comes so near to the skin is rooted there
+ROOT_MM = 3.0  # a part this near to the skin is rooted there
 Shapes = Mapping[str, Float[np.ndarray, "v 3"]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neutral:
-    """Holds a head without expression: the model's full level (mm), its triangles, and the mesh's position on it."""
+    """Holds a head without expression: vertices (mm) and triangles of the model's finest mesh, and a template on it."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -70,10 +70,11 @@ def carried_shapes(
     shapes: Shapes,
     landmarks: Points,
 ) -> dict[str, Places]:
-    """Returns the displacement of each vertex of a mesh (mm, weight 1), by shape; everything in the head frame.
+    """Returns the displacement of each vertex of a template (mm, at weight 1), by name of the blendshape, in the head
+    frame.
 
     ``surface_binding``: binding of the mesh to the model. ``triangles``: triangles of the mesh. ``neutral``: head
-    without expression. ``shapes``: displacements of the model's full level. ``landmarks``: landmarks of that head.
+    without expression. ``shapes``: displacements of its finest mesh. ``landmarks``: landmarks of this head.
     """
     names = list(shapes)
     mesh, count = neutral.mesh, len(neutral.mesh)
@@ -100,7 +101,7 @@ def carried_shapes(
 def loose_parts(
     surface_binding: SurfaceBinding, triangles: Int[np.ndarray, "g 3"], count: int
 ) -> Int[np.ndarray, " t"]:
-    """Returns the index of the separate part that each vertex of a mesh belongs to, -1 for vertices connected to the
+    """Returns the index of the separate part to which each vertex of a mesh belongs, -1 for vertices connected to the
     skin."""
     edges = _edges(triangles)
     parts = connected_components(_matrix(edges, np.ones(len(edges)), count), directed=False)[1]
@@ -114,13 +115,13 @@ def _edges(triangles: Int[np.ndarray, "g 3"]) -> Int[np.ndarray, "e 2"]:
 
 
 def _matrix(edges: Int[np.ndarray, "e 2"], values: np.ndarray, count: int) -> sparse.csr_array:
-    """Returns the symmetric matrix with a value for each edge."""
+    """Returns a symmetric sparse matrix with one value for each edge."""
     rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
     return sparse.csr_array((np.concatenate([values, values]), (rows, columns)), shape=(count, count))
 
 
 def _with_skin(attachment: Attachment, surface_binding: SurfaceBinding) -> Attachment:
-    """Returns the attachment of all vertices, with the skin attached as registered."""
+    """Returns the attachment in which skin vertices have the attachment of the registered template."""
     skin, registered = surface_binding.skin, surface_binding.attachment
     for whole, part in (
         (attachment.triangles, registered.triangles),
@@ -143,8 +144,8 @@ def _led(
     skin: Int[np.ndarray, " n"],
     near: Bool[np.ndarray, " t"],
 ) -> Bool[np.ndarray, " t"]:
-    """Tells which vertices the surface carries: the skin, and vertices connected to it by edges over vertices near the
-    surface that move alike in every shape."""
+    """Returns a mask of the vertices that move with the head model's surface: the skin, and near vertices connected to
+    it by edges over vertices with similar displacements."""
     a, b = edges.T
     parting = np.linalg.norm(moves[a] - moves[b], axis=2).max(axis=1, initial=0.0)
     alike = parting < ALIKE * np.linalg.norm(mesh[a] - mesh[b], axis=1) + ALIKE_MM
@@ -162,8 +163,8 @@ def _follow(
     leading: Bool[np.ndarray, " t"],
     following: Bool[np.ndarray, " t"],
 ) -> None:
-    """Sets the displacements of ``following`` vertices to the mean of their neighbours', weighted by nearness;
-    ``leading`` vertices keep theirs."""
+    """Sets the displacements of the ``following`` vertices to the mean of their neighbours' displacements, weighted by
+    nearness."""
     rows, fixed = np.flatnonzero(following), np.flatnonzero(leading)
     if not len(rows):
         return
@@ -176,7 +177,7 @@ def _follow(
 
 
 def _jaw_moves(landmarks: Points, neutral: Neutral, shapes: Shapes, mesh: Places) -> Float[np.ndarray, "t s 3"]:
-    """Returns the displacement of each vertex as if it were fixed to the lower jaw."""
+    """Returns the displacement that each vertex would have if it were fixed to the lower jaw."""
     motions = jaw_motions(landmarks, neutral.vertices, shapes)
     still = np.zeros_like(mesh)
     return np.stack([motions[name].apply(mesh) - mesh if name in motions else still for name in shapes], axis=1)
@@ -189,7 +190,7 @@ def _standing_at_roots(
     skin: Int[np.ndarray, "g 3"],
     moves: Float[np.ndarray, "t s 3"],
 ) -> Float[np.ndarray, "r s 3"] | None:
-    """Returns the displacements of a part that stands on the skin; None if it is not near the skin."""
+    """Returns the displacements of a part that stands on the skin, such as lashes; None if it is not near the skin."""
     hits = SurfaceIndex(mesh, skin).closest(mesh[rows])
     roots = hits.distances < ROOT_MM
     if not roots.any():
@@ -200,7 +201,7 @@ def _standing_at_roots(
 def _nearest_root(
     mesh: Places, edges: Int[np.ndarray, "e 2"], rows: Int[np.ndarray, " r"], roots: Bool[np.ndarray, " r"]
 ) -> Int[np.ndarray, " r"]:
-    """Returns, for each vertex of a part, its nearest root along the part's edges."""
+    """Returns, for each vertex of a part, the root vertex that is nearest along the part's edges."""
     number = np.full(len(mesh), -1)
     number[rows] = np.arange(len(rows))
     inside = edges[(number[edges] >= 0).all(axis=1)]
@@ -213,7 +214,7 @@ def _nearest_root(
 def _standing(
     mesh: Places, rows: Int[np.ndarray, " r"], corners: Int[np.ndarray, "r 3"], moves: Float[np.ndarray, "t s 3"]
 ) -> Float[np.ndarray, "r s 3"]:
-    """Returns the displacements of vertices that stand on triangles of the mesh's own skin and rotate with them."""
+    """Returns the displacements of vertices that stand on the template's skin triangles and rotate with them."""
     used, local = np.unique(corners, return_inverse=True)
     faces, rest = local.reshape(-1, 3), mesh[used]
     thirds = np.full((len(rows), 3), 1.0 / 3.0)
@@ -227,7 +228,7 @@ def _standing(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnimatedMesh:
-    """Holds a mesh without expression, its shapes and its pivots, in the head frame, mm."""
+    """Holds a mesh without expression, its blendshapes and its pivots, in the head frame, mm."""
 
     neutral: Float[np.ndarray, "t 3"]
     shapes: Mapping[str, Float[np.ndarray, "t 3"]]  # displacements at weight 1: Apple's, others of the head, visemes
@@ -235,7 +236,7 @@ class AnimatedMesh:
     eyeballs: Mapping[str, Int[np.ndarray, " b"]]  # rows of the mesh, by pivot
     added: Mapping[str, Eyeball] = field(default_factory=dict)  # eyeballs that the mesh lacks, by pivot
     inner: InnerMouth = field(default_factory=InnerMouth)  # teeth and tongue that the mesh lacks
-    gazes: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)  # of eyes that were seen, by pivot
+    gazes: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)  # gazes of measured eyes, by pivot
 
 
 def animated_mesh(
@@ -248,12 +249,13 @@ def animated_mesh(
     *,
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> AnimatedMesh:
-    """Carries shapes to a mesh and keeps its lips and lids apart; adds the visemes, pivots, eyeballs, teeth and tongue.
+    """Transfers a head model's blendshapes to a template, keeps lips and lids from crossing, and adds visemes, pivots,
+    eyeballs, teeth and a tongue.
 
     ``surface_binding``: binding of the mesh to the model. ``triangles``: triangles of the mesh. ``vertices``: the
-    model's full level without expression, head frame, mm. ``faces``: its triangles. ``shapes``: displacements of that
-    level, by Apple's names or the model's. ``landmark_rows``: the model's landmarks, as rows of that level. ``gazes``:
-    directions of the eyes (unit vectors, head frame), by pivot; straight ahead for missing ones.
+    model's finest mesh without expression, head frame, mm. ``faces``: its triangles. ``shapes``: its displacements, by
+    Apple's names or the model's. ``landmark_rows``: the indices of its landmarks. ``gazes``: directions of the eyes
+    (unit vectors, head frame), by pivot; missing ones are straight ahead.
     """
     mesh = surface_binding.on(vertices, faces)
     landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
@@ -283,8 +285,8 @@ def animated_head(
     *,
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> AnimatedMesh:
-    """Shuts the lips of a model's full level (head frame, mm), and adds pivots, eyeballs, teeth and a tongue. The
-    triangles ``opened`` lack those that close eyes and mouth. Lips and lids move according to the model's shapes."""
+    """Closes the lips of the head model's finest mesh, and adds pivots, eyeballs, teeth and tongue (head frame, mm).
+    The triangles ``opened`` leave holes at the eyes and the mouth. The model's blendshapes move lips and lids."""
     landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
     vertices = shut_lips(vertices, opened, landmarks)
     bare = AnimatedMesh(vertices, shapes, pivots(landmarks, vertices, shapes, []), {}, gazes=gazes)
@@ -299,7 +301,7 @@ def _with_parts(
     jaw: Mapping[str, RigidTransform],
     loose: Int[np.ndarray, " t"],
 ) -> AnimatedMesh:
-    """Returns the mesh with missing eyeballs, teeth and tongue added, and lids and lips that do not touch these."""
+    """Returns the mesh with missing eyeballs, teeth and tongue, and with lids and lips corrected to avoid them."""
     mesh, shapes = bare.neutral, bare.shapes
     lacking = {name: at for name, at in bare.pivots.items() if name.startswith("eye_") and name not in bare.eyeballs}
     added = placed_eyeballs(mesh, triangles, landmarks, lacking, bare.gazes)
@@ -314,10 +316,10 @@ def _with_parts(
 def parted_shapes(
     rest: RestSurface, shapes: Mapping[str, Float[np.ndarray, "t 3"]]
 ) -> dict[str, Float[np.ndarray, "t 3"]]:
-    """Returns shapes without crossing triangles, and the visemes mixed from them, also without crossing.
+    """Returns the blendshapes corrected until no triangles cross, and visemes mixed from the corrected blendshapes.
 
-    ``mouthClose`` closes a mouth that ``jawOpen`` has opened, and is corrected together with it: by Apple's definition,
-    lips cross if it is used alone."""
+    ``mouthClose`` closes a mouth that ``jawOpen`` has opened, and is corrected together with ``jawOpen``: by
+    Apple's definition, lips cross if ``mouthClose`` is used alone."""
     out = {
         name: kept_apart(rest, shape, closing=name.startswith(LIDS))
         for name, shape in shapes.items()
@@ -333,8 +335,8 @@ def parted_shapes(
 def shut_lips(
     vertices: Float[np.ndarray, "v 3"], opened: Int[np.ndarray, "f 3"], landmarks: Points
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns the vertices (head frame, mm) with nearly shut lips shut. ``opened``: triangles without those that close
-    the mouth."""
+    """Returns the vertices of a head (head frame, mm) after a nearly shut mouth has been closed. The triangles
+    ``opened`` leave a hole at the mouth."""
     rim = min(
         boundary_loops(opened), key=lambda loop: np.linalg.norm(vertices[loop].mean(axis=0) - landmarks["stomion"])
     )
@@ -365,8 +367,8 @@ def shut_lips(
 def _lips(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], rim: Int[np.ndarray, " r"]
 ) -> tuple[Int[np.ndarray, " u"], Int[np.ndarray, " l"]]:
-    """Returns the rows of the upper and of the lower lip: each vertex belongs to the half of the inner edge that is
-    nearer along the mesh."""
+    """Returns the vertex indices of the upper and of the lower lip: each vertex belongs to the half of the lips' inner
+    edge that is nearer along the mesh."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     long = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
     graph = sparse.csr_array((long, (ends[:, 0], ends[:, 1])), shape=(len(vertices), len(vertices)))

@@ -1,8 +1,8 @@
-"""Deforms a template together with a head.
+"""Deforms a template's vertices together with a fitted head.
 
-A skin vertex stores its triangle of the model, its barycentric coordinates there, and its offset in the triangle's own
-frame. Deeper vertices (mouth, sockets, lashes) follow the skin around them by the smooth map of ``landmark_warp``.
-Closed parts (eyeballs, teeth) move rigidly and change only their size, so that a ball stays a ball.
+A skin vertex of the template stores its triangle of the head model, its barycentric coordinates in that triangle, and
+its offset in the triangle's frame. Vertices below the skin (mouth, sockets, lashes) follow the surrounding skin by the
+smooth map in ``landmark_warp``. Closed parts (eyeballs, teeth) get a similarity transform, so that a ball stays a ball.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from pipeline.geometry.registration.rigid import procrustes
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.gaussian_process import spread_nodes
 
-CANDIDATES = 16  # triangles about a vertex that are looked at
+CANDIDATES = 16  # nearest triangles that are tested for a vertex
 ANCHORS = 360  # vertices of the skin that lead what lies deeper: 3 mm apart along lids and lips
 ALL_OVER = 60  # ... of them spread over all of the skin
 WHOLE_ANCHORS = 40  # that lead a closed part
@@ -24,15 +24,15 @@ WHOLE_ANCHORS = 40  # that lead a closed part
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attachment:
-    """Holds points attached to a surface of triangles: for each its triangle, its barycentric coordinates there, and
-    its offset in the triangle's frame (``frames``)."""
+    """Holds points attached to a triangle mesh: the triangle of each point, its barycentric coordinates there, and its
+    offset in the triangle's frame (``frames``)."""
 
     triangles: Int[np.ndarray, " n"]  # rows of the surface's faces
     weights: Float[np.ndarray, "n 3"]  # barycentric
     offsets: Float[np.ndarray, "n 3"]  # mm, in the triangle's frame (``frames``)
 
     def on(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
-        """Returns the positions of the attached points when the surface's vertices are at ``vertices``."""
+        """Returns the positions of the attached points for the given positions of the mesh's vertices."""
         corners = vertices[faces[self.triangles]]
         off = np.einsum("nax,na->nx", frames(corners), self.offsets)
         return np.einsum("nk,nkx->nx", self.weights, corners) + off
@@ -44,8 +44,8 @@ def bind_vertices(
     vertices: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
 ) -> tuple[Attachment, Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Attaches points to the nearest point of a surface that faces the same way. Returns the attachment, the distances
-    (mm), and the cosine between each point's unit normal and the surface's."""
+    """Attaches each point to the nearest point of a mesh that has a similar normal. Returns the attachment, the
+    distances (mm), and the cosine between each point's unit normal and the mesh's normal."""
     surface = SurfaceIndex(vertices, faces)
     hits = surface.closest(points, CANDIDATES, facing=normals)
     offsets = np.einsum("nax,nx->na", frames(vertices[faces[hits.triangles]]), points - hits.points)
@@ -64,22 +64,22 @@ def frames(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceBinding:
-    """Holds how all n vertices of a template follow the surface of a head model."""
+    """Holds how a template's n vertices follow a head model's surface: attached skin vertices, anchors for others."""
 
-    rest: Float[np.ndarray, "t 3"]  # where the mesh lay when it was registered, mm
-    skin: Int[np.ndarray, " n"]  # rows that the surface carries, as ``attachment`` says
+    rest: Float[np.ndarray, "t 3"]  # the registered mesh, mm
+    skin: Int[np.ndarray, " n"]  # vertices attached to the surface by ``attachment``
     attachment: Attachment
     anchors: Int[np.ndarray, " a"]  # of ``skin``, rows of the mesh, that lead the rest
     wholes: Int[np.ndarray, " t"]  # number of the closed part that a vertex belongs to, -1 of none
     whole_anchors: Int[np.ndarray, "w k"]  # rows of the mesh that lead each closed part
 
     def on(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "t 3"]:
-        """Returns the template's vertices deformed with a head. ``vertices`` are those of the model's full level, in
-        any frame, mm."""
+        """Returns the template's vertices deformed with a fitted head. ``vertices`` belong to the head model's finest
+        mesh and may be in any frame, mm."""
         return self.with_skin(self.attachment.on(vertices, faces))
 
     def with_skin(self, skin: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "t 3"]:
-        """Returns the template's vertices if its skin lies at ``skin``; all others follow it."""
+        """Returns the template's vertices for given positions of its skin vertices; other vertices follow the skin."""
         out = np.empty_like(self.rest)
         out[self.skin] = skin
         deep = self.wholes < 0
@@ -95,8 +95,8 @@ class SurfaceBinding:
 def surface_binding(
     rest: Float[np.ndarray, "t 3"], skin: Int[np.ndarray, " n"], attachment: Attachment, wholes: Int[np.ndarray, " t"]
 ) -> SurfaceBinding:
-    """Builds a binding, and chooses the skin vertices that deeper ones follow: the nearest ones, and some spread over
-    all of the skin."""
+    """Builds a binding, and chooses the anchors: skin vertices that the deeper vertices will follow, some of them near
+    and some spread over all of the skin."""
     tree = KDTree(rest[skin])
     deep = wholes < 0
     deep[skin] = False
@@ -117,8 +117,8 @@ def surface_binding(
 
 
 def _nearest(tree: KDTree, part: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " k"]:
-    """Returns at most ``count`` points of the tree that lie nearest to any point of a part: for an eyeball, the edges
-    of its lids."""
+    """Returns at most ``count`` points of the tree, those nearest to any point of a part; for an eyeball these are the
+    edges of its lids."""
     distance, row = tree.query(part, k=count)
     distance, row = np.ravel(distance), np.ravel(row)
     order = np.argsort(distance, kind="stable")

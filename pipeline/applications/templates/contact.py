@@ -1,13 +1,13 @@
-"""Changes shapes so that lips and lids meet but do not pass through each other, at every weight from 0 to 1.
+"""Corrects blendshapes so that lips and lids may touch but do not pass through each other at any weight from 0 to 1.
 
-A blendshape is linear and ignores collisions. If triangles of a posed mesh cross that do not cross at rest:
+A blendshape moves every vertex along a straight line and ignores collisions. Triangles that cross in the posed mesh but
+not at rest are corrected as follows:
 
-- lids, which are apart at rest, stop where they first meet: their displacement is scaled there;
-- lips, which touch at rest, move together: their displacement is blended with its mean over the surrounding space. (A
-  smooth field in space carries both lips alike; if it changes by less than 1 mm per mm, nothing can cross.)
+- Lids are apart at rest, so their displacement is scaled down until they only touch.
+- Lips touch at rest, so their displacement is blended with its mean over the surrounding space. (A mean moves both lips
+  in the same way; if it changes by less than 1 mm per mm, no triangles can cross.)
 
-Both changes are as small as possible and widen until nothing crosses; all other vertices keep their displacement.
-"""
+Each correction starts small and grows until no triangles cross; all other vertices keep their displacement."""
 
 from dataclasses import dataclass
 
@@ -18,17 +18,17 @@ from scipy.spatial import KDTree
 
 from pipeline.fusion.crossings import crossing_faces
 
-WEIGHTS = (0.25, 0.5, 0.75, 1.0)  # at which shapes are looked at
+WEIGHTS = (0.25, 0.5, 0.75, 1.0)  # at which shapes are tested
 MEETING = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # ... lids, which meet late
 MEETING_ROUNDS = 6
-STILL_MM = 0.01  # what moves less stays
+STILL_MM = 0.01  # vertices that move less count as unmoved
 MARGIN = 0.02  # of the weight: lids stop so much before they meet
 RADII_MM = (3.0, 6.0, 12.0, 24.0)  # of the space over which lips move together; lips are some 10 mm high
 BLEND_STEP = 0.25  # of the way to moving together, a round
 MAX_ROUNDS = 60
-ZONE_RINGS = 6  # of triangles about what crosses that are looked at in a round; all are at the end
+ZONE_RINGS = 6  # rings tested around crossing triangles in a round; at the end all are
 MAX_ZONES = 5  # that a change makes wider
-FEW = 0.35  # share of the triangles from which looking at all of them takes less time
+FEW = 0.35  # share of the triangles from which testing all is faster
 SOFT_RINGS = 3  # over which a change fades
 RELAXING = 4  # halvings of the search for the least change that is enough
 Vertices = Float[np.ndarray, "t 3"]
@@ -37,8 +37,8 @@ Rows = Int[np.ndarray, " r"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RestSurface:
-    """Holds a mesh at rest for contact: ``beside`` is 1 for every two vertices joined by an edge. Triangles that cross
-    others at rest, and their neighbours, are ``excluded``, because no shape can separate them."""
+    """Holds a mesh without expression for the collision tests; ``beside`` is 1 for every two vertices that an edge
+    joins. Triangles that already cross others at rest, and their neighbours, are ``excluded`` from the tests."""
 
     vertices: Vertices
     faces: Int[np.ndarray, "f 3"]
@@ -47,7 +47,7 @@ class RestSurface:
 
 
 def rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurface:
-    """Prepares a mesh at rest (mm)."""
+    """Prepares a mesh without expression (mm) for the collision tests."""
     count = len(vertices)
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     ones = sparse.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
@@ -59,15 +59,15 @@ def rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurfa
 
 
 def crossings(rest: RestSurface, displacement: Vertices, weights: tuple[float, ...] = WEIGHTS) -> Int[np.ndarray, " w"]:
-    """Returns, at each weight of a shape, the number of triangles that cross others but do not at rest."""
+    """Returns, for each weight of a blendshape, the number of triangles that cross others only in the posed mesh."""
     moved = _moved(rest, displacement)
     return np.array([np.count_nonzero(_crossing(rest, displacement, w, moved)) for w in weights])
 
 
 def kept_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> Vertices:
-    """Returns the displacement (mm, weight 1) with the smallest change so that no triangles cross at ``WEIGHTS`` that
-    do not at rest; if that is impossible, as few as possible cross. ``closing``: lids, which stop where they meet; all
-    other vertices move together."""
+    """Returns a blendshape's displacement (mm, at weight 1) with the smallest change that leaves as few new crossings
+    of triangles at ``WEIGHTS`` as possible. If ``closing``, the shape closes the lids, which stop where they meet;
+    otherwise vertices on both sides of a crossing move together."""
     spot = _spot(rest, displacement, WEIGHTS[1::2])
     best, fewest, zone = displacement, np.count_nonzero(spot), np.zeros(len(rest.vertices), bool)
     for _ in range(MAX_ZONES):
@@ -84,12 +84,12 @@ def kept_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> V
 
 
 def _moved(rest: RestSurface, displacement: Vertices) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles a shape moves. Unmoved triangles cannot begin to cross each other."""
+    """Returns a mask of the triangles that a blendshape moves. Unmoved triangles cannot begin to cross each other."""
     return (np.abs(displacement).max(axis=1) > STILL_MM)[rest.faces].any(axis=1)
 
 
 def _stopped(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
-    """Returns the displacement scaled by the weight at which its triangles first meet."""
+    """Returns the displacement scaled by the weight at which triangles of the zone first touch."""
     scale = np.ones(len(displacement))
     for _ in range(MEETING_ROUNDS):
         first = np.full(len(displacement), np.inf)
@@ -105,7 +105,7 @@ def _stopped(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
 
 
 def _together(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
-    """Returns the displacement blended with its mean over growing radii, until no triangles of a zone cross."""
+    """Returns the displacement blended with its mean over growing spheres, until no triangles of the zone cross."""
     out, rounds = displacement, 0
     best, fewest = displacement, np.inf
     for radius_mm in RADII_MM:
@@ -129,7 +129,7 @@ def _together(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices
 
 
 def _relaxed(rest: RestSurface, wanted: Vertices, clean: Vertices, zone: Rows) -> Vertices:
-    """Returns the displacement between ``clean`` and ``wanted`` that is nearest to ``wanted`` and does not cross."""
+    """Returns the displacement between ``clean`` and ``wanted`` that is nearest to ``wanted`` without crossings."""
     if (wanted == clean).all() or _spot(rest, clean, WEIGHTS, zone).any():
         return clean
     low, high = 0.0, 1.0
@@ -141,7 +141,7 @@ def _relaxed(rest: RestSurface, wanted: Vertices, clean: Vertices, zone: Rows) -
 
 
 def _mean_in_space(vertices: Vertices, rows: Rows, radius_mm: float) -> sparse.csr_array:
-    """Returns the matrix of Gaussian means around some vertices, over all vertices near them."""
+    """Returns the matrix that averages displacements near some vertices with Gaussian weights."""
     near = KDTree(vertices).query_ball_point(vertices[rows], 2.0 * radius_mm)
     counts = np.array([len(each) for each in near])
     column, row = np.concatenate(near).astype(int), np.repeat(np.arange(len(rows)), counts)
@@ -154,7 +154,7 @@ def _mean_in_space(vertices: Vertices, rows: Rows, radius_mm: float) -> sparse.c
 def _crossing(
     rest: RestSurface, displacement: Vertices, weight: float, active: Bool[np.ndarray, " f"]
 ) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles cross at a weight; only pairs with an active one are tested."""
+    """Returns a mask of the triangles that cross at a weight; only pairs with an active triangle are tested."""
     if not active.any():
         return active
     few = active if active.mean() < FEW else None
@@ -162,7 +162,7 @@ def _crossing(
 
 
 def _crossing_within(rest: RestSurface, displacement: Vertices, weight: float, rows: Rows) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles of ``rows`` cross each other at a weight; it takes a tenth of the time of testing all."""
+    """Returns a mask of the triangles in ``rows`` that cross each other at a weight, in a tenth of the time."""
     out = np.zeros(len(rest.faces), bool)
     out[rows] = crossing_faces(rest.vertices + weight * displacement, rest.faces[rows])
     return out & ~rest.excluded
@@ -171,7 +171,7 @@ def _crossing_within(rest: RestSurface, displacement: Vertices, weight: float, r
 def _spot(
     rest: RestSurface, displacement: Vertices, weights: tuple[float, ...], zone: Rows | None = None
 ) -> Bool[np.ndarray, " t"]:
-    """Tells which vertices are corners of triangles that cross at some weight; with a ``zone``, only its triangles."""
+    """Returns a mask of the vertices whose triangles cross at some weight, in a ``zone`` or everywhere."""
     out, moved = np.zeros(len(rest.vertices), bool), _moved(rest, displacement)
     for weight in weights:
         crossing = (
@@ -190,7 +190,7 @@ def _grown(rest: RestSurface, chosen: Bool[np.ndarray, " t"], rings: int) -> Boo
 
 
 def _faded(rest: RestSurface, retained: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
-    """Returns factors that rise to 1 over the rings around vertices with smaller factors."""
+    """Raises the factors to 1 gradually over the rings of neighbours around vertices with smaller factors."""
     count = np.maximum(np.asarray(rest.beside.sum(axis=1)).ravel(), 1.0)
     out = retained
     for _ in range(SOFT_RINGS):

@@ -1,9 +1,9 @@
-"""Adds eyeballs to a mesh without any: a ball with a cornea behind the lids, and lids that close over it.
+"""Adds eyeballs to a mesh that has none: a ball with a cornea behind the lids, and lids that close over the ball.
 
-Sizes are an adult's: a ball of 12 mm, a cornea of 7.8 mm that meets it at a limbus of 5.9 mm (after Gullstrand's
-schematic eye). The ball lies as far in front as open lids allow; ``pivots`` gives its sideways position. A blendshape
-moves a lid along a straight line, which cuts through the ball; so the lid is lifted as half and full weight require.
-"""
+Sizes are an adult's: the ball's radius is 12 mm, the cornea's 7.8 mm, and they meet in a circle of radius 5.9 mm, the
+limbus (after Gullstrand's schematic eye). The ball lies as far in front as the open lids allow; the module ``pivots``
+gives its sideways position. A blendshape moves a lid along a straight line, which cuts through the ball; the
+displacement is therefore lifted so that the lid clears the ball at half and full weight."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,20 +27,20 @@ RINGS, SECTORS = 40, 48
 OPEN_SHARE = 0.4  # of the eye's length, within which lids of an open eye have a border about its middle
 AHEAD = np.array([0.0, 0.0, 1.0])
 STRAIGHT: Mapping[str, Float[np.ndarray, " 3"]] = {}
-WHITE, IRIS, PUPIL = (225, 220, 214), (96, 72, 52), (12, 12, 12)  # sRGB; no photograph tells them
+WHITE, IRIS, PUPIL = (225, 220, 214), (96, 72, 52), (12, 12, 12)  # sRGB; not measured in photographs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eyeball:
-    """Holds an eyeball in the head frame, mm. ``gaze`` is the unit vector of its direction."""
+    """Holds an eyeball in the head frame, mm. ``gaze`` is the unit vector of the viewing direction."""
 
     centre: Float[np.ndarray, " 3"]
     gaze: Float[np.ndarray, " 3"]
     radius_mm: float = EYE_RADIUS_MM
 
     def reach(self, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Returns the distance of the surface from the centre in each direction (unit vectors), mm: the ball's or,
-        within the limbus, the cornea's."""
+        """Returns the distance (mm) from the eyeball's centre to its surface in each direction (unit vectors); within
+        the limbus this surface is the cornea."""
         cosine = directions @ self.gaze
         cornea = float(np.sqrt(self.radius_mm**2 - LIMBUS_MM**2) - np.sqrt(CORNEA_MM**2 - LIMBUS_MM**2))
         inside = np.maximum(CORNEA_MM**2 - cornea**2 * (1.0 - cosine**2), 0.0)
@@ -48,7 +48,7 @@ class Eyeball:
         return np.where(cosine > _limbus_cosine(self.radius_mm), bulge, self.radius_mm)
 
     def mesh(self) -> Mesh:
-        """Returns the surface as rings around the gaze, coloured as white, iris and pupil."""
+        """Returns the eyeball's mesh as rings around the gaze, with vertex colours of white, iris and pupil."""
         limbus, pupil = np.arccos(_limbus_cosine(self.radius_mm)), np.arcsin(PUPIL_MM / self.radius_mm)
         marks = np.unique(np.concatenate([np.linspace(0.0, np.pi, RINGS), [pupil, limbus]]))[1:-1]
         around = np.arange(SECTORS) * 2.0 * np.pi / SECTORS
@@ -67,7 +67,7 @@ def _limbus_cosine(radius_mm: float) -> float:
 
 
 def _ring_faces(count: int) -> Int[np.ndarray, "f 3"]:
-    """Returns the triangles of a pole, ``count`` rings and the other pole."""
+    """Returns the triangles between one pole of a sphere, ``count`` rings of vertices, and the other pole."""
     ring = np.arange(SECTORS)
     beside = (ring + 1) % SECTORS
     last = 1 + (count - 1) * SECTORS
@@ -88,7 +88,7 @@ def _ring_faces(count: int) -> Int[np.ndarray, "f 3"]:
 def _outward(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], centre: Float[np.ndarray, " 3"]
 ) -> Int[np.ndarray, "f 3"]:
-    """Returns the triangles oriented so that their normals point out of the ball."""
+    """Returns the triangles reordered so that their normals point out of the ball."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     inward = np.einsum("fx,fx->f", np.cross(b - a, c - a), a - centre) < 0.0
     return np.where(inward[:, None], faces[:, ::-1], faces)
@@ -102,8 +102,8 @@ def _colours(angles: Float[np.ndarray, " n"], pupil: float, limbus: float) -> UI
 
 
 def turn_to(gaze: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
-    """Returns the rotation of an eye from straight ahead to ``gaze`` (unit, head frame), without roll about the line of
-    sight (Listing's law)."""
+    """Returns the rotation of an eye from straight ahead to ``gaze`` (unit vector, head frame), without roll about the
+    line of sight (Listing's law)."""
     axis = np.cross(AHEAD, gaze)
     sine = float(np.linalg.norm(axis))
     return rotation_from_vector(axis * (np.arctan2(sine, gaze @ AHEAD) / sine if sine > 0.0 else 1.0))
@@ -116,14 +116,14 @@ def placed_eyeballs(
     centres: Mapping[str, Float[np.ndarray, " 3"]],
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> dict[str, Eyeball]:
-    """Returns eyeballs behind the open eyes of a mesh without expression, by pivot; none where the mesh closes an eye.
+    """Returns eyeballs behind the open eyes of a mesh without expression, by pivot; closed eyes get none.
 
     Args:
         mesh: vertices, head frame, mm.
-        triangles: of the mesh.
-        landmarks: of the head.
+        triangles: triangles of the mesh.
+        landmarks: landmarks of the head.
         centres: the pivots ``eye_right`` and ``eye_left``, or one of them.
-        gazes: where they look (unit vectors, head frame), straight ahead where there is none.
+        gazes: their viewing directions (unit vectors, head frame); missing ones are straight ahead.
     """
     out = {}
     for name in centres:
@@ -138,7 +138,7 @@ def placed_eyeballs(
 
 
 def _is_open(mesh: Places, triangles: Int[np.ndarray, "g 3"], landmarks: Points, side: str) -> bool:
-    """Tells whether the mesh has a border near the middle of an eye, as around an open eye."""
+    """Returns whether the mesh has a hole near the middle of an eye, as around an open eye."""
     outer, inner = landmarks[f"exocanthion_{side}"], landmarks[f"endocanthion_{side}"]
     border = mesh[np.unique(boundary_edges(triangles))]
     away = np.linalg.norm(border - 0.5 * (outer + inner), axis=1)
@@ -146,20 +146,20 @@ def _is_open(mesh: Places, triangles: Int[np.ndarray, "g 3"], landmarks: Points,
 
 
 def _near(mesh: Places, triangles: Int[np.ndarray, "g 3"], centre: Float[np.ndarray, " 3"]) -> Bool[np.ndarray, " g"]:
-    """Tells which triangles lie around an eye and in front of its centre."""
+    """Returns a mask of the triangles that lie around an eye and in front of its centre."""
     near = (np.linalg.norm(mesh - centre, axis=1) < REACH_MM) & (mesh[:, 2] > centre[2] - BACK_MM)
     return near[triangles].all(axis=1)
 
 
 def sample_triangles(mesh: Places, triangles: Int[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 7 3"]:
-    """Returns points of each triangle: corners, middles of edges, and the middle."""
+    """Returns seven points of each triangle: its corners, the midpoints of its edges, and its centroid."""
     corners = mesh[triangles]
     middles = 0.5 * (corners + np.roll(corners, -1, axis=1))
     return np.concatenate([corners, middles, corners.mean(axis=1, keepdims=True)], axis=1)
 
 
 def _depths(eyeball: Eyeball, points: Float[np.ndarray, "g 7 3"]) -> Float[np.ndarray, " g"]:
-    """Returns how deep (mm) each triangle lies within an eyeball and its required gap; 0 for triangles outside."""
+    """Returns how deep (mm) each triangle lies in an eyeball or the required gap around it; 0 for triangles outside."""
     away = points - eyeball.centre
     distance = np.linalg.norm(away, axis=2)
     reach = eyeball.reach((away / np.maximum(distance, 1e-9)[:, :, None]).reshape(-1, 3)).reshape(distance.shape)
@@ -169,7 +169,7 @@ def _depths(eyeball: Eyeball, points: Float[np.ndarray, "g 7 3"]) -> Float[np.nd
 def lifted(
     mesh: Places, triangles: Int[np.ndarray, "g 3"], displacement: Places, eyeballs: Mapping[str, Eyeball]
 ) -> Places:
-    """Returns a shape's displacement (mm) with lids lifted off the eyeballs at ``WEIGHTS``; all else is unchanged."""
+    """Returns a blendshape's displacement (mm) with lids lifted off the eyeballs at ``WEIGHTS``, else unchanged."""
     out = displacement
     for eyeball in eyeballs.values():
         about = triangles[_near(mesh, triangles, eyeball.centre)]

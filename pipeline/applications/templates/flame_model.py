@@ -1,13 +1,13 @@
-"""Computes the surface of a FLAME head model: linear shape and expression, pose correctives, skinning over five joints.
+"""Computes the surface of a FLAME head model: linear shape and expression modes, pose correctives, and skinning over
+five joints.
 
 T. Li, T. Bolkart, M. J. Black, H. Li and J. Romero, *Learning a model of facial shape and expression from 4D scans*,
-ACM Transactions on Graphics 36(6), 2017, sections 3 and 4. Lengths are metres, as in the model's files; y is up, z out
-of the face. The joints are, in this order, the root, the neck, the jaw and the two eyes.
+ACM Transactions on Graphics 36(6), 2017, sections 3 and 4. Lengths are metres, as in the model's files; y points up, z
+out of the face. The joints are, in this order, the root, the neck, the jaw and the two eyes.
 
-Its parameters are fitted to a mesh in its vertex order by Levenberg-Marquardt on the distances of the vertices, with
-Gaussian priors. The standard deviation of the distances is estimated in rounds too. If the model can reproduce the
-mesh, the priors fade; if not, they decide what the mesh leaves undetermined.
-"""
+The parameters are fitted to a mesh in FLAME's vertex order by Levenberg-Marquardt on the vertex distances, with
+Gaussian priors. The standard deviation of the vertex distances is estimated anew in each round of the fit. The smaller
+this standard deviation, the less the priors count; the priors decide parameters that the mesh leaves undetermined."""
 
 from dataclasses import dataclass, replace
 
@@ -40,17 +40,17 @@ class FlameParameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlameModel:
-    """Holds the arrays of a FLAME model.
+    """Holds the arrays of a FLAME head model.
 
     Attributes:
         template: vertices of the mean head, m.
         shape_modes: displacement for one standard deviation of each coefficient of shape, m.
         expression_modes: the same for expression.
-        pose_modes: displacement by each element of the rotation matrices of the joints below the root, less the
-            identity's, m.
-        joint_regressor: weights that make the joints of the shaped vertices.
-        weights: how much each vertex turns with each joint.
-        parents: the joint above each joint; the root's own is -1.
+        pose_modes: displacement by each element of the rotation matrices (minus the identity) of the joints below
+            the root, m.
+        joint_regressor: weights that compute the joints from the shaped vertices.
+        weights: skinning weight of each vertex for each joint.
+        parents: the parent of each joint; -1 for the root.
         faces: triangles.
     """
 
@@ -69,7 +69,7 @@ class FlameModel:
         return FlameParameters(np.zeros(shapes), np.zeros(expressions), np.zeros((JOINTS, 3)), np.zeros(3))
 
     def shaped(self, parameters: FlameParameters) -> Float[np.ndarray, "v 3"]:
-        """Returns the vertices with shape and expression, before any joint rotates, m."""
+        """Returns the vertices with shape and expression applied, before any joint rotates, m."""
         return self.template + self.shape_modes @ parameters.shape + self.expression_modes @ parameters.expression
 
     def surface(
@@ -80,7 +80,7 @@ class FlameModel:
         return self.posed(shaped if offsets is None else shaped + offsets, parameters.pose) + parameters.translation
 
     def posed(self, shaped: Float[np.ndarray, "v 3"], pose: Float[np.ndarray, "5 3"]) -> Float[np.ndarray, "v 3"]:
-        """Returns shaped vertices with the joints rotated."""
+        """Returns the vertices after the joints have been rotated."""
         local = rotation_from_vector(pose)
         turns = chained(local, self.parents)
         shifts = joint_shifts(turns, (self.joint_regressor @ shaped)[:, :, None], self.parents)[:, :, 0]
@@ -88,12 +88,12 @@ class FlameModel:
         return np.einsum("vxy,vy->vx", self.blended(turns), corrected) + self.weights @ shifts
 
     def blended(self, turns: Float[np.ndarray, "5 3 3"]) -> Float[np.ndarray, "v 3 3"]:
-        """Returns the matrix by which each vertex rotates: the mean over the joints, with the vertex's weights."""
+        """Returns the matrix that rotates each vertex: the mean of the joints' rotations with the skinning weights."""
         return np.tensordot(self.weights, turns, axes=1)
 
 
 def chained(local: Float[np.ndarray, "5 3 3"], parents: Int[np.ndarray, " 5"]) -> Float[np.ndarray, "5 3 3"]:
-    """Returns the rotation of each joint in space, from rotations relative to the parent joints."""
+    """Returns the rotation of each joint in the model's frame, from rotations relative to the parent joints."""
     out = local.copy()
     for joint in range(1, JOINTS):
         out[joint] = out[parents[joint]] @ local[joint]
@@ -103,8 +103,8 @@ def chained(local: Float[np.ndarray, "5 3 3"], parents: Int[np.ndarray, " 5"]) -
 def joint_shifts(
     turns: Float[np.ndarray, "5 3 3"], joints: Float[np.ndarray, "5 3 k"], parents: Int[np.ndarray, " 5"]
 ) -> Float[np.ndarray, "5 3 k"]:
-    """Returns what is added to a vertex after it rotates with each joint, so that the joint stays in position. It is
-    linear in the joints' positions; the last axis holds several sets of them."""
+    """Returns, for each joint, the translation that follows its rotation so that the joint itself does not move. The
+    translations are linear in the joints' positions; the last axis of ``joints`` holds several sets of positions."""
     placed = joints.copy()
     for joint in range(1, JOINTS):
         above = parents[joint]
@@ -114,7 +114,7 @@ def joint_shifts(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlameFit:
-    """Holds fitted parameters, their remaining distances from the mesh, and offsets that remove these, m."""
+    """Holds fitted FLAME parameters, the remaining vertex distances from the mesh, and offsets that remove them, m."""
 
     parameters: FlameParameters
     distances: Float[np.ndarray, " v"]  # from the mesh to the surface that the parameters make, m
@@ -124,12 +124,12 @@ class FlameFit:
 def fit_flame(
     model: FlameModel, target: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, " v"] | None = None
 ) -> FlameFit:
-    """Fits the model to a mesh in the model's vertex order.
+    """Fits the FLAME model to a mesh in FLAME's vertex order.
 
     Args:
         model: the model.
         target: the mesh's vertices, m, in any frame.
-        weights: how much each vertex counts, 0 to 1; equally by default.
+        weights: the weight of each vertex, 0 to 1; 1 by default.
     """
     counted = np.ones(len(target)) if weights is None else weights
     value, deviation = _start(model, target, counted), FIRST_M
@@ -146,7 +146,7 @@ def fit_flame(
 
 
 def _start(model: FlameModel, target: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, " v"]) -> FlameParameters:
-    """Returns the mean head at the mesh's position. The root rotates about its joint."""
+    """Returns the parameters of the mean head, moved rigidly to the mesh. The motion rotates about the root joint."""
     placed = rigid_fit(model.template, target, weights)
     mean, root = model.neutral(), model.joint_regressor[0] @ model.template
     pose = np.zeros((JOINTS, 3))
@@ -170,13 +170,13 @@ def _moved(value: FlameParameters, step: Float[np.ndarray, " p"]) -> FlameParame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Prior:
-    """Holds the priors: coefficients are N(0, 1), angles of the joints below the root N(0, ``TURN_RAD``)."""
+    """Holds the priors: coefficients are N(0, 1), joint angles except the root's N(0, ``TURN_RAD``)."""
 
     form: Quadratic
 
     @classmethod
     def of(cls, model: FlameModel) -> "_Prior":
-        """Returns the priors of a model's parameters."""
+        """Returns the priors of a FLAME model's parameters."""
         turns = np.full((JOINTS, 3), 1.0 / TURN_RAD**2)
         turns[0] = 0.0
         modes = model.shape_modes.shape[2] + model.expression_modes.shape[2]
@@ -184,27 +184,27 @@ class _Prior:
         return cls(Quadratic.prior(np.diag(information), np.zeros(len(information))))
 
     def at(self, value: FlameParameters) -> LinearisedQuadratic:
-        """Returns the priors' cost at a value."""
+        """Returns the cost of the priors at given parameters."""
         return self.form.at(_vector(value))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Vertices:
-    """Holds the distances of all vertices as a term; ``roots`` divide them by their standard deviations (1/m)."""
+    """Holds the vertex distances as a cost term; ``roots`` are the distances' inverse standard deviations (1/m)."""
 
     model: FlameModel
     target: Float[np.ndarray, "v 3"]
     roots: Float[np.ndarray, " v"]
 
     def at(self, value: FlameParameters) -> Residuals:
-        """Returns the distances of a face from the mesh."""
+        """Returns the vertex distances between a FLAME face and the mesh."""
         residual = (self.model.surface(value) - self.target) * self.roots[:, None]
         return Residuals(residual, lambda: surface_jacobian(self.model, value) * self.roots[:, None, None])
 
 
 def surface_jacobian(model: FlameModel, value: FlameParameters) -> Float[np.ndarray, "v 3 p"]:
-    """Returns the derivatives of a face's vertices by shape, expression, pose and translation, in this order. The
-    surface is linear in the coefficients; the derivatives by angles are finite differences."""
+    """Returns the derivatives of a FLAME face's vertices by shape, expression, pose and translation, in this order.
+    Derivatives by shape and expression are exact; those by joint angles are finite differences."""
     turns = chained(rotation_from_vector(value.pose), model.parents)
     blended, shaped = model.blended(turns), model.shaped(value)
     columns = []
@@ -224,8 +224,8 @@ def surface_jacobian(model: FlameModel, value: FlameParameters) -> Float[np.ndar
 
 
 def _offsets(model: FlameModel, value: FlameParameters, target: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
-    """Returns the offsets of the shaped vertices with which the face equals the mesh. Offsets also move the joints,
-    about which all vertices rotate; the 15 coordinates of the joints are therefore solved for as well."""
+    """Returns the vertex offsets with which the FLAME face equals the mesh. Offsets also move the joints, about which
+    all vertices rotate, so the 15 joint coordinates are solved for as well."""
     turns = chained(rotation_from_vector(value.pose), model.parents)
     back = np.linalg.inv(model.blended(turns))
     missing = np.einsum("vxy,vy->vx", back, target - model.surface(value))

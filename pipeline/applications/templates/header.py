@@ -1,6 +1,6 @@
-"""Lists the registered templates and their files (in the folder ``templates`` of the data folder, each with its
-picture). Reads the header of a template's file without its arrays, and checks whether a job may use the template. It
-loads no model, because the command line, the service and the console call it before any work begins."""
+"""Lists the registered templates, which are files in the folder ``templates`` of the data folder. Reads the header of a
+template's file without its arrays, and checks whether a job may use the template. This module loads no head model,
+because the command line, the service and the console call it before any job starts."""
 
 import json
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ WORDS = ("name", "source", "source_sha256", "model_name", "model_sha256")
 
 
 class UnknownTemplate(EigenheadError):
-    """Reports a name without a registered template."""
+    """Reports a name for which no template is registered."""
 
     def __init__(self, name: str) -> None:
         known = [*list_templates()] or ["none"]
@@ -36,12 +36,12 @@ class WrongName(EigenheadError):
 
 
 def is_name(name: str) -> bool:
-    """Tells whether a name is allowed for a template."""
+    """Returns whether a name is allowed for a template."""
     return TEMPLATE_NAME.fullmatch(name) is not None
 
 
 def templates_folder() -> Path:
-    """Returns the folder of registered templates. The folder may not exist yet."""
+    """Returns the folder that holds the registered templates. The folder may not exist yet."""
     return data_folder() / "templates"
 
 
@@ -61,7 +61,7 @@ def template_path(name: str) -> Path:
 
 
 def new_path(name: str) -> Path:
-    """Returns the path at which a template of this name is stored, whether it exists or not. Raises WrongName."""
+    """Returns the path at which a template of this name is or would be stored. Raises WrongName."""
     if not is_name(name):
         raise WrongName(name)
     return templates_folder() / f"{name}.npz"
@@ -76,7 +76,7 @@ def remove_template(name: str) -> Path:
 
 
 class BadTemplate(EigenheadError):
-    """Reports a damaged file, or one of another kind, in place of a registered template."""
+    """Reports a template file that is damaged or is not a template file."""
 
     def __init__(self, path: Path, why: Message | str) -> None:
         super().__init__(compose("template-unusable", path=str(path), why=why, name=path.stem))
@@ -84,7 +84,7 @@ class BadTemplate(EigenheadError):
 
 
 class OtherModel(EigenheadError):
-    """Reports a template that was registered to a model other than the one in use."""
+    """Reports a template that was registered to a head model other than the one in use."""
 
     def __init__(self, template: "TemplateHeader", model_name: str) -> None:
         same = template.model_name == model_name
@@ -103,7 +103,7 @@ class OtherModel(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class TemplateHeader:
-    """Holds which mesh was registered to which model, and figures of the quality."""
+    """Holds which mesh was registered to which head model, and figures that measure the quality of the registration."""
 
     name: str
     source: str  # the OBJ file's name
@@ -132,7 +132,7 @@ def read_header(path: Path) -> TemplateHeader:
 
 
 def read_meta(path: Path, file: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Returns the decoded ``meta`` of an open template file. Raises BadTemplate for another kind of file."""
+    """Returns the decoded ``meta`` entry of an open template file. Raises BadTemplate for files of another kind."""
     if "meta" not in file:
         raise BadTemplate(path, compose("template-without-format"))
     meta = json.loads(file["meta"].tobytes())
@@ -142,13 +142,13 @@ def read_meta(path: Path, file: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def header_words(meta: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the text fields of a header from its decoded ``meta``. Raises KeyError if one is missing."""
+    """Returns the text fields of a template's header from its ``meta`` entry. Raises KeyError if a field is missing."""
     return {word: str(meta[word]) for word in WORDS}
 
 
 def check_template(name: str | None, model: str) -> None:
-    """Checks that a job with this model (a name or a file) can use the named template; None is always allowed. Raises
-    UnknownTemplate, BadTemplate, OtherModel, UnknownModel."""
+    """Checks that a job with the head model ``model`` (a name or a file) can use the named template; ``name`` may be
+    None. Raises UnknownTemplate, BadTemplate, OtherModel, UnknownModel."""
     path = model_path(model)
     if name is not None:
         read_header(template_path(name)).check_model(model, model_sha256(path))

@@ -1,10 +1,10 @@
-"""Adds teeth and a tongue behind the lips of a mesh without any, and moves them with its jaw. Lips must not touch them.
+"""Adds teeth and a tongue behind the lips of a mesh that has none, and moves them with the mesh's jaw. Lips must not
+touch the teeth or the tongue.
 
-The similarity of the mouth's landmarks brings the shipped parts (``load_inner_mouth``) to the person. The parts then
-move back until no lip touches them, shut or open. Upper teeth stay with the skull; lower teeth and tongue move with the
-jaw as parts of a mesh do (``pivots.jaw_motions``). A shape that presses lips through the teeth is lifted there together
-with its surroundings, like lids off eyeballs (``eyeballs.lifted``).
-"""
+A similarity transform between mouth landmarks places the shipped teeth and tongue (``load_inner_mouth``) in the
+person's head. Teeth and tongue are then moved back until no lip touches them, with the mouth shut or open. Upper teeth
+stay with the skull; lower teeth and tongue move with the jaw (``pivots.jaw_motions``). Where a blendshape would press
+lips through the teeth, the lips are lifted, as lids are lifted off eyeballs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -36,7 +36,7 @@ ANCHORS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InnerPart:
-    """Holds a part with its colours, and its displacement when the tongue is out (mm; empty if it does not move)."""
+    """Holds teeth or a tongue, and the part's displacement when the tongue is out (mm; empty if it does not move)."""
 
     mesh: Mesh
     tongue_out: Float[np.ndarray, "n 3"]
@@ -44,7 +44,7 @@ class InnerPart:
 
 @lru_cache(maxsize=1)
 def load_inner_mouth() -> tuple[dict[str, InnerPart], Mapping[str, Float[np.ndarray, " 3"]]]:
-    """Returns the parts by name, and the landmarks of the head that contains them."""
+    """Returns the shipped teeth and tongue by name, and the landmarks of the head for which they were made."""
     with np.load(PACK) as file:
         parts = {}
         for name in PARTS:
@@ -54,7 +54,7 @@ def load_inner_mouth() -> tuple[dict[str, InnerPart], Mapping[str, Float[np.ndar
         return parts, dict(zip(ANCHORS, file["anchors"].astype(float), strict=True))
 
 
-ABOUT_MM = 25.0  # beyond the teeth, where the mesh is looked at: what a shape may bring to them
+ABOUT_MM = 25.0  # around the teeth, within which the mesh is tested: shapes may move it there
 BACK_MM, STEP_MM = 10.0, 1.0  # how far the parts are moved back until lips are free
 SPARE_MM = 0.5  # by which they are moved back once more
 OPENING = (0.0, 0.5, 1.0)  # weights of jawOpen at which parts must be free of the mesh
@@ -63,7 +63,7 @@ DEEP_MM = 10.0  # behind the teeth's front, a point is in the mouth, not in a to
 SHADE_MM = 40.0  # behind the lips, where the light of DEEP_LIGHT is left
 DEEP_LIGHT = 0.15  # of the light at the lips
 WEIGHTS = (0.5, 1.0)
-STILL_MM = 0.05  # a mouth that a shape moves less is left alone
+STILL_MM = 0.05  # shapes that move the mouth less are not corrected
 ROUNDS = 20
 NUDGE_MM = 0.3  # a round, for what meets teeth although its corners and middles do not
 SPREAD_MM = 5.0  # over which a lip that is lifted takes along what lies about: lips are some 10 mm thick
@@ -78,15 +78,16 @@ Shapes = Mapping[str, Places]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InnerMouth:
-    """Holds the parts by name without expression (head frame, mm), and the displacements of each by shape; shapes that
-    do not move a part are missing. ``absence``: reason why there are no parts."""
+    """Holds teeth and tongue without expression by name (head frame, mm), and their displacements by blendshape,
+    without blendshapes that do not move them. ``absence`` is the reason if there are no teeth and tongue."""
 
     parts: Mapping[str, Mesh] = field(default_factory=dict)
     moves: Mapping[str, Mapping[str, Float[np.ndarray, "n 3"]]] = field(default_factory=dict)
     absence: Absence | None = None
 
     def posed(self, shape: str, weight: float) -> dict[str, Float[np.ndarray, "n 3"]]:
-        """Returns the vertices of each part at a shape's weight. Shapes for an open jaw are combined with one."""
+        """Returns the vertices of teeth and tongue at a weight of one blendshape. Blendshapes for an open jaw, such as
+        ``mouthClose``, are combined with ``jawOpen``."""
         with_jaw, out = jaw_weight(shape, weight), {}
         for name, part in self.parts.items():
             moves = self.moves[name]
@@ -95,7 +96,7 @@ class InnerMouth:
 
 
 def jaw_weight(shape: str, weight: float) -> float:
-    """Returns the weight of ``jawOpen`` that belongs to a shape at a weight."""
+    """Returns the weight of ``jawOpen`` that is combined with a blendshape at a weight."""
     return 0.0 if shape not in OPENED else 1.0 if shape == TONGUE_OUT else weight
 
 
@@ -107,7 +108,7 @@ def placed_inner_mouth(
     jaw: Mapping[str, RigidTransform],
     loose: Int[np.ndarray, " t"],
 ) -> InnerMouth:
-    """Returns teeth and tongue for a mesh without expression, or why there are none.
+    """Returns teeth and tongue for a mesh without expression, or the reason why none are added.
 
     ``mesh``: vertices of the mesh, head frame, mm. ``triangles``: triangles of the mesh. ``shapes``: the mesh's
     displacements by Apple's names, mm. ``landmarks``: landmarks of the head. ``jaw``: motion of the lower jaw for each
@@ -116,7 +117,7 @@ def placed_inner_mouth(
     shipped, anchors = load_inner_mouth()
     place = procrustes(np.stack([anchors[name] for name in ANCHORS]), np.stack([landmarks[name] for name in ANCHORS]))
     shift = landmarks["stomion"] - place.apply(anchors["stomion"])
-    shift[2] = 0.0  # how far behind the lips, the whole mouth says
+    shift[2] = 0.0  # depth behind the lips: fitted to the whole mouth
     parts = {
         name: Mesh(place.apply(part.mesh.vertices) + shift, part.mesh.faces, _shaded(part.mesh))
         for name, part in shipped.items()
@@ -135,7 +136,7 @@ def placed_inner_mouth(
 
 
 def _shaded(part: Mesh) -> UInt8[np.ndarray, "n 3"]:
-    """Returns a part's colours with the shadow of the mouth, which viewers do not compute."""
+    """Returns the vertex colours darkened by the shadow of the mouth, because viewers do not compute this shadow."""
     z = part.vertices[:, 2]
     assert part.colours is not None
     light = 1.0 - np.clip((z.max() - z) / SHADE_MM, 0.0, 1.0) * (1.0 - DEEP_LIGHT)
@@ -143,7 +144,7 @@ def _shaded(part: Mesh) -> UInt8[np.ndarray, "n 3"]:
 
 
 def _has_own(mesh: Places, loose: Int[np.ndarray, " t"], parts: Mapping[str, Mesh]) -> bool:
-    """Tells whether a separate part of the mesh lies at the teeth's position."""
+    """Returns whether the mesh already has teeth: a separate part at their position."""
     inside = np.concatenate([part.vertices for part in parts.values()])
     low, high = inside.min(axis=0), inside.max(axis=0)
     middles = [mesh[loose == number].mean(axis=0) for number in range(loose.max(initial=-1) + 1)]
@@ -166,7 +167,7 @@ def _moving(
 
 
 def _about(mesh: Places, triangles: Int[np.ndarray, "g 3"], inner: InnerMouth) -> Int[np.ndarray, " r"]:
-    """Returns which triangles lie about the parts, or where the jaw takes them."""
+    """Returns the indices of the mesh's triangles near teeth and tongue, or near where the jaw moves them."""
     points = np.concatenate([inner.posed("jawOpen", weight)[name] for name in inner.parts for weight in (0.0, 1.0)])
     low, high = points.min(axis=0) - ABOUT_MM, points.max(axis=0) + ABOUT_MM
     corners = mesh[triangles]
@@ -176,7 +177,7 @@ def _about(mesh: Places, triangles: Int[np.ndarray, "g 3"], inner: InnerMouth) -
 def meeting_triangles(
     mesh: Places, triangles: Int[np.ndarray, "g 3"], vertices: Mapping[str, Float[np.ndarray, "n 3"]], inner: InnerMouth
 ) -> Bool[np.ndarray, " g"]:
-    """Tells which mesh triangles the inner parts cross; ``vertices``: of the parts."""
+    """Returns a mask of the mesh's triangles that cross teeth or tongue; ``vertices`` are those of teeth and tongue."""
     points = np.concatenate([vertices[name] for name in inner.parts])
     starts = np.cumsum([0, *(len(vertices[name]) for name in inner.parts)])
     faces = np.concatenate([part.faces + start for part, start in zip(inner.parts.values(), starts, strict=False)])
@@ -197,7 +198,7 @@ def meeting_triangles(
 
 
 def _meets(mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth) -> bool:
-    """Tells whether the mesh meets a part while the jaw opens."""
+    """Returns whether the mesh touches teeth or tongue at some opening of the jaw."""
     about = triangles[_about(mesh, triangles, inner)]
     opened = shapes.get("jawOpen", np.zeros_like(mesh))
     return any(
@@ -207,7 +208,7 @@ def _meets(mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inne
 
 
 def _is_covered(mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth) -> bool:
-    """Tells whether the mesh hides the gap between the front teeth although the jaw is open: the lips do not part."""
+    """Returns whether the mesh hides the gap between the front teeth although the jaw is open."""
     if "jawOpen" not in shapes:
         return True
     posed = inner.posed("jawOpen", 1.0)
@@ -225,7 +226,7 @@ def _is_covered(mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes,
 def kept_off_teeth(
     mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth
 ) -> dict[str, Places]:
-    """Returns shapes (mm) with lips lifted off the teeth at ``WEIGHTS``; all other vertices are unchanged."""
+    """Returns blendshapes (mm) with lips lifted off the teeth at ``WEIGHTS``; all other vertices are unchanged."""
     if not inner.parts:
         return dict(shapes)
     about = triangles[_about(mesh, triangles, inner)]
@@ -251,7 +252,7 @@ def _lift(
     name: str,
     inner: InnerMouth,
 ) -> Float[np.ndarray, "m 3"] | None:
-    """Returns a change of a displacement after which no triangle touches the teeth; None if none does anyway."""
+    """Returns a change of a displacement that keeps all triangles off the teeth; None if no change is needed."""
     lift, fronts = np.zeros_like(rest), {}
     for _ in range(ROUNDS):
         need = np.zeros(len(rest))
@@ -272,7 +273,7 @@ def _lift(
 def _spread(
     rest: Float[np.ndarray, "m 3"], motion: Float[np.ndarray, " m"], need: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, " m"]:
-    """Spreads each vertex's needed shift to its neighbours, with decreasing weight, but only to moving vertices."""
+    """Spreads the shift that each vertex needs to the moving vertices around it, with decreasing weight."""
     pressed = np.flatnonzero(need)
     near = KDTree(rest[pressed]).sparse_distance_matrix(KDTree(rest), 2.5 * SPREAD_MM, output_type="coo_matrix")
     source, row = pressed[near.row], near.col
@@ -283,13 +284,13 @@ def _spread(
 
 
 def _axis(inner: InnerMouth) -> Float[np.ndarray, " 2"]:
-    """Returns the x and z of the vertical line around which the arch of the teeth bends."""
+    """Returns the horizontal position (x and z) of the vertical axis about which the arch of the teeth bends."""
     rest = inner.parts["teeth_upper"].vertices
     return np.array([0.5 * (rest[:, 0].min() + rest[:, 0].max()), rest[:, 2].min()])
 
 
 def _outward(inner: InnerMouth, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Returns the horizontal directions away from that line."""
+    """Returns the horizontal unit vectors that point from the arch's vertical axis to the points."""
     axis = _axis(inner)
     away = (points - (axis[0], 0.0, axis[1])) * (1.0, 0.0, 1.0)
     return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
@@ -298,7 +299,7 @@ def _outward(inner: InnerMouth, points: Float[np.ndarray, "n 3"]) -> Float[np.nd
 @dataclass(frozen=True, slots=True, eq=False)
 class _Front:
     """Holds the distance of the teeth's outer faces from the arch's vertical axis, by direction and height; 0 where
-    there is none."""
+    there are no teeth."""
 
     axis: Float[np.ndarray, " 2"]  # x and z
     lowest: float
@@ -322,14 +323,14 @@ class _Front:
     def cells(
         self, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Returns the cell of each point, and its distance from the axis."""
+        """Returns the direction and height cell of each point, and its distance from the arch's vertical axis."""
         x, z = (points[:, [0, 2]] - self.axis).T
         turn = (np.degrees(np.arctan2(x, z)) // TURN_DEG).astype(int) % self.reach.shape[0]
         height = np.floor((points[:, 1] - self.lowest) / RISE_MM).astype(int)
         return turn, height, np.hypot(x, z)
 
     def depths(self, posed: Float[np.ndarray, "m 3"], triangles: Int[np.ndarray, "a 3"]) -> Float[np.ndarray, " a"]:
-        """Returns how far each triangle reaches into the teeth and the gap before them, mm; 0 where it does not."""
+        """Returns how deep (mm) each triangle lies in the teeth or the required gap before them; 0 outside."""
         points = sample_triangles(posed, triangles).reshape(-1, 3)
         turn, height, away = self.cells(points)
         inside = (height >= 0) & (height < self.reach.shape[1])

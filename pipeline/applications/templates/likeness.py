@@ -1,10 +1,10 @@
-"""Fits a head model to another mesh, shape and pose together.
+"""Fits a head model's shape and pose together to another mesh.
 
 Gauss-Newton minimises the distances from the model's vertices to the tangent planes at their closest points on the mesh
-(Chen and Medioni 1992), under the prior z ~ N(0, I), with eigenheads and the smooth deformations of
-``gaussian_process``. It is the search of section 3.2 with a scale and without landmarks. Distances go from model to
-mesh, so other parts of the mesh, such as shoulders, have no effect.
-"""
+(Chen and Medioni 1992), under the prior z ~ N(0, I) of the model's coefficients. The coefficients are those of
+eigenheads and of the smooth deformations in ``gaussian_process``; this is the search of the paper's section 3.2 with a
+scale and without landmarks. Distances are measured from model to mesh, so the mesh's other parts, such as shoulders,
+have no effect."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ from rig.mesh import vertex_normals
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Holds the limits that apply to several steps of the search (lengths in mm)."""
+    """Holds the limits that apply to several consecutive steps of the search (lengths in mm)."""
 
     steps: int
     modes: int | None  # the first ones; None: all, the smooth deformations too
@@ -41,18 +41,18 @@ STAGES = (
     Stage(6, None, 10.0, 12.0, 0.4),
     Stage(10, None, 5.0, 0.0, 0.05),
 )
-FACING = 0.6  # cosine between normals of what meets
+FACING = 0.6  # cosine between normals of matched points
 ROBUST, MIN_MM = 5.0, 0.05  # scale of Geman and McClure's weight, by the median residual; and its least
-MET_MM = 10.0  # what is nearer in the end was met
+MET_MM = 10.0  # points nearer at the end count as matched
 MARK_MM = 0.5  # to which a landmark is marked, an axis
 BULGE = 0.75  # of the way to the tangent planes at a triangle's corners, as its authors have it
 CANDIDATES = 16
-ROWS = 6000  # vertices of the model that look for the mesh
+ROWS = 6000  # vertices of the model that are matched
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceMarks:
-    """Holds points of a model's surface, each a mean of three vertices (full level), and their positions on a mesh."""
+    """Holds points on a head model's surface, each a mean of three vertices, and their positions on another mesh."""
 
     rows: Int[np.ndarray, "p 3"]
     weights: Float[np.ndarray, "p 3"]
@@ -61,7 +61,7 @@ class SurfaceMarks:
 
     @classmethod
     def of_landmarks(cls, model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]]) -> "SurfaceMarks":
-        """Returns marks for a person's landmarks; names that the model lacks are ignored."""
+        """Returns marks for a person's landmarks; landmarks that the head model lacks are ignored."""
         known = {model.landmarks[name]: point for name, point in landmarks.items() if name in model.landmarks}
         rows = np.repeat(np.array(list(known), int)[:, None], 3, axis=1)
         return cls(
@@ -72,13 +72,13 @@ class SurfaceMarks:
         )
 
     def on(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "p 3"]:
-        """Returns the points on a head of the model."""
+        """Returns the marks' positions on a head with the given vertices."""
         return np.einsum("pk,pkx->px", self.weights, vertices[self.rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Likeness:
-    """Holds the model fitted to a mesh, and the distances that remain."""
+    """Holds the head model fitted to a mesh, and the distances that remain between them."""
 
     vertices: Float[np.ndarray, "v 3"]  # of the full level, in the frame that the search began in
     distances: Float[np.ndarray, " s"]  # mm, of some vertices of the model from the mesh; inf where nothing was met
@@ -90,8 +90,8 @@ class Likeness:
 def fit_model_to_mesh(
     model: HeadModel, mesh: Surface, marks: SurfaceMarks | None = None, stages: Sequence[Stage] = STAGES
 ) -> Likeness:
-    """Fits shape and pose of the model to a mesh and to marks of that mesh. The mesh must already lie approximately at
-    the mean head's position."""
+    """Fits a head model's shape and pose to a mesh and to marks on that mesh. The mesh must already lie approximately
+    at the mean head's position."""
     wide = with_kernel(model, len(model.modes))
     full, count = model.levels["full"], len(model.modes)
     marks = marks or SurfaceMarks.of_landmarks(model, {})
@@ -140,7 +140,7 @@ def _modes_on(model: HeadModel, marks: SurfaceMarks) -> Float[np.ndarray, "p 3 m
 
 
 class MetSurface:
-    """Holds the mesh to which the model is fitted, with search trees of its surface and of its oriented points."""
+    """Holds the mesh to which the head model is fitted, with search trees by position and by position with normal."""
 
     def __init__(self, mesh: Surface) -> None:
         self._mesh, self._surface = mesh, SurfaceIndex(mesh.vertices, mesh.faces)
@@ -150,8 +150,7 @@ class MetSurface:
     def meet(
         self, points: Float[np.ndarray, "s 3"], normals: Float[np.ndarray, "s 3"], stage: Stage
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Returns, for each point, its closest point on the mesh, the normal there, the distance, and a weight: 0 where
-        the mesh faces another way, is too far, or ends (there the closest point lies sideways)."""
+        """Returns, for each point, its closest point on the mesh, the normal there, the distance, and a weight."""
         places, planes = self._nearest(points, normals, stage.normal_mm)
         apart = places - points
         off = np.linalg.norm(apart, axis=1)

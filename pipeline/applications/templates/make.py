@@ -1,4 +1,4 @@
-"""Makes a template for ``eigenhead template add``. Jobs only ``load`` a template, without these imports."""
+"""Makes a template file for the command ``eigenhead template add``. Jobs with a template do not import this module."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -29,8 +29,8 @@ def make_template(
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
     report: Progress,
 ) -> tuple[Template, Registration]:
-    """Registers the mesh of an OBJ file, or of a FLAME model's file, to a head model. Returns the template and the
-    registration. Raises InputError that lists every fault of the file."""
+    """Registers a mesh to a head model; the mesh comes from an OBJ file or a FLAME model's file. Returns the template
+    and the registration. Raises InputError that lists every fault of the file."""
     flame = read_flame(path) if path.suffix.lower() in SUFFIXES else None
     mesh = read_polygons(path) if flame is None else _polygons(flame)
     found = register(mesh, model, name=path.name, landmarks=landmarks, report=report)
@@ -62,7 +62,7 @@ NAMES = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintr
 
 
 def read_flame(path: Path) -> FlameModel:
-    """Returns the model in a file. Raises InputError that lists every fault."""
+    """Returns the FLAME model stored in a file. Raises InputError that lists every fault."""
     arrays = read_pickled_arrays(path) if path.suffix.lower() == ".pkl" else _archive(path)
     faults = [compose("flame-array-missing", name=name) for name in NAMES if name not in arrays]
     faults = faults or [*_unfit(arrays)] or [*_not_finite(arrays)]
@@ -92,7 +92,7 @@ def _archive(path: Path) -> dict[str, np.ndarray]:
 
 
 def _unfit(arrays: Mapping[str, np.ndarray]) -> Iterable[Message]:
-    """Returns a fault for each array whose shape is not the model's."""
+    """Returns a fault for each array whose shape is not that of a FLAME model."""
     count = len(arrays["v_template"]) if arrays["v_template"].ndim else 0
     wanted = {
         "v_template": (count, 3),
@@ -123,14 +123,14 @@ def _not_finite(arrays: Mapping[str, np.ndarray]) -> Iterable[Message]:
             yield compose("flame-not-finite", name=name)
 
 
-DEEP, WHOLE = (120, 150, 214), (120, 204, 150)  # what follows the skin, and what moves as a whole
+DEEP, WHOLE = (120, 150, 214), (120, 204, 150)  # vertices that follow the skin, and parts that move as a whole
 AZIMUTHS_DEG = (0.0, 55.0)
 
 
 def template_picture(template: Template, found: Registration, model: HeadModel) -> ImageRgb:
-    """Draws a template from the front and the side, in five panels: the original mesh; the model fitted to it; the mesh
-    registered to the model (blue: vertices that follow the skin; green: closed parts that move as a whole); the mesh on
-    the model's mean head; and that mean head."""
+    """Draws five panels, each from the front and the side: the original mesh; the head model fitted to it; the mesh
+    registered to the model (blue: skin vertices; green: closed parts that move as a whole); the mesh on the model's
+    mean head; and that mean head."""
     faces, triangles = model.levels["full"].faces, template.mesh.triangles()
     mean = model.vertices(np.zeros(0))
     kinds = np.tile(np.array(DEEP), (len(found.surface_binding.rest), 1))

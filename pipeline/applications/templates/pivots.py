@@ -1,13 +1,12 @@
-"""Computes the pivots of a head's parts: lower jaw, eyes, neck (head frame: x to the subject's left, y up, z out of the
-face).
+"""Computes the points about which a head's jaw, eyes and neck rotate (head frame: x to the subject's left, y up, z out
+of the face).
 
-- ``jaw``: the middle of the hinge axis, which lies 13 mm from each tragion towards the outer corner of the eye (Beyron
-  1942, the arbitrary hinge axis of dental articulators).
-- ``eye_right``, ``eye_left``: the centre of the mesh's eyeball, or else of a ball of 12 mm radius (an adult's) on
-  which the lid slides when it closes.
-- ``neck``: the joint of skull and spine, 26 mm below and 11 mm behind the middle of the ears' openings (Ewing and
-  Thomas 1972).
-"""
+- ``jaw`` is the middle of the hinge axis, which lies 13 mm from each tragion towards the outer corner of the eye
+  (Beyron 1942, the arbitrary hinge axis of dental articulators).
+- ``eye_right`` and ``eye_left`` are the centres of the mesh's eyeballs; without eyeballs, of balls of 12 mm radius (an
+  adult's) over which the closing lids slide.
+- ``neck`` is the joint of skull and spine, 26 mm below and 11 mm behind the midpoint between the ear openings (Ewing
+  and Thomas 1972)."""
 
 from collections.abc import Mapping
 
@@ -29,12 +28,12 @@ Points = Mapping[str, Float[np.ndarray, " 3"]]
 def pivots(
     landmarks: Points, vertices: Vertices, shapes: Mapping[str, Vertices], balls: list[Float[np.ndarray, "b 3"]]
 ) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns the pivots of a head by name, mm.
+    """Returns the pivots (rotation centres) of a head's parts by name, in the head frame, mm.
 
     Args:
-        landmarks: of the head without expression.
-        vertices: its full level.
-        shapes: displacements of the full level, by Apple's names.
+        landmarks: landmarks of the head without expression.
+        vertices: its finest mesh.
+        shapes: displacements of the finest mesh, by Apple's names.
         balls: vertices of each eyeball of the mesh.
     """
     out = {"jaw": hinge(landmarks)}
@@ -59,7 +58,7 @@ def hinge(landmarks: Points) -> Float[np.ndarray, " 3"]:
 
 
 def _lid_centre(vertices: Vertices, blink: Vertices) -> Float[np.ndarray, " 3"]:
-    """Returns the centre of the eyeball under a lid: the ball that the lid's edge touches both open and closed."""
+    """Returns the centre of the eyeball under a lid: the lid's edge touches this ball both open and closed."""
     moved = np.linalg.norm(blink, axis=1)
     rows = moved > SLIDING * moved.max()
     points = np.concatenate([vertices[rows], vertices[rows] + blink[rows]])
@@ -71,8 +70,8 @@ def _lid_centre(vertices: Vertices, blink: Vertices) -> Float[np.ndarray, " 3"]:
 
 
 def jaw_motions(landmarks: Points, vertices: Vertices, shapes: Mapping[str, Vertices]) -> dict[str, RigidTransform]:
-    """Returns the motion of the lower jaw for each shape that moves it, from the skin over the chin: ``jawOpen``
-    rotates about the hinge axis, the others shift."""
+    """Returns the rigid motion of the lower jaw for each blendshape that moves it, estimated from the skin over the
+    chin: ``jawOpen`` rotates about the hinge axis, the others translate."""
     chin = np.linalg.norm(vertices - landmarks["gnathion"], axis=1) < CHIN_MM
     before, out = vertices[chin].mean(axis=0), {}
     for name in ("jawForward", "jawLeft", "jawRight"):
@@ -88,7 +87,7 @@ def jaw_motions(landmarks: Points, vertices: Vertices, shapes: Mapping[str, Vert
 
 
 def in_mouth(landmarks: Points, points: Float[np.ndarray, "n 3"]) -> bool:
-    """Tells whether a part of a mesh lies in the lower half of the mouth, like teeth and tongue on the jaw."""
+    """Returns whether a part of a mesh lies in the lower half of the mouth, as lower teeth and tongue do."""
     centre, wide = points.mean(axis=0), landmarks["cheilion_left"][0] - landmarks["cheilion_right"][0]
     low, high, middle = landmarks["gnathion"][1], landmarks["stomion"][1], landmarks["stomion"][0]
     inside = low < centre[1] < high and abs(centre[0] - middle) < wide

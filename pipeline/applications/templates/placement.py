@@ -1,9 +1,9 @@
-"""Finds the placement of a foreign mesh: head_from_template, a similarity, from landmarks or by a search.
+"""Finds head_from_template, the similarity transform that places another program's mesh in the head frame, from
+landmarks or by a search.
 
-The search tries millimetres, centimetres, decimetres and metres, every convention of axes, and three starts for each.
-It then iterates closest points (Besl and McKay 1992; with Umeyama's scale) from the model's surface to the mesh, so
-other parts of the mesh (teeth, eyeballs, shoulders) have no effect.
-"""
+The search tries millimetres, centimetres, decimetres and metres, every orientation of the axes, and three start
+positions for each combination. Iterated closest points (Besl and McKay 1992; with Umeyama's scale) from the head
+model's surface to the mesh then refine the transform; teeth, eyeballs or shoulders of the mesh have no effect."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,19 +23,19 @@ from rig.messages.message import compose
 
 UNITS = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0}
 EXTENT_MM = (110.0, 750.0)  # of a face alone, and of a bust
-COARSE, FINE = 400, 3000  # points of the model that look for the mesh
+COARSE, FINE = 400, 3000  # points of the model that are matched
 SAMPLES = 20_000  # of the mesh's points that are found
 COARSE_STEPS, FINE_STEPS = 8, 30
-TRIED = 4  # coarse places that are looked at closely
-NORMAL_MM = 20.0  # what a normal that is off by a unit counts
-FAR_MM = 20.0  # no place is worse
+TRIED = 4  # coarse placements that are refined
+NORMAL_MM = 20.0  # distance that equals a unit difference of normals
+FAR_MM = 20.0  # distances are clipped here
 SCALE_RANGE = (0.7, 1.45)  # of adults' and children's heads by the model's
-UNLIKE_MM = 8.0  # mean distance of the face beyond which a place is none
+UNLIKE_MM = 8.0  # mean distance of the face beyond which a placement is rejected
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Holds a triangle mesh with unit vertex normals; in mm once it has been placed."""
+    """Holds a triangle mesh with unit vertex normals; lengths are in mm after placement in the head frame."""
 
     vertices: Float[np.ndarray, "t 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -43,16 +43,16 @@ class Surface:
 
     @classmethod
     def of(cls, vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> "Surface":
-        """Returns the mesh with its normals."""
+        """Returns the mesh with computed vertex normals."""
         return cls(vertices, faces, vertex_normals(vertices, faces))
 
     def placed(self, place: Similarity) -> "Surface":
-        """Returns the surface moved by a similarity."""
+        """Returns the mesh transformed by a similarity."""
         return Surface(place.apply(self.vertices), self.faces, self.normals @ place.rotation.T)
 
 
 def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> Surface:
-    """Returns the mesh with its normals; if its faces point inwards, all of them are flipped."""
+    """Returns the mesh with computed vertex normals; if its faces point inwards, all of them are flipped."""
     corners = vertices[faces] - vertices[np.unique(faces)].mean(axis=0)
     if np.einsum("fx,fx->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
         faces = faces[:, ::-1]
@@ -60,8 +60,8 @@ def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -
 
 
 def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]], name: str) -> Similarity:
-    """Computes head_from_template from at least four landmarks of the mesh. Raises InputError, whose message begins
-    with the mesh's ``name``, if there are fewer or they determine no placement."""
+    """Computes head_from_template from at least four landmarks in the mesh's frame. Raises InputError, which begins
+    with the mesh's ``name``, if the landmarks do not suffice."""
     names = [each for each in landmarks if each in model.landmarks]
     if len(names) < 4:
         raise InputError(name, [compose("template-landmarks-too-few", count=len(names), names=names or ["none"])])
@@ -73,8 +73,8 @@ def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarra
 
 
 def find_place(model: HeadModel, mesh: Surface, name: str) -> Similarity:
-    """Finds head_from_template by a search over units, axes and closest points. Raises InputError if the mesh does
-    not resemble a head."""
+    """Finds head_from_template by a search over units, axes and start positions. Raises InputError if the mesh does not
+    resemble a head."""
     used = mesh.vertices[np.unique(mesh.faces)]
     extent = float(np.ptp(used, axis=0).max())
     factors = [f for f in UNITS.values() if EXTENT_MM[0] < extent * f < EXTENT_MM[1]]
@@ -104,8 +104,8 @@ def find_place(model: HeadModel, mesh: Surface, name: str) -> Similarity:
 
 
 def _model_points(model: HeadModel, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns points of the model without its neck, their normals, and their weights. Points of the face weigh most,
-    because the mesh may be only a mask."""
+    """Returns points on the head model without its neck, their normals, and their weights. Points of the face have the
+    largest weight, because the mesh may consist of a face alone."""
     vertices, regions = model.vertices(np.zeros(0)), head_regions(model)
     rows = np.flatnonzero(~regions["neck"])
     rows = rows[:: max(1, len(rows) // count)]
@@ -114,7 +114,7 @@ def _model_points(model: HeadModel, count: int) -> tuple[np.ndarray, np.ndarray,
 
 
 def samples(mesh: Surface) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Returns points of a mesh and the unit normals there: its used vertices, and the middles of its faces."""
+    """Returns points of a mesh and the unit normals there: its used vertices, and the centres of its faces."""
     middle = mesh.vertices[mesh.faces].mean(axis=1)
     normal = mesh.normals[mesh.faces].sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
@@ -135,7 +135,7 @@ def _axis_turns() -> list[Float[np.ndarray, "3 3"]]:
 def _starts(
     model: HeadModel, points: np.ndarray, turned: Similarity, used: Float[np.ndarray, "t 3"]
 ) -> list[Similarity]:
-    """Returns three poses that bring the mesh's nose, crown or middle to that of the model."""
+    """Returns three transforms that bring the mesh's nose, crown or centre to that of the head model."""
     here, ours = turned.apply(used), model.vertices(np.zeros(0))
     low, high = here.min(axis=0), here.max(axis=0)
     nose, crown = here[here[:, 2].argmax()], np.array([*(low + high)[[0]] / 2, high[1], (low + high)[2] / 2])
@@ -156,9 +156,9 @@ def _closest_points(
     place: Similarity,
     steps: int,
 ) -> tuple[float, Similarity]:
-    """Refines a pose by iterated closest points. Returns the least weighted mean distance (mm, each at most ``FAR_MM``)
-    of the model's points from the mesh, and the pose. ``tree`` holds the mesh's points times ``factor``, and their
-    normals."""
+    """Refines a similarity by iterated closest points. Returns the smallest weighted mean distance (mm, clipped at
+    ``FAR_MM``) of the head model's points from the mesh, and the similarity. ``tree`` is a search tree over the mesh's
+    points, scaled by ``factor``, with their normals."""
     start = place.scale
     found = (FAR_MM, place)
     for step in range(steps + 1):

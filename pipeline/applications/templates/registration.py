@@ -1,9 +1,9 @@
-"""Registers a foreign mesh to a head model once (section 3.2 in the opposite direction).
+"""Registers another program's mesh to a head model once, so that the mesh can deform with fitted heads.
 
-The model is fitted to the mesh as closely as possible (``fit_model_to_mesh``). Then ``geometry.registration.nonrigid``
-deforms the mesh's skin onto that head, so that their difference does not appear in results. Every skin vertex now has
-its point on the model's surface, and deeper ones follow (``carrying``).
-"""
+The head model is fitted to the mesh as closely as possible (``fit_model_to_mesh``). Then
+``geometry.registration.nonrigid`` deforms the mesh's skin onto the fitted head, so that the difference between mesh and
+fitted head does not appear in results. Finally, every skin vertex gets its point on the head model's surface, and
+deeper vertices follow the skin (``carrying``)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -52,13 +52,13 @@ class NotRegistered(InputError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """Holds a mesh bound to a model's surface, and figures of how well it fits."""
+    """Holds a mesh bound to a head model's surface, and figures that measure how well it fits."""
 
     surface_binding: SurfaceBinding
     placed: Vertices  # the mesh at its first place in the head frame, in its own shape, mm
-    head: Float[np.ndarray, "v 3"]  # the model as like it as it can be, full level, mm
-    off_mm: Float[np.ndarray, " n"]  # skin to that head, after the mesh was drawn to it
-    unlike_mm: Float[np.ndarray, " n"]  # and before
+    head: Float[np.ndarray, "v 3"]  # the model fitted to it, finest mesh, mm
+    off_mm: Float[np.ndarray, " n"]  # distance of the skin from that head after the deformation
+    unlike_mm: Float[np.ndarray, " n"]  # the same before the deformation
     covered: float  # share of the model's face region that the mesh shows
 
     def figures(self) -> dict[str, float]:
@@ -82,13 +82,13 @@ def register(
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
     report: Progress,
 ) -> Registration:
-    """Registers a mesh to a model: places it, fits the model to it, deforms the mesh onto that head, and binds it.
+    """Registers a mesh to a head model: places the mesh, fits the model to it, deforms the mesh onto the fitted head,
+    and binds it.
 
     ``mesh``: in any unit and with any axes. ``model``: the head model. ``name``: name of the mesh, for messages.
     ``landmarks``: landmarks in the mesh's frame; None searches for the placement. ``report``: progress.
 
-    Raises InputError if the mesh is no head, and NotRegistered if the model cannot follow it.
-    """
+    Raises InputError if the mesh is no head, and NotRegistered if the head model cannot follow its shape."""
     report("placing", 0.0)
     surface = outward(mesh.vertices, mesh.triangles())
     place = place_by_landmarks(model, landmarks, name) if landmarks else find_place(model, surface, name)
@@ -122,8 +122,8 @@ def register(
 
 
 def _check(like: Likeness, name: str, *, marked: bool) -> float:
-    """Returns the fraction of the face region's area that the mesh covers. Raises NotRegistered if it covers too little
-    or differs too much; with landmarks an unusual shape is allowed."""
+    """Returns the fraction of the face region's area that the mesh covers. Raises NotRegistered if the fraction is too
+    small or the shape too unusual; with landmarks an unusual shape is allowed."""
     met, area = np.isfinite(like.distances), np.where(like.in_face, like.areas, 0.0)
     covered = float(area[met].sum() / area.sum())
     faults = []
@@ -140,11 +140,10 @@ def _check(like: Likeness, name: str, *, marked: bool) -> float:
 
 
 def weld(mesh: Surface) -> tuple[Surface, Int[np.ndarray, " t"]]:
-    """Joins vertices at the same position along open borders, because files cut surfaces along texture seams. Returns
-    the mesh and the new index of each old vertex.
+    """Joins vertices at the same position along open borders, because mesh files cut surfaces along texture seams.
+    Returns the mesh and the new index of each old vertex.
 
-    Lashes stay separate parts, because the lid has no border at their roots.
-    """
+    Lashes remain separate parts, because the lid has no border at their roots."""
     ends = np.zeros(len(mesh.vertices), bool)
     ends[boundary_edges(mesh.faces)] = True
     identity = np.where(ends, -1, np.arange(len(ends)))[:, None]
@@ -158,7 +157,7 @@ def weld(mesh: Surface) -> tuple[Surface, Int[np.ndarray, " t"]]:
 
 
 def components(mesh: Surface) -> Int[np.ndarray, " t"]:
-    """Returns the index of the connected part that each vertex belongs to."""
+    """Returns the index of the connected part to which each vertex belongs."""
     return connected_components(_graph(mesh.faces, len(mesh.vertices)), directed=False)[1]
 
 
@@ -168,8 +167,8 @@ def _graph(faces: Int[np.ndarray, "f 3"], count: int) -> sparse.csr_array:
 
 
 def skin_parts(mesh: Surface, parts: Int[np.ndarray, " t"], head: Surface) -> Bool[np.ndarray, " p"]:
-    """Tells which connected parts of the mesh are skin: those near the head, facing the same way, over a large enough
-    fraction of its area."""
+    """Returns a mask of the mesh's connected parts that are skin: a large enough fraction of their area is near the
+    head and faces the same way."""
     rows = slice(None, None, max(1, len(head.vertices) // 6000))
     hits = SurfaceIndex(mesh.vertices, mesh.faces).closest(head.vertices[rows], CANDIDATES, facing=head.normals[rows])
     part = parts[mesh.faces[hits.triangles, 0]]
@@ -179,7 +178,7 @@ def skin_parts(mesh: Surface, parts: Int[np.ndarray, " t"], head: Surface) -> Bo
 
 
 def balls(mesh: Surface, parts: Int[np.ndarray, " t"], among: Bool[np.ndarray, " p"]) -> Int[np.ndarray, " t"]:
-    """Returns, for each vertex, the index of the closed, round part that it belongs to, among the parts ``among``; -1
+    """Returns, for each vertex, the index of its closed, round part (such as an eyeball) out of the parts ``among``; -1
     for all other vertices."""
     closed = among.copy()
     closed[parts[boundary_edges(mesh.faces).ravel()]] = False
@@ -200,8 +199,8 @@ def _used(mesh: Surface) -> Flags:
 def parting(
     attachment: Attachment, rest: Vertices, skin: Flags, faces: Int[np.ndarray, "f 3"], model: HeadModel
 ) -> Flags:
-    """Tells which vertices move away from their neighbours on at least one random head. Such vertices were attached to
-    another layer of the surface, such as the inside of a lid or the eyeball."""
+    """Returns a mask of the vertices that move away from their neighbours on at least one random head. A vertex that
+    does was attached to the wrong layer of the surface, such as the inside of a lid or the eyeball."""
     graph = _graph(faces[skin[faces].all(axis=1)], len(rest))
     graph = sparse.csr_array(((graph + graph.T) > 0).astype(float))
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)[:, None]
@@ -214,8 +213,8 @@ def parting(
 
 
 def without_edge(skin: Flags, faces: Int[np.ndarray, "f 3"]) -> Flags:
-    """Returns the skin without its vertices next to deeper parts. Where a lid turns inwards, it is chance which of
-    these vertices still match the model's lid; without all of them the deeper parts follow evenly."""
+    """Returns the mask of skin vertices without those next to deeper parts. Where a lid turns inwards, vertices at the
+    edge of the skin match the head model's lid only by chance, so deeper parts would follow the skin unevenly."""
     out = skin.copy()
     for _ in range(EDGE_RINGS):
         out[faces[~out[faces].all(axis=1)]] = False
@@ -231,8 +230,8 @@ def without_specks(mask: Flags, faces: Int[np.ndarray, "f 3"]) -> Flags:
 
 
 def _drawn(mesh: Surface, skin: Flags, head: Surface, marks: Sequence[tuple[np.ndarray, np.ndarray]]) -> Vertices:
-    """Returns the mesh's vertices with the skin deformed onto the head, and its landmarks onto the head's; other parts
-    stay."""
+    """Returns the mesh's vertices after its skin was deformed onto the head, and its landmarks onto the head's
+    landmarks; other parts do not move."""
     rows = np.flatnonzero(skin)
     place = np.full(len(skin), -1)
     place[rows] = np.arange(len(rows))
@@ -249,7 +248,7 @@ def _drawn(mesh: Surface, skin: Flags, head: Surface, marks: Sequence[tuple[np.n
 
 
 def _followed(before: Vertices, after: Vertices, skin: Flags) -> Vertices:
-    """Returns ``after`` for the skin; all other vertices move from ``before`` smoothly with the skin around them."""
+    """Returns ``after`` for skin vertices; other vertices move from ``before`` smoothly with the skin around them."""
     rows = np.flatnonzero(skin)
     rows = rows[spread_nodes(before[rows], min(400, len(rows)))]
     out = after.copy()

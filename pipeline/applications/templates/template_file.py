@@ -43,8 +43,8 @@ CARRIER = {"rest": "f", "skin": "i", "anchors": "i", "wholes": "i", "whole_ancho
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Template(TemplateHeader):
-    """Holds a mesh registered to a head model. ``mesh.vertices`` is ``surface_binding.rest``; ``flame``: the FLAME
-    model, if the mesh came from one."""
+    """Holds a mesh registered to a head model. ``mesh.vertices`` equals ``surface_binding.rest``; ``flame`` is the
+    FLAME model, if the mesh came from one."""
 
     mesh: PolygonMesh
     surface_binding: SurfaceBinding
@@ -81,7 +81,7 @@ def _stored(kind: str) -> type:
 
 
 def read_template(path: Path) -> Template:
-    """Returns a template from its file. Raises BadTemplate."""
+    """Reads a template from its file. Raises BadTemplate."""
     try:
         with open_npz(path) as file:
             meta = read_meta(path, file)
@@ -124,7 +124,7 @@ def _template(meta: dict, arrays: Mapping[str, np.ndarray], flame: FlameModel | 
 
 
 def _check(path: Path, template: Template) -> None:
-    """Raises BadTemplate if rows or numbers of the file are invalid; otherwise a job would fail only at its end."""
+    """Raises BadTemplate if indices or numbers of a template file are invalid, before a job uses the file."""
     mesh, surface_binding = template.mesh, template.surface_binding
     count = len(surface_binding.rest)
     rows = (mesh.corners, surface_binding.skin, surface_binding.anchors, surface_binding.whole_anchors)
@@ -145,10 +145,9 @@ def _check(path: Path, template: Template) -> None:
 
 
 def load_template(name: str | None, model: HeadModel) -> Template | None:
-    """Loads the named template for a job with this model; returns None if ``name`` is None.
+    """Loads the named template for a job with the head model ``model``; returns None if ``name`` is None.
 
-    Raises UnknownTemplate, BadTemplate, OtherModel.
-    """
+    Raises UnknownTemplate, BadTemplate, OtherModel."""
     if name is None:
         return None
     template = read_template(template_path(name))

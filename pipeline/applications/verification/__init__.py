@@ -1,2 +1,2 @@
-"""Judges whether a result is correct, and whether it is repeatable. In: meshes and landmarks, from any program. Out:
-judgements."""
+"""Judges whether a reconstruction result is correct and repeatable. The input is meshes and landmarks, from any
+program. The output is the error figures and whether they are within limits."""

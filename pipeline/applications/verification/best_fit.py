@@ -1,11 +1,11 @@
-"""Aligns a measured head to its reference by a rigid motion: least squares of the distances to the surface.
+"""Aligns a measured head to its reference scan by the rigid motion that minimises the squared distances to the surface.
 
-The reference has a frame of its own. The motion starts from landmarks if both have them. Otherwise it starts from a
-search: rotations spread over all directions, with the head's middle at the middles of parts of the scan. The start with
-the best fit of the face wins. Steps on distances along the reference's normals over the face, weighted by area,
-complete the motion (``pipeline.geometry.registration``). This is the standard's best fit, in which size is not
-corrected. The size error is then found by the same steps with a scale, and reported.
-"""
+The reference scan may be in any frame. The motion starts from landmarks if head and scan both have them. Otherwise many
+starts are tried: rotations in all directions, with the head's centre at the centres of parts of the scan. The start
+with the best fit of the face is chosen. Gauss-Newton steps on the distances along the reference's normals over the
+face, weighted by area, refine the motion (``pipeline.geometry.registration``). This is the best fit of the standard
+VDI/VDE 2634, which does not correct size. The size error is then estimated by the same steps with a scale, and only
+reported."""
 
 from dataclasses import dataclass
 
@@ -29,10 +29,10 @@ from pipeline.head_model.landmarks import stacked
 from rig.errors import InputError
 from rig.geometry import RigidTransform, Similarity, rigid_fit
 
-FAR_MM = 10.0  # from the reference: what is farther off has no counterpart on it
+FAR_MM = 10.0  # from the reference: farther points have no match on it
 POINTS = 2000  # of the face, for the fit: six numbers need no more
 PARTS = 4  # of the scan: shoulders or a stand move its middle away from the head's
-FEW = 300  # of these points, for telling starts apart
+FEW = 300  # of these points, to compare starts
 MIN_MARKS = 3
 MIN_COVERED = 0.3  # share of the face that must not lie at the scan's rim
 MIN_POINTS = 42  # with a counterpart: six to each unknown of a similarity
@@ -46,7 +46,7 @@ class BestFit:
     """Holds the rigid motion that aligns a head to its reference.
 
     ``start`` is "landmarks" or "search". ``rms_mm`` is the RMS distance after the rigid motion, over the ``points``
-    that have a counterpart on the reference. ``scale`` is the size of the measured head relative to the reference, 1 if
+    that have a match on the reference. ``scale`` is the size of the measured head relative to the reference, 1 if
     correct.
     """
 
@@ -59,7 +59,7 @@ class BestFit:
 
 def best_fit(measured: Measured, reference: Reference) -> BestFit:
     """Finds the rigid motion that aligns the face of a measured head to the reference. Raises InputError if the
-    reference is no scan of this head."""
+    reference is not a scan of this head."""
     face = measured.regions["face"]
     rng = np.random.default_rng(0)
     count = min(POINTS, int(face.sum()))
@@ -84,7 +84,7 @@ def best_fit(measured: Measured, reference: Reference) -> BestFit:
 
 
 def counted(hits: Hits, reference: Reference) -> Bool[np.ndarray, " n"]:
-    """Tells which closest points are valid counterparts: near enough, and not at an open edge of the scan."""
+    """Returns a mask of the closest points that are valid matches: near enough, and not at an open edge of the scan."""
     return (hits.distances < FAR_MM) & ~reference.beside(hits)
 
 
@@ -96,11 +96,11 @@ def _refined(
     *,
     free_scale: bool,
 ) -> tuple[Similarity, float, int]:
-    """Refines a motion by Gauss-Newton. Returns the motion, the RMS distance (mm) and the number of points with a
-    counterpart. Far points weigh less at first (Geman and McClure), and equally in the end.
+    """Refines a motion by Gauss-Newton steps. Returns the motion, the RMS distance (mm) and the number of matched
+    points. Distant points have less weight in the first steps (Geman and McClure), and the same weight in the last.
 
-    A point far from the scan counts in the RMS as ``FAR_MM`` off, so a fit to a small part of the scan does not win.
-    """
+    In the RMS, a point far from the scan counts as ``FAR_MM`` away, so that a fit to a small part of the scan is not
+    chosen."""
 
     def meet(_: Similarity, there: Float[np.ndarray, "n 3"], reach: float) -> Counterparts | None:
         hits = reference.index.closest(there)
@@ -123,8 +123,8 @@ def _refined(
 
 
 def _searched(measured: Measured, reference: Reference, rng: np.random.Generator) -> list[Similarity]:
-    """Returns the best starting motions among all rotations: many are tried briefly with few points, then the better
-    ones longer with more."""
+    """Returns the best starting motions among all rotations: many are tried with few points and iterations, then the
+    better ones with more."""
     head = np.flatnonzero(~measured.regions["neck"])
     chosen = head[draw_rows(measured.areas[head], ROUNDS[-1].points, rng)]
     surface, facing = draw_surface_points(reference.index, rng)

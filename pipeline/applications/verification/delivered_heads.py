@@ -1,16 +1,16 @@
-"""Reads the heads of many results of one model, and builds a new model from them and their stated standard deviations.
+"""Reads the heads of many results made with one head model, and builds a new model from them and their standard
+deviations.
 
-The heads already have their model's topology, so no correspondence is needed. The model that made them is the prior
+The heads already have the model's vertices and triangles, so no correspondence is needed. The old model is the prior
 population; shapes outside its span come from the heads. Topology, landmarks and expressions stay the same, so the new
-model is used like the old one.
+model can replace the old one.
 
-The observed heads update the population, each vertex according to its accuracy. Mean and covariance have a
-normal-inverse-Wishart prior from the known population (K. Murphy, *Conjugate Bayesian analysis of the Gaussian
-distribution*, 2007, section 8), which counts as a stated number of heads. Heads have errors. So each head is replaced
-by its expected shape in the population, given its standard deviations, together with the covariance of that
-expectation: a step of expectation maximisation for a Gaussian with known noise. Without this step, errors where a rig
-sees nothing would count as variation of people.
-"""
+The heads update the population, each vertex according to its accuracy. Mean and covariance have a
+normal-inverse-Wishart prior from the old model (K. Murphy, *Conjugate Bayesian analysis of the Gaussian distribution*,
+2007, section 8), which counts as a given number of heads. The reconstructed heads contain errors. Each head is
+therefore replaced by its expected shape in the population, given its standard deviations, together with the covariance
+of this shape: a step of expectation maximisation for a Gaussian with known noise. Without this step, errors in places
+that a rig's cameras cannot see would count as variation between people."""
 
 import os
 from dataclasses import dataclass, replace
@@ -40,7 +40,7 @@ MIN_DEVIATION_MM = 0.05  # no vertex is known better
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Population:
-    """Holds a Gaussian of heads (mm): mean and orthogonal modes, one standard deviation each."""
+    """Holds a Gaussian distribution of heads (mm): the mean and orthogonal modes, scaled to one standard deviation."""
 
     mean: Float[np.ndarray, "V 3"]
     modes: Float[np.ndarray, "M V 3"]
@@ -48,7 +48,7 @@ class Population:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Delivered:
-    """Holds N heads without expression in the head frame of their model, mm, at true size."""
+    """Holds N heads without expression in the head frame, mm, at true size."""
 
     names: tuple[str, ...]
     cages: Float[np.ndarray, "N V0 3"]
@@ -56,8 +56,8 @@ class Delivered:
 
 
 def updated_model(parts: ModelParts, delivered: Delivered, *, name: str, report: Progress) -> ModelParts:
-    """Returns the model that ``parts`` becomes by heads that it made. Its figures have the mean distance of a face from
-    the modes before and after (mm), each head held out once."""
+    """Returns the head model ``parts`` after it was updated with heads that were reconstructed with it. Its figures
+    include the mean distance (mm) between a face and the modes' span before and after, with each head held out once."""
     known = Population(parts.mean.astype(float), parts.modes.astype(float))
     weights = above_neck(known.mean, parts.landmarks)
     heads = np.array([rigid_fit(head, known.mean, weights).apply(head) for head in delivered.cages])
@@ -82,8 +82,8 @@ def updated_model(parts: ModelParts, delivered: Delivered, *, name: str, report:
 def held_out_mm(
     known: Population, heads: Float[np.ndarray, "N V 3"], face: Bool[np.ndarray, " V"]
 ) -> tuple[float, float]:
-    """Computes the mean distance (mm, over the face) of each head to the nearest of the first 60 modes of the known
-    population, and of that updated by all other heads."""
+    """Computes the mean distance (mm, over the face) of each head from the span of the first 60 modes, for the known
+    population and for one updated with all other heads."""
     far = [
         [_nearest_mm(population, heads[k], face) for population in (known, pooled(known, np.delete(heads, k, axis=0)))]
         for k in range(len(heads))
@@ -107,7 +107,7 @@ def updated(
     *,
     report: Progress = discard_progress,
 ) -> Components:
-    """Returns the population updated by N observed heads, which are aligned to its mean.
+    """Returns the population updated with N observed heads, which are aligned to its mean.
 
     ``deviation_mm`` is the standard deviation of each vertex along an axis, above zero. ``scores`` are those of the
     heads' average in the new modes."""
@@ -126,8 +126,8 @@ def updated(
 def pooled(
     known: Population, heads: Float[np.ndarray, "N V 3"], spread: Float[np.ndarray, "S V 3"] | None = None
 ) -> Population:
-    """Returns the posterior mean of the population. The rows of ``spread`` are the square root of the additional
-    covariance of the heads, summed over all heads."""
+    """Returns the posterior mean of the population's mean and covariance. The rows of ``spread`` are a square root of
+    the heads' additional covariance, summed over all heads."""
     count, average = len(heads), heads.mean(axis=0)
     mean = (count * average + MEAN_HEADS * known.mean) / (count + MEAN_HEADS)
     between = np.sqrt(count * MEAN_HEADS / (count + MEAN_HEADS)) * (average - known.mean)
@@ -139,8 +139,8 @@ def pooled(
 def _expected(
     population: Population, heads: Float[np.ndarray, "N V 3"], deviation_mm: Float[np.ndarray, "N V"]
 ) -> tuple[Float[np.ndarray, "N V 3"], Float[np.ndarray, "M V 3"]]:
-    """Returns the expected shape of each head, given the population and its standard deviations, and the square root of
-    the summed covariance."""
+    """Returns the expected shape of each head, given the population and the head's standard deviations, and a square
+    root of the summed covariance of these shapes."""
     count, vertices = population.modes.shape[:2]
     weight = np.sqrt(min(1.0, PATCHES / vertices)) / deviation_mm
     coefficients, covariance = np.zeros((len(heads), count)), np.zeros((count, count))
@@ -155,10 +155,10 @@ def _expected(
 
 
 def build_from_results(folder: Path, out: Path, *, name: str, report: Progress = discard_progress) -> Built:
-    """Builds a model from all results below ``folder`` and saves it as ``out``. Results whose warnings doubt the head
-    are left out.
+    """Builds a model from all results in or below ``folder`` and saves it as ``out``. Results with warnings that
+    question the head are left out.
 
-    Raises InputError, naming every fault, if results are damaged or of several models, or fewer than 3 are sound."""
+    Raises InputError with all faults, if results are damaged or of several models, or if fewer than 3 remain."""
     folders = find_results(folder)
     parts = _model_of(folder, folders)
     delivered, skipped = read_delivered(folder, folders, assemble(parts, ""), report=report)
@@ -171,8 +171,8 @@ def build_from_results(folder: Path, out: Path, *, name: str, report: Progress =
 
 
 def find_results(folder: Path) -> tuple[Path, ...]:
-    """Returns the folders of all results in or below ``folder``, in order; links are followed, each counts once.
-    Raises InputError if there is none."""
+    """Returns the folders of all results in or below ``folder``, sorted; links are followed, and each result is listed
+    once. Raises InputError if there is no result."""
     places: dict[str, Path] = {}
     for place, below, _ in os.walk(folder, followlinks=True):
         if places.setdefault(os.path.realpath(place), Path(place)) != Path(place):
@@ -186,8 +186,8 @@ def find_results(folder: Path) -> tuple[Path, ...]:
 def read_delivered(
     folder: Path, folders: tuple[Path, ...], model: HeadModel, *, report: Progress = discard_progress
 ) -> tuple[Delivered, dict[str, Message]]:
-    """Reads results that ``model`` made. Returns the heads, and the reasons for left-out results, by their path below
-    ``folder``. Raises InputError naming every damaged result."""
+    """Reads results that were made with ``model``. Returns the heads, and the reasons why results were left out, by
+    their path below ``folder``. Raises InputError that lists every damaged result."""
     names, points, deviations, skipped, faults = [], [], [], {}, []
     for k, place in enumerate(folders):
         name = place.relative_to(folder).as_posix() if place != folder else place.name
@@ -212,7 +212,7 @@ def read_delivered(
 
 
 def _model_of(folder: Path, folders: tuple[Path, ...]) -> ModelParts:
-    """Returns the one model that made all results. Raises InputError."""
+    """Returns the one head model with which all results were made. Raises InputError."""
     made: dict[tuple[str, str], list[str]] = {}
     for place, identity in zip(folders, map(identity_of, folders), strict=True):
         made.setdefault((identity.model, identity.sha256), []).append(place.relative_to(folder).as_posix())
@@ -227,7 +227,7 @@ def _model_of(folder: Path, folders: tuple[Path, ...]) -> ModelParts:
 
 
 def _neutral_points(model: HeadModel, measured: Measured) -> Float[np.ndarray, "V0 3"]:
-    """Returns the surface points at the cage's vertices, without the expression, in the head frame."""
+    """Returns the head's surface points at the coarsest mesh's vertices, without the expression (head frame, mm)."""
     count = len(model.mean)
     known = {name: weight for name, weight in measured.expression.items() if name in model.expressions.names}
     moved = (model.levels["full"].operator @ model.expressions.moved(known))[:count]

@@ -1,25 +1,26 @@
-"""Computes the figures of a verification after VDI/VDE 2634 part 3, with a mannequin in place of its spheres.
+"""Computes the figures of a verification after the standard VDI/VDE 2634 part 3, with a mannequin head in place of the
+standard's spheres.
 
-Deviations are signed distances (mm, positive outside) from the reference to a measured head's vertices after the best
-fit, weighted by the area of each vertex. Vertices whose closest point lies at the rim of the scan, or farther than 10
-mm, are not judged; the remaining fraction is reported.
+Deviations are signed distances (mm, positive outside) from the reference scan to a measured head's vertices after the
+best fit, weighted by vertex area. Vertices are not judged if their closest point lies at the scan's open edge or
+farther than 10 mm away; the fraction of judged area is reported.
 
-- probing error, form: the range of the deviations of 99.7 % of the face's area;
-- probing error, size: the best-fit scale minus 1, in percent;
-- distance error: distances between landmarks, measured minus reference. No alignment is needed for it;
-- repeatability: scatter of the heads over the captures (``repeatability``). The limit applies to the scatter along the
-  normal, because a vertex's position along the surface does not matter here;
-- error by region: mean, RMS, median and 95th percentile, and the part common to all captures (``repeated``).
+- The probing error of form is the range that contains the deviations of 99.7 % of the face's area.
+- The probing error of size is the scale of the best fit minus 1, in percent.
+- The distance error compares distances between landmarks: measured minus reference. Distances between landmarks need no
+  alignment.
+- The repeatability is the scatter of the heads over repeated captures (``repeatability``). The limit of repeatability
+  applies to the scatter along the normal, because sliding of a vertex along the surface does not change the shape.
+- Errors by region are mean, RMS, median and 95th percentile, also of the mean deviation over all captures
+  (``repeated``).
 
-Repeatability is the scatter of heads of one subject that was shot several times. All heads have the model's own
-vertices, so each vertex is compared with itself. Rigid motions, without scale, remove the subject's position: each head
-is aligned to the mean of all over the given vertices, and the mean is computed anew (generalised Procrustes analysis
-without scale; Gower 1975, https://doi.org/10.1007/BF02291478).
+Repeatability is computed from heads of one subject captured several times. All heads have corresponding vertices, which
+are compared. The heads are aligned by rigid motions, without scale, to their mean over the given vertices, and the mean
+is recomputed (generalised Procrustes analysis without scale; Gower 1975, https://doi.org/10.1007/BF02291478).
 
-The default limits are about one and a half times the values of the simulated studio with a bare mannequin from outside
-the model's population (tests/laboratory/notes/verification.md). A sound rig passes, and a rig with a lasting fault does
-not.
-"""
+The default limits are about one and a half times the values that a bare mannequin from outside the head model's
+population gives in the simulated studio (tests/laboratory/notes/verification.md). Rigs without faults pass, and rigs
+with a permanent fault do not."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -37,7 +38,7 @@ from rig.errors import InputError
 from rig.geometry import rigid_fit
 from rig.mesh import vertex_normals
 
-ROUNDS = 20  # of laying on and averaging; three are usual
+ROUNDS = 20  # of aligning and averaging; three are usual
 STILL_MM = 1e-7  # a mean that moves by less is the mean
 
 FORM_SHARE = 0.997  # of the area; the rest are outliers, as three of a thousand points
@@ -48,8 +49,7 @@ MIN_FACING = 0.5  # share of the judged face where both surfaces face the same w
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Holds the limit of each figure of a verification: the largest value allowed, except for ``least_covered``, which
-    is the smallest."""
+    """Holds the limit of each verification figure: the largest allowed value, for ``least_covered`` the smallest."""
 
     face_rms_mm: float = 0.35  # deviation from the reference, of any capture
     features_rms_mm: float = 0.8  # the same of eyes, nose and mouth, the worst of them
@@ -62,8 +62,8 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Holds a figure and its limit. ``value`` and ``passed`` are None if the captures or the reference do not provide
-    the figure."""
+    """Holds one figure of a verification with its limit. ``value`` and ``passed`` are None if captures and reference do
+    not allow the figure to be computed."""
 
     name: str
     value: float | None
@@ -72,7 +72,7 @@ class Check:
 
 
 def checks(limits: Limits, values: Mapping[str, float | None]) -> tuple[Check, ...]:
-    """Returns a check for every limit; ``values`` are the figures by the limits' names."""
+    """Returns one check for each limit; ``values`` are the figures by the names of the limits."""
     found = []
     for field in fields(limits):
         limit, value = getattr(limits, field.name), values[field.name]
@@ -83,7 +83,8 @@ def checks(limits: Limits, values: Mapping[str, float | None]) -> tuple[Check, .
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scatter:
-    """Holds the scatter of each vertex over several shots of one subject: standard deviations (mm) about the mean head.
+    """Holds the scatter of each vertex over several captures of one subject: standard deviations (mm) from the mean
+    head.
 
     ``position_mm`` is over all three directions together, ``normal_mm`` along the mean head's normal. The mean head has
     the pose of the first head.
@@ -96,11 +97,11 @@ class Scatter:
     def figures(
         self, stated_mm: Float[np.ndarray, " v"], weights: Float[np.ndarray, " v"], kept: Bool[np.ndarray, " v"]
     ) -> dict[str, float]:
-        """Returns figures over the ``kept`` vertices, weighted by ``weights``: the RMS scatter and the stated standard
-        deviation (mm, along the normal).
+        """Returns statistics of the ``kept`` vertices, weighted by ``weights``: the RMS scatter and the RMS standard
+        deviation that the results state (mm, along the normal).
 
-        ``scatter_over_stated`` is their ratio: 1 if the stated deviation is all scatter, less if a part of it repeats
-        in each shot. ``rank_correlation`` tells whether vertices with a larger stated deviation scatter more.
+        ``scatter_over_stated`` is their ratio: 1 if all stated deviation is scatter, less if a part of it repeats
+        in each capture. ``rank_correlation`` shows whether vertices with a larger stated deviation scatter more.
         """
         share = weights[kept] / weights[kept].sum()
         position, normal, stated = self.position_mm[kept], self.normal_mm[kept], stated_mm[kept]
@@ -121,8 +122,8 @@ class Scatter:
 
 @dataclass(frozen=True, slots=True)
 class RegionError:
-    """Holds the deviations (mm) of a region of the head, weighted by area. ``covered`` is the fraction of the region's
-    area that the reference contains."""
+    """Holds statistics of the deviations (mm) in a region of the head, weighted by area. ``covered`` is the fraction of
+    the region's area that the reference scan contains."""
 
     covered: float
     mean_mm: float
@@ -133,8 +134,8 @@ class RegionError:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """Holds the judgement of one capture. ``deviation_mm`` is the signed distance of each vertex to the reference, NaN
-    where it has no counterpart."""
+    """Holds the judgement of one capture. ``deviation_mm`` is the signed distance of each vertex from the reference,
+    NaN where the vertex has no match."""
 
     name: str
     fit: BestFit
@@ -146,12 +147,12 @@ class Judged:
 
     @property
     def size_error_percent(self) -> float:
-        """Returns by how many percent the head is too large; negative if too small."""
+        """Returns by how many percent the head is larger than the reference; negative if it is smaller."""
         return 100.0 * (self.fit.scale - 1.0)
 
     @property
     def distance_rms_mm(self) -> float | None:
-        """Returns the RMS error (mm) of the distances between landmarks; None without any distance."""
+        """Returns the RMS error (mm) of the distances between landmarks; None if there are no common landmarks."""
         off = [measured - true for measured, true in self.distances_mm.values()]
         return float(np.sqrt(np.mean(np.square(off)))) if off else None
 
@@ -172,13 +173,13 @@ class Judgement:
 
     @property
     def passed(self) -> bool:
-        """Tells whether all figures are within their limits. A figure that could not be judged (no landmarks, a single
-        capture) does not fail."""
+        """Returns whether all figures are within their limits. Figures that could not be computed (no landmarks, a
+        single capture) are ignored."""
         return all(check.passed is not False for check in self.checks)
 
 
 def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) -> Judgement:
-    """Judges heads of one model and subject against the reference. Raises InputError if it shows another head."""
+    """Judges heads of one subject and head model against the reference scan. Raises InputError if it shows another."""
     captures = tuple(judge_one(one, reference) for one in measured)
     first = measured[0]
     deviations = np.stack([one.deviation_mm for one in captures])
@@ -197,8 +198,8 @@ def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) ->
 
 
 def judge_one(measured: Measured, reference: Reference) -> Judged:
-    """Judges one head against the reference. Raises InputError if the reference shows another head, or if its faces
-    point inwards."""
+    """Judges one head against the reference scan. Raises InputError if the reference shows another head, or if its
+    faces point inwards."""
     fit = best_fit(measured, reference)
     there = fit.reference_from_world.apply(measured.mesh_world.vertices)
     hits = reference.index.closest(there)
@@ -215,7 +216,7 @@ def judge_one(measured: Measured, reference: Reference) -> Judged:
 
 
 def region_errors(deviation_mm: Float[np.ndarray, " v"], measured: Measured) -> dict[str, RegionError]:
-    """Returns the errors of every region with at least ``MIN_COVERED`` of its area in the reference."""
+    """Returns the errors in every region with at least the fraction ``MIN_COVERED`` of its area in the reference."""
     found = {}
     known = np.isfinite(deviation_mm)
     for name in REGIONS:
@@ -238,8 +239,8 @@ def _region_error(deviation_mm: Float[np.ndarray, " n"], areas: Float[np.ndarray
 
 
 def weighted_range(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], share: float) -> float:
-    """Returns the width of the central range that holds this ``share`` of the weight; half of the remainder is cut off
-    on each side."""
+    """Returns the width of the central range that contains the fraction ``share`` of the weight; half of the remaining
+    weight is cut off on each side."""
     low, high = weighted_quantiles(values, weights, (0.5 - share / 2, 0.5 + share / 2))
     return high - low
 
@@ -247,15 +248,15 @@ def weighted_range(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, "
 def weighted_quantiles(
     values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], shares: Sequence[float]
 ) -> list[float]:
-    """Returns, for each of ``shares`` (0 to 1), the value below which that part of the weight lies, interpolated."""
+    """Returns, for each of ``shares`` (0 to 1), the value below which this fraction of weight lies, interpolated."""
     order = np.argsort(values)
     reached = (np.cumsum(weights[order]) - 0.5 * weights[order]) / weights.sum()
     return np.interp(shares, reached, values[order]).tolist()
 
 
 def distance_pairs(measured: Measured, reference: Reference) -> dict[str, tuple[float, float]]:
-    """Returns every anthropometric distance (mm) whose landmarks both the head and the reference have: measured on the
-    head, and on the reference."""
+    """Returns each anthropometric distance (mm) whose landmarks exist on head and reference, as a pair: on the head,
+    and on the reference."""
     found = {}
     for name, (one, other) in DISTANCES.items():
         if all(mark in marks for mark in (one, other) for marks in (measured.landmarks, reference.landmarks)):
@@ -267,7 +268,7 @@ def distance_pairs(measured: Measured, reference: Reference) -> dict[str, tuple[
 
 
 def _values(captures: Sequence[Judged], repeatability: Mapping[str, Mapping[str, float]]) -> dict[str, float | None]:
-    """Returns the figures of the worst capture, by the limits' names."""
+    """Returns the figures of the worst capture, by the names of the limits."""
     faces = [one.regions.get("face") for one in captures]
     features = [one.regions[name].rms_mm for one in captures for name in FEATURES if name in one.regions]
     distances = [rms for one in captures if (rms := one.distance_rms_mm) is not None]
@@ -285,8 +286,8 @@ def _values(captures: Sequence[Judged], repeatability: Mapping[str, Mapping[str,
 def scatter(
     heads: Float[np.ndarray, "n v 3"], faces: Int[np.ndarray, "f 3"], laid_on: Bool[np.ndarray, " v"]
 ) -> Scatter:
-    """Computes the scatter of two or more heads (mm, each in its own frame) with the same vertices. The heads are first
-    aligned to each other over the vertices ``laid_on``."""
+    """Computes the scatter of two or more heads with corresponding vertices (mm, each head in any frame). The heads are
+    first aligned with each other over the vertices ``laid_on``."""
     if len(heads) < 2:
         raise ValueError(f"{len(heads)} heads have no scatter; two are needed")
     mean = heads[0]

@@ -1,4 +1,4 @@
-"""Reads a result folder for its judgement: the head, its stated standard deviations, and its landmarks."""
+"""Reads the head, its standard deviations and its landmarks from a result folder, for verification."""
 
 import json
 from collections.abc import Mapping
@@ -18,14 +18,14 @@ from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 from rig.messages.message import compose
 
-# Codes of warnings that doubt the head.
+# Codes of warnings that question the head.
 DOUBTFUL = ("face-elsewhere", "no-face", "pose-doubtful", "scale-assumed", "scale-implausible")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """Holds one reconstructed head. ``stated_mm`` is the result's standard deviation of each vertex along the
-    normal."""
+    """Holds one reconstructed head. ``stated_mm`` is the standard deviation of each vertex along the normal, as the
+    result states it."""
 
     name: str
     mesh_world: Mesh
@@ -40,19 +40,19 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class ResultIdentity:
-    """Holds the name of the model that made a result, and the digest of the model's file."""
+    """Holds the name of the head model that made a result, and the SHA-256 of the model's file."""
 
     model: str
     sha256: str
 
 
 def is_result(folder: Path) -> bool:
-    """Tells whether a folder holds the result of a reconstruction: a report.json and a head.ply."""
+    """Returns whether a folder holds the result of a reconstruction: a report.json and a head.ply."""
     return (folder / "report.json").is_file() and (folder / "head.ply").is_file()
 
 
 def identity_of(folder: Path) -> ResultIdentity:
-    """Returns which model made a result. Raises InputError if report.json is missing, damaged or lacks the model."""
+    """Returns the head model with which a result was made. Raises InputError if report.json does not name it."""
     try:
         model = read_report(folder)["model"]
         return ResultIdentity(str(model["name"]), str(model["sha256"]))
@@ -61,7 +61,7 @@ def identity_of(folder: Path) -> ResultIdentity:
 
 
 def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
-    """Reads a result folder made with ``model``. Raises InputError that names each file or field that is wrong."""
+    """Reads a result folder that was made with ``model``. Raises InputError with all invalid files and fields."""
     report = read_report(folder)
     mesh, stated_mm = read_head_ply(folder / "head.ply")
     full = model.levels["full"]

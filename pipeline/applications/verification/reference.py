@@ -1,9 +1,8 @@
-"""Holds the reference: a scan of the mannequin, in mm and in a frame of its own, with its landmarks.
+"""Holds the reference scan of the mannequin (mm, in any frame) and its landmarks.
 
-Faults of a file are named before it is used: a scan in metres or centimetres, too few triangles (half a file), faces
-with inconsistent orientation, landmarks off the surface. Holes alone are no fault; ``judgement`` reports how much of
-each region the scan covers.
-"""
+Files are checked for faults first: a scan in metres or centimetres, too few triangles (half a file), faces with
+inconsistent orientation, landmarks off the surface. Holes are allowed; ``judgement`` reports which fraction of each
+region the scan covers."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,8 +28,8 @@ ON_EDGE = 1e-9  # a corner's share of a closest point that lies on the edge acro
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """Holds a scan of the subject (mm, in a frame of its own) with an index for closest points. ``rim`` lists the
-    scan's open edges; ``landmarks`` may be empty."""
+    """Holds a scan of the subject (mm, in any frame) with a search index for closest points. ``rim`` lists the scan's
+    open edges; ``landmarks`` may be empty."""
 
     name: str
     sha256: str
@@ -43,8 +42,8 @@ class Reference:
     def of(
         cls, mesh: Mesh, landmarks: Mapping[str, Float[np.ndarray, " 3"]], name: str = "reference", sha256: str = ""
     ) -> "Reference":
-        """Checks a mesh and prepares it as a reference. The mesh has no repeated vertices. Raises InputError with every
-        fault."""
+        """Checks a mesh and prepares it as a reference. The mesh must not contain repeated vertices. Raises InputError
+        that lists every fault."""
         faults = [*_surface_faults(mesh), *_landmark_faults(mesh, landmarks)]
         if faults:
             raise InputError(name, faults)
@@ -52,7 +51,7 @@ class Reference:
         return cls(name, sha256, mesh, dict(landmarks), SurfaceIndex(mesh.vertices, mesh.faces, SPACING_MM), rim)
 
     def beside(self, hits: Hits) -> Bool[np.ndarray, " n"]:
-        """Tells which closest points lie on an open edge of the scan and are therefore no counterparts."""
+        """Returns a mask of the closest points that lie on an open edge of the scan, so are no valid matches."""
         corners, off = self.mesh.faces[hits.triangles], hits.weights < ON_EDGE
         found = np.zeros(len(corners), bool)
         for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
@@ -64,8 +63,8 @@ class Reference:
 
 
 def read_reference(path: Path, landmarks: Path | None = None) -> Reference:
-    """Reads a scan with its landmarks: from the file ``landmarks`` or, if None, from the file of the same name beside
-    the scan if there is one. Raises InputError that names every fault."""
+    """Reads a scan with its landmarks: from the file ``landmarks`` or, if None, from a file of the same name beside the
+    scan, if it exists. Raises InputError that lists every fault."""
     mesh, _ = welded(read_mesh(path))
     landmarks_path = landmarks or landmark_file(path)
     marks = {} if landmarks_path is None else read_landmarks(landmarks_path)

@@ -1,4 +1,4 @@
-"""Builds ``report.json`` of a verification (format ``eigenhead-verification/1``)."""
+"""Builds the document ``report.json`` of a verification (format ``eigenhead-verification/1``)."""
 
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -19,7 +19,7 @@ VerificationReport = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Occasion:
-    """Holds the report's content besides the judgement: the day of the test (ISO 8601), the model, and the limits."""
+    """Holds the report's content besides the judgement: date of the test (ISO 8601), head model, and limits."""
 
     date: str
     model: ResultIdentity
@@ -27,8 +27,8 @@ class Occasion:
 
 
 def report_document(judgement: Judgement, reference: Reference, occasion: Occasion) -> VerificationReport:
-    """Returns ``report.json`` of a verification, as JSON types. ``value`` and ``passed`` of a check are null if the
-    captures or the reference do not provide its figure."""
+    """Returns ``report.json`` of a verification, as JSON types. ``value`` and ``passed`` of a check are null if
+    captures and reference do not allow the figure to be computed."""
     return {
         "format": FORMAT,
         "version": version("eigenhead"),
@@ -69,7 +69,7 @@ def _capture(one: Judged) -> dict[str, Any]:
 
 
 def _alignment(fit: BestFit, size_error_percent: float) -> dict[str, Any]:
-    """Returns the motion ``x_reference = rotation @ x_world + translation`` (mm), and how it was found."""
+    """Returns the motion ``x_reference = rotation @ x_world + translation`` (mm), and how it was computed."""
     motion = fit.reference_from_world
     return {
         "method": "rigid, least squares of the distances along the reference's normals over the face, by area",

@@ -23,12 +23,12 @@ AZIMUTHS_DEG = (-50.0, 0.0, 50.0)
 PANEL = (420, 460)
 HEAT_DARKEST = 0.7  # of a colour, so that shading leaves the scale readable
 PAPER = (255, 255, 255)
-UNTOLD = (190, 190, 190)  # grey: nothing is said there
+UNTOLD = (190, 190, 190)  # grey: unknown deviation
 # Blue, white, red: ColorBrewer's RdBu (https://colorbrewer2.org), which the colour-blind can read.
 RAMP = np.array([[33, 102, 172], [103, 169, 207], [247, 247, 247], [239, 138, 98], [178, 24, 43]], float)
 STEPS_MM = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # the ends that a scale may have
 SHOWN = 0.95  # share of the face that lies within the ends of the scale
-TOLD = 8  # captures that page one has room for
+TOLD = 8  # captures that fit on page one
 FIGURES = {  # name of the limit: (words, digits, unit)
     "face_rms_mm": ("Deviation of the face, RMS, worst capture", 3, "mm"),
     "features_rms_mm": ("Deviation of eyes, nose and mouth, RMS, the worst of them", 3, "mm"),
@@ -54,8 +54,8 @@ NOTES = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pictures:
-    """Holds three rows of pictures, seen from ``AZIMUTHS_DEG``. ``end_mm`` is the error (mm) at the ends of the colour
-    scale."""
+    """Holds three rows of pictures (reference, result, error), seen from ``AZIMUTHS_DEG``. ``end_mm`` is the error (mm)
+    at the ends of the colour scale."""
 
     reference: tuple[Resized, ...]
     result: tuple[Resized, ...]
@@ -64,8 +64,8 @@ class Pictures:
 
 
 def draw(first: Measured, reference: Reference, judgement: Judgement) -> Pictures:
-    """Draws all pictures. ``first`` is the head of the first capture in ``judgement``. The head is coloured with the
-    mean error over all captures."""
+    """Draws the pictures of reference, result and error. ``first`` is the head of the first capture in ``judgement``.
+    The head is coloured with the mean error over all captures."""
     head = first.head_from_world.apply(first.mesh_world.vertices)
     fitted = Mesh(head, first.mesh_world.faces)
     head_from_reference = first.head_from_world @ judgement.captures[0].fit.reference_from_world.inverse()
@@ -81,16 +81,15 @@ def draw(first: Measured, reference: Reference, judgement: Judgement) -> Picture
 
 
 def scale_end(deviation_mm: Float[np.ndarray, " n"]) -> float:
-    """Returns the end of a colour scale (mm): the smallest of ``STEPS_MM`` that is larger than most of the
-    deviations."""
+    """Returns the end of a colour scale (mm): the smallest of ``STEPS_MM`` that exceeds most of the deviations."""
     known = np.abs(deviation_mm[np.isfinite(deviation_mm)])
     wanted = float(np.quantile(known, SHOWN)) if len(known) else 0.0
     return next((step for step in STEPS_MM if step >= wanted), STEPS_MM[-1])
 
 
 def heat_colours(deviation_mm: Float[np.ndarray, " v"], end_mm: float) -> UInt8[np.ndarray, "v 3"]:
-    """Returns a colour for each deviation: blue where the result lies inside the reference, red where it lies outside,
-    white where they agree, grey where unknown. The colours saturate at ``end_mm``."""
+    """Returns a colour for each deviation: blue where the result lies inside the reference, red outside, white where
+    they agree, grey where the deviation is unknown. The colours saturate at ``end_mm``."""
     place = np.clip(np.nan_to_num(deviation_mm) / end_mm, -1.0, 1.0)
     stops = np.linspace(-1.0, 1.0, len(RAMP))
     colours = np.stack([np.interp(place, stops, RAMP[:, channel]) for channel in range(3)], axis=1)
@@ -107,7 +106,7 @@ def legend(width: int = 600, height: int = 24) -> Resized:
 def write_verification(
     folder: Path, first: Measured, reference: Reference, judgement: Judgement, occasion: Occasion
 ) -> VerificationReport:
-    """Writes a verification's files, report.json last, and returns its content. ``first``: the first capture's head."""
+    """Writes verification files, report.json last, and returns its content. ``first`` is the first capture's head."""
     document, pictures = report_document(judgement, reference, occasion), draw(first, reference, judgement)
     rows = [np.hstack(row) for row in (pictures.reference, pictures.result, pictures.error)]
     write_image(folder / "error.png", np.vstack(rows))
@@ -185,7 +184,7 @@ def _captures_table(pdf: PdfPage, report: VerificationReport) -> None:
 
 
 def _distances_table(pdf: PdfPage, report: VerificationReport) -> None:
-    """Draws the table of landmark distances, mean of all captures, with as many rows as fit on the page."""
+    """Draws the table of landmark distances (mean over all captures), with as many rows as fit on the page."""
     captures = list(report["captures"].values())
     names = list(captures[0]["distances"])
     if not names:

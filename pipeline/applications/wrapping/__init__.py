@@ -1,6 +1,6 @@
-"""Wraps raw scans: gives a scan of one head the vertex order of a template.
+"""Wraps raw scans: represents the scan of one head in the vertex order of a template.
 
-In: a triangle mesh in any unit and orientation (``scan``), with or without colours, and a template with its head model.
-Out: the template's vertices on the scan, in the scan's own frame and unit, the remaining distances, and a texture in
-the template's layout. This is section 3.2 for one scan; the face finder supplies its landmarks.
-"""
+The input is a triangle mesh in any unit and orientation (``scan``), with or without colours, and a template with its
+head model. The output is the template's vertices on the scan (in the scan's frame and unit), the remaining distances,
+and a texture in the template's texture coordinates. The method is the paper's section 3.2 for a single scan, with
+landmarks from a face detector."""

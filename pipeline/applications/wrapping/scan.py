@@ -1,4 +1,4 @@
-"""Reads the scan: a triangle mesh in its own unit and axes, with vertices joined along seams, and its colours."""
+"""Reads a scan: a triangle mesh in the file's unit and axes, with vertices joined along seams, and its colours."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ GREY = 190  # of a scan without colours
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawScan:
-    """Holds a scan in the unit and axes of its file. Triangles of ``mesh`` and ``painted`` correspond."""
+    """Holds a scan in the unit and axes of its file. Triangles of ``mesh`` and ``painted`` have the same order."""
 
     name: str
     mesh: Mesh  # vertices joined along seams, no colours
@@ -31,7 +31,7 @@ class RawScan:
 
     @property
     def is_coloured(self) -> bool:
-        """Tells whether the file holds a texture or colours of vertices."""
+        """Returns whether the file contains a texture or vertex colours."""
         return self.painted.image is not None or self.painted.mesh.colours is not None
 
     def turned_over(self) -> "RawScan":
@@ -43,7 +43,7 @@ class RawScan:
         self, triangles: Int[np.ndarray, " n"], weights: Float[np.ndarray, "n 3"]
     ) -> UInt8[np.ndarray, "n 3"]:
         """Returns the sRGB colours of points on the surface, given by triangle and barycentric weights; grey if the
-        file has none."""
+        file has no colours."""
         rows = self.painted.mesh.faces[triangles]
         if self.painted.image is not None and self.painted.uv is not None:
             return _texels(self.painted.image, np.einsum("nk,nkx->nx", weights, self.painted.uv[rows]))
@@ -53,8 +53,7 @@ class RawScan:
         return np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
 
     def drawable(self) -> Mesh:
-        """Returns the scan with colours at its vertices; its triangles are divided until vertex colours do not blur the
-        texture."""
+        """Returns the scan with vertex colours, subdivided so that vertex colours do not blur the texture."""
         mesh = self.painted.mesh
         if self.painted.image is None or self.painted.uv is None:
             return mesh
@@ -65,7 +64,7 @@ class RawScan:
 
 
 def read_raw_scan(path: Path) -> RawScan:
-    """Reads a scan with its colours. Raises InputError with the fault of the file."""
+    """Reads a scan with its colours. Raises InputError that states the file's fault."""
     painted = read_textured_mesh(path)
     count = len(painted.mesh.faces)
     if count < MIN_TRIANGLES:
@@ -78,7 +77,7 @@ def read_raw_scan(path: Path) -> RawScan:
 
 
 def raw_scan(painted: TexturedMesh, name: str) -> RawScan:
-    """Joins the vertices of a mesh that lie at the same position, and drops its degenerate triangles."""
+    """Joins the mesh's vertices that lie at the same position, and removes degenerate triangles."""
     mesh, (whole, proper) = painted.mesh, welded(painted.mesh)
     return RawScan(name, whole, replace(painted, mesh=Mesh(mesh.vertices, mesh.faces[proper], mesh.colours)))
 
@@ -88,7 +87,7 @@ def _reversed(mesh: Mesh) -> Mesh:
 
 
 def _texels(image: ImageRgb, uv: Float[np.ndarray, "n 2"]) -> UInt8[np.ndarray, "n 3"]:
-    """Reads a texture bilinearly at coordinates (v upwards), which repeat outside the unit square."""
+    """Reads a texture bilinearly at texture coordinates (v upwards), which repeat outside the unit square."""
     size = np.array(image.shape[1::-1])
     shares = np.where((uv >= 0.0) & (uv <= 1.0), uv, uv % 1.0)
     at = np.clip(np.stack([shares[:, 0], 1.0 - shares[:, 1]], axis=1) * size - 0.5, 0.0, size - 1.0)

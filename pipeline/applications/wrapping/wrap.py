@@ -1,14 +1,13 @@
-"""Wraps a scan in four steps: it is placed by its face, the model is fitted, the template is deformed, and distances
-are measured.
+"""Wraps a scan in four steps: it is placed by its detected face, the head model is fitted, the template is deformed,
+and distances are measured.
 
-The face is found on rendered pictures, whatever the scan's unit and axes. The scan is rendered from all sides until one
-picture shows a face (the finder accepts any roll). The points of the face are projected onto the scan; their size gives
-the unit, and their arrangement the axes. Then the scan is rendered from seven directions in front of that face, like
-photographs of a rig, and the face is found in these as in any capture.
+The face is detected in rendered pictures, for any unit and axes of the scan. The scan is rendered from all sides until
+one picture shows a face; the detector accepts any roll of the picture. The detected face points are projected onto the
+scan; their size determines the unit, and their arrangement the axes. Then the scan is rendered from seven directions in
+front of that face, like photographs of a rig, and the face is detected and matched in these pictures as in a capture.
 
-Then the model is fitted to the scan, as to a mesh in a template's registration (``templates``). Last, the template's
-own vertices are deformed as in ``geometry.registration.nonrigid``, with exact closest points on the scan's triangles.
-"""
+Next, the head model is fitted to the scan, as in a template's registration (``templates``). Last, the template's
+vertices are deformed as in ``geometry.registration.nonrigid``, with exact closest points on the scan's triangles."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -87,7 +86,7 @@ NEAR_MM = 8.0  # of a mean adult: a lifted point that differs by this weighs a q
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Glance:
-    """Holds a face in one picture, projected onto the scan (in the scan's unit)."""
+    """Holds a face detected in one rendered picture, projected onto the scan (in the scan's unit)."""
 
     detection: FaceDetection
     scan_from_face: Similarity  # of a mean adult's points, mm
@@ -95,8 +94,9 @@ class _Glance:
 
 
 def unit_of(scale: float) -> tuple[str | None, float]:
-    """Returns the unit, and its length in mm, in which a face has a human's size; ``scale`` is its size in the scan's
-    unit relative to a mean adult in mm. Returns None, and the factor to a mean adult's size, if no unit fits."""
+    """Returns the unit's name, and its length in mm, in which a face has a human size; ``scale`` is the face's size in
+    the scan's unit relative to a mean adult's in mm. If no unit fits, returns None and the factor to a mean adult's
+    size."""
     for unit, factor in UNITS_MM.items():
         if SIZE_RANGE[0] < scale * factor < SIZE_RANGE[1]:
             return unit, factor
@@ -104,7 +104,7 @@ def unit_of(scale: float) -> tuple[str | None, float]:
 
 
 def front_rig(world_from_face: Similarity) -> Rig:
-    """Returns cameras in front of a face (mm), directed at its middle."""
+    """Returns cameras in front of a face (mm), directed at its centre."""
     turn, middle = world_from_face.rotation, world_from_face.translation
     lens = _lens(FRONT_PX, FRONT_PX * FRONT_MM / FRONT_SHOWN_MM)
     cameras = []
@@ -120,8 +120,8 @@ def _lens(size: int, focal_px: float) -> Intrinsics:
 
 
 def _search(mesh: Mesh, light: Light, networks: FaceNetworks, renderer: Renderer) -> _Glance | None:
-    """Returns the best face in the pictures from all sides: first along the axes, then, unless one is beyond doubt,
-    from directions between."""
+    """Returns the best face detected in pictures from all sides: first along the axes, then, unless one detection is
+    certain, from directions between the axes."""
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     low, high = np.percentile(centres, [OUTLYING, 100.0 - OUTLYING], axis=0)
     middle, factor = (low + high) / 2, SEARCH_RADIUS / max(float(np.linalg.norm(high - low)) / 2, 1e-12)
@@ -167,7 +167,7 @@ def _pictures(rig: Rig, mesh: Mesh, light: Light, renderer: Renderer) -> dict[st
 def _lifted(
     face: FaceDetection, camera: Camera, depth: Float[np.ndarray, "h w"], small_from_scan: Similarity
 ) -> _Glance | None:
-    """Projects the points of a face onto the scan. Returns None if too few of them lie on it."""
+    """Projects the detected points of a face onto the scan. Returns None if too few points lie on the scan."""
     columns, rows = np.clip(np.rint(face.landmarks_px).astype(int), 0, SEARCH_PX - 1).T
     away = depth[rows, columns].astype(float)
     hit = np.isfinite(away)
@@ -187,7 +187,7 @@ def _lifted(
 
 
 def _looks_inwards(mesh: Mesh, scan_from_face: Similarity) -> bool:
-    """Tells whether the triangles in front of the face point into the head."""
+    """Returns whether the normals of the triangles in front of the face point into the head."""
     face_from_scan = scan_from_face.inverse()
     middles = face_from_scan.apply(mesh.vertices[mesh.faces].mean(axis=1))
     shape = point_table().shape_mm
@@ -197,13 +197,13 @@ def _looks_inwards(mesh: Mesh, scan_from_face: Similarity) -> bool:
 
 
 def nearest_axis(direction: Float[np.ndarray, " 3"]) -> str:
-    """Returns the axis nearest to a direction, as "+y"."""
+    """Returns the name of the axis nearest to a direction, such as "+y"."""
     largest = int(np.abs(direction).argmax())
     return ("+" if direction[largest] > 0 else "-") + "xyz"[largest]
 
 
 def _lids(face: MatchedFaces, rig: Rig) -> Float[np.ndarray, "32 3"] | None:
-    """Triangulates the edges of the lids from the eye network's points, also for closed eyes."""
+    """Triangulates the edges of the lids from the eye network's image points, also for closed eyes."""
     seen = {name: found.lids_px for name, found in face.detections.items() if found.lids_px is not None}
     if len(seen) < 2:
         return None
@@ -217,11 +217,11 @@ def _lids(face: MatchedFaces, rig: Rig) -> Float[np.ndarray, "32 3"] | None:
 def drawn_onto(
     carried: Float[np.ndarray, "t 3"], template: Template, model: HeadModel, scan: Surface
 ) -> tuple[Float[np.ndarray, "t 3"], Bool[np.ndarray, " t"]]:
-    """Deforms a template onto a nearby scan. Returns all vertices, and which of them lie on the scan.
+    """Deforms a template onto a nearby scan. Returns all vertices, and a mask of the vertices that lie on the scan.
 
-    The parts with skin are deformed as one surface, starting from the template's registered shape, so that lips and
-    lids stay as smooth as there; deeper vertices in them follow by stiffness. All other parts follow the skin
-    (``SurfaceBinding.with_skin``)."""
+    The template's parts that contain skin are deformed as one surface, starting from the registered shape, so that lips
+    and lids stay smooth; deeper vertices of these parts follow by stiffness. All other parts of the template follow the
+    skin (``SurfaceBinding.with_skin``)."""
     binding, target = template.surface_binding, MetSurface(scan)
     welded, joined = weld(Surface.of(binding.rest, template.mesh.triangles()))
     first = np.unique(joined, return_index=True)[1]  # a row of the file for every joined vertex
@@ -259,15 +259,15 @@ def drawn_onto(
 
 
 def _near_face(points: Float[np.ndarray, "n 3"], model: HeadModel) -> Bool[np.ndarray, " n"]:
-    """Tells which points of a registered template lie near the face of the mean head. Points there that are no skin
-    belong to the mouth, the nose or the sockets."""
+    """Returns a mask of the points of a registered template that lie near the face of the mean head. If such points are
+    not skin, they belong to the mouth, the nose or the eye sockets."""
     mean = model.vertices(np.zeros(0))
     return KDTree(mean[model.levels["full"].face_region]).query(points)[0] < FACE_MM
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedScan:
-    """Holds a scan with its unit and axes, and the pose of the mean head on it."""
+    """Holds a scan with its unit and axes, and the pose of the mean head on the scan."""
 
     scan: RawScan  # turned over where its triangles looked inwards
     turned_over: bool
@@ -279,12 +279,12 @@ class PlacedScan:
 
     @property
     def up(self) -> str:
-        """Returns the scan's axis nearest to the head's upward direction, as "+y"."""
+        """Returns the scan's axis nearest to the head's upward direction, such as "+y"."""
         return nearest_axis(self.head_from_scan.rotation[1])
 
     @property
     def front(self) -> str:
-        """Returns the scan's axis nearest to the face's direction."""
+        """Returns the scan's axis nearest to the direction in which the face points."""
         return nearest_axis(self.head_from_scan.rotation[2])
 
     def surface(self) -> Surface:
@@ -295,8 +295,8 @@ class PlacedScan:
 def place_scan(
     scan: RawScan, model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None
 ) -> PlacedScan:
-    """Places a scan by its detected face, or by landmarks in the scan's own frame. Raises InputError if no face is
-    found, or too few landmarks are named."""
+    """Places a scan by its detected face, or by landmarks in the scan's frame. Raises InputError if no face is
+    detected, or if too few landmarks are given."""
     if not landmarks:
         with Renderer.create() as renderer:
             return _place_on_face(scan, model, load_networks(), renderer)
@@ -316,8 +316,8 @@ def place_scan(
 
 
 def _place_on_face(scan: RawScan, model: HeadModel, networks: FaceNetworks, renderer: Renderer) -> PlacedScan:
-    """Places a scan by its face, whatever that face's size: its points become marks, the lids' edges among them. Raises
-    InputError if no picture shows a face."""
+    """Places a scan by its detected face of any size; the face points, with the edges of the lids, become marks for the
+    fit. Raises InputError if no rendered picture shows a face."""
     mesh = scan.drawable()
     lights = (UNLIT, HEADLIGHT) if scan.is_coloured else (HEADLIGHT,)
     glance = next((found for light in lights if (found := _search(mesh, light, networks, renderer))), None)
@@ -369,7 +369,7 @@ SCAN_POINTS = 20_000  # of the scan, whose distance from the template is measure
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Wrapped:
-    """Holds a template on a scan, in the scan's own frame and unit."""
+    """Holds a template on a scan, in the scan's frame and unit."""
 
     template: Template
     placed: PlacedScan
@@ -381,11 +381,11 @@ class Wrapped:
     index: SurfaceIndex  # of the scan, own frame
 
     def hits(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Hits:
-        """Returns the closest points of the scan that face the same way."""
+        """Returns the closest points of the scan whose normals have a similar direction."""
         return _closest(self.index, points, normals, self.placed.mm_per_unit)
 
     def figures(self) -> dict[str, float]:
-        """Returns the figures of the wrapping by name, for printing."""
+        """Returns quality figures of the wrapping by name, for printing."""
         on = self.distance_mm[self.covered]
         return {
             "vertices": float(len(self.vertices)),
@@ -406,16 +406,16 @@ def wrap(
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
     report: Progress,
 ) -> Wrapped:
-    """Gives a scan the vertex order of a template.
+    """Wraps a scan in the vertex order of a template.
 
     Args:
-        scan: in any unit and orientation.
-        template: registered to ``model``.
+        scan: the scan, in any unit and orientation.
+        template: a template registered to ``model``.
         model: the head model.
-        landmarks: in the scan's frame; None finds the face on renders.
+        landmarks: landmarks in the scan's frame; None detects the face in rendered pictures.
         report: progress.
 
-    Raises InputError if the scan shows no face, or is no head."""
+    Raises InputError if the scan shows no face, or is not a head."""
     report("finding the face", 0.0)
     placed = place_scan(scan, model, landmarks)
     surface = placed.surface()
@@ -443,7 +443,7 @@ def wrap(
 
 
 def residual_colours(distance_mm: Float[np.ndarray, " t"], covered: Bool[np.ndarray, " t"]) -> UInt8[np.ndarray, "t 3"]:
-    """Returns colours of distances: white at 0, yellow at 0.5 mm, red from 1 mm on; grey where there is no scan."""
+    """Returns colours for distances: white at 0, yellow at 0.5 mm, red from 1 mm on; grey for missing scan surface."""
     share = np.clip(distance_mm, 0.0, 1.0)
     colours = np.stack(
         [np.ones_like(share), np.clip(2.0 - 2.0 * share, 0, 1), np.clip(1.0 - 2.0 * share, 0, 1)], axis=1
@@ -465,8 +465,8 @@ def _scan_distances(
     triangles: Int[np.ndarray, "f 3"],
     covered: Bool[np.ndarray, " t"],
 ) -> Float[np.ndarray, " n"]:
-    """Returns the distances (mm) of the scan's points from the template, for points whose closest point lies in a
-    covered triangle."""
+    """Returns the distances (mm) of the scan's points from the template, for points whose closest triangle of the
+    template lies on the scan."""
     mesh = placed.scan.mesh
     rows = np.arange(0, len(mesh.vertices), max(1, len(mesh.vertices) // SCAN_POINTS))
     normals = vertex_normals(mesh.vertices, mesh.faces)[rows]

@@ -36,7 +36,7 @@ AZIMUTHS_DEG, CLOSE_MM, CLOSE_UP = (0.0, 50.0), 85.0, (640, 480)
 
 
 def write_wrapped(folder: Path, wrapped: Wrapped) -> dict[str, Any]:
-    """Writes wrapped.obj (.mtl, .jpg), residual.ply, residual.npz, wrap.json and wrap.png. Returns the document of
+    """Writes wrapped.obj (.mtl, .jpg), residual.ply, residual.npz, wrap.json and wrap.png. Returns the content of
     wrap.json. Raises OSError."""
     _write_obj(folder, wrapped)
     _write_residuals(folder, wrapped)
@@ -109,7 +109,7 @@ def _write_residuals(folder: Path, wrapped: Wrapped) -> None:
 
 
 def wrap_picture(wrapped: Wrapped) -> ImageRgb:
-    """Draws, from front and side, the scan in clay, the template on it, and the residuals, with the face below."""
+    """Draws the scan in grey clay, the template on it, and the residuals, from front and side, with close-ups."""
     scan = wrapped.placed.surface()  # both in the frame and scale of the mean head
     template = Mesh(wrapped.placed.head_from_scan.apply(wrapped.vertices), wrapped.template.mesh.triangles())
     colours = residual_colours(wrapped.distance_mm, wrapped.covered)
@@ -138,8 +138,8 @@ def vertex_colours(wrapped: Wrapped) -> UInt8[np.ndarray, "t 3"]:
 
 
 def baked_textures(wrapped: Wrapped) -> dict[Tile, UInt8[np.ndarray, "s s 3"]]:
-    """Returns the texture images (sRGB) by UDIM tile, for the tiles that hold a covered triangle; empty if the scan has
-    no colours or the template no texture coordinates."""
+    """Returns the texture images (sRGB) by UDIM tile, for tiles with a triangle on the scan; empty if the scan has no
+    colours or the template no texture coordinates."""
     mesh, scan = wrapped.template.mesh, wrapped.placed.scan
     tiles = corner_tiles(mesh)
     of_polygon = np.repeat(np.arange(len(mesh.sizes)), mesh.sizes - 2)

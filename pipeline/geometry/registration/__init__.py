@@ -1,5 +1,4 @@
-"""Registers surfaces to each other: by rigid motions and similarities, with or without shape coefficients or a search
-from many starts (``rigid``), and by smooth non-rigid deformation (``nonrigid``). Lengths are mm.
+"""Registers surfaces to each other, by rigid motions and similarities (``rigid``) or by smooth non-rigid deformation
+(``nonrigid``). Module ``rigid`` can also estimate shape coefficients and search from many starts. Lengths are in mm.
 
-The caller defines the matches, their weights, and when a result is refused.
-"""
+The caller defines correspondences, their weights, and when a result is rejected."""

@@ -1,10 +1,10 @@
-"""Deforms a mesh smoothly onto another surface, by non-rigid closest points (Amberg, Romdhani and Vetter 2007): each
-step is linear in the displacements. Also warps by landmarks (section 3.2, step 3: scattered-data interpolation).
+"""Deforms a mesh smoothly onto another surface by non-rigid closest points (Amberg, Romdhani and Vetter 2007); each
+step is linear in the displacements. Also warps points by landmarks (the paper's section 3.2, step 3: scattered-data
+interpolation).
 
-The kernel of a warp is the distance itself, which minimises bending in three dimensions (F. Bookstein's thin plate in
-3-D; Carr et al. 2001, *Reconstruction and Representation of 3D Objects with Radial Basis Functions*, section 3), with a
-linear polynomial so that affine motions are exact everywhere.
-"""
+The warp uses the distance itself as its radial kernel, which minimises bending in three dimensions (F. Bookstein's thin
+plate in 3-D; Carr et al. 2001, *Reconstruction and Representation of 3D Objects with Radial Basis Functions*, section
+3). An additional linear polynomial makes affine motions exact everywhere."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from rig.mesh import edges_of, vertex_normals
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Holds the limits of one stage of the search for a head's points on a scan. Lengths in mm."""
+    """Holds the limits for one stage of a search for correspondences between vertices and a scan. Lengths are in mm."""
 
     steps: int
     reach_mm: float  # a match farther than this is another part of the head
@@ -32,7 +32,7 @@ class Search:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """Holds points of a surface with their normals; ``marks`` are its landmarks."""
+    """Holds points on a surface with their normals; ``marks`` are its landmarks."""
 
     vertices: Float[np.ndarray, "S 3"]
     normals: Float[np.ndarray, "S 3"]
@@ -40,7 +40,7 @@ class Target:
 
 
 def oriented_tree(target: Target, search: Search) -> KDTree:
-    """Returns a search tree of the scan's points by position and normal together."""
+    """Returns a search tree over positions and normals of the scan's points."""
     return KDTree(np.concatenate([target.vertices, target.normals * search.normal_mm], 1), balanced_tree=False)
 
 
@@ -54,8 +54,8 @@ def draw_to_target(
     marks: Mapping[int, Float[np.ndarray, " 3"]] = MappingProxyType({}),
     mark_weight: float = 0.0,
 ) -> Float[np.ndarray, "V 3"]:
-    """Deforms a mesh onto a target by non-rigid closest points (``draw_to_matches``). Matches are the nearest points by
-    position and normal together. ``marks`` are target positions of vertices (mm)."""
+    """Deforms a mesh onto a target by non-rigid closest points (``draw_to_matches``). Each vertex is matched with the
+    point that is nearest by position and normal together. ``marks`` are target positions (mm) by vertex index."""
     tree, fixed = oriented_tree(target, search), np.array(list(marks), int)
 
     def match(shape: Float[np.ndarray, "V 3"]) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, " V"]]:
@@ -75,12 +75,13 @@ def draw_to_matches(
     match: Callable[[Float[np.ndarray, "V 3"]], tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, " V"]]],
     stiffnesses: Sequence[float],
 ) -> Float[np.ndarray, "V 3"]:
-    """Moves a mesh smoothly to its vertices' matches: non-rigid closest points, one step for each stiffness.
+    """Moves a mesh's vertices smoothly to matched positions by non-rigid closest points, with one step for each
+    stiffness.
 
-    Each step solves (W + k L^T L) u = W d for the displacements u from ``start``. L is the graph Laplacian, so nearly
-    affine motions cost little; all three axes share the matrix. ``match`` returns the target position (mm) and the
-    weight of every vertex. The target should lie along the normal of the match, so that the vertex does not move in the
-    tangent plane."""
+    Each step solves (W + k L^T L) u = W d for the displacements u from ``start``, with stiffness k, weights W and
+    distances d to the matches. L is the graph Laplacian, so nearly affine motions cost little; all three axes have the
+    same matrix. ``match`` returns the target position (mm) and the weight of every vertex. The target position should
+    lie along the normal at the match, so that the vertex does not slide in the tangent plane."""
     bending, shape = _bending(faces, start), start
     for stiffness in stiffnesses:
         wanted, weight = match(shape)
@@ -93,7 +94,7 @@ def draw_to_matches(
 def match_points(
     shape: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], target: Target, tree: KDTree, search: Search
 ) -> tuple[Int[np.ndarray, " V"], Float[np.ndarray, " V"]]:
-    """Returns the nearest scan points, and weights: 1 where the match is near and its normal similar, otherwise 0."""
+    """Returns the nearest scan point of each vertex, and a weight: 1 for a near point with a similar normal, else 0."""
     normals = vertex_normals(shape, faces)
     near = np.asarray(tree.query(np.concatenate([shape, normals * search.normal_mm], 1), workers=1)[1])
     distance = np.linalg.norm(target.vertices[near] - shape, axis=1)
@@ -102,12 +103,12 @@ def match_points(
 
 
 def dots(a: Float[np.ndarray, "N 3"], b: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
-    """Returns the products of n pairs of vectors."""
+    """Returns the dot products of n pairs of vectors."""
     return np.einsum("nx,nx->n", a, b)
 
 
 def _bending(faces: Int[np.ndarray, "F 3"], vertices: Float[np.ndarray, "V 3"]) -> sparse.csr_array:
-    """Returns L^T L of a graph Laplacian whose weights fall with edge length, because vertices are unevenly dense."""
+    """Returns L^T L of a graph Laplacian L whose weights fall with edge length, because vertex density varies."""
     edges, _, _ = edges_of(faces)
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     weight = 1 / np.maximum(length, 0.5)
@@ -126,9 +127,9 @@ def landmark_warp(
     *,
     smoothing: float = 0.0,
 ) -> Float[np.ndarray, "N 3"]:
-    """Moves points by the smooth map that takes each source landmark to its target. If ``smoothing`` (mm) is above 0,
-    landmarks may miss their targets in exchange for less bending. Raises numpy.linalg.LinAlgError unless at least 4
-    landmarks span all three dimensions."""
+    """Moves points by the smooth map that takes each source landmark to its target position. If ``smoothing`` (mm) is
+    above 0, landmarks may miss their targets in exchange for less bending. Raises numpy.linalg.LinAlgError unless at
+    least 4 landmarks span all three dimensions."""
     count = len(source)
     affine = np.concatenate([np.ones((count, 1)), source], 1)
     system = np.zeros((count + 4, count + 4))

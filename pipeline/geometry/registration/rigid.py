@@ -1,7 +1,8 @@
-"""Fits motions of points to a surface. Gauss-Newton steps minimise the distances along the normals (Chen and Medioni
-1992), over a motion and optionally shape coefficients. A search from many starts uses trimmed iterations of points
-closest in position and direction (Besl and McKay 1992, https://doi.org/10.1109/34.121791): brief from all starts,
-longer from the best. Procrustes analysis (section 4.2, eq. 3) also has a form with a covariance."""
+"""Fits rigid motions and similarities of points to a surface. Gauss-Newton steps minimise the distances along the
+normals (Chen and Medioni 1992), over a motion and, if requested, shape coefficients. A search from many starts uses
+trimmed iterated closest points, by position and normal (Besl and McKay 1992, https://doi.org/10.1109/34.121791): few
+iterations from all starts, more from the best ones. Procrustes analysis (the paper's section 4.2, eq. 3) is also
+possible with a covariance."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,8 +23,8 @@ Points = Float[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Counterparts:
-    """Holds the counterparts of n points: the unit normals there, the distances to the surface along them (mm), and
-    weights, 0 for a point without a counterpart. ``reach_mm`` is the largest distance of a counterpart at the next
+    """Holds the correspondences of n points on a surface: the unit normals there, the distances along them (mm), and
+    weights, 0 for a point without correspondence. ``reach_mm`` is the largest distance of a correspondence in the next
     step."""
 
     normals: Points
@@ -38,9 +39,10 @@ Meet = Callable[[Similarity, Points, float], Counterparts | None]
 def fit_motion(
     points: Points, meet: Meet, start: Similarity, *, reach_mm: float, steps: int, still_mm: float, scale: bool = False
 ) -> Similarity | None:
-    """Fits points to a surface by a rigid motion or, with ``scale``, a similarity. ``meet`` finds the counterparts of
-    the moved points within a reach, at first ``reach_mm``. It returns None if there are too few; so does this function.
-    A step that moves every point by less than ``still_mm`` is the last, unless the reach shrinks."""
+    """Fits points to a surface by a rigid motion or, with ``scale``, a similarity. The callback ``meet`` finds the
+    surface correspondences of the moved points within a distance, which is ``reach_mm`` in the first step. Returns None
+    as soon as ``meet`` returns None, which means too few correspondences. The iteration ends after a step that moves
+    every point by less than ``still_mm``, unless ``meet`` shrinks the distance."""
     motion = start
     for _ in range(steps):
         there = motion.apply(points)
@@ -60,8 +62,8 @@ def fit_motion(
 
 
 def motion_columns(arms: Points, normals: Points, *, scale: bool = False) -> Float[np.ndarray, "n p"]:
-    """Returns the displacement of points along normals by a rotation (rad) about the origin of ``arms``, by a shift
-    (mm) and, with ``scale``, by the logarithm of the scale."""
+    """Returns the derivatives of the points' displacement along normals by a rotation (rad) about the origin of
+    ``arms``, by a translation (mm) and, with ``scale``, by the logarithm of the scale."""
     columns = [np.cross(arms, normals), normals]
     if scale:
         columns.append((arms * normals).sum(axis=1, keepdims=True))
@@ -84,12 +86,11 @@ def solve_with_prior(
     precision: type = np.float64,
     ridge: float = 0.0,
 ) -> Float[np.ndarray, " p"]:
-    """Returns the step of the unknowns from ``state`` that best explains the distances ``ahead``, under independent
-    priors about 0 of information ``prior``.
+    """Returns the least-squares step of the unknowns from ``state`` for the distances ``ahead``, under independent
+    Gaussian priors with mean 0 and information ``prior``.
 
-    Single ``precision`` halves the time; use it where the prior is strong. ``ridge`` keeps unknowns without a prior
-    bounded: it is added to their information, as a multiple of the mean information.
-    """
+    Single ``precision`` halves the time and suffices if the prior is strong. ``ridge`` bounds unknowns without a prior:
+    it is added to their information, as a multiple of the mean information."""
     root = np.sqrt(information)
     weighted = (columns * root[:, None]).astype(precision)
     system = (weighted.T @ weighted).astype(float)
@@ -101,7 +102,8 @@ def solve_with_prior(
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Holds one round of the search: the number of points, of iterations, and of best starts that continue."""
+    """Holds the limits of one round of the search: numbers of points and iterations, fraction of points, number of
+    starts."""
 
     points: int
     iterations: int
@@ -121,9 +123,9 @@ def search_motions(
     turns: Float[np.ndarray, "t 3 3"],
     places: Float[np.ndarray, "p 3"],
 ) -> list[Similarity]:
-    """Returns the best starting motions of points in random order. Every rotation, with the points' middle at every
-    place, is tried briefly with few points; the best motions continue with more. ``normals`` and ``facing`` are unit
-    normals of the points and of ``surface``, points of the other surface."""
+    """Returns the best starting motions from points to a surface; the points must be in random order. Every combination
+    of a rotation with a position of the points' centre is tried with few points; the best motions continue with more
+    points. ``normals`` are the unit normals of the points, ``facing`` those of the sampled ``surface``."""
     middle = points.mean(axis=0)
     points = points - middle
     tree = KDTree(np.concatenate([surface, TURN_MM * facing], axis=1))
@@ -150,7 +152,7 @@ def search_motions(
 def draw_surface_points(
     surface: SurfaceIndex, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Returns points drawn over a surface by area (middles of triangles), and their normals."""
+    """Returns random points on a surface, uniform by area (centroids of triangles), and their normals."""
     corners = surface.corners
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     chosen = draw_rows(area, SURFACE_POINTS, rng)
@@ -158,19 +160,18 @@ def draw_surface_points(
 
 
 def draw_rows(weights: Float[np.ndarray, " n"], count: int, rng: np.random.Generator) -> Int[np.ndarray, " k"]:
-    """Returns at most ``count`` different rows, drawn by their weights."""
+    """Returns at most ``count`` different indices, drawn with probabilities proportional to their weights."""
     return rng.choice(len(weights), min(count, int((weights > 0).sum())), replace=False, p=weights / weights.sum())
 
 
 def procrustes(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
 ) -> Similarity:
-    """Computes the full ordinary Procrustes alignment: the similarity T that minimises eq. (3), ``sum_j w_j |target_j -
-    T(source_j)|^2``.
+    """Computes the full ordinary Procrustes alignment: the similarity T that minimises the paper's eq. (3), ``sum_j w_j
+    |target_j - T(source_j)|^2``.
 
-    Dryden and Mardia, Statistical Shape Analysis, section 7.2; the determinant excludes mirror images. Raises
-    ValueError if the points lie on a line and determine no rotation.
-    """
+    The method is from Dryden and Mardia, Statistical Shape Analysis, section 7.2; a test of the determinant excludes
+    mirror images. Raises ValueError if the points lie on a line and so determine no rotation."""
     share = np.full(len(source), 1.0 / len(source)) if weights is None else weights / weights.sum()
     source_mean, target_mean = share @ source, share @ target
     centred, wanted = source - source_mean, target - target_mean
@@ -184,8 +185,8 @@ def procrustes(
 
 
 def rigid_procrustes(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> RigidTransform:
-    """Computes the rigid motion that minimises eq. (3), with the rotation of ``procrustes`` but no scale: a scale would
-    overfit few points."""
+    """Computes the rigid motion that minimises the paper's eq. (3); it has no scale, because a scale would overfit few
+    points."""
     rotation = procrustes(source, target).rotation
     return RigidTransform(rotation, target.mean(axis=0) - rotation @ source.mean(axis=0))
 
@@ -199,12 +200,11 @@ def generalised_procrustes(
     start: Similarity,
     scale_spread: float = SCALE_SPREAD,
 ) -> Similarity:
-    """Computes the most likely similarity T for ``target = T(source + e) + f``; the errors e (head frame) and f (world
-    frame) are correlated between points.
+    """Computes the most likely similarity T for ``target = T(source + e) + f``, where the errors e (head frame) and f
+    (world frame) are correlated between points.
 
-    Iterated generalised least squares from ``start``: the residual's covariance is ``s^2 R C R^T + F``, taken at the
-    last estimate. log s has the prior N(0, ``scale_spread``^2).
-    """
+    Iterates generalised least squares from ``start`` with the residual covariance ``s^2 R C R^T + F`` of the last
+    estimate. The logarithm of the scale s has the prior N(0, ``scale_spread``^2)."""
     scale, rotation, translation = start.scale, start.rotation, start.translation
     for _ in range(ITERATIONS):
         turn = scale * np.kron(np.eye(len(source)), rotation)
@@ -225,7 +225,7 @@ def generalised_procrustes(
 
 
 def block_diagonal(blocks: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "p p"]:
-    """Returns the joint covariance of points whose errors are independent, from the covariance of each."""
+    """Returns the joint covariance of points with independent errors, from the covariance of each point."""
     whole = np.zeros((len(blocks), 3, len(blocks), 3))
     whole[np.arange(len(blocks)), :, np.arange(len(blocks)), :] = blocks
     return whole.reshape(3 * len(blocks), -1)

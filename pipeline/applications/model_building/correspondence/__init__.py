@@ -1,1 +1,1 @@
-"""Brings scans into correspondence (section 3.2): warps the reference to the landmarks, then fits it to each scan."""
+"""Brings scans into correspondence (the paper's section 3.2): warps a reference to landmarks, fits it to surfaces."""

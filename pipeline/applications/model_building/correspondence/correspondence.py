@@ -1,22 +1,22 @@
-"""Brings raw scans into correspondence (section 3.2): landmark warp, cylindrical resampling, refinement.
+"""Brings raw scans into correspondence (the paper's section 3.2): landmark warp, cylindrical resampling, refinement.
 
-Every scan is first moved rigidly (by its landmarks) into the head frame. Its surface gets the default model's
-connectivity, because modes on a scan's own hundred thousand vertices would take a hundred megabytes (the paper keeps
-the scan's vertices). The paper's steps, ``on_reference`` and ``warp_and_resample``, draw figure 3. Landmarks alone
-leave the surface free to slide between them, so a model is built of what the refinement finds: the most probable head
-under a prior of heads, given the scan's landmarks and surface, and from there a smooth displacement along the normals
-onto the scan.
+Each scan is first moved rigidly into the head frame by its landmarks. The result has the vertices and triangles of the
+default model, because modes on a scan's hundred thousand vertices would take a hundred megabytes; the paper keeps the
+scan's vertices. The functions ``on_reference`` and ``warp_and_resample`` are the paper's steps; they serve only to draw
+its figure 3. Landmarks alone leave the vertices between them free to slide along the surface. A model is therefore
+built from refined heads: the most probable head under a prior of heads, given the scan's landmarks and surface, is
+displaced smoothly along its normals onto the scan.
 
-The prior allows more heads than the span of a model. A PCA of 138 heads has 137 directions, and a new head needs
-others: on heads outside its span, the PCA alone pulls vertices to wrong positions. Two facts extend the sample. A head
-and its mirror image are equally likely, so the covariance is averaged with its mirror image. Distant parts of a head
-are nearly independent, so the covariance is also multiplied by a Gaussian of the distance between vertices. This
-retains the correlation of neighbours only (localised Gaussian process morphable models, Luethi et al. 2018, *Gaussian
-Process Morphable Models*, section 3.3). The prior is a mixture of the plain and the localised covariance.
+The prior contains more heads than the span of a PCA. A PCA of 138 heads has 137 directions, and a head outside this
+span would be fitted with vertices at wrong positions. Two assumptions extend the sample of heads. A head and its mirror
+image are equally likely, so the covariance is averaged with the covariance of mirrored heads. Distant parts of a head
+are nearly independent, so a second covariance is multiplied by a Gaussian of the distance between vertices. The product
+keeps only the correlation of near vertices (localised models: Luethi et al. 2018, *Gaussian Process Morphable Models*,
+section 3.3). The prior mixes the original and the localised covariance.
 
-Rays are cast from the vertical axis through the head outwards. A ray is (angle, height): angle 0 points along +z (out
-of the face), pi/2 along +x (the subject's left); height is y. Scans are processed in several processes, because SuperLU
-and numpy hold the interpreter lock."""
+Resampling casts rays outwards from the vertical axis through the head. A ray is (angle, height): angle 0 points along
++z (out of the face), pi/2 along +x (the subject's left); height is y. Several processes work on scans, because SuperLU
+and numpy do not release the interpreter lock."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -83,7 +83,7 @@ _SYMMETRIC = 0.99  # share of edges that must exist mirrored too; not all do, si
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Workers:
-    """Runs a module-level function, or a partial of one, over items in several processes."""
+    """Runs a picklable function over items in several processes."""
 
     pool: ProcessPoolExecutor | None
 
@@ -100,7 +100,7 @@ class Workers:
 
 @contextmanager
 def workers(count: int, items: int) -> Iterator[Workers]:
-    """Yields ``count`` processes for ``items`` pieces of work; for few items the work runs in this process."""
+    """Yields ``count`` processes for ``items`` pieces of work; few items are processed in the calling process."""
     if count < 2 or items < FEW:
         yield Workers(None)
         return
@@ -120,7 +120,7 @@ def points_at(angles: PerVertex, heights: PerVertex, radii: PerVertex) -> Float[
 
 
 class CylinderIndex:
-    """Holds a triangle surface (mm, axis x = z = 0) prepared for rays from the axis."""
+    """Holds a triangle surface (mm), prepared for rays from the vertical axis x = z = 0."""
 
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
         self._vertices = np.ascontiguousarray(vertices, float)
@@ -130,8 +130,8 @@ class CylinderIndex:
         self._start, self._members = bin_triangles(self._vertices, self._faces, self._low, self._rows)
 
     def cast(self, angles: PerVertex, heights: PerVertex, near: PerVertex | None = None) -> PerVertex:
-        """Returns the radius (mm) of each ray's hit, NaN without one: the radius nearest to ``near``, or without it the
-        outermost."""
+        """Returns the radius (mm) at which each ray hits the surface: the hit nearest to ``near`` or, without ``near``,
+        the outermost hit; NaN without a hit."""
         wanted = np.full(len(angles), np.inf) if near is None else np.asarray(near, float)
         return cast_rays(
             self._vertices, self._faces, self._low, self._rows, self._start, self._members, angles, heights, wanted
@@ -141,7 +141,7 @@ class CylinderIndex:
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
     """Holds a distribution of heads (mm): mean + z modes with z ~ N(0, I). Modes need not be orthogonal; the first
-    ``broad`` ones are global, the others localised."""
+    ``broad`` modes are global, the others localised."""
 
     mean: Float[np.ndarray, "V 3"]
     modes: Float32[np.ndarray, "K V 3"]
@@ -151,7 +151,7 @@ class Prior:
 def registration_prior(
     mean: Float[np.ndarray, "V 3"], modes: Float[np.ndarray, "M V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Prior:
-    """Returns the mixture for a model's mean and modes (mm per sigma), mirrored if the mesh is symmetric."""
+    """Returns the mixed prior for a model's mean and modes (mm per sigma), mirrored if the mesh is symmetric."""
     opposite = mirror_images(mean, faces)
     if opposite is not None:
         mean = (mean + mean[opposite] * _MIRROR) / 2
@@ -162,10 +162,10 @@ def registration_prior(
 
 
 def mirror_images(mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " V"] | None:
-    """Returns for each vertex its counterpart across the median plane x = 0; None if the mesh is not symmetric.
+    """Returns, for each vertex, its mirror vertex across the median plane x = 0; None if the mesh is not symmetric.
 
-    It is the cheapest one-to-one assignment. A mean head is not exactly symmetric, so taking the nearest mirrored
-    vertex would use some vertices twice."""
+    The pairs are the one-to-one assignment with the least total distance. A mean head is not exactly symmetric, so
+    choosing the nearest mirrored vertex would use some vertices twice."""
     opposite = linear_sum_assignment(cdist(mean, mean * _MIRROR, "sqeuclidean"))[1]
     edges = edges_of(faces)[0].astype(np.int64)
     across = np.sort(opposite[edges], 1)
@@ -174,10 +174,11 @@ def mirror_images(mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"])
 
 
 def localised(mean: Float[np.ndarray, "V 3"], modes: Float32[np.ndarray, "M V 3"]) -> Float32[np.ndarray, "K V 3"]:
-    """Returns the ``KEPT`` strongest modes of the covariance multiplied by a Gaussian of the distance on the mean head.
+    """Returns the ``KEPT`` strongest modes of the localised covariance: the modes' covariance times a Gaussian of the
+    vertex distance on the mean head.
 
-    That product K is too large to store (400 MB), so its rows are computed in blocks and multiplied once by a random
-    sketch: K ~ Y (P^T Y)^-1 Y^T with Y = K P (Halko, Martinsson, Tropp 2011, section 5.5)."""
+    This matrix K is too large to store (400 MB), so its rows are computed in blocks and multiplied by a random matrix
+    P: K ~ Y (P^T Y)^-1 Y^T with Y = K P (Halko, Martinsson, Tropp 2011, section 5.5)."""
     size = mean.size
     flat = modes.reshape(len(modes), size)
     probe = np.random.default_rng(0).standard_normal((size, min(KEPT + _SPARE, size))).astype(np.float32)
@@ -198,8 +199,8 @@ def localised(mean: Float[np.ndarray, "V 3"], modes: Float32[np.ndarray, "M V 3"
 
 
 def correspond(scans: Sequence[Scan], template: HeadModel, report: Progress) -> Float[np.ndarray, "N V 3"]:
-    """Returns the scans as heads with the vertices of the template's cage (mm), moved into the common frame. The scans
-    must have passed ``scan_checks.check``."""
+    """Returns the scans as heads with the vertices of the template's coarsest mesh, the cage (mm), in the common head
+    frame. The scans must have passed ``scan_checks.check``."""
     count = len(template.mean)
     faces, mean = template.levels["cage"].faces, template.vertices(np.zeros(0))[:count]
     prior = registration_prior(mean, template.basis("full", len(template.modes), np.arange(count)), faces)
@@ -210,8 +211,8 @@ def correspond(scans: Sequence[Scan], template: HeadModel, report: Progress) -> 
 
 
 def common_frame(scans: Sequence[Scan], template: HeadModel) -> list[RigidTransform]:
-    """Returns the rigid motions of all scans into the head frame: landmarks are aligned with each other, and their mean
-    with the template's."""
+    """Returns the rigid motion of each scan into the head frame: the scans' landmarks are aligned with each other, and
+    their mean with the template's landmarks."""
     marks = np.array([stacked(scan.landmarks) for scan in scans])
     ours = template.vertices(np.zeros(0))[[template.landmarks[name] for name in NAMES]]
     weights = np.ones(len(NAMES))
@@ -221,7 +222,7 @@ def common_frame(scans: Sequence[Scan], template: HeadModel) -> list[RigidTransf
 
 
 def prepared(scan: Scan, frame_from_scan: RigidTransform) -> Target:
-    """Returns the scan in the common frame, smoothed without shrinking (Taubin 1995), with smooth normals."""
+    """Returns the scan in the common frame, smoothed without shrinking (Taubin 1995), with smoothed normals."""
     vertices = frame_from_scan.apply(scan.vertices)
     averaging = _averaging(scan.faces, len(vertices))
     for factor in _TAUBIN * _SMOOTHINGS:
@@ -243,7 +244,7 @@ def _averaging(faces: Int[np.ndarray, "F 3"], count: int) -> sparse.csr_array:
 
 
 def on_reference(target: Target, template: HeadModel) -> Float[np.ndarray, "V 3"]:
-    """Returns the template's cage vertices placed on the surface of the reference scan."""
+    """Returns the template's cage vertices moved onto the surface of the reference scan."""
     surface = template.vertices(np.zeros(0))[: len(template.mean)]
     index = _landmark_rows(template)
     warped = landmark_warp(surface[index], target.marks, surface)
@@ -258,9 +259,9 @@ def warp_and_resample(
     marks: Float[np.ndarray, "L 3"],
     cylinder: CylinderIndex,
 ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
-    """Warps the reference to the target's landmarks and resamples it on the target's surface (steps 3 and 4 of section
-    3.2). Returns the warped reference, its resampling, and where the target has no surface; such vertices stay at the
-    warped position."""
+    """Warps the reference head to the scan's landmarks and resamples it on the scan's surface (steps 3 and 4 of the
+    paper's section 3.2). Returns the warped head, the resampled head, and a mask of the vertices without surface, which
+    stay at the warped position."""
     warped = landmark_warp(shape[index], marks, shape, smoothing=MARK_SMOOTHING_MM)
     angles, heights, radii = coordinates(warped)
     hits = cylinder.cast(angles, heights, radii)
@@ -285,12 +286,12 @@ def _landmark_rows(template: HeadModel) -> Int[np.ndarray, " L"]:
 def statistical(
     prior: Prior, faces: Int[np.ndarray, "F 3"], index: Int[np.ndarray, " L"], target: Target
 ) -> Float[np.ndarray, "V 3"]:
-    """Returns the most probable head under the prior, given the scan's landmarks and surface: first with broad modes,
-    then with all.
+    """Returns the most probable head under the prior, given the scan's landmarks and surface; it is fitted first with
+    the broad modes, then with all modes.
 
-    On a plain cheek smoothness cannot determine where a vertex belongs; statistics of other heads can. Residuals are
-    point-to-plane and are weighted per cm2 of surface; landmarks count along all three axes; six columns are the
-    pose."""
+    On a featureless cheek, smoothness cannot determine where a vertex belongs, but the statistics of other heads can.
+    Surface residuals are point-to-plane distances weighted by area (cm2); landmark residuals count along all three
+    axes; six unknowns are the pose."""
     mean, areas = prior.mean, vertex_areas(prior.mean, faces)
     shape = landmark_warp(mean[index], target.marks, mean, smoothing=20.0)
     points = np.concatenate([mean, np.repeat(mean[index], 3, axis=0)])  # a landmark is three planes

@@ -1,5 +1,5 @@
-"""Holds the compiled loops that cast rays from the axis of a cylinder. The axis of the cylinder is y; angles about it
-are counted from z towards x."""
+"""Holds the compiled loops that cast rays from the axis of a cylinder. The cylinder's axis is y; angles about it are
+measured from z towards x."""
 
 import numpy as np
 
@@ -11,8 +11,8 @@ CELLS_ROUND = 288  # 2 mm at 92 mm from the axis
 
 @njit(cache=True)
 def cells_spanned(vertices, face, low, rows):  # pragma: no cover - compiled
-    """Returns the first and last column (these may exceed a full turn) and the first and last row of the grid cells
-    that a triangle may touch. ``low`` is the height (mm) of the grid's lower end."""
+    """Returns the range of columns (which may exceed a full turn) and of rows of the grid cells that a triangle may
+    touch. ``low`` is the height (mm) of the grid's lower edge."""
     angle0 = np.arctan2(vertices[face[0], 0], vertices[face[0], 2])
     first = last = angle0
     bottom = top = vertices[face[0], 1]
@@ -31,8 +31,8 @@ def cells_spanned(vertices, face, low, rows):  # pragma: no cover - compiled
 
 @njit(cache=True)
 def bin_triangles(vertices, faces, low, rows):  # pragma: no cover - compiled
-    """Sorts triangles into a grid of cells in angle and height, ``rows`` of ``CELLS_ROUND`` cells. Returns ``start``
-    and ``members``: the triangles of cell i are ``members[start[i]:start[i + 1]]``."""
+    """Sorts triangles into a cylindrical grid with ``rows`` rows (height) of ``CELLS_ROUND`` cells (angle). Returns
+    ``start`` and ``members``: the triangles of cell i are ``members[start[i]:start[i + 1]]``."""
     counts = np.zeros(rows * CELLS_ROUND + 1, np.int64)
     for f in range(len(faces)):
         a, b, c, d = cells_spanned(vertices, faces[f], low, rows)
@@ -55,10 +55,10 @@ def bin_triangles(vertices, faces, low, rows):  # pragma: no cover - compiled
 @njit(cache=True)
 def cast_rays(vertices, faces, low, rows, start, members, angles, heights, wanted):  # pragma: no cover - compiled
     """Casts horizontal rays from the y axis, each at an angle (rad) and a height (mm). Returns the radius (mm) of each
-    ray's hit: the one nearest to its ``wanted`` radius, or the outermost one if that is infinite; NaN without hit.
+    ray's hit: the hit nearest to the ray's ``wanted`` radius, or the outermost hit if ``wanted`` is infinite; NaN
+    without a hit.
 
-    Intersections are after Moeller and Trumbore 1997. ``start`` and ``members`` are the results of ``bin_triangles``.
-    """
+    Intersections follow Moeller and Trumbore 1997. ``start`` and ``members`` are the results of ``bin_triangles``."""
     radii = np.full(len(angles), np.nan)
     width = 2 * np.pi / CELLS_ROUND
     for k in range(len(angles)):

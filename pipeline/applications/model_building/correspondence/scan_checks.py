@@ -1,7 +1,7 @@
-"""Checks raw scans before they are averaged: units, sides, orientation of faces, landmarks off the surface, holes.
+"""Checks raw scans for problems: units, left and right, orientation of faces, landmarks off the surface, holes.
 
-A problem with one obvious remedy (units, a mirrored file, exchanged names, inverted faces) is repaired and reported.
-All else is a fault, and all faults of a scan are named. Landmarks are compared with the default model's mean."""
+A problem with one obvious remedy (units, a mirrored file, exchanged landmark names, inverted faces) is repaired and
+reported. All other problems are faults, which are all reported. Landmarks are compared with the default model's."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ _OUTWARD_SHARE = 0.7  # of the area: folds of ear and nostril look inwards even 
 
 
 class BadScan(InputError):
-    """Reports a scan with faults. ``faults`` lists all of them."""
+    """Reports a scan that has faults. ``faults`` lists all faults of the scan."""
 
     def __init__(self, name: str, faults: Iterable[str]) -> None:
         super().__init__(f"scan {name}", faults)
@@ -38,14 +38,14 @@ class BadScan(InputError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checked:
-    """Holds a scan fit for correspondence, and the repairs made to it."""
+    """Holds a scan that passed all checks, and the repairs made to it."""
 
     scan: Scan
     repairs: tuple[str, ...]
 
 
 def check(scan: Scan, template: HeadModel) -> Checked:
-    """Returns the scan in millimetres, with sides and faces repaired. Raises BadScan naming every fault."""
+    """Returns the scan in millimetres, with left and right and faces repaired. Raises BadScan with all faults."""
     _check_complete(scan)
     scan, repairs = _in_millimetres(scan, template)
     scan, side_repairs = _sides_and_windings(scan, template)
@@ -71,8 +71,8 @@ def _check_complete(scan: Scan) -> None:
 
 
 def _in_millimetres(scan: Scan, template: HeadModel) -> tuple[Scan, list[str]]:
-    """Converts a scan to millimetres. The distances between landmarks decide its unit: heads differ by a third, units
-    by a factor of 10."""
+    """Converts a scan to millimetres. The distances between landmarks decide the unit: heads differ in size by a third,
+    units by a factor of 10."""
     ratio = _radius_of_gyration(stacked(scan.landmarks)) / _radius_of_gyration(_mean_marks(template))
     for unit, factor in UNITS.items():
         if SIZE_RANGE[0] < ratio * factor < SIZE_RANGE[1]:
@@ -85,8 +85,8 @@ def _in_millimetres(scan: Scan, template: HeadModel) -> tuple[Scan, list[str]]:
 
 
 def _sides_and_windings(scan: Scan, template: HeadModel) -> tuple[Scan, list[str]]:
-    """Repairs exchanged sides (compared with the mean head) and inverted faces (compared with the axis). Both together
-    mean a mirrored file."""
+    """Repairs exchanged left and right (compared with the mean head) and inverted faces (compared with the direction
+    from the axis). A scan with both problems is a mirrored file."""
     marks, mean = stacked(scan.landmarks), _mean_marks(template)
     swapped = marks[[NAMES.index(mirrored(name)) for name in NAMES]]
     flipped = _misfit(swapped, mean) < 0.6 * _misfit(marks, mean)
@@ -120,7 +120,7 @@ def _landmark_faults(scan: Scan, template: HeadModel) -> list[str]:
 
 
 def _surface_faults(scan: Scan) -> list[str]:
-    """Returns a fault if neighbouring faces are oriented differently: both use their edge in one direction."""
+    """Returns a fault if neighbouring faces are oriented differently, so that both use their edge in one direction."""
     directed = np.concatenate([scan.faces[:, [0, 1]], scan.faces[:, [1, 2]], scan.faces[:, [2, 0]]]).astype(np.int64)
     keys = directed[:, 0] * len(scan.vertices) + directed[:, 1]
     doubled = len(keys) - len(np.unique(keys))
@@ -130,8 +130,8 @@ def _surface_faults(scan: Scan) -> list[str]:
 
 
 def _hole_faults(scan: Scan, template: HeadModel) -> list[str]:
-    """Returns a fault for each hole below the crown that is too wide, seen from the axis. The diameter is that of a
-    disc of the same area."""
+    """Returns a fault for each hole below the crown that is too wide, seen from the axis. A hole's width is the
+    diameter of a disc with the same area."""
     void, face = voids(scan, template)
     faults = []
     for where, mask, limit in (("face", void & face, FACE_HOLE_MM), ("head", void, HEAD_HOLE_MM)):
@@ -142,8 +142,8 @@ def _hole_faults(scan: Scan, template: HeadModel) -> list[str]:
 
 
 def voids(scan: Scan, template: HeadModel) -> tuple[Bool[np.ndarray, "H A"], Bool[np.ndarray, "H A"]]:
-    """Returns the cells (4 mm wide, by height and angle, from chin to above the brow) without a surface of the scan,
-    and the cells that belong to the face."""
+    """Returns a mask of the grid cells (4 mm wide, by height and angle, from the chin to above the brow) without
+    scanned surface, and a mask of the cells that belong to the face."""
     marks, placed = stacked(scan.landmarks), _placed(scan, template)
     at = dict(zip(NAMES, rigid_fit(marks, _mean_marks(template)).apply(marks), strict=True))
     heights = np.arange(at["gnathion"][1] + 4, at["glabella"][1] + 35, _CELL_MM)
@@ -155,7 +155,7 @@ def voids(scan: Scan, template: HeadModel) -> tuple[Bool[np.ndarray, "H A"], Boo
 
 
 def outward_share(scan: Scan, template: HeadModel) -> float:
-    """Returns the fraction of the scan's area whose faces point away from the head's axis."""
+    """Returns the fraction of the scan's area whose normals point away from the head's axis."""
     corners = _placed(scan, template)[scan.faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     outward = (doubled * (corners.mean(1) * [1, 0, 1])).sum(1) > 0
@@ -164,8 +164,8 @@ def outward_share(scan: Scan, template: HeadModel) -> float:
 
 
 def _widest(mask: Bool[np.ndarray, "H A"]) -> float:
-    """Returns the diameter (mm) of a disc as large as the largest connected patch. Columns are cyclic around the
-    head."""
+    """Returns the diameter (mm) of a disc with the area of the mask's largest connected patch. The mask's first and
+    last column are neighbours on the cylinder."""
     # Two copies side by side, so that the seam cuts no patch.
     twice = np.zeros((len(mask), 2 * mask.shape[1]), np.int32)
     ndimage.label(np.concatenate([mask, mask], 1), output=twice)

@@ -1,8 +1,8 @@
-"""Reads raw scans and their landmarks: a mesh file (PLY, OBJ, GLB) and, in its folder, a landmark file of its name.
+"""Reads raw scans and their landmarks: a mesh file (PLY, OBJ, GLB) and a landmark file of the same name beside it.
 
 Landmark files are ``.json`` (``{"points": {"pronasale": [x, y, z]}}``, or the names at the top level), MeshLab's picked
-points ``.pp``, landmarker.io's ``.ljson`` (versions 1 to 3; a label for a single point is its name), and 3D Slicer's
-``.mrk.json``. Names are the 26 of landmarks.py; case, blanks and hyphens do not matter."""
+points ``.pp``, landmarker.io's ``.ljson`` (versions 1 to 3; a label with a single point is a landmark), and 3D Slicer's
+``.mrk.json``. Landmark names are the 26 in landmarks.py, in any case and with blanks or hyphens."""
 
 import json
 import xml.etree.ElementTree as ElementTree
@@ -26,7 +26,7 @@ LANDMARK_SUFFIXES = (".json", ".mrk.json", ".pp", ".ljson")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """Holds one head as a scanner delivers it: any number of vertices, possibly with holes, in a frame of its own.
+    """Holds one head as a scanner delivers it: any number of vertices, possibly with holes, in the scanner's frame.
     Landmarks are in the same frame."""
 
     name: str
@@ -36,8 +36,8 @@ class Scan:
 
 
 def find_scans(folder: Path) -> list[Path]:
-    """Returns the mesh files of a folder, sorted by name. Raises InputError if there are none, or two files of one
-    head."""
+    """Returns the mesh files of a folder, sorted by name. Raises InputError if there are no mesh files, or several for
+    one head."""
     found = sorted(p for p in folder.glob("*") if p.suffix.lower() in MESH_SUFFIXES) if folder.is_dir() else []
     if not found:
         raise InputError(str(folder), ["holds no .ply, .obj or .glb scans (for results of jobs give --from-results)"])
@@ -49,7 +49,7 @@ def find_scans(folder: Path) -> list[Path]:
 
 
 def read_scan(path: Path) -> Scan:
-    """Returns a scan with its landmarks. Raises InputError."""
+    """Returns a scan with its landmarks. Raises InputError if a file cannot be used."""
     mesh, _ = welded(read_mesh(path))
     landmarks_path = landmark_file(path)
     if landmarks_path is None:
@@ -59,17 +59,17 @@ def read_scan(path: Path) -> Scan:
 
 
 def landmark_file(mesh: Path) -> Path | None:
-    """Returns the landmark file beside a mesh file, or None."""
+    """Returns the landmark file that belongs to a mesh file, or None."""
     beside = (mesh.with_suffix(suffix) for suffix in LANDMARK_SUFFIXES)
     return next((path for path in beside if path.is_file()), None)
 
 
 def welded(mesh: Mesh) -> tuple[Mesh, Bool[np.ndarray, " F"]]:
-    """Returns the mesh with every position stored once, without unused vertices, colours and degenerate triangles; and
-    which triangles it kept.
+    """Returns the mesh with each position stored once, without unused vertices, colours and degenerate triangles; also
+    a mask of the triangles that remain.
 
-    Files repeat vertices along texture seams, or for each triangle. Such a torn surface lacks the neighbours needed to
-    smooth noise."""
+    Mesh files repeat vertices along texture seams or for each triangle. A mesh torn along seams lacks the neighbours
+    that are needed to smooth noise."""
     _, first, index = np.unique(mesh.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
     corners = index.ravel()[mesh.faces]
     proper = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
@@ -78,8 +78,8 @@ def welded(mesh: Mesh) -> tuple[Mesh, Bool[np.ndarray, " F"]]:
 
 
 def read_landmarks(path: Path, axes: Axes = "LPS") -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns landmarks by this project's names; other points of the file are ignored. A .mrk.json states its own axes
-    and is turned to ``axes``. Raises InputError."""
+    """Returns landmarks by this project's names; other points in the file are ignored. A .mrk.json file states its own
+    axes and is converted to ``axes``. Raises InputError if the file cannot be used."""
     readers = {".json": _from_json, ".pp": _from_pp, ".ljson": _from_ljson}
     try:
         is_list = path.name.lower().endswith(".mrk.json")
@@ -101,7 +101,7 @@ def read_landmarks(path: Path, axes: Axes = "LPS") -> dict[str, Float[np.ndarray
 
 
 def plain_name(name: str) -> str:
-    """Returns the name in lower case with underscores."""
+    """Returns a landmark's name in lower case with underscores."""
     return "_".join(name.strip().lower().replace("-", " ").replace("_", " ").split())
 
 

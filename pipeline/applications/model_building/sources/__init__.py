@@ -1,1 +1,1 @@
-"""Reads models from other sources: MakeHuman's population, other programs' files, downloads."""
+"""Reads head models from other sources: MakeHuman, other programs' files, downloads."""

@@ -1,7 +1,7 @@
-"""Downloads published models: ICT-FaceKit Light at one fixed (pinned) commit, imported into the user's folder.
+"""Downloads the head model ICT-FaceKit Light at one fixed (pinned) git commit into the user's folder of models.
 
-The pin is a git commit, a hash over every byte of the tree. The checked-out commit must be the pinned one, whatever the
-server or folder returns; otherwise it is refused before any of its files is read."""
+A git commit is a hash over every byte of the files. A download with another commit than the pinned one is refused
+before any of its files is read."""
 
 import os
 import re
@@ -21,7 +21,7 @@ from rig.progress import Progress, discard_progress
 
 @dataclass(frozen=True, slots=True)
 class Remote:
-    """Describes the repository of a published model, and the commit with which this project was tested."""
+    """Describes the git repository of a published model, and the commit with which this project was tested."""
 
     url: str
     commit: str  # 40 hex digits
@@ -52,7 +52,7 @@ class CannotFetch(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fetched:
-    """Holds a fetched model: its file, its content, and the licence text to show."""
+    """Holds a downloaded model: its file, its content, and the licence text to show."""
 
     path: Path
     parts: ModelParts
@@ -95,7 +95,7 @@ def fetch_model(
 def _check_out(
     name: str, url: str, commit: str, remote: Remote, folder: Path, *, timeout_s: float, report: Progress
 ) -> None:
-    """Checks out the needed files of the pinned commit into ``folder``, without history."""
+    """Checks out only the needed files of the pinned commit into ``folder``, without history."""
     report("fetching", 0.0)
     place = str(Path(url).resolve()) if Path(url).exists() else url
     _git(name, folder, timeout_s, "init", "--quiet")
@@ -111,7 +111,7 @@ def _check_out(
 
 
 def _git(name: str, folder: Path, timeout_s: float, *arguments: str, report: Progress = discard_progress) -> str:
-    """Runs one git command and returns its output. It never asks for a password; its progress lines are reported."""
+    """Runs one git command and returns its output. Git never asks for a password; its progress lines are reported."""
     environment = os.environ | {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C", "GIT_LFS_SKIP_SMUDGE": "1"}
     try:
         with (folder.parent / f"{folder.name}.log").open("w+b") as errors:
@@ -139,7 +139,7 @@ def _git(name: str, folder: Path, timeout_s: float, *arguments: str, report: Pro
 
 
 def _waited(process: subprocess.Popen[bytes], errors: IO[bytes], until: float, report: Progress) -> bytes:
-    """Returns the standard output of a process, and reports its progress lines meanwhile. Raises TimeoutExpired."""
+    """Waits for a process, reporting its progress lines, and returns its standard output. Raises TimeoutExpired."""
     while True:
         try:
             return process.communicate(timeout=min(0.25, until - time.monotonic()))[0]

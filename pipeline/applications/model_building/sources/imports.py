@@ -1,10 +1,11 @@
-"""Imports models of other formats: ICT-FaceKit, statismo and Basel HDF5 files, plain npz.
+"""Imports head models of other formats: ICT-FaceKit, statismo and Basel HDF5 files, plain npz.
 
-Every reader returns a ``Foreign`` model in millimetres and head axes; ``adopt`` converts it to a model of this project.
-The model's own vertices stay. Modes that are not orthogonal become the principal axes of the same Gaussian
-(pca.orthogonalised), so the probability of every head stays the same. Landmarks missing in the source come from the
-default model, which is fitted to the mean and then warped. The face region follows from the landmarks. Triangles
-between existing vertices close the openings of eyes and mouth, so that the head hides what is behind it."""
+Every reader returns a ``Foreign`` model in millimetres and head-frame axes; ``adopt`` converts it to this project's
+form. The imported model keeps its vertices. Modes that are not orthogonal are replaced by the principal axes of the
+same Gaussian (``pca.orthogonalised``), so the probability of every head stays the same. Landmarks that the source lacks
+come from the default model, which is fitted to the imported mean head and then warped onto it. The face region follows
+from the landmarks. New triangles between existing vertices close the openings of eyes and mouth, which hides what is
+behind."""
 
 import json
 import re
@@ -48,8 +49,8 @@ class CannotImport(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Foreign:
-    """Holds a model in the form of its file, in mm and the axes of the head frame (x to the subject's left, y up, z out
-    of the face)."""
+    """Holds an imported head model before its conversion, in mm and in the head frame's axes (x to the subject's left,
+    y up, z out of the face)."""
 
     name: str
     licence: str
@@ -64,7 +65,7 @@ class Foreign:
 
 
 def read_obj(path: Path, *, polygons: bool = True) -> tuple[Vertices, list[list[int]]]:
-    """Returns vertices and polygons in the order of the file. trimesh would merge and reorder the vertices to which
+    """Returns vertices and polygons in the order of the file; trimesh would merge and reorder vertices, to which
     published indices refer."""
     vertices, faces = [], []
     with path.open(encoding="utf-8", errors="replace") as file:
@@ -107,9 +108,9 @@ _BASEL_NAMES = {
 
 
 def import_model(path: Path, *, name: str | None = None, report: Progress = discard_progress) -> ModelParts:
-    """Reads a model of another format and converts it; a model file of this project is only renamed.
+    """Reads a model of another format and converts it; a model file of this project only gets the new name.
 
-    A folder with exactly one model file is read as that file. Raises CannotImport."""
+    A folder with exactly one model file is read as that file. Raises CannotImport if there is no readable model."""
     files = [f for f in path.iterdir() if f.suffix.lower() in (".npz", ".h5", ".hdf5")] if path.is_dir() else []
     files = [f for f in files if not f.name.endswith(ICT_EXPRESSIONS)]  # read with the identities beside it
     path = files[0] if len(files) == 1 else path
@@ -133,7 +134,8 @@ def import_model(path: Path, *, name: str | None = None, report: Progress = disc
 
 
 def read_ict_compact(path: Path) -> Foreign:
-    """Returns the one-file copy of ICT-FaceKit Light: mean, modes, faces, landmarks68, in mm. Raises CannotImport."""
+    """Returns the model in ICT-FaceKit Light's one-file copy: mean, modes, faces, landmarks68 (mm). Raises
+    CannotImport."""
     with open_npz(path) as file:
         mean, modes, faces = (file[key] for key in ("mean", "modes", "faces"))
         points = file["landmarks68"]
@@ -141,7 +143,7 @@ def read_ict_compact(path: Path) -> Foreign:
 
 
 def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
-    """Returns the expressions from the file beside the identities': names, and shapes in mm on the same vertices."""
+    """Returns the expressions from the file beside the identity file: names and displacements of its vertices in mm."""
     beside = path.with_name(path.stem.removesuffix("_light") + ICT_EXPRESSIONS)
     if not beside.is_file():
         return None
@@ -153,8 +155,8 @@ def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
 
 
 def read_ict_repository(folder: Path, *, report: Progress = discard_progress) -> Foreign:
-    """Returns ICT-FaceKit from its repository's layout: generic_neutral_mesh.obj and identity000.obj ... in
-    centimetres."""
+    """Returns the model in a checkout of ICT-FaceKit's repository: generic_neutral_mesh.obj, identity000.obj and so on,
+    in centimetres."""
     inside = next((f for f in (folder, folder / "FaceXModel") if (f / "generic_neutral_mesh.obj").is_file()), None)
     if inside is None:
         raise CannotImport(folder, "it has no FaceXModel/generic_neutral_mesh.obj")
@@ -170,7 +172,7 @@ def read_ict_repository(folder: Path, *, report: Progress = discard_progress) ->
 
 
 def _repository_expressions(folder: Path, neutral: Vertices, report: Progress) -> Expressions | None:
-    """Returns the expressions from meshes named after them: browDown_L.obj and so on. Raises CannotImport."""
+    """Returns the expressions from mesh files named after them: browDown_L.obj and so on. Raises CannotImport."""
     paths = [path for path in sorted(folder.glob("*.obj")) if ICT_EXPRESSION.fullmatch(path.stem)]
     if not paths:
         return None
@@ -181,7 +183,7 @@ def _repository_expressions(folder: Path, neutral: Vertices, report: Progress) -
 def _displacements(
     folder: Path, paths: list[Path], neutral: Vertices, stage: str, report: Progress
 ) -> Float[np.ndarray, "M S 3"]:
-    """Returns how meshes (cm) of the repository ``folder`` differ from the neutral one, mm. Raises CannotImport."""
+    """Returns the displacements (mm) of the meshes in ``paths`` (cm) from the neutral mesh. Raises CannotImport."""
     shapes = []
     for k, path in enumerate(paths):
         vertices, _ = read_obj(path, polygons=False)
@@ -207,10 +209,10 @@ def _ict(mean: np.ndarray, modes: np.ndarray, faces: np.ndarray, points: np.ndar
 
 
 def read_statismo(path: Path) -> Foreign:
-    """Returns the model in a statismo file, also Basel Face Model 2017 and 2019: shape/model/{mean, pcaBasis,
+    """Returns the model in a statismo file, such as Basel Face Model 2017 and 2019: shape/model/{mean, pcaBasis,
     pcaVariance}, mm.
 
-    Basel models have the axes of our head frame: z out of the face, y up. Landmarks are read from
+    Basel models have the axes of this project's head frame: y up, z out of the face. Landmarks are read from
     metadata/landmarks/json."""
     try:
         import h5py
@@ -250,11 +252,10 @@ def _basel_landmarks(listed: list[dict], mean: Vertices) -> dict[str, int]:
 
 def read_plain(path: Path) -> Foreign:
     """Reads a model from an npz file of mean (V, 3), modes (M, V, 3) and faces (F, 3), in mm; docs/models.md describes
-    it. A mode is the displacement of one standard deviation, or of unit length where sigma is there.
+    it. A mode is the displacement of one standard deviation or, if the file contains sigma, a vector of unit length.
 
-    Optional: sigma (M,), standard deviations of unit modes; landmark_names, landmark_vertices; name, licence, source,
-    notice; subjects (total, male, female).
-    """
+    Optional entries are: sigma (M,), standard deviations of unit modes; landmark_names, landmark_vertices; name,
+    licence, source, notice; subjects (total, male, female)."""
     with open_npz(path) as file:
         missing = [key for key in ("mean", "modes", "faces") if key not in file]
         if missing:
@@ -289,8 +290,8 @@ def _check_plain(path: Path, mean: np.ndarray, modes: np.ndarray, faces: np.ndar
 
 
 def adopt(foreign: Foreign, *, report: Progress = discard_progress) -> ModelParts:
-    """Converts a model to this project's parts: orthogonal modes, all 26 landmarks, head frame, face region, closed
-    openings, levels. Raises CannotImport."""
+    """Converts an imported model to the parts of a model file: orthogonal modes, all 26 landmarks, head frame, face
+    region, closed openings, decimated meshes. Raises CannotImport if a part cannot be computed."""
     extent = float(np.ptp(foreign.mean, axis=0).max())
     if not 100 < extent < 600:
         raise CannotImport(foreign.name, f"its mean is {extent:.3g} mm large, which no head is: convert it to mm")
@@ -333,7 +334,7 @@ def largest_miss(
 
 
 def close_openings(vertices: Vertices, faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
-    """Returns the faces with strips that close every opening up to ``OPENING_MM`` wide except the neck."""
+    """Returns the faces, and additional faces that close every opening up to ``OPENING_MM`` wide except the neck."""
     loops = boundary_loops(faces)
     if not loops:
         return faces
@@ -347,8 +348,8 @@ def close_openings(vertices: Vertices, faces: Int[np.ndarray, "F 3"]) -> Int[np.
 
 
 def complete_landmarks(mean: Vertices, faces: Int[np.ndarray, "F 3"], known: Mapping[str, int]) -> dict[str, int]:
-    """Returns all 26 landmarks as vertices: the known ones, and the others from the default model, fitted and warped to
-    this mean head."""
+    """Returns all 26 landmarks as vertex indices: the known landmarks, and the others from the default model after
+    fitting and warping it to this mean head."""
     if set(known) >= set(NAMES):
         return {name: int(known[name]) for name in NAMES}
     default = load_model()
@@ -372,8 +373,8 @@ def complete_landmarks(mean: Vertices, faces: Int[np.ndarray, "F 3"], known: Map
 def _symmetric(at: Float[np.ndarray, "26 3"], mean: Vertices, surface: SurfaceIndex) -> Float[np.ndarray, "26 3"]:
     """Returns landmarks averaged with their mirror images if the mean head is symmetric (to 0.5 mm).
 
-    The default population is not exactly symmetric: on a perfectly symmetric head the fit alone puts an ear's landmark
-    3 mm higher on one side."""
+    The default model is not exactly symmetric: on a perfectly symmetric head, its fit alone puts one ear's landmark 3
+    mm higher than the other's."""
     middle = 2 * at[[NAMES.index(name) for name in MIDLINE], 0].mean() * np.array([1.0, 0.0, 0.0])
     flip = np.array([-1.0, 1.0, 1.0])
     if np.median(surface.closest(mean[::7] * flip + middle).distances) > 0.5:
@@ -382,7 +383,7 @@ def _symmetric(at: Float[np.ndarray, "26 3"], mean: Vertices, surface: SurfaceIn
 
 
 def _start(default: HeadModel, mean: Vertices, known: Mapping[str, int]) -> RigidTransform:
-    """Returns the starting pose for fitting the default model to a mean head: from shared landmarks, otherwise from the
+    """Returns the starting pose for fitting the default model to a mean head, from common landmarks or else from the
     tip of the nose."""
     ours = default.vertices(np.zeros(0))
     if len(known) >= 3:
@@ -393,7 +394,7 @@ def _start(default: HeadModel, mean: Vertices, known: Mapping[str, int]) -> Rigi
 
 
 def _likeness(default: HeadModel, mean: Vertices, faces: Int[np.ndarray, "F 3"], start: RigidTransform) -> Vertices:
-    """Returns the default model's head that best fits the mean head without its neck."""
+    """Returns the head of the default model that best fits the mean head without its neck."""
     areas = vertex_areas(mean, faces)
     placed = start.apply(default.vertices(np.zeros(0)))
     chin = placed[default.landmarks["gnathion"]]
@@ -418,8 +419,8 @@ def fit_surface(
     *,
     sigma_mm: float = 0.5,
 ) -> tuple[Float[np.ndarray, " m"], RigidTransform]:
-    """Estimates the pose and ``count`` coefficients that bring the model's surface to the points, under the prior.
-    Returns the coefficients (standard deviations) and target_from_head.
+    """Estimates the pose and ``count`` coefficients that bring the model's surface to the points, under the prior of
+    the coefficients. Returns the coefficients (standard deviations) and target_from_head.
 
     ``weights`` are the areas (mm²) that the points represent; ``sigma_mm`` is the standard deviation of a residual. The
     first steps fit only the pose and few modes and downweight distant points (Geman and McClure), so that a rough start

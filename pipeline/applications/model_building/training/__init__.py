@@ -1,1 +1,1 @@
-"""Trains a model on scans in correspondence (section 3.1), and measures how good it is."""
+"""Trains a head model on scans in correspondence (the paper's section 3.1), and measures its quality."""

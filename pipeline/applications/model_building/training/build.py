@@ -1,5 +1,5 @@
-"""Builds a head model from a folder of raw scans: checks, correspondence (section 3.2), alignment, principal components
-(3.1)."""
+"""Builds a head model from a folder of raw scans: checks, correspondence (the paper's section 3.2), alignment,
+principal components (3.1)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Built:
     parts: ModelParts
     used: tuple[str, ...]
     repaired: Mapping[str, tuple[str, ...]]  # what was repaired, by scan
-    skipped: Mapping[str, str]  # why a scan was left out, by scan
+    skipped: Mapping[str, str]  # faults of each omitted scan, by name
 
 
 def build_model(
@@ -39,8 +39,8 @@ def build_model(
 ) -> Built:
     """Builds a model from the scans of a folder and saves it as ``out``.
 
-    Every scan is checked before any other work. With ``on_bad="stop"`` bad scans raise InputError, which names all of
-    them; with ``"skip"`` they are left out. Raises InputError too if fewer than 3 sound scans remain."""
+    All scans are checked before any other work. With ``on_bad="stop"``, scans with faults raise one InputError that
+    lists them; with ``"skip"`` they are left out. Also raises InputError if fewer than 3 scans remain."""
     parts, sha256 = read_parts(model_path("default"))
     template = assemble(parts, sha256)
     good, skipped = read_checked(scans_folder, template, report)
@@ -69,7 +69,7 @@ def build_model(
 
 
 def read_checked(folder: Path, template: HeadModel, report: Progress) -> tuple[list[Checked], dict[str, str]]:
-    """Returns the sound scans of a folder, and the others' faults by name. Raises InputError for an empty folder."""
+    """Returns the faultless scans of a folder, and all others' faults. Raises InputError for an empty folder."""
     paths = find_scans(folder)
     with workers(WORKERS, len(paths)) as crew:
         found = crew.over(partial(_read_and_check, template), paths, "checking scans", report)
@@ -78,7 +78,7 @@ def read_checked(folder: Path, template: HeadModel, report: Progress) -> tuple[l
 
 
 def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
-    """Returns the checked scan, or a text that says what is wrong with it."""
+    """Returns the checked scan, or a text that describes its faults."""
     try:
         return check(read_scan(path), template)
     except InputError as fault:
@@ -86,11 +86,11 @@ def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
 
 
 def cages_through(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> Float[np.ndarray, "N V0 3"]:
-    """Computes cages (mm) whose subdivided surface passes through the points at the cage's vertices.
+    """Computes coarse control meshes, called cages (mm), whose subdivision surface passes through given points.
 
-    The subdivided surface lies inside the cage. So the cage C must solve S C = P, where S are the rows of the
-    subdivision matrix for the cage vertices. S nearly removes detail as fine as the cage itself, so its inverse would
-    amplify noise. A few steps C += P - S C, starting from the template's own detail, end before that happens."""
+    A subdivision surface lies inside its cage. The cage C must therefore solve S C = P, with the points P and the
+    subdivision matrix's rows S for the cage's vertices. S nearly removes details as fine as the cage itself, so its
+    inverse would amplify noise. A few iterations C += P - S C from the template's details avoid the noise."""
     rows = template.levels["full"].operator[: len(template.mean)]
     mean = template.mean.astype(float)
     away = points - rows @ mean

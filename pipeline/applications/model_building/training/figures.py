@@ -1,7 +1,7 @@
-"""Draws a model: its first modes (figure 2), correspondence step by step (figure 3), and curves of its quality.
+"""Draws a head model: its first modes (the paper's figure 2), the steps of correspondence (figure 3), and curves of its
+quality.
 
-All shading and drawing is in software, so that machines without graphics card and plotting library give the same
-pictures."""
+Pictures are drawn in software, so that machines without graphics card and plotting library give the same pictures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ _STEEPEST = 4.0  # ... unless the grid is coarse: 4 mm apart, the side of a nose
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scanner:
-    """Holds the properties of a scanner and its subjects. Lengths in mm."""
+    """Holds the properties of a simulated scanner and of its subjects. Lengths in mm."""
 
     spacing_mm: float = 1.0
     noise_mm: float = 0.1
@@ -57,7 +57,7 @@ def scan_head(
     scanner: Scanner,
     rng: np.random.Generator,
 ) -> Scan:
-    """Returns a raw scan of a head (head frame, mm) in the scanner's frame: rotated and shifted slightly."""
+    """Simulates a raw scan of a head (head frame, mm); the scan is slightly rotated and shifted."""
     angles, heights = _grid(vertices, scanner, rng)
     columns, rows = np.meshgrid(angles, heights)
     radii = CylinderIndex(vertices, faces).cast(columns.ravel(), rows.ravel())
@@ -76,8 +76,8 @@ def scan_head(
 def _grid(
     vertices: Float[np.ndarray, "V 3"], scanner: Scanner, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, " A"], Float[np.ndarray, " H"]]:
-    """Returns angles and heights of the samples, about ``spacing_mm`` apart on a head of 90 mm radius, different for
-    each scan."""
+    """Returns the angles and heights at which a scan samples a head, about ``spacing_mm`` apart on a head of 90 mm
+    radius and different for each scan."""
     spacing_mm = scanner.spacing_mm * rng.uniform(0.95, 1.05)
     count = round(2 * np.pi * 90 / spacing_mm)
     angles = -np.pi + 2 * np.pi * (np.arange(count) + rng.uniform()) / count
@@ -91,7 +91,7 @@ def _swallowed(
     scanner: Scanner,
     rng: np.random.Generator,
 ) -> Bool[np.ndarray, " N"]:
-    """Returns which samples hair or the ears absorb."""
+    """Returns a mask of the samples that the simulated scanner loses in hair or ears."""
     lost = np.zeros(len(points), bool)
     hair_line = marks["glabella"][1] + 45.0
     hairy = np.flatnonzero((points[:, 1] > hair_line) | ((points[:, 2] < -20) & (points[:, 1] > 0)))
@@ -107,7 +107,7 @@ def _swallowed(
 def _grid_faces(
     valid: Bool[np.ndarray, "H A"], points: Float[np.ndarray, "N 3"], jump_mm: float
 ) -> Int[np.ndarray, "F 3"]:
-    """Returns triangles between neighbouring samples, across the seam too; none has a side of ``jump_mm`` or more."""
+    """Returns triangles between neighbouring samples, also across the angle's seam; no edge reaches ``jump_mm``."""
     rows, columns = valid.shape
     index = np.arange(rows * columns).reshape(rows, columns)
     here, right = index[:-1], np.roll(index, -1, 1)[:-1]
@@ -132,7 +132,7 @@ _BEHIND_RAD = 2.4
 
 
 def show_model(model: HeadModel, folder: Path, *, modes: int, report: Progress) -> list[Path]:
-    """Writes modes.png, correspondence.png and curves.png (the last where training heads are known) into a folder."""
+    """Writes modes.png, correspondence.png and, if the model's training heads are known, curves.png into a folder."""
     report("drawing modes", 0.0)
     pictures = {"modes.png": modes_figure(model, modes)}
     report("drawing correspondence", 0.0)
@@ -151,7 +151,7 @@ def shaded(
     marked: Bool[np.ndarray, " V"] | None = None,
     azimuth_rad: float = 0.45,
 ) -> Image:
-    """Returns one head (head frame, mm) lit from the upper left; ``marked`` vertices are red."""
+    """Draws one head (head frame, mm) lit from the upper left; ``marked`` vertices are red."""
     turn = np.array([np.sin(azimuth_rad), 0.0, np.cos(azimuth_rad)])
     width, height = 2 * PANEL[0], 2 * PANEL[1]
     focal = height * _DISTANCE_MM / _FIELD_MM
@@ -167,7 +167,7 @@ def shaded(
 
 
 def modes_figure(model: HeadModel, modes: int) -> Image:
-    """Draws figure 2: one row for each mode, with heads at -3, 0 and +3 standard deviations."""
+    """Draws the paper's figure 2: one row for each mode, with heads at -3, 0 and +3 standard deviations."""
     faces = model.levels["full"].faces
     rows = []
     for k in range(min(modes, len(model.modes))):
@@ -181,10 +181,10 @@ def modes_figure(model: HeadModel, modes: int) -> Image:
 
 
 def correspondence_figure(model: HeadModel) -> Image:
-    """Draws figure 3: reference, target scan, warped reference, and resampled head with its voids in red.
+    """Draws the paper's figure 3: reference, target scan, warped reference, and resampled head with its holes in red.
 
-    Each is seen from the front and from behind. Both heads are drawn at random from the model and scanned by the
-    simulated scanner, holes included."""
+    Each head is drawn from the front and from behind. Reference and target are random heads of the model, scanned by
+    the simulated scanner with holes."""
     rng = np.random.default_rng(3)
     count = min(20, len(model.modes))
     faces = model.levels["full"].faces
@@ -231,7 +231,7 @@ def curves_figure(model: HeadModel, report: Progress) -> Image:
 
 
 def chart(title: str, values: Mapping[int, float], colour: tuple[int, int, int]) -> Image:
-    """Draws one curve over the number of modes, from zero up, with its axes."""
+    """Draws one curve over the number of modes, from zero up, with axes."""
     width, height, left, bottom, top = 420, 320, 55, 275, 40
     canvas = np.full((height, width, 3), PAPER, np.uint8)
     most, highest = max(values), max(values.values())

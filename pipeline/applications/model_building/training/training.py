@@ -1,7 +1,7 @@
-"""Turns corresponded heads into the content of a model file: alignment, principal components, levels, face region. Also
-measures compactness, generalisation and specificity (R. Davies, *Learning Shape: Optimal Models for Analysing Natural
-Variability*, 2002, chapter 5). None of the three is enough: a model of one head is compact and specific, a model that
-allows any shape generalises."""
+"""Computes the content of a model file from corresponded heads: alignment, principal components, decimated meshes, face
+region. Also measures compactness, generalisation and specificity (R. Davies, *Learning Shape: Optimal Models for
+Analysing Natural Variability*, 2002, chapter 5). No single measure suffices: a model of one head is compact and
+specific, and a model that allows any shape generalises well."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ USED_MODES = 60  # section 4.4
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Training:
-    """Holds corresponded heads (mm, in any common pose, y up, z to the front), and the other content of a model."""
+    """Holds corresponded heads (mm, in any common pose, y up, z out of the face), and the training's other inputs."""
 
     name: str
     licence: str
@@ -36,9 +36,9 @@ class Training:
 
 
 def train(training: Training, *, report: Progress) -> ModelParts:
-    """Computes a model's parts: rigid Procrustes alignment (no scale), PCA, levels, generalisation and specificity.
+    """Computes a model's parts: rigid Procrustes alignment (no scale), PCA, decimated meshes, quality figures.
 
-    Raises NotAManifold."""
+    Raises NotAManifold if the faces form no manifold."""
     check_manifold(training.faces)
     report("aligning", 0.0)
     ears = training.heads[:, [training.landmarks["tragion_right"], training.landmarks["tragion_left"]]].mean(1)
@@ -65,7 +65,7 @@ def finish(
     *,
     report: Progress = discard_progress,
 ) -> ModelParts:
-    """Builds the parts of a model from its components. Decimated levels are chosen on the mean head."""
+    """Builds the parts of a model file from its principal components. Decimated meshes are chosen on the mean head."""
     report("decimating", 0.0)
     decimated = levels_of(components.mean, training.faces, region, training.landmarks, training.subdivisions)
     report("decimating", 1.0)
@@ -95,10 +95,10 @@ def levels_of(
     landmarks: Mapping[str, int],
     subdivisions: int,
 ) -> dict[str, tuple[Int[np.ndarray, " K"], Int[np.ndarray, "G 3"]]]:
-    """Computes the levels of 95 % and 99 % reduction: their vertices as rows of the full level, and their faces. Every
-    landmark is kept.
+    """Computes two decimated meshes with 95 % and 99 % fewer triangles: their vertices as indices into the finest mesh,
+    and their faces. Decimation keeps every landmark.
 
-    They have 5 % and 1 % of the triangles of the full level, or of the paper's 96,000 if a model has fewer."""
+    The meshes have 5 % and 1 % of the triangles of the finest mesh, or of the paper's 96,000 if a model has fewer."""
     full, full_faces = refine(faces, len(mean), subdivisions)
     targets = tuple(round(max(len(full_faces), PAPER_FACES) * share) for share in (0.05, 0.01))
     steps = 0
@@ -121,15 +121,15 @@ def centred(heads: Float[np.ndarray, "N V 3"], landmarks: Mapping[str, int]) -> 
 
 
 def above_neck(head: Float[np.ndarray, "V 3"], landmarks: Mapping[str, int]) -> Float[np.ndarray, " V"]:
-    """Returns weights: 1 above a plane from chin to nape, 0 below it, so that the posture of the neck does not rotate
-    the head."""
+    """Returns vertex weights: 1 above a plane from chin to nape, 0 below it, so that the posture of the neck does not
+    affect the head's alignment."""
     chin = head[landmarks["gnathion"]]
     slope = 0.35  # the line from under the chin to the nape rises towards the back
     return (head[:, 1] > chin[1] - 3 + slope * (chin[2] - head[:, 2])).astype(float)
 
 
 def face_region(mean: Float[np.ndarray, "V 3"], landmarks: Mapping[str, int]) -> Bool[np.ndarray, " V"]:
-    """Marks the face: in front of the ears, above the jaw line, below the hair."""
+    """Returns a mask of the face: in front of the ears, above the jaw line, below the hair."""
     at = {name: mean[index] for name, index in landmarks.items()}
     eye = (at["exocanthion_right"] + at["exocanthion_left"]) / 2
     jaw = (at["gonion_right"] + at["gonion_left"]) / 2
@@ -156,8 +156,8 @@ def generalisation(
     """Computes, by number of modes, the mean vertex distance (mm, over ``region``) between each head and its best fit
     in the PCA of all others.
 
-    The heads are rotated into the components' own axes, which is exact for training heads. So each PCA is one of N - 1
-    points in N - 1 dimensions instead of 3 V."""
+    Training heads are represented exactly in the principal axes of the N heads. Each PCA without one head is therefore
+    computed in N - 1 dimensions instead of 3 V."""
     counts = list(counts)
     points = components.scores * components.sigma  # mm, orthonormal axes
     axes = (components.modes / components.sigma[:, None, None])[:, region].reshape(len(components.sigma), -1)
@@ -184,7 +184,7 @@ def specificity(
     draws: int = 200,
     seed: int = 0,
 ) -> float:
-    """Computes the mean distance (mm, in ``region``) of random draws of a model to the nearest of ``heads``."""
+    """Computes the mean distance (mm, over ``region``) between random heads of a model and the nearest of ``heads``."""
     rng = np.random.default_rng(seed)
     known = heads[:, region].astype(np.float32)
     total = 0.0

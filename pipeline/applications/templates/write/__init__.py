@@ -1,1 +1,1 @@
-"""Writes a result in the vertex order of a template."""
+"""Writes a fitted head in the vertex order of a template."""

@@ -1,11 +1,11 @@
-"""Writes ``head-NAME.obj`` of a result: the head in a template's vertex order, with its polygons, groups and texture
-coordinates. Also writes ``head_hair-NAME.obj``, the head pushed out to its hair.
+"""Writes a fitted head as ``head-NAME.obj``, in a template's vertex order and with the template's polygons, groups and
+texture coordinates. Also writes ``head_hair-NAME.obj``, the head with its surface moved out to its hair.
 
-World frame, mm, like head.ply and head.obj. If the result has a texture and the template has texture coordinates, the
-skin is textured (head-NAME.mtl, head-NAME.jpg, and one more file for each further tile); otherwise the vertices are
-coloured. A texel of the template's layout lies in a triangle whose corners have positions in the model's layout; the
-texture is read there. Triangles across the cut of the model's layout are filled from neighbouring texels. Coordinates
-beyond the unit square are separate tiles (UDIM).
+The OBJ files are in the world frame, mm, like head.ply and head.obj. If the result has a texture and the template has
+texture coordinates, the skin is textured (head-NAME.mtl, head-NAME.jpg, and one more image for each further UDIM tile);
+otherwise the vertices are coloured. Each texel of the template's texture lies in a triangle whose corners have
+positions in the head model's texture, and its colour is read there. Triangles that cross a seam of the head model's
+texture are filled from neighbouring texels. Texture coordinates beyond the unit square belong to separate UDIM tiles.
 """
 
 from pathlib import Path
@@ -31,13 +31,13 @@ NEAR = 0.02  # of the side: so far from known texels the nearest one is repeated
 CUT = 0.05  # of the model's layout: a triangle longer than that lies over its cut
 
 Tile = tuple[int, int]
-NO_SKIN = 200  # grey of what no photograph shows
+NO_SKIN = 200  # grey of vertices without photographs
 SKIN_SHARE = 0.1  # of a material's polygons on the skin, beyond which it shows the texture: shoulders may be the rest
 
 
 def corner_tiles(mesh: PolygonMesh) -> Int[np.ndarray, "p 2"]:
-    """Returns the UDIM tile (column, row) of each polygon: the tile that contains the middle of its texture
-    coordinates. (-1, -1) for a polygon without texture coordinates."""
+    """Returns the UDIM tile (column, row) that contains the centre of each polygon's texture coordinates; (-1, -1) for
+    a polygon without texture coordinates."""
     if not len(mesh.uv):
         return np.full((len(mesh.sizes), 2), -1)
     first = np.cumsum(mesh.sizes) - mesh.sizes
@@ -48,7 +48,7 @@ def corner_tiles(mesh: PolygonMesh) -> Int[np.ndarray, "p 2"]:
 
 
 def skin_polygons(mesh: PolygonMesh, surface_binding: SurfaceBinding) -> Bool[np.ndarray, " p"]:
-    """Tells which polygons of the template have all their corners on the skin."""
+    """Returns a mask of the template's polygons whose corners are all skin vertices."""
     skin = np.zeros(len(surface_binding.rest), bool)
     skin[surface_binding.skin] = True
     return np.logical_and.reduceat(skin[mesh.corners], np.cumsum(mesh.sizes) - mesh.sizes)
@@ -77,7 +77,7 @@ def template_textures(
 
 
 def _places(layout: Layout, surface_binding: SurfaceBinding) -> Float[np.ndarray, "t 2"]:
-    """Returns the position of each skin vertex in the model's layout; all other vertices get the layout's corner."""
+    """Returns each skin vertex's position in the head model's texture; other vertices get the texture's corner."""
     attached = surface_binding.attachment
     out = np.zeros((len(surface_binding.rest), 2))
     out[surface_binding.skin] = np.einsum("nk,nkx->nx", attached.weights, layout.uv[layout.faces[attached.triangles]])
@@ -108,8 +108,8 @@ def read_in_tile(
     size: int,
     values: Float32[np.ndarray, "c k"],
 ) -> tuple[Float32[np.ndarray, "s s k"], Bool[np.ndarray, "s s"]]:
-    """Returns values of the ``corners`` of triangles (of the mesh's polygons) at the texels of a tile, interpolated,
-    and which texels lie in a triangle."""
+    """Interpolates values at triangle ``corners`` (of the mesh's polygons) at the texels of a tile; returns the values,
+    and a mask of the texels that lie in a triangle."""
     uv = mesh.uv[mesh.corner_uv[corners.ravel()]] - tile
     texels = size * np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1) - 0.5
     faces, ones = np.arange(len(uv), dtype=np.int32).reshape(-1, 3), np.ones(len(uv))
@@ -119,8 +119,8 @@ def read_in_tile(
 
 
 def filled(image: UInt8[np.ndarray, "s s 3"], known: Bool[np.ndarray, "s s"]) -> UInt8[np.ndarray, "s s 3"]:
-    """Returns the image with unknown texels filled: near known ones (a margin for blurred reading, and the cut) with
-    the nearest known texel, elsewhere with the mean colour. The fill is coarse; known texels do not change."""
+    """Returns the image with unknown texels filled: texels near known ones with the nearest known colour, all others
+    with the mean colour. Filled texels near the border serve blurred texture reads; known texels do not change."""
     step = max(1, len(image) // COARSE)
     if not known[::step, ::step].any():
         return image
@@ -141,7 +141,7 @@ def _extended(image: UInt8[np.ndarray, "c c 3"], known: Bool[np.ndarray, "c c"])
 
 
 def write_template(folder: Path, result: Reconstruction, template: Template) -> None:
-    """Writes the head in the template's vertex order, with its textures and materials. Raises OSError."""
+    """Writes the fitted head in the template's vertex order, with its textures and materials. Raises OSError."""
     head, surface_binding, name = result.mesh_world, template.surface_binding, f"head-{template.name}"
     vertices = surface_binding.on(head.vertices, head.faces)
     textures = (
@@ -171,8 +171,8 @@ def write_template(folder: Path, result: Reconstruction, template: Template) -> 
 
 
 def write_template_hair(folder: Path, result: Reconstruction, template: Template) -> None:
-    """Writes the template on the head with its hair, if the result has hair; its vertices retain their positions in the
-    model's triangles. Raises OSError."""
+    """Writes the template deformed to the head with its hair, if the result has hair; each vertex keeps its barycentric
+    coordinates in the head model's triangles. Raises OSError."""
     hair, faces = result.hair, result.mesh_world.faces
     if hair is None:
         return
@@ -197,14 +197,14 @@ def tile_suffix(tile: Tile) -> str:
 
 
 def template_colours(result: Reconstruction, template: Template) -> UInt8[np.ndarray, "t 3"]:
-    """Returns the colours of the template's vertices: the head's on the skin, grey elsewhere."""
+    """Returns the colours of the template's vertices: the fitted head's colours on the skin, grey elsewhere."""
     return _carry_colours(result.texturing.vertices.colours, result.mesh_world.faces, template)
 
 
 def _carry_colours(
     colours: UInt8[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], template: Template
 ) -> UInt8[np.ndarray, "t 3"]:
-    """Converts the model's vertex colours to the template's; grey outside its skin."""
+    """Converts the head model's vertex colours to the template's vertices; vertices outside the skin become grey."""
     attached = template.surface_binding.attachment
     corners = colours[faces[attached.triangles]].astype(float)
     out = np.full((len(template.surface_binding.rest), 3), NO_SKIN, np.uint8)
@@ -213,8 +213,8 @@ def _carry_colours(
 
 
 def template_materials(template: Template, files: dict[Tile, str]) -> tuple[PolygonMesh, bytes]:
-    """Returns the mesh with a material for each part that has one in its file, otherwise one for the whole mesh; also
-    the material library. A skin material shows the image of the tile with most of its skin."""
+    """Returns the mesh with its file's materials, or with one material for the whole mesh, and the material library. A
+    skin material shows the image of the UDIM tile that holds most of its skin."""
     mesh = template.mesh
     tiles, skin = corner_tiles(mesh), skin_polygons(mesh, template.surface_binding)
     used = [(before, line.partition(" ")[2]) for before, line in mesh.statements if line.startswith("usemtl ")]

@@ -1,14 +1,14 @@
-"""Writes the files that applications add to a job's result. ``head-NAME.glb`` and ``head-NAME-shapes.npz`` are the
-template's mesh without expression, with shapes. ``posed.glb`` is the same for the model's own mesh, with its texture.
+"""Writes the files that applications add to a job's result. ``head-NAME.glb`` and ``head-NAME-shapes.npz`` hold the
+template's mesh without expression and its blendshapes. ``posed.glb`` holds the model's textured mesh and blendshapes.
 
-All are in the head frame: the GLBs in metres, the archive in mm. Vertices keep their order. In a GLB, eyeballs are
-separate parts; ``extras.rows`` of a node lists its vertices. Eyeballs, teeth and a tongue that were added have no
-``rows``. For the formats OBJ and USDZ, ``head-NAME-parts.obj`` and ``head-NAME-parts.usdz`` are the same without
-shapes, with named parts.
+The GLB files are in the head frame in metres, the NPZ file in the head frame in mm. Vertices keep the order of the
+template or of the head model. In a GLB file, eyeballs are separate nodes, and a node's ``extras.rows`` lists the
+indices of its vertices in the mesh. Eyeballs, teeth and tongue that this program added have no ``rows``. For the
+formats OBJ and USDZ, ``head-NAME-parts.obj`` and ``head-NAME-parts.usdz`` hold the template's named parts without
+blendshapes.
 
-The image of an eyeball is centred at the iris, equidistant in angle. The part between the lids has the head's texture;
-hidden parts have the median colour of their ring of the iris, or of the white.
-"""
+The image of an eyeball is centred at the iris; distance from its centre is proportional to the angle from the gaze.
+Between the lids, an eyeball's image shows the head's texture, elsewhere median colours of iris or white."""
 
 import io
 import json
@@ -51,7 +51,7 @@ from rig.mesh import Mesh
 SIZE_PX = 512  # a texel is 0.15 mm, about a pixel of a photograph
 FRONT_DEG = 75.0  # from the gaze: lids hide what is farther
 ASIDE_MM = 0.5  # between a point of the ball and the nearest one between the lids, along the ball: more is hidden
-FEATHER_PX = 6  # over which what is seen fades to what is guessed
+FEATHER_PX = 6  # over which photographed colours fade to guessed ones
 RING_DEG = 1.0
 MIN_SEEN = 0.3  # of the iris
 BRIGHT = 0.7  # of what is seen beside the iris, the share that lids and their shadow may be
@@ -63,8 +63,8 @@ LID_MM = 30.0  # from an eyeball's middle: no other opening is so near
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotographedEyes:
-    """Holds the head as photographed (head frame, mm), the indices of its triangles between lids and lips, and its
-    texture, if it has one."""
+    """Holds the head as photographed (head frame, mm), the indices of its triangles between lids and between lips, and
+    its texture, if it has one."""
 
     head: Mesh
     between: Int[np.ndarray, " g"]
@@ -72,7 +72,7 @@ class PhotographedEyes:
 
 
 def eyeball_uv(eyeball: Eyeball, mesh: Mesh) -> Float[np.ndarray, "n 2"]:
-    """Returns the image coordinates of the vertices of an eyeball that looks straight ahead."""
+    """Returns the image coordinates of the vertices of an eyeball whose gaze is straight ahead."""
     away = mesh.vertices - eyeball.centre
     angle = np.arctan2(np.hypot(away[:, 0], away[:, 1]), away[:, 2])
     aside = np.hypot(away[:, 0], away[:, 1])
@@ -103,8 +103,8 @@ def paint_eyeball(eyeball: Eyeball, photographed: PhotographedEyes) -> UInt8[np.
 
 
 def darkest_direction(eyeball: Eyeball, photographed: PhotographedEyes) -> Float[np.ndarray, " 3"] | None:
-    """Returns the direction (unit vector) from the eyeball to the middle of the darkest area between the lids; None if
-    nothing is much darker than the rest, as between closed lids."""
+    """Returns the direction (unit vector) from the eyeball's centre to the middle of the darkest area between the lids,
+    usually the iris; None if no area is much darker than the rest, as between closed lids."""
     _, _, directions = _front(eyeball.gaze)
     colours, seen = _photographed(eyeball, directions, photographed)
     if not seen.any():
@@ -118,7 +118,8 @@ def darkest_direction(eyeball: Eyeball, photographed: PhotographedEyes) -> Float
 def _front(
     gaze: Float[np.ndarray, " 3"],
 ) -> tuple[Float[np.ndarray, "s s"], Bool[np.ndarray, "s s"], Float[np.ndarray, "n 3"]]:
-    """Returns the angle from the gaze (rad) of each texel, which texels are in front, and their directions."""
+    """Returns, for each texel of an eyeball's image, the angle from the gaze (rad) and whether it is on the front half;
+    also the directions of these texels."""
     offsets = (np.arange(SIZE_PX) + 0.5) / SIZE_PX - 0.5
     x, y = np.meshgrid(offsets, -offsets)
     angle = 2.0 * np.pi * np.hypot(x, y)
@@ -130,7 +131,7 @@ def _front(
 def _photographed(
     eyeball: Eyeball, directions: Float[np.ndarray, "n 3"], photographed: PhotographedEyes
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Returns the head's colours (sRGB) in these directions of an eyeball, and which of them no lid hides."""
+    """Returns photographed colours (sRGB) in directions from an eyeball's centre, and which directions no lid hides."""
     head, atlas = photographed.head, photographed.atlas
     if atlas is None or not len(photographed.between):
         return np.zeros_like(directions), np.zeros(len(directions), bool)
@@ -147,20 +148,19 @@ def _photographed(
 
 
 def load_template_writers(name: str | None, model: HeadModel) -> tuple[ResultWriter, ...]:
-    """Loads the named template, if any, for a job with this model; returns the writer of posed.glb, and the template's.
+    """Loads the named template, if any, for a job with ``model``; returns the writers of posed.glb and template files.
 
-    Raises UnknownTemplate, BadTemplate, OtherModel.
-    """
+    Raises UnknownTemplate, BadTemplate, OtherModel."""
     template = load_template(name, model)
     return (write_posed, *(() if template is None else template_writers(template)))
 
 
 def template_writers(template: Template) -> tuple[ResultWriter, ...]:
-    """Returns the writers with which ``write_result`` also writes a result in this template's order:
+    """Returns the functions with which ``write_result`` also writes files in the template's vertex order:
 
-    - head-NAME.obj with its textures, head_hair-NAME.obj if the head was pushed out to its hair,
-    - with morphs: head-NAME.glb and head-NAME-shapes.npz,
-    - flame_param.npz if the template was made from a FLAME model, and ``template`` in report.json.
+    - head-NAME.obj is written with its textures, and head_hair-NAME.obj if the result has hair.
+    - head-NAME.glb and head-NAME-shapes.npz are written if the settings request morph targets.
+    - flame_param.npz is written if the template was made from a FLAME model; report.json gets the entry ``template``.
     """
     writers = (write_flame, write_template, write_template_shapes, write_template_hair)
     return tuple(partial(write, template=template) for write in writers)
@@ -170,8 +170,8 @@ DEEP = 0.1  # how much a vertex off the skin counts
 
 
 def write_flame(folder: Path, result: Reconstruction, template: Template) -> AddedReport:
-    """Fits the template's FLAME model, if it has one, to the head and writes its parameters. Returns the report's entry
-    for the template, with the figures of the fit. Raises OSError."""
+    """Fits the template's FLAME model, if it has one, to the head and writes FLAME's parameters. Returns the template's
+    entry in report.json, with figures of this fit. Raises OSError."""
     report: TemplateReport = {
         "name": template.name,
         "source": template.source,
@@ -192,8 +192,8 @@ def write_flame(folder: Path, result: Reconstruction, template: Template) -> Add
 
 
 def _flame_figures(fit: FlameFit, skin: np.ndarray) -> dict[str, float]:
-    """Returns the distance (mm) of the fitted model's skin from the head without ``static_offset``, and the distance of
-    its parameters from the mean (RMS, in standard deviations)."""
+    """Returns the distance (mm) between the fitted FLAME skin and the head without ``static_offset``, and the distance
+    of the FLAME parameters from the mean (RMS, in standard deviations)."""
     off_mm = 1000.0 * fit.distances[skin]
     return {
         "residual_median_mm": float(np.median(off_mm)),
@@ -204,8 +204,8 @@ def _flame_figures(fit: FlameFit, skin: np.ndarray) -> dict[str, float]:
 
 
 def write_template_shapes(folder: Path, result: Reconstruction, template: Template) -> None:
-    """Writes the template's mesh with morph targets and pivots, and the same as arrays, if the settings request morphs
-    and the model has shapes. Raises OSError."""
+    """Writes the template's mesh with morph targets and pivots as GLB and as arrays, if the settings request morph
+    targets and the head model has blendshapes. Raises OSError."""
     blendshape_rig = result.evidence.blendshape_rig
     if blendshape_rig is None or not result.settings.outputs.morphs:
         return
@@ -232,8 +232,9 @@ def write_template_shapes(folder: Path, result: Reconstruction, template: Templa
 
 
 def write_posed(folder: Path, result: Reconstruction) -> None:
-    """Writes posed.glb if the settings request morphs and the model has shapes: the head without expression, with its
-    texture, shapes, pivots, eyeballs, teeth and tongue, at the weights of the photographed head. Raises OSError."""
+    """Writes posed.glb if the settings request morph targets and the head model has blendshapes. The file holds a head
+    without expression, texture, blendshapes, pivots, eyeballs, teeth, tongue, and the photographed weights. Raises
+    OSError."""
     blendshape_rig = result.evidence.blendshape_rig
     if blendshape_rig is None or not result.settings.outputs.morphs:
         return
@@ -261,7 +262,7 @@ def write_posed(folder: Path, result: Reconstruction) -> None:
 
 
 def _is_bridged(pivot: str, result: Reconstruction) -> bool:
-    """Tells whether an eye was closed by bridging, without a blink expression of the model."""
+    """Returns whether an eye of the head was closed by a bridge between its lids instead of a blink expression."""
     side, found = pivot.removeprefix("eye_"), result.evidence.blendshape_rig
     eye, blink = result.faces.eyes.get(side), f"eyeBlink{side.title()}"
     return isinstance(eye, UnseenEye) and eye.cause == "closed" and not (found and found.weights.get(blink))
@@ -273,8 +274,8 @@ def _towards_irises(
     from_world: RigidTransform,
     photographed: PhotographedEyes,
 ) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns the directions from added eyeballs to the irises. Irises thus lie where they were photographed, although
-    the lids constrain the ball's position. If an iris was not measured, the dark area between open lids replaces it."""
+    """Returns the directions from the centres of added eyeballs to the photographed irises. Each iris thus lies where
+    it was photographed. The darkest area between the open lids replaces an iris that was not measured."""
     found = {}
     for name, ball in animated.added.items():
         eye = eyes.get(name.removeprefix("eye_"))
@@ -287,7 +288,7 @@ def _towards_irises(
 
 
 def _with_picture(part: Part, animated: AnimatedMesh, photographed: PhotographedEyes) -> Part:
-    """Returns an added eyeball with its image if its iris is visible; other parts unchanged."""
+    """Returns an added eyeball with its image if its iris is visible; returns other parts unchanged."""
     if part.name not in animated.added or part.name not in animated.gazes:
         return part
     ball = replace(animated.added[part.name], gaze=animated.gazes[part.name])
@@ -298,7 +299,7 @@ def _with_picture(part: Part, animated: AnimatedMesh, photographed: Photographed
 
 
 def _gazes(eyes: Mapping[str, Iris | UnseenEye], from_world: RigidTransform) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns the directions of measured eyes, by pivot (head frame)."""
+    """Returns the gaze directions of measured eyes, by pivot (unit vectors, head frame)."""
     return {f"eye_{side}": from_world.rotation @ eye.gaze for side, eye in eyes.items() if isinstance(eye, Iris)}
 
 
@@ -347,7 +348,7 @@ def _part(
 
 
 def _inner_arrays(animated: AnimatedMesh) -> dict[str, Any]:
-    """Returns teeth and tongue as one mesh; ``inner_parts`` is the part of each vertex."""
+    """Returns teeth and tongue as one mesh; ``inner_parts`` holds the part to which each vertex belongs."""
     inner, vertices, faces, numbers, moves = animated.inner, [], [], [], []
     for number, (name, part) in enumerate(inner.parts.items()):
         faces.append(part.faces + sum(len(each) for each in vertices))
