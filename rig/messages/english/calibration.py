@@ -29,7 +29,7 @@ TEMPLATES = {
     "rim-uncovered": "{cameras}: the board was never near the border of the picture: move it there",
     "offsets-used": "the cameras were not synchronous; their time offsets, in units of the time between shots, were estimated and used: {offsets}",
     "camera-offset": "{camera} {shots:+.2f}",
-    "board-has-markers": "the board's squares hold markers ({dictionary} has them): write kind = \"charuco\" and the dictionary into board.toml",
+    "board-has-markers": 'the board\'s squares hold markers ({dictionary} has them): write kind = "charuco" and the dictionary into board.toml',
     "camera-alone": "{camera} is the only camera, but a rig has several: make a folder for each camera, IMAGES/<camera>/<shot>",
     "shots-named-apart": "no two cameras have a shot of the same name ({camera} has {shot}, {other} has {other_shot}): give simultaneous pictures the same name in all cameras",
     "group-shares-no-shot": "{cameras} shares no shot with the others ({others}): take shots in which the board is seen by both at once",

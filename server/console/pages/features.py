@@ -1,4 +1,4 @@
-"""Implements the page Features, where the operator picks the paper's seven points (section 4.2) and others in some views.
+"""Implements the page Features, where the operator picks the paper's seven points (section 4.2) and others in views.
 
 This step is optional: without points the pipeline finds the alignment itself.
 """

