@@ -40,21 +40,21 @@ class Forbidden(Refused):
 
 
 class NotFound(Refused):
-    """Refuses a request for a thing that does not exist."""
+    """Refuses a request for an object that does not exist."""
 
     def __init__(self, what: Message, identity: str, hint: Message | None = None) -> None:
-        """Words the refusal. ``what``: the kind of thing, a message of the catalogue; ``hint``: where to look for what
-        there is."""
+        """Words the refusal. ``what``: the kind of object, a message of the catalogue; ``hint``: how to find existing
+        objects."""
         where = hint or compose("hint-list")
         super().__init__("not-found", compose("not-found", what=what, identity=f"{identity!r:.80}", where=where))
 
 
 class Conflict(Refused):
-    """Refuses an action that the current state of a thing does not allow."""
+    """Refuses an action that the current state of an object does not allow."""
 
 
 class Gone(Refused):
-    """Refuses a request for a thing that existed and was removed."""
+    """Refuses a request for an object that was removed."""
 
 
 class TooLarge(Refused):

@@ -1,7 +1,7 @@
-"""Writes log lines to standard error, for people or as JSON. Each carries the id of its request or job.
+"""Writes log lines to standard error, for people or as JSON. Each line carries the id of its request or job.
 
-Lines of libraries are written in the same form. A job that failed or was cancelled gets one line; the job engine's own
-traceback of it is left out.
+Lines of libraries are written in the same form. A job that failed or was cancelled gets one line, without the job
+engine's traceback.
 """
 
 import logging
@@ -23,10 +23,10 @@ def log_file(jobs: Path, job_id: str) -> Path:
 
 
 class JobLog:
-    """Writes lines about a job to the job's own file, too, for everyone who may read the job. It is a processor of
+    """Writes each line about a job also to the job's own file, for everyone who may read the job. It is a processor of
     structlog.
 
-    Tracebacks are left out, since they show the inside of the service. A job whose folder was removed has no log.
+    Tracebacks are left out, because they reveal internals of the service. A job whose folder was removed has no log.
     """
 
     def __init__(self, jobs: Path) -> None:
@@ -43,8 +43,8 @@ class JobLog:
 
 
 class _OnStandardError(structlog.PrintLogger):
-    """Ignores errors of writing a line, as the standard library's handlers do: the disk may be full, or the reader
-    gone."""
+    """Ignores errors of writing a line, as the standard library's handlers do: the disk may be full, or the reader may
+    have ended."""
 
     def msg(self, message: str) -> None:
         with suppress(OSError):
@@ -87,7 +87,7 @@ def set_up(as_json: bool, level: str = "info", jobs: Path | None = None) -> None
 
 def is_no_known_failure(record: logging.LogRecord) -> bool:
     """Returns False for a log record with the traceback of a job that failed for a known reason or was cancelled, or of
-    a webhook that did not answer, since each has its own log line; True for all others."""
+    a webhook that did not answer, because these have their own log lines; otherwise True."""
     error = record.exc_info[1] if record.exc_info else None
     if error is None:
         return True

@@ -1,9 +1,9 @@
 """Decides which other servers this service may call on behalf of a caller, and at which address.
 
-A caller who names an address must not turn the service against its own network (server-side request forgery). Only
-origins that the operator listed are called; ``https://*`` stands for every public one. A name is looked up once and
-each of its addresses is judged. The connection then goes to a judged address, so a later change of the name's address
-has no effect. Code that follows a redirection must judge the new address in the same way.
+A caller who names an address must not turn the service against its own network (server-side request forgery). The
+service calls only origins that the operator listed; ``https://*`` stands for every public origin. A name is looked up
+once, and each of its addresses is checked. The connection then goes to a checked address, so a later change of the
+name's address has no effect. Code that follows a redirection must check the new address in the same way.
 """
 
 import ipaddress
@@ -27,7 +27,7 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Holds a judged address: the URL to connect to, and the headers and extensions that name the intended host in the
+    """Holds a checked address: the URL to connect to, and the headers and extensions that name the intended host in the
     request."""
 
     url: httpx.URL
@@ -36,8 +36,8 @@ class Target:
 
 
 def target(url: str, origins: Collection[str]) -> Target:
-    """Judges ``url`` and returns where to connect. ``origins``: the origins that the operator allows. Blocks on the
-    name service.
+    """Checks ``url`` and returns where to connect. ``origins``: the origins that the operator allows. Blocks during the
+    name lookup.
 
     Raises InvalidInput ("url-refused") for an address that is malformed, not allowed, or not public.
     """
@@ -59,7 +59,7 @@ def target(url: str, origins: Collection[str]) -> Target:
 
 
 def parsed(url: str) -> httpx.URL:
-    """Parses a web address, without looking up its host. Raises InvalidInput ("url-refused") if it is none, is not
+    """Parses a web address, without looking up its host. Raises InvalidInput ("url-refused") if it is not a URL, is not
     http(s), or names a host that cannot exist."""
     try:
         wanted = httpx.URL(url)
@@ -82,8 +82,8 @@ def origin_of(url: httpx.URL) -> str:
 
 
 def is_public(address: Address) -> bool:
-    """Returns whether an IP address belongs to the public internet. An IPv6 address that contains an IPv4 one is judged
-    by that."""
+    """Returns whether an IP address belongs to the public internet. An IPv6 address that contains an IPv4 address is
+    classified by the latter."""
     if isinstance(address, ipaddress.IPv6Address):
         inner = [address.ipv4_mapped, address.sixtofour, *(address.teredo or ())]
         inner.append(ipaddress.IPv4Address(int(address) & 0xFFFFFFFF) if address in NAT64 else None)

@@ -1,8 +1,8 @@
 """Lists the public type of every problem and of every failed job, with its title: stable names on which programs may
 rely.
 
-Types are written out here, and a title is its type's words. They are not derived from names of classes or from
-messages, since those may change: a class that is renamed keeps its type by an entry in ``FAILURE_TYPES``. On the wire
+Types are listed explicitly, and a title is the words of its type. They are not derived from class names or messages,
+which may change: a renamed class keeps its type by an entry in ``FAILURE_TYPES``. On the wire
 ``urn:eigenhead:problem:`` stands before a type.
 """
 

@@ -1,8 +1,8 @@
 """Starts Python processes that run this package's own code, and identifies processes: the worker beside the service,
 and the children that do heavy work.
 
-They must run the code of this installation only, even if a folder named like one of the packages lies in the working
-directory or on PYTHONPATH.
+These processes must run the code of this installation, even if a folder with the name of one of its packages lies in
+the working directory or on PYTHONPATH.
 """
 
 import gc
@@ -30,7 +30,7 @@ def python_command(module: str, *arguments: str) -> list[str]:
 def python_environment() -> dict[str, str]:
     """Returns this process's environment variables, with the checkout put before everything else on PYTHONPATH.
 
-    In the wheel the packages have a name of their own, so the variables stay as they are.
+    In the wheel the package has a unique name, so the variables stay unchanged.
     """
     if "." in SERVER:
         return dict(os.environ)
@@ -40,11 +40,10 @@ def python_environment() -> dict[str, str]:
 
 
 def share_one_heap() -> None:
-    """Makes all threads of this process share one heap, if the C library is glibc. To be called before there are
-    threads.
+    """Makes all threads of this process share one heap, if the C library is glibc. Call it before any thread starts.
 
-    By default each thread has a heap of its own, and other threads cannot reuse its freed memory. A default job then
-    needs 150 MB more and is no faster. In addition Python then collects garbage so often that it takes 1.5 of 31 CPU s.
+    By default each thread has its own heap, and other threads cannot reuse its freed memory. A default job then needs
+    150 MB more and is no faster. It also makes garbage collection so frequent that it takes 1.5 of 31 CPU s.
     """
     import ctypes
 
@@ -54,10 +53,10 @@ def share_one_heap() -> None:
 
 
 def tidied(report: Progress) -> Progress:
-    """Returns ``report`` as a job takes it that gives the system, whenever a stage begins, the pages of this process's
-    heap that nothing uses any more, if the C library is glibc, in milliseconds.
+    """Returns ``report``, extended for a job: whenever a stage begins, unused pages of this process's heap are returned
+    to the system, which takes milliseconds and needs glibc.
 
-    Without this call glibc keeps freed memory below arrays that still exist: 110 MB after a default job's depth maps.
+    Without this, glibc keeps freed memory below arrays that still exist: 110 MB after a default job's depth maps.
     """
     import ctypes
 
@@ -71,8 +70,8 @@ def tidied(report: Progress) -> Progress:
 
 
 def process_identity() -> tuple[str, str, int, int]:
-    """Returns what identifies this process: machine (boot and pid namespace), host name, pid, and start time in clock
-    ticks after boot."""
+    """Returns a unique identity of this process: machine (boot and pid namespace), host name, pid, and start time in
+    clock ticks after boot."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
         machine = f"{boot}/{Path('/proc/self/ns/pid').readlink()}"
@@ -94,7 +93,8 @@ def process_started(pid: int) -> int:
 def end_with_parent(parent: int) -> None:
     """Makes the kernel kill this process when the thread that started it ends; ``parent`` is that thread's process.
 
-    Otherwise a child would go on writing and hold memory after a SIGKILL of its parent. Works on Linux only.
+    Otherwise a child process would continue to write and hold memory after a SIGKILL of its parent. Works on Linux
+    only.
     """
     import ctypes
 

@@ -1,4 +1,5 @@
-"""Defines the settings of the service: from the command line, from EIGENHEAD_* variables, or these defaults."""
+"""Defines the settings of the service, which come from the command line, from EIGENHEAD_* variables, or from these
+defaults."""
 
 import json
 import re
@@ -20,7 +21,7 @@ MOVED: dict[str, str] = {"server.work:reconstruct_capture": RECONSTRUCT}
 
 
 class ServiceSettings(BaseSettings):
-    """Holds the settings of an operator. Each field is also the environment variable ``EIGENHEAD_<FIELD>``."""
+    """Holds the settings of an operator. Each field is also an environment variable ``EIGENHEAD_<FIELD>``."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, env_ignore_empty=True, frozen=True, extra="forbid")
 
@@ -178,7 +179,7 @@ class ServiceSettings(BaseSettings):
     def url(self) -> str:
         """Returns the database's URL in SQLAlchemy's form.
 
-        PostgreSQL is set to end a session that idles inside a transaction: otherwise a vanished worker would keep its
+        PostgreSQL is set to end a session that is idle inside a transaction: otherwise a vanished worker would keep its
         row locks, and no other worker could take over its job.
         """
         if self.database_url is None:
@@ -193,8 +194,7 @@ class ServiceSettings(BaseSettings):
 
     @property
     def place(self) -> str:
-        """Returns the place of keys and jobs in readable form: the data folder, or the database's URL without
-        password."""
+        """Returns the location of keys and jobs for people: the data folder, or the database's URL without password."""
         if self.database_url is None:
             return str(self.data.resolve())
         import sqlalchemy as sa  # half a second that a service on SQLite, and `eigenhead doctor`, need not wait

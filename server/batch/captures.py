@@ -1,9 +1,9 @@
 """Finds the captures of a batch below a folder, or reads them from a list with subject, session and settings.
 
-A capture's name is the path of its result below ``OUT``. A list is a text file with one capture a line (``#`` begins a
-comment), or a CSV file whose first row names its columns; relative paths start at the list's folder. A stable hash of
-the captures' names divides a batch among machines that do not communicate. The SHA-256 of a capture tells a later run
-whether its result is up to date."""
+A capture's name is the path of its result below ``OUT``. A list is a text file with one capture in each line (``#``
+begins a comment), or a CSV file whose first row names its columns; relative paths start at the list's folder. A hash of
+each capture's name assigns it to one of several machines, which need not communicate. The SHA-256 of a capture tells a
+later run whether its result is up to date."""
 
 import csv
 import hashlib
@@ -47,7 +47,7 @@ class BatchCapture:
 
 
 def find_captures(folder: Path, out: Path) -> tuple[BatchCapture, ...]:
-    """Finds all captures below a folder, sorted by name. ``out`` and folders of results are skipped.
+    """Finds all captures below a folder, sorted by name. Skips ``out`` and folders of results.
 
     Raises InputError if there is none, if the folder itself is a capture, and if the results of several captures would
     have one folder (it names all of them).

@@ -1,4 +1,4 @@
-"""Manages the folder that a batch fills: results by name, each complete or absent, and records of work in progress.
+"""Manages the output folder of a batch: results by name, each complete or absent, and records of unfinished work.
 
 NAME/             a result as ``eigenhead reconstruct`` writes it, and batch.json: what it was made from
 heads.csv heads.parquet sheet.html sheet.pdf
@@ -48,7 +48,7 @@ class ShareTaken(EigenheadError):
 @dataclass(frozen=True, slots=True)
 class Origin:
     """Holds the origin of a result: the SHA-256 of the capture's files, of the settings and of the model, and the
-    program's version. A difference in ``version`` alone is no reason to make a result again."""
+    program's version. A result is not made again if only ``version`` differs."""
 
     input_sha256: str
     settings_sha256: str
@@ -95,7 +95,7 @@ class BatchFolder:
             self._tidy()
 
     def _tidy(self) -> None:
-        """Removes attempts that no running process owns, and empty folders."""
+        """Removes the temporary folders of attempts that no running process owns, and empty folders."""
         alive = set[str]()
         for lock in self.work.glob("*.lock"):
             with self._lock(lock.stem, wait=False) as free:
@@ -115,8 +115,8 @@ class BatchFolder:
 
     @contextmanager
     def _lock(self, name: str, *, wait: bool) -> Iterator[bool]:
-        """Locks a file in ``.batch`` during the block and removes it then; the kernel releases a lock when its process
-        ends, on NFS too. Yields whether this process has the lock."""
+        """Locks a file in ``.batch`` during the block and then removes it; the kernel releases the lock if the process
+        dies, on NFS too. Yields whether this process has the lock."""
         path = self.work / f"{name}.lock"
         file = _locked(path, wait=wait)
         try:
@@ -146,7 +146,7 @@ class BatchFolder:
         return json.loads((self.result(name) / REPORT).read_text(encoding="utf-8"))
 
     def new_attempt(self, shard: Shard) -> Path:
-        """Makes a folder for one attempt at a result of a share, with the empty folders ``result`` and ``scratch`` in
+        """Makes a temporary folder for one attempt at a result, with the empty folders ``result`` and ``scratch`` in
         it."""
         attempt = self.attempts / f"{_lock_name(shard)}.{secrets.token_hex(4)}"
         for part in ("result", "scratch"):
@@ -207,8 +207,8 @@ class BatchFolder:
         return self.work / "failures" / f"{file_name(name)}.json"
 
     def forget_failures_but_of(self, names: set[str]) -> None:
-        """Removes the failure records of all captures that are not in ``names``, and files that a kill left half
-        written."""
+        """Removes the failure records of all captures that are not in ``names``, and incomplete files of killed
+        processes."""
         retained = {self.failure_file(name).name for name in names}
         with suppress(FileNotFoundError):
             for path in (self.work / "failures").iterdir():

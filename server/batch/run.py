@@ -73,15 +73,15 @@ class Observer(Protocol):
     """Declares the methods that are called as a batch proceeds, from several threads but never two at a time."""
 
     def begin(self, pending: int) -> None:
-        """Receives how many captures are to be made, once, before the first."""
+        """Receives the number of captures to reconstruct, once, before the first one."""
         ...
 
     def report(self, name: str, share: float) -> None:
-        """Receives which share of a capture is done, 0 to 1; with 0 work on it begins."""
+        """Receives the done fraction of a capture, 0 to 1; 0 means that its work begins."""
         ...
 
     def end(self, outcome: Outcome) -> None:
-        """Receives how a capture ended."""
+        """Receives the outcome of a capture."""
         ...
 
 
@@ -106,8 +106,8 @@ class BatchRun:
         self._outcomes: dict[str, Outcome] = {}
 
     def run(self, publish_table: Callable[[], object]) -> list[Outcome]:
-        """Makes the results that are missing and returns how each capture ended, in the order of the tasks. It may be
-        killed at any moment; the next run then makes the missing results.
+        """Makes the missing results and returns the outcome of each capture, in the order of the tasks. If the process
+        is killed, the next run makes the missing results.
 
         ``publish_table`` is called at the end, never by two processes at a time. Raises ShareTaken if another process
         works on the same part, and OSError if the folder cannot be written.
@@ -142,7 +142,7 @@ class BatchRun:
         return Origin(input_sha256, task.settings_sha256, task.model_sha256, task.version)
 
     def _work_off(self) -> None:
-        """Starts the workers, and stops them if somebody interrupts this process."""
+        """Starts the workers, and stops them if this process is interrupted."""
         with ThreadPoolExecutor(self._workers, thread_name_prefix="worker") as pool:
             at_work = [pool.submit(self._serve) for _ in range(self._workers)]
             try:

@@ -1,6 +1,6 @@
 """Draws the contact sheet of a batch: one self-contained HTML file (``server.batch.sheet_pdf``: as a PDF).
 
-Each head has three views of its turntable, its name, figures and warnings. Red marks warnings that question the head
+The sheet shows of each head three views, its name, figures and warnings. Red marks warnings that question the head
 itself, amber those about missing input, grey the rest. The sheet contains no times, so equal results give equal bytes.
 """
 
@@ -60,7 +60,7 @@ ul { margin: 4px 0 0; padding-left: 1.1em; font-size: 13px; } code { font-size: 
 @dataclass(frozen=True, slots=True)
 class Card:
     """Holds what the sheet shows of one capture. ``of``: subject and session; ``messages``: its warnings, or why it
-    failed; ``turntable``: the picture of its views; ``link``: address of its result, relative to the sheet."""
+    failed; ``turntable``: the picture with its views; ``link``: address of its result, relative to the sheet."""
 
     name: str
     of: str
@@ -77,7 +77,7 @@ def severity(code: str) -> str:
 
 
 def card_class(card: Card) -> str:
-    """Returns the class by which a card is coloured: its worst warning, or the state of a capture that is not done."""
+    """Returns the CSS class for a card's colour: its worst warning, or its state if it is not done."""
     if card.state != "done":
         return card.state
     severities = {severity(message["code"]) for message in card.messages}
@@ -85,7 +85,7 @@ def card_class(card: Card) -> str:
 
 
 def ranked_cards(cards: Iterable[Card]) -> list[Card]:
-    """Returns the cards in the order of the sheet: what needs attention first, then by name."""
+    """Returns the cards in the order of the sheet: the most serious first, then by name."""
     order = ("failed", "severe", "warning", "good", "missing")
     return sorted(cards, key=lambda card: (order.index(card_class(card)), card.name))
 
@@ -97,7 +97,7 @@ def ranked_messages(card: Card) -> list[MessageDocument]:
 
 
 def message_class(card: Card, message: MessageDocument) -> str:
-    """Returns the class by which a message on a card is coloured."""
+    """Returns the CSS class for the colour of a message on a card."""
     return "failed" if card.state == "failed" else severity(message["code"])
 
 

@@ -1,8 +1,8 @@
 """Draws the contact sheet of a batch as a PDF, to be printed or sent: the cards of ``server.batch.sheet``, two beside
 each other on A4 pages.
 
-The PDF's own fonts have Latin-1. A name in other letters is drawn as a picture; in messages such letters become
-question marks. The sheet contains no times, so that equal results give equal bytes.
+The fonts of a PDF contain only Latin-1 letters. A name with other letters is drawn as a picture; in messages such
+letters become question marks. The sheet contains no times, so that equal results give equal bytes.
 """
 
 from collections.abc import Iterator, Sequence
@@ -46,7 +46,7 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """Holds a line of a card. ``lead``: its first so many characters are bold, in ``ink``."""
+    """Holds a line of a card, whose first ``lead`` characters are bold, in ``ink``."""
 
     text: str
     size_pt: float
@@ -73,7 +73,7 @@ def sheet_pdf(title: str, cards: Sequence[Card]) -> bytes:
 
 
 class _Page(FPDF):
-    """Draws A4 pages with numbers at their feet, and the parts of a card."""
+    """Draws A4 pages with page numbers, and the parts of a card."""
 
     def __init__(self, title: str) -> None:
         super().__init__(unit="mm", format="A4")
@@ -98,7 +98,7 @@ class _Page(FPDF):
         return cast(list[str], lines)
 
     def write_line(self, line: _Line, x: float, width_mm: float) -> None:
-        """Writes one line at the height of the cursor, and moves that below it."""
+        """Writes one line at the cursor, and moves the cursor below the line."""
         y = self.get_y()
         if latin(line.text) == line.text:
             self.set_xy(x, y)
@@ -117,7 +117,7 @@ class _Page(FPDF):
         self.set_xy(x, y + line.height_mm)
 
     def write_cards(self, cards: Sequence[Card]) -> None:
-        """Draws cards beside each other, on a new page where this one has no room for them."""
+        """Draws cards beside each other, on a new page if the current page has too little space."""
         pictures = [None if card.turntable is None else views_of(card.turntable, FINE_PX) for card in cards]
         texts = [[*_lines(self, card)] for card in cards]
         view_mm = TEXT_MM * PANEL_PX[1] / (3 * PANEL_PX[0])
@@ -170,7 +170,7 @@ def _font() -> cv2.FontFace:
 
 
 def _drawn(text: str, ink: Ink, *, bold: bool) -> tuple[np.ndarray, float]:
-    """Returns a line of text as a picture, and how many times the line's height a pixel of it is."""
+    """Returns a line of text as a picture, and the height of a pixel relative to the line's height."""
     size_px, weight = 48, 700 if bold else 400
     printable = "".join(letter if letter.isprintable() else "?" for letter in text)
     _, _, width, _ = cv2.getTextSize((10, 10), printable, (0, 0), _font(), size_px, weight)

@@ -1,7 +1,7 @@
 """Builds the table of a batch: one row for each capture, with the columns of ``columns_of``.
 
-In: reports of results and records of failures. Leaves: plain values. Lengths are mm, in the world frame; there are no
-angles. A cell is None if the capture has no such value. The table is written as CSV and, if pyarrow is installed, as
+It reads results' reports and failure records and computes plain values. Lengths are mm, in the world frame; there are
+no angles. A cell is None if the capture has no such value. The table is written as CSV and, if pyarrow is installed, as
 Parquet with units.
 """
 
@@ -40,8 +40,8 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Holds what became of a capture: ``report`` and ``origin`` if it is done, ``failure`` if it failed, neither if it
-    is not made yet. ``link``: address of its result on the sheet."""
+    """Holds the outcome of a capture: ``report`` and ``origin`` if it is done, ``failure`` if it failed, neither if it
+    is not made yet. ``link``: the address of its result on the sheet."""
 
     capture: BatchCapture
     result: Path

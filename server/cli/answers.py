@@ -38,7 +38,7 @@ class CannotWrite(EigenheadError):
 
 
 class SpoilsCapture(EigenheadError):
-    """Reports an output path within the capture, where the next run would read the result as input."""
+    """Reports an output path within the capture, because the next run would read the result as input."""
 
     def __init__(self, path: Path, option: str = "--out") -> None:
         super().__init__(f"{path} lies where the capture's own pictures do; name another place with {option}")
@@ -187,7 +187,7 @@ def prepare_folder(path: Path, sign: str = "", *, overwrite: bool = True) -> Non
 
 
 def _make_folder(path: Path) -> None:
-    """Makes a folder. What is still empty at the end goes again: the command was refused."""
+    """Makes a folder, and removes it at the end if it is still empty because the command was refused."""
     atexit.register(_remove_empty, [folder for folder in (path, *path.parents) if not folder.exists()])
     path.mkdir(parents=True, exist_ok=True)
 
@@ -200,8 +200,8 @@ def _remove_empty(folders: Iterable[Path]) -> None:
 
 @contextmanager
 def terminated_like_interrupted() -> Iterator[None]:
-    """Makes SIGTERM end the block as Ctrl-C does, so nothing unfinished remains. Schedulers send it some seconds before
-    SIGKILL."""
+    """Makes SIGTERM end the block as Ctrl-C does, so nothing unfinished remains. Job schedulers send SIGTERM some
+    seconds before SIGKILL."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt

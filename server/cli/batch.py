@@ -183,8 +183,8 @@ Clock = Callable[[], float]
 
 
 class BatchProgress:
-    """Counts finished captures; ``workers`` of them run at once. Estimates the remaining time from their mean duration,
-    and from ``expected_s`` until the first is done. ``clock`` returns seconds and never goes back."""
+    """Counts finished captures; ``workers`` of them run at once. The remaining time is estimated from their mean
+    duration, and from ``expected_s`` until the first is done. ``clock`` returns monotonic seconds."""
 
     def __init__(self, captures: int, workers: int, expected_s: float, clock: Clock = time.monotonic) -> None:
         self._captures, self._workers, self._expected_s, self._clock = captures, workers, expected_s, clock
@@ -193,7 +193,7 @@ class BatchProgress:
         self.ended = self.failed = 0
 
     def report(self, name: str, share: float) -> None:
-        """Records which share of a capture is done, from 0, with which work on it begins, to 1."""
+        """Records the done fraction of a capture, 0 to 1; 0 means that its work begins."""
         since, _ = self._running.get(name, (self._clock(), 0.0))
         self._running[name] = since, min(1.0, max(0.0, share))
 
@@ -220,7 +220,7 @@ class BatchProgress:
 
 
 def told_time(seconds: float) -> str:
-    """Formats a duration in seconds, minutes or hours, rounded as coarsely as an estimate deserves."""
+    """Formats a duration in seconds, minutes or hours, rounded as an estimate."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -83,7 +83,7 @@ class Client:
     def post(self, path: str, document: Any = None, headers: dict[str, str] | None = None) -> Any:
         """Sends a POST of ``document`` and returns the JSON of the answer. Raises ServiceError and Unreachable.
 
-        After a broken connection it is unknown whether the service acted. So the request is repeated only if
+        After a broken connection the client cannot know whether the service acted, so it repeats the request only if
         ``headers`` has an Idempotency-Key.
         """
         again = bool(headers and "Idempotency-Key" in headers)
@@ -193,7 +193,7 @@ class Client:
 
     def _send_part(self, location: str, stream: Any, offset: int) -> tuple[int, str | None]:
         """Sends one PATCH and returns the new offset (bytes) and the capture's address once the upload is complete.
-        After a failure the service is asked by HEAD how much it has."""
+        After a failure it asks the service by HEAD for the number of bytes received."""
         stream.seek(offset)
         data = stream.read(PART_BYTES)
         checksum = "sha256 " + base64.b64encode(hashlib.sha256(data).digest()).decode()

@@ -38,7 +38,7 @@ MEMORY_LEAST = 2 << 30  # a job takes up to 1.5 GB
 
 
 def examine(settings: ServiceSettings) -> dict[str, dict[str, Any]]:
-    """Runs every check of this machine. Returns by name whether it passed (``ok``) and what was found or what to do
+    """Runs every check of this machine. Returns by name whether the check passed (``ok``) and its finding or remedy
     (``detail``). Only reads: it makes neither folders nor tables."""
     checks = (
         *(_python, _egl, _gpu, _model, _cores, _memory, _data, _models, _cache, _database, _retention, _results),
@@ -146,8 +146,8 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _results(settings: ServiceSettings) -> tuple[bool, str]:
-    """Checks the results of succeeded jobs, the newest first, for ``COMPARE_S`` seconds; names jobs without a result
-    folder (removed by hand, or missing from a restored backup), and files with changed content."""
+    """Compares the files of succeeded jobs' results with their records, newest first, for ``COMPARE_S`` seconds; names
+    jobs without a result folder (removed by hand, or missing from a restored backup), and changed files."""
     kind = _kind(settings)
     connection = _connected(settings)
     if connection is None:
@@ -213,7 +213,7 @@ def _read_only(path: Path) -> sqlite3.Connection:
 
 
 def _variables(settings: ServiceSettings) -> tuple[bool, str]:
-    """Names the environment variables with the project's prefix that nothing reads, such as misspelt ones."""
+    """Names environment variables with the project's prefix that the program does not read, such as misspelt ones."""
     known = {PREFIX + name.upper() for name in ServiceSettings.model_fields} | OTHER_VARIABLES
     present = sorted(name for name in os.environ if name.startswith(PREFIX))
     faults = []
@@ -233,7 +233,7 @@ def _rig(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _stores(settings: ServiceSettings) -> tuple[bool, str]:
-    """Lists the first object of each object store; only a delivery shows whether the service may write there."""
+    """Lists the first object of each object store; whether the service may write there is seen only at a delivery."""
     stores = [place for place in (settings.captures_store, settings.results_store) if place is not None]
     places = dict.fromkeys([*settings.import_prefixes, *settings.deliver_prefixes, *stores])
     if not places:

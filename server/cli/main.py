@@ -1,4 +1,4 @@
-"""Implements the command ``eigenhead``. Everything heavy is imported inside the commands, so that ``--help`` answers at
+"""Implements the command ``eigenhead``. Commands import heavy modules when they run, so that ``--help`` answers at
 once."""
 
 import os
@@ -26,7 +26,7 @@ THREADS, ALONE = "Of compiled loops; all processors by default.", "No progress a
 
 
 class Commands(TyperGroup):
-    """Lists the commands by purpose. Adds the common options to each, and prints each example on a line."""
+    """Lists the commands by purpose. Adds the common options to each command, and prints each example on a line."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
@@ -48,7 +48,7 @@ class Commands(TyperGroup):
 
 
 def _option(name: str, use: Callable[[Any], None], help_text: str, **kind: Any) -> TyperOption:
-    """Returns an option of every command; the function ``use`` receives its value, the command does not."""
+    """Returns an option that every command has; its value goes to the function ``use``, not to the command."""
     return TyperOption(param_decls=[name], callback=lambda *of: use(of[-1]), help=help_text, expose_value=False, **kind)
 
 

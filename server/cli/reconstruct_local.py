@@ -33,9 +33,9 @@ def reconstruct_locally(
 ) -> "ReportDocument":
     """Reconstructs a capture folder or archive into ``out`` and returns the content of report.json.
 
-    Estimated cameras and masks are kept in ``out`` even if a later stage fails; an earlier result stays until the new
-    one is complete. Settings, model, template, capture, ``out`` and ``trace`` are checked before heavy modules are
-    loaded. The file ``trace`` records which thread ran which code and when, even if the job fails.
+    Estimated cameras and masks stay in ``out`` even if a later stage fails; an earlier result stays until the new one
+    is complete. Settings, model, template, capture, ``out`` and ``trace`` are checked before heavy modules are loaded.
+    The file ``trace`` records which thread ran which code and when, even if the job fails.
     """
     from pipeline.applications.templates.header import check_template
     from pipeline.settings import settings_from_document
@@ -71,7 +71,7 @@ def reconstruct_locally(
 
 
 def flame_lines(document: "ReportDocument", out: Path) -> list[str]:
-    """Returns lines for people on the fit of a FLAME model: its file, and how far the model is from the head."""
+    """Returns lines for people on the fit of a FLAME model: its file, and its distance from the head."""
     from rig.formats.meshes.flame_param import FILE
 
     figures = (document.get("template") or {}).get("flame")

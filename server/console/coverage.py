@@ -49,9 +49,9 @@ def covered(corners: Float[np.ndarray, "n 2"]) -> float:
 
 
 def summary(cameras: list[str], shots: list[Corners]) -> list[JsonObject]:
-    """Computes the coverage of each camera by the shots so far: pictures that show the board (``views``), ``covered``
-    share, whether that is enough, and ``corners`` of earlier shots and of the ``last`` as shares of width and
-    height."""
+    """Computes the coverage of each camera by the shots so far: the number of pictures that show the board (``views``),
+    the fraction ``covered``, whether that is enough, and ``corners`` of earlier shots and of the ``last``, as fractions
+    of width and height."""
     lines: list[JsonObject] = []
     for name in cameras:
         seen = [shot[name] for shot in shots if shot.get(name)]

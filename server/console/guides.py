@@ -1,7 +1,7 @@
 """Computes aids for picking one feature point in several views: epipolar guides, the triangulated point, the model's
 landmark.
 
-Everything is computed from a rig and pixels alone. A guide includes lens distortion, so it is a curve.
+Its inputs are only a rig and pixels. An epipolar guide includes lens distortion, so it is a curve.
 """
 
 from collections.abc import Collection, Mapping
@@ -54,7 +54,7 @@ class Located:
 
 
 class Guides:
-    """Computes the aids for picking feature points in the pictures of one rig. It keeps results and recomputes only
+    """Computes the aids for picking feature points in the pictures of one rig. It caches results and recomputes only
     those that a change affects, so the cost of a click does not grow with the number of points."""
 
     def __init__(self, rig: Rig) -> None:
@@ -166,7 +166,7 @@ def mean_landmarks(context: WorkerContext, report: Progress, *, model: str, name
 
 
 def _seen(rig: Rig, points: Mapping[str, Float[np.ndarray, " 3"]]) -> dict[str, dict[str, list[float]]]:
-    """Returns the pixel of each point by camera; cameras whose pictures do not hold it are left out."""
+    """Returns the pixel of each point by camera; cameras whose pictures do not contain the point are left out."""
     places = np.array(list(points.values()))
     clicks: dict[str, dict[str, list[float]]] = {name: {} for name in points}
     for camera in rig:

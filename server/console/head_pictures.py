@@ -3,7 +3,7 @@ removed with the job.
 
 The page Result shows ``first-view.jpg`` (some 30 kB) until the browser has loaded and drawn the 3 MB of the head.
 Position, lens and light are those of ``pages/result.js`` and ``static/views.js``: three-quarter view, light "studio",
-texture. Lists show ``portrait.jpg``, by which people and heads are told apart at a glance.
+texture. Lists show ``portrait.jpg``, by which people recognise a head at once.
 """
 
 import json
@@ -89,8 +89,8 @@ def draw_first_view(service: Service, job_id: str) -> None:
 
 @cache
 def warm_up() -> None:
-    """Imports and runs the code that reads and draws heads, once a process, so that the first request does not take a
-    second longer."""
+    """Imports and runs the code that reads and draws heads once in each process, so that the first request does not
+    take a second longer."""
     corners = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]])
     corner = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32))
     with suppress(OSError), TemporaryDirectory() as folder:  # on a full disk the first head waits
@@ -131,7 +131,7 @@ def drawn(mesh: Mesh) -> UInt8[np.ndarray, "s s 3"]:
 
 
 def lit(mesh: Mesh) -> UInt8[np.ndarray, "v 3"]:
-    """Computes the vertices' colours in the page's lights, as three.js does for a rough surface: linear colour times
+    """Computes the vertices' colours under the page's lights, as three.js does for a rough surface: linear colour times
     light over pi."""
     normals = vertex_normals(mesh.vertices, mesh.faces)
     light: Float[np.ndarray, " v"] = np.full(len(normals), AMBIENT)

@@ -1,8 +1,8 @@
-"""Identifies the user of a page: anybody on this machine while there are no API keys, otherwise a key's owner.
+"""Identifies the user of a page: anybody on this machine if there are no API keys, otherwise a key's owner.
 
-The key itself is not stored. The user storage of the browser's session (a file in the data folder, named by a signed
-cookie) holds the key's id, and every refresh of a page looks the key up in the database. So a removed key ends access
-to its pages, and a sign-in survives a restart of the service.
+The session does not store the key itself. The user storage of the browser's session (a file in the data folder, named
+by a signed cookie) holds the key's id, and every refresh of a page looks the key up in the database. So the pages close
+when the key is removed, and a sign-in survives a restart of the service.
 """
 
 import secrets
@@ -49,8 +49,8 @@ def permit(caller: Caller | None, scope: str) -> Caller:
 
 
 def cookie_secret(data: Path) -> str:
-    """Returns the secret that signs session cookies. It is made once and kept in the data folder, so nobody is signed
-    out by a restart."""
+    """Returns the secret that signs session cookies. The secret is made once and stored in the data folder, so a
+    restart signs nobody out."""
     path = data / "console" / "secret"
     if not path.is_file() or not path.stat().st_size:  # an empty one is left where a full disk met the first start
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)

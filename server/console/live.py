@@ -1,4 +1,4 @@
-"""Provides the live view: one thread takes pictures while somebody watches, and every open page gets them."""
+"""Provides the live view: one thread takes pictures while a page is open, and every open page gets them."""
 
 import asyncio
 import json
@@ -37,9 +37,9 @@ def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> JsonObject:
 
 
 def rig_frames(rig: RigBackend, child: Child, look: int) -> list[JsonObject]:
-    """Returns the present picture of each camera, with its measurements. The simulated studio is drawn in ``child``;
-    real cameras are looked at all at once, and the sharpness of one's picture is measured, in turn, since that needs
-    the full size. ``look`` counts the calls. Raises Unavailable if the rig cannot be opened."""
+    """Returns the current picture of each camera, with its measurements. ``child`` draws the simulated studio; real
+    cameras take their pictures at once, and the sharpness of one of them, in turn, is measured at full size. ``look``
+    counts the calls. Raises Unavailable if the rig cannot be opened."""
     described = rig.describe()
     if described.kind == "simulated":
         return child.remote(frames)(look=look)
@@ -48,8 +48,8 @@ def rig_frames(rig: RigBackend, child: Child, look: int) -> list[JsonObject]:
 
 
 class LiveView:
-    """Holds the newest pictures of all cameras, numbered. Its thread takes pictures while somebody watches, and ends
-    ``KEEP_S`` seconds after the last viewer has left."""
+    """Holds the newest pictures of all cameras, numbered. Its thread takes pictures while pages are open, and ends
+    ``KEEP_S`` seconds after the last page closed."""
 
     def __init__(self, service: Service) -> None:
         self._service = service
@@ -128,7 +128,7 @@ def look_bytes(frames: list[JsonObject], fault: Message | None, head: object = N
 
 
 def frames(context: WorkerContext, report: Progress, *, look: int) -> list[JsonObject]:
-    """Returns the present picture of each camera of the simulated studio, drawn in a child process. ``look`` counts the
+    """Returns the current picture of each camera of the simulated studio, drawn in a child process. ``look`` counts the
     calls."""
     from server.console import studio_drawing
 

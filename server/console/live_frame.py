@@ -6,9 +6,8 @@ from server.storage.records import JsonObject
 
 
 def measured_frame(name: str, picture: ImageRgb, data: bytes, large: ImageRgb | None) -> JsonObject:
-    """Returns a camera's frame: its name, ``data``, which is its ``picture`` as a JPEG file, and the picture's ``mean``
-    (0 to 255) and share of ``clipped`` pixels. In ``large``, the picture in full size, its sharpness is measured
-    (``blur_px``)."""
+    """Returns a camera's frame: its name, ``data`` (``picture`` as a JPEG file), the picture's ``mean`` (0 to 255) and
+    fraction of ``clipped`` pixels. The sharpness (``blur_px``) is measured in ``large``, the picture in full size."""
     level = exposure(picture)
     frame: JsonObject = {
         "name": name,

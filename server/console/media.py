@@ -3,8 +3,8 @@ results, numbers by vertex.
 
 Each route identifies the caller by the browser's session, as the API does by an API key.
 
-For the view through a camera of the rig they send its pose in the head's frame, and its photograph without lens
-distortion, onto which a pinhole camera draws the mesh exactly.
+For the view through a camera, the routes send its pose in the head's frame and its photograph without lens distortion,
+which fits the pinhole camera that draws the mesh.
 """
 
 import asyncio
@@ -111,8 +111,8 @@ async def live(who: Reader) -> StreamingResponse:
 
 @pages.get("/console/captures/{capture_id}/{camera}.jpg")
 def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
-    """Returns a small JPEG file of an image of a capture. The browser may keep it for ever, since pictures of a capture
-    never change."""
+    """Returns a small JPEG file of an image of a capture. The browser may cache it for ever, because pictures of a
+    capture never change."""
     service = who[0]
     name = _image_name(service.store.capture(capture_id), camera)
     path = service.store.cache_of(capture_id) / "small" / f"{Path(name).stem}.jpg"
@@ -375,8 +375,8 @@ def outline(mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "y x 4"]:
 
 def camera_views(rig: Rig, report: Report) -> list[JsonObject]:
     """Returns every camera of a capture as seen from the head, as a pinhole camera (px) with ``camera_from_head``: rows
-    of a 4 x 4 matrix (metres) in the frame of head.glb. The pose is that of ``report``, the size the true one: x_world
-    = R x_head + s t."""
+    of a 4 x 4 matrix (metres) in the frame of head.glb. The head's pose comes from ``report``, its size is the true
+    one: x_world = R x_head + s t."""
     pose = report["world_from_head"]
     shift = np.array(pose["translation"]) * pose["scale"]
     world_from_head = RigidTransform(np.array(pose["rotation"]), shift)
@@ -448,8 +448,8 @@ def to_surface(result: Path, other: Path, *, align: bool = False) -> Float[np.nd
 
 def moved_onto(mine: Mesh, theirs: Mesh) -> Float[np.ndarray, "v 3"]:
     """Returns the vertices of ``mine`` after the rigid motion that brings them closest to ``theirs``. Heads with
-    equally many vertices are compared vertex by vertex. Others are compared by nearest points, without the farthest
-    fifth."""
+    equally many vertices are compared vertex by vertex. Other heads are compared by nearest points, without the
+    farthest fifth."""
     if len(mine.vertices) == len(theirs.vertices):
         return rigid_procrustes(mine.vertices, theirs.vertices).apply(mine.vertices)
     points = mine.vertices - mine.vertices.mean(0) + theirs.vertices.mean(0)

@@ -30,9 +30,9 @@ FOLDERS = ("/_nicegui", "/console/", "/features/", "/result/")
 
 
 def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
-    """Adds the pages to the service's app, at ``/``. Addresses of no page stay with the API.
+    """Adds the pages to the service's app, at ``/``. The API handles all other addresses.
 
-    NiceGUI has one app a process. If several services run in one process, the last one has the pages.
+    NiceGUI has only one app in each process. If several services run in one process, the last one has the pages.
     """
     from server.console import media  # noqa: F401 - they add their routes to NiceGUI's app
     from server.console.pages import (  # noqa: F401
@@ -85,8 +85,8 @@ def path_below(scope: Scope) -> str:
 
 
 def style_first(inner: ASGIApp) -> ASGIApp:
-    """Returns the app with a low priority for its pages' scripts: at 400 kbit/s they would delay the style sheets that
-    the first text needs."""
+    """Returns the app with a low priority for its pages' scripts, which would otherwise delay the style sheets at 400
+    kbit/s."""
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
         async def ordered(message: Message) -> None:

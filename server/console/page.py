@@ -1,5 +1,5 @@
 """Provides for all pages: a component that shows a state document, actions that run in threads, cached values, and
-shortened messages of refusals, since nobody sends a document again from a page."""
+shorter texts of refusals."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -53,9 +53,9 @@ _threads = anyio.CapacityLimiter(16)  # actions and looks of all pages; a captur
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """Describes what an event of a page does. ``function(page, event)`` runs in a thread, for callers with ``scope``.
-    ``page`` is the page on which the event happened, ``event`` what its component sent: an ``id``, or the fields of a
-    form.
+    """Describes the action that an event of a page runs. ``function(page, event)`` runs in a thread, for callers with
+    ``scope``. ``page`` is the page on which the event happened, ``event`` what its component sent: an ``id``, or the
+    fields of a form.
 
     A message that the function returns is shown in the corner; an error is shown there with its faults.
     """
@@ -66,10 +66,10 @@ class Action:
 
 @dataclass
 class Cache:
-    """Keeps values that all open pages show, so they agree and ten pages cost no more than one.
+    """Caches values that all open pages show, so that they agree and ten pages cost no more than one.
 
-    A value is kept at least ``KEEP_TIMES`` times its computing time, but by this rule at most ``KEEP_MOST_S`` seconds.
-    So computing it takes at most a tenth of the time.
+    A value is kept at least ``KEEP_TIMES`` times its computing time, up to ``KEEP_MOST_S`` seconds, so that computing
+    takes at most a tenth of the time.
     """
 
     _values: dict[Any, tuple[float, float, Any]] = field(default_factory=dict)
@@ -94,8 +94,8 @@ class Cache:
             return value
 
     def forget(self, *kinds: str) -> None:
-        """Drops the values whose key is one of ``kinds``, or is a tuple that begins with one. Values that are just
-        being computed are not kept."""
+        """Drops the values whose key is one of ``kinds``, or is a tuple that begins with one. Values that are being
+        computed are not cached."""
         self._forgets += 1
         for key in list(self._values):
             if (key[0] if isinstance(key, tuple) else key) in kinds:
@@ -143,8 +143,8 @@ class Page(Element):
     def begin(self) -> None:
         """Starts to refresh the page's state, the status and the followed jobs regularly.
 
-        NiceGUI sends a page when its first timer waits for the browser's connection. Timers start after the first
-        refresh, so that the state is sent with the page.
+        NiceGUI sends a page when its first timer waits for the browser's connection, so timers start after the first
+        refresh, and the state is sent with the page.
         """
         ui.timer(REFRESH_S, self.refresh, immediate="loading" in self.props["state"])
         ui.timer(STATUS_S, self._refresh_status, immediate=True)
@@ -241,8 +241,8 @@ class Page(Element):
 
 
 def undo(page: Page, event: JsonObject) -> Message:
-    """Takes back a removal that is still waiting, whichever page began it. Raises Gone if it is too late, and Forbidden
-    for a caller who could not have removed the thing."""
+    """Undoes a removal that is still waiting, whichever page began it. Raises Gone if it is too late, and Forbidden for
+    a caller who could not have removed the object."""
     removal = removals.waiting().get(event["id"])
     if removal is not None:
         permit(page.caller, removal.scope)
@@ -256,15 +256,15 @@ UNDO = Action("read", undo)
 
 
 def remove_later(identity: str, remove: Callable[[], None], title: Message, scope: str) -> None:
-    """Hides a thing from all pages at once, and calls ``remove`` after ``UNDO_S`` seconds unless somebody takes the
-    removal back."""
+    """Hides an object from all pages at once, and calls ``remove`` after ``UNDO_S`` seconds unless a user undoes the
+    removal."""
     removals.add(identity, remove, title, scope)
     shared.clear()
 
 
 def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: Message, scope: str) -> None:
-    """Hides several things from all pages at once, and removes each after ``UNDO_S`` seconds unless somebody takes the
-    whole removal back. Things that then cannot be removed are logged."""
+    """Hides several objects from all pages at once, and removes each after ``UNDO_S`` seconds unless a user undoes the
+    whole removal. Objects that cannot be removed then are logged."""
 
     def remove_each() -> None:
         done = each(ids, remove)
@@ -276,7 +276,7 @@ def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: M
 
 
 def said_unless_refused(said: Message, done: BulkOut) -> Message:
-    """Returns the message about an action on many things. Raises InvalidInput with the reasons if some were refused."""
+    """Returns the message about an action on many objects. Raises InvalidInput if some were refused."""
     if done.refused:
         faults = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
         raise InvalidInput("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
@@ -303,8 +303,8 @@ async def signed_in() -> Caller | None:
 
 
 def serve_page(name: str, page: type[Page], *, paths: Sequence[str], choices: Sequence[str] = ()) -> None:
-    """Serves ``page`` at its paths. The values of the names ``choices`` in an address, behind its ``?`` or in the path,
-    are the page's first choice: the selection, the search, and the order."""
+    """Serves ``page`` at its paths. The values in an address with the names ``choices``, after its ``?`` or in the
+    path, are the page's initial selection, search and order."""
 
     async def serve(request: Request) -> RedirectResponse | None:
         said = {**request.query_params, **request.path_params}
@@ -331,7 +331,7 @@ async def show(name: str, page: type[Page], **initial: str | None) -> RedirectRe
 
 def followed_jobs(service: Service, ids: Sequence[str]) -> list[JsonObject]:
     """Returns the progress of the jobs with these ids, in their order. A removed job has the state ``gone``. All pages
-    use the same answer."""
+    share the same answer."""
 
     def make() -> list[JsonObject]:
         known = {job.id: job for job in service.jobs.of(ids)}

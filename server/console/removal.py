@@ -1,8 +1,8 @@
-"""Implements removal with undo: a thing disappears from the pages at once and is removed a little later, unless
-somebody undoes that.
+"""Implements removal with undo: an object disappears from the pages at once and is removed a little later, unless a
+user undoes that.
 
-Waiting removals exist in this process only. If the service ends before, nothing is removed and the thing appears again,
-which is the safe outcome.
+Waiting removals exist in this process only. If the service ends before, nothing is removed and the object appears
+again, which is the safe outcome.
 """
 
 import threading
@@ -31,7 +31,7 @@ class Removal:
 
 @dataclass
 class Removals:
-    """Holds the removals that can still be undone, by id. ``identity in removals`` tells whether a thing is being
+    """Holds the removals that can still be undone, by id. ``identity in removals`` is true while an object is being
     removed. Thread-safe."""
 
     wait_s: float = UNDO_S
@@ -45,7 +45,7 @@ class Removals:
         self, identity: str, remove: Callable[[], None], title: Message, scope: str, also: Iterable[str] = ()
     ) -> None:
         """Adds a removal; ``remove`` is called after ``wait_s`` seconds unless it is undone. ``also``: ids of further
-        things that it removes. Does nothing if the thing is being removed already."""
+        objects that ``remove`` removes. Does nothing if the object is already being removed."""
         timer = threading.Timer(self.wait_s, self._remove, (identity, remove))
         timer.daemon = True
         with self._lock:

@@ -1,7 +1,7 @@
 """Draws the live view of the simulated studio, in a child process of its own, so that a shot does not stop it.
 
-The studio is drawn once; each picture adds fresh sensor noise only. For this, cameras use binning, as real ones do for
-a live view. From time to time one camera is exposed at full size to measure its sharpness.
+The studio is drawn once; each picture adds fresh sensor noise only. Cameras use binning, as real ones do for a live
+view, which makes this fast. From time to time one camera is exposed at full size to measure its sharpness.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ SUBJECT_SEED = 1  # the same person as in the rig's own previews
 
 def frames(context: WorkerContext, look: int) -> list[JsonObject]:
     """Returns the present picture of each camera of the simulated studio. ``look`` counts the calls: every
-    ``SHARP_EVERY``-th measures one camera's blur, too."""
+    ``SHARP_EVERY``-th call also measures one camera's blur."""
     views = context.keep("live", _draw)
     rng = context.keep("noise", np.random.default_rng)
     names = list(views)

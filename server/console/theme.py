@@ -45,7 +45,7 @@ class Frame(Element, component="static/frame.js"):
         self.props.update(links=links, current=current, status={}, removed=[], followed=[])
 
     def show(self, **changed: Any) -> None:
-        """Updates the frame: the ``status`` of the service, ``removed`` things whose removal can be undone, or the
+        """Updates the frame: the ``status`` of the service, the ``removed`` objects whose removal can be undone, or the
         progress of ``followed`` jobs."""
         if any(self.props[name] != value for name, value in changed.items()):
             self.props.update(changed)

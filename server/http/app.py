@@ -1,4 +1,4 @@
-"""Composes the API as an ASGI app: routers, middleware, the tasks that run beside the requests, and its description."""
+"""Composes the API as an ASGI app: routers, middleware, background tasks, and the OpenAPI description."""
 
 import asyncio
 import hashlib
@@ -216,8 +216,8 @@ async def _send_start(send: Send, message: Message) -> None:
 async def _repeat(
     service: Service, action: Callable[[], object], every_s: float, fault: str, again_s: float = 0.0
 ) -> None:
-    """Does an action in a thread at once, and then every ``every_s`` seconds. One that fails, as of a full disk or a
-    database that is away, is logged as ``fault``, and done again after ``again_s`` seconds at least."""
+    """Does an action in a thread at once, and then every ``every_s`` seconds. An action that fails, for example because
+    the disk is full or the database is unreachable, is logged as ``fault`` and repeated after ``again_s`` or more."""
     while True:
         pause_s = every_s
         try:
@@ -237,12 +237,12 @@ async def _measure_lag(metrics: Metrics) -> None:
 
 
 class JsonBodies:
-    """Guards the routes that take a JSON body: identifies the caller, reads the body, at most ``most`` bytes, and
+    """Guards the routes that take a JSON body: identifies the caller, reads at most ``most`` bytes of the body, and
     passes the request on. It answers bad requests with a problem document: 401 or 403 for the caller, 413 for the size,
     415 for a form.
 
-    FastAPI reads the whole body of a route that declares one before it runs the route's dependencies, so a dependency
-    comes too late. Routes that read their body themselves, mainly uploads, are passed through: their dependencies run
+    FastAPI reads the JSON body of a route before it runs the route's dependencies, so a dependency would check the
+    caller too late. Routes that read their body themselves, mainly uploads, are passed through: their dependencies run
     first, and they have limits of their own."""
 
     def __init__(
@@ -276,7 +276,7 @@ class JsonBodies:
         """Returns the ASGI messages of the body, up to its end or the client's disconnection.
 
         Raises a 413 problem for a body that is too large, 408 for one that takes longer than ``body_s`` seconds, and
-        415 for a form: that is an archive sent to the wrong address."""
+        415 for a form, which is an archive sent to the wrong address."""
         if request.headers.get("content-type", "").casefold().startswith("multipart/"):
             detail = compose("json-wanted-here")
             raise Problem(415, "unsupported-media-type", detail)
@@ -304,17 +304,17 @@ class DrainRequestBody:
     another ``linger_s`` seconds.
 
     uvicorn closes a connection that is not kept alive as soon as the answer is sent. Bytes that arrive afterwards reset
-    the connection, and a sender such as nginx loses the answer: its client saw 502 in place of 401 or 422. So the
-    remaining bytes are read and dropped before the answer ends, as nginx's own lingering_close does. The rest of a
-    short upload is dropped before the answer begins: where an answer overtakes the body, nginx closes the connection to
-    its client although it promised to keep it, and the client's next request fails.
+    the connection, and a sender such as nginx loses the answer: its client saw 502 in place of 401 or 422. So this
+    class reads and drops the remaining bytes before the answer ends, as nginx's own lingering_close does. It drops the
+    rest of a short upload before the answer begins: if an answer overtakes the body, nginx closes its client's
+    kept-alive connection, and the client's next request fails.
     """
 
     def __init__(self, app: ASGIApp, *, patience_s: float = PATIENCE_S, linger_s: float = LINGER_S) -> None:
         self._app, self._patience_s, self._linger_s = app, patience_s, linger_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handles one ASGI connection. Others, and those that will be kept alive, are passed on unchanged."""
+        """Handles one ASGI connection. Requests whose connection is kept alive are passed on unchanged."""
         if scope["type"] != "http" or not _closes(scope):
             await self._app(scope, receive, send)
             return
@@ -356,9 +356,9 @@ def _has_body(scope: Scope) -> bool:
 
 
 def describe(app: FastAPI, address: str | None) -> None:
-    """Replaces ``app.openapi`` by a function that returns the completed document, which is made once: the pipeline's
-    settings get schemas of their own, files are marked as bytes, and problem documents replace the framework's errors.
-    ``address``: what the service is known as; None where it is that of the request."""
+    """Replaces ``app.openapi`` by a function that returns the completed document: the pipeline's settings get their own
+    schemas, files are marked as bytes, and problem documents replace the framework's errors. ``address``: the service's
+    public address; None: the address of the request."""
     original = app.openapi
 
     def openapi() -> JsonObject:
@@ -392,7 +392,7 @@ def _name_problems(document: JsonObject) -> None:
 
 
 def _name_conditions(document: JsonObject) -> None:
-    """Adds ``If-Match`` to what changes or removes something that can be got, and ``ETag`` to what gets it."""
+    """Adds ``If-Match`` to the requests that change or remove a resource, and ``ETag`` to those that get it."""
     text = {"schema": {"type": "string"}}
     tag = {"description": "of this state; If-Match takes it", **text}
     for path in document["paths"].values():

@@ -96,13 +96,13 @@ def _check_origin(request: Request) -> None:
 
 
 class FairShares:
-    """Serves the requests of each caller one by one, so a caller with thousands delays another caller by one. Serving
-    them in parallel is no faster, since they wait for Python's lock (2,000 took 13.1 s two at once, 7.8 one by one).
+    """Serves the requests of each caller one by one, so that thousands of requests delay another caller by only one.
+    Parallel requests would be slower, because of Python's lock (2,000 took 13.1 s two at once, 7.8 one by one).
 
-    A caller is identified by his key once it was accepted, and by his address before. The next request's turn comes
-    when an answer begins, when a request waits for a long body, and after ``SLOW_S`` seconds if fewer than
-    ``SLOW_MOST`` requests were that slow. A caller whose streams, slow downloads and uploads use the fraction ``SHARE``
-    of all connections gets no more (429).
+    A caller is identified by the API key after it was accepted, and by the network address before. The next request
+    begins when the answer of the previous one begins, when that waits for a long body, or after ``SLOW_S`` seconds if
+    fewer than ``SLOW_MOST`` requests were that slow. A caller whose streams, slow downloads and uploads use the
+    fraction ``SHARE`` of all connections gets no more (429).
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -111,7 +111,7 @@ class FairShares:
         self._lines: WeakValueDictionary[str, _Line] = WeakValueDictionary()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handles one ASGI connection. Requests that are not to the API are passed on."""
+        """Handles one ASGI connection. Passes on requests that are not for the API."""
         if scope["type"] != "http" or not scope["path"].startswith("/v1/"):
             await self._app(scope, receive, send)
             return

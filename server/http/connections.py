@@ -1,9 +1,9 @@
-"""Limits the cost of a connection before anybody has shown a key: bytes and seconds of a header, the pace of a body and
-of the reader of an answer, and the number of connections.
+"""Limits the cost of a connection before the caller has shown an API key: bytes and seconds of a header, the pace of a
+body, the client's pace of reading, and the number of connections.
 
-uvicorn's parser, httptools, joins a header that arrives in pieces quadratically and bounds neither it nor the time that
-it takes. h11 bounds the header, at 139 us of CPU a request against 60 us, and leaves the time open. So bytes are
-counted here, in front of the parser. A connection beyond its time is closed; a header that is too long is answered.
+uvicorn's parser, httptools, takes quadratic time for a header in many pieces and limits neither its size nor its time.
+h11 limits only the size, at 139 us of CPU for each request against 60 us. So bytes are counted here, in front of the
+parser. A connection that exceeds its time is closed; a header that is too long gets an error answer.
 """
 
 import resource
@@ -29,8 +29,8 @@ PIPELINED_MOST = 16  # requests that wait behind the one that is answered
 class BoundedConnection(HttpToolsProtocol):
     """Serves a connection, as uvicorn does, within the limits of this module.
 
-    If there are too many connections, or too many of one address (half of all), an idle one is closed for a new one: of
-    the address with the most connections, the one that has waited longest for a header. If no such connection is idle,
+    If there are too many connections, or one address has more than half of them, an idle one is closed for a new one:
+    from the address with the most connections, the one that has waited longest for a header. If no connection is idle,
     the new one is closed.
     """
 
@@ -67,18 +67,18 @@ class BoundedConnection(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def pause_writing(self) -> None:
-        """Starts the time within which the client must read part of an answer."""
+        """Starts the timer within which the client must read part of an answer."""
         self._stalled = self.loop.call_later(STALL_S, self.drop)
         super().pause_writing()
 
     def resume_writing(self) -> None:
-        """Ends that time."""
+        """Stops the timer for reading an answer."""
         if self._stalled is not None:
             self._stalled.cancel()
         super().resume_writing()
 
     def data_received(self, data: bytes) -> None:
-        """Passes bytes to the parser while it can make a header or a body of them."""
+        """Passes bytes to the parser within the limits of header and body."""
         self._unparsed += len(data)
         self._received += len(data)
         if self._in_header and self._timer is None:
@@ -88,7 +88,7 @@ class BoundedConnection(HttpToolsProtocol):
             self._refuse(Problem(431, "header-too-large", compose("header-too-large", bytes=HEADER_BYTES)))
 
     def on_headers_complete(self) -> None:
-        """Begins a request, and the time within which some of its body must arrive."""
+        """Begins a request, and the timer within which part of its body must arrive."""
         self._in_header, self._unparsed = False, 0
         self._keep_pace()
         if len(self.pipeline) >= PIPELINED_MOST:
@@ -101,13 +101,13 @@ class BoundedConnection(HttpToolsProtocol):
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """Ends a request. The next one's time begins with its first byte; until then uvicorn's keep-alive applies."""
+        """Ends a request. The timer of the next request begins with its first byte; before, keep-alive applies."""
         self._in_header, self._unparsed, self.since = True, 0, self.loop.time()
         self._set_timer(None)
         super().on_message_complete()
 
     def handle_websocket_upgrade(self) -> None:
-        """Hands the connection over: a WebSocket has its own pings."""
+        """Ends the checks of this connection, because a WebSocket has its own pings."""
         self._set_timer(None)
         super().handle_websocket_upgrade()
 
@@ -152,7 +152,7 @@ class BoundedConnection(HttpToolsProtocol):
 
 
 def connections_most() -> int:
-    """Returns how many connections may be open: at most ``CONNECTIONS_MOST``, and so few that each can open a file
-    within the limit of open files."""
+    """Returns how many connections may be open: at most ``CONNECTIONS_MOST``, and few enough for the process's limit of
+    open files."""
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     return min(CONNECTIONS_MOST, max(files - DESCRIPTORS_SPARED, files // 2) // 2)

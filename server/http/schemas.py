@@ -1,5 +1,5 @@
-"""Defines documents of HTTP: requests about captures, sessions, jobs, the rig and calibrations, and those answers that
-no service makes: captures, results and lists."""
+"""Defines HTTP documents: requests about captures, sessions, jobs, the rig and calibrations, and the answers for
+captures, results and lists, which no service defines."""
 
 import base64
 import binascii
@@ -327,7 +327,7 @@ class NewDelivery(Received):
 
 class CameraSettingsEdit(Received):
     """Changes a camera's settings. A key that is left out keeps its value. With null the service no longer sets the
-    value, and the camera keeps the one that it has."""
+    value, and the camera keeps its current one."""
 
     model_config = example({"exposure_ms": 8.0, "gain_db": 0.0})
 

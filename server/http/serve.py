@@ -31,8 +31,8 @@ log = structlog.get_logger()
 class WorkerProcess:
     """Keeps a worker process running as long as this process lives.
 
-    A worker that dies is started again, after a pause that grows with each early death. It ends when its standard input
-    closes, so also if this process is killed.
+    A worker that dies is started again, after a pause that grows with each early death. The worker ends when its
+    standard input closes, so also if this process is killed.
     """
 
     def __init__(self, settings: ServiceSettings) -> None:
@@ -43,8 +43,8 @@ class WorkerProcess:
         self._thread.start()
 
     def expect_end(self) -> None:
-        """Stops restarting the worker. To be called when this process is asked to end: the signal may have gone to the
-        whole process group or container, and ends the worker, too."""
+        """Stops restarting the worker. Call it when this process is asked to end: the signal may have gone to the whole
+        process group or container and then also ends the worker."""
         self._stop.set()
 
     def close(self) -> None:
@@ -89,9 +89,9 @@ class WorkerProcess:
 def run_service(settings: ServiceSettings, *, worker: bool = True, ready: Callable[[str], None] | None = None) -> None:
     """Serves requests until a signal ends the process. ``ready`` is called with the service's address once it answers.
 
-    Faults of the rig's file, the address and the database are found before anything heavy is loaded. Raises InputError
-    for the rig's file, AddressTaken, DatabaseUnavailable, and KeylessAddress if others could reach a service without
-    keys.
+    Faults of the rig's file, the address and the database are reported before heavy modules are loaded. Raises
+    InputError for the rig's file, AddressTaken, DatabaseUnavailable, and KeylessAddress if others could reach a service
+    without keys.
     """
     if settings.rig is not None:
         read_rig_config(settings.rig)

@@ -1,5 +1,4 @@
-"""Declares the common part of the service's documents. The services return them, HTTP answers them as JSON, and pages
-show them."""
+"""Declares the base classes of the service's documents, which services return, HTTP sends as JSON, and pages show."""
 
 from typing import Annotated, Any, Literal
 
@@ -51,7 +50,7 @@ class Answer(BaseModel):
 
 
 def as_data(field: str, form: Any = MessageOut) -> Any:
-    """Returns a field of an ``Answer`` that holds as data the message that ``field`` holds as text. ``form``:
+    """Returns a field of an ``Answer`` that holds the message of the text field ``field`` as data. ``form``:
     ``MessageOut``, with ``| None`` if there may be none, or a list of it."""
 
     def read(self: Answer) -> Any:

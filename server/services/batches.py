@@ -1,9 +1,9 @@
 """Implements batches: many captures, one job each, in the same queues as other jobs and behind them.
 
-A batch states the wanted outcome for its captures. ``Batches.serve``, which the service calls every ``poll_s`` seconds,
-brings it about. It keeps at most ``FED_MOST`` jobs of batches in each queue, so a batch of ten thousand captures does
-not fill the queue. It withdraws the queued jobs of a paused batch and cancels the jobs of a cancelled one. After any
-interruption of a call, the next call continues from the rows in the database.
+A batch states the desired outcome for its captures. ``Batches.serve``, which the service calls every ``poll_s``
+seconds, produces it. It keeps at most ``FED_MOST`` jobs of batches in each queue, so a batch of ten thousand captures
+does not fill the queue. It withdraws the queued jobs of a paused batch and cancels the jobs of a cancelled one. After
+any interruption of a call, the next call continues from the rows in the database.
 """
 
 import json
@@ -47,9 +47,9 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class BatchRequest:
-    """Holds a request for a batch: what is done with each of which captures, and in which queue (None: the service's
-    own). Exactly one is set of ``captures``, their ids, ``session``, its id, and ``prefix``, the text that their labels
-    begin with. Of two jobs the one with the lower ``priority`` runs first."""
+    """Holds the request for a batch: the settings, the captures, and the queue (None: the service's default). Exactly
+    one of these is set: ``captures`` (their ids), ``session`` (its id), or ``prefix`` (the beginning of their labels).
+    Of two jobs the one with the lower ``priority`` runs first."""
 
     work: ReconstructionRequest
     captures: Sequence[str] | None = None
@@ -171,12 +171,11 @@ class Batches:
         self._index.remove(identity)
 
     def serve(self) -> None:
-        """Starts, withdraws and cancels jobs until they agree with the wishes of the owners of all batches, and records
+        """Starts, withdraws and cancels jobs until they agree with the requested states of all batches, and records
         which batches have finished.
 
-        The service calls it every ``poll_s`` seconds. It may run in several processes at once: the jobs of a batch are
-        given in one transaction that locks the batch's row. A process killed between two steps loses nothing; the next
-        call repeats them.
+        The service calls it every ``poll_s`` seconds. It may run in several processes at once: a transaction that locks
+        the batch's row assigns the jobs. A process killed between two steps loses nothing; the next call repeats them.
         """
         for identity, jobs in self._index.recalled().items():  # also those that an ended process left
             self._take_back(identity, jobs)
@@ -201,8 +200,8 @@ class Batches:
                 self._index.finish(row, time.time_ns() // 1_000_000)
 
     def captures(self, identity: str) -> Iterator[tuple[str | None, JobOut | None]]:
-        """Yields the captures of a batch in their order: the id (None if the capture was erased) and its latest job
-        (None if it has none)."""
+        """Yields each capture of a batch in order: its id (None if it was erased) and its latest job (None if it has
+        none)."""
         for items in self._index.items(identity):
             ids = [item.job_id for item in items if item.job_id is not None and is_id(item.job_id)]
             jobs = {job.id: job for job in self._jobs.of(ids)}
@@ -255,7 +254,7 @@ class Batches:
         return faults
 
     def _feed(self, row: BatchRow, limit: int) -> int:
-        """Queues jobs for the next captures of a batch, all in one transaction. Returns how many."""
+        """Queues jobs for the next captures of a batch, all in one transaction. Returns how many jobs were queued."""
         try:
             self._store.reserve(0, self._settings.free_bytes)
         except DiskFull:
@@ -267,7 +266,7 @@ class Batches:
         return len(jobs)
 
     def _job_within(self, connection: sa.Connection, row: BatchRow, item: BatchItem) -> str | None:
-        """Returns the id of a new job, None if the capture was removed since the batch began."""
+        """Returns the id of a new job, None if the capture was removed after the batch began."""
         capture = self._store.found("captures", item.capture_id or "")
         if not isinstance(capture, CaptureRecord):
             return None
@@ -286,7 +285,7 @@ class Batches:
                     self._webhooks.announce(job_id, "cancelled", self._jobs.client.enqueue)
 
     def _take_back(self, identity: str, jobs: Sequence[str]) -> None:
-        """Removes recalled jobs, so their captures wait again; a job that has ended meanwhile stays."""
+        """Removes withdrawn jobs, so that their captures wait again; a job that has ended meanwhile stays."""
         for job_id in jobs:
             taken = True
             with suppress(NotFound):  # erased, or removed before this was noted

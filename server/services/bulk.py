@@ -1,4 +1,4 @@
-"""Applies one action to many things, each of which succeeds or is refused independently."""
+"""Applies one action to many objects, each of which succeeds or is refused independently."""
 
 from collections.abc import Callable, Iterable
 
@@ -21,14 +21,14 @@ class RefusedOne(Answer):
 
 
 class BulkOut(Answer):
-    """Holds the result of an action on many things. Each id is in one of the two lists."""
+    """Holds the result of an action on many objects. Each id is in one of the two lists."""
 
     done: list[str]
     refused: list[RefusedOne]
 
 
 def each(ids: Iterable[str], action: Callable[[str], object]) -> BulkOut:
-    """Calls ``action`` once for every different id and collects the outcomes. A refusal for one id does not stop the
+    """Calls ``action`` once for every different id and collects the results. A refusal for one id does not stop the
     others. Exceptions other than EigenheadError pass through."""
     done, refused = [], []
     for identity in dict.fromkeys(ids):

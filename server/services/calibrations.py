@@ -3,7 +3,7 @@ one of the results is selected for use.
 
 <data>/calibrations/<id>/record.json  board.toml  images/<camera>/<shot>.<ext>  result/cameras.json  calibration.json
 
-A scene has no board.toml, and may have scale.json. Its pictures may show a person, so its images/ are removed once the
+A scene has no board.toml, but may have scale.json. Its pictures may show a person, so its images/ are removed once the
 job has ended.
 """
 
@@ -41,8 +41,8 @@ class Calibrations:
         self._store, self._client, self._queue, self._events = store, client, queue, events
 
     def add(self, folder: Path, source: str, label: str) -> CalibrationOut:
-        """Moves ``folder`` to its final place in the data folder and queues its calibration. The folder holds images/,
-        and board.toml if they show a board; ``source`` says where they come from ("upload", "rig"). If the process is
+        """Moves ``folder`` to its final place in the data folder and queues its calibration. The folder contains
+        images/, and board.toml if they show a board; ``source`` is their origin ("upload", "rig"). If the process is
         killed before the job is queued, ``get`` queues it. Raises InputError for an invalid label."""
         check_texts({"label": label})
         identity = new_id()
@@ -79,8 +79,8 @@ class Calibrations:
             return self.add(target, "rig", label)
 
     def get(self, identity: str) -> CalibrationOut:
-        """Returns a calibration with its progress or its outcome. Queues the job anew if the service was killed before
-        it was queued. Raises NotFound."""
+        """Returns a calibration with its progress or its outcome. Queues the job if the service was killed before it
+        did so. Raises NotFound."""
         record = self._store.calibration(identity)
         row = self._row(identity)
         state = STATES[row.status] if row else "queued"

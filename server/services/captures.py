@@ -1,5 +1,5 @@
-"""Manages captures: shoots them with the rig or makes them from archives, searches, changes and removes them, and
-stores their feature points."""
+"""Manages captures: takes them with the rig or makes them from archives, searches, changes and removes them, and stores
+their feature points."""
 
 import hashlib
 import json
@@ -180,8 +180,7 @@ class Captures:
         return self._store.change_capture(identity, lambda r: replace(r, tags=checked_tags([*r.tags, *tags])))
 
     def untag(self, identity: str, tags: Sequence[str]) -> CaptureRecord:
-        """Removes tags from a capture; upper and lower case count as the same. Raises NotFound, and InputError for
-        invalid tags."""
+        """Removes tags from a capture, ignoring case. Raises NotFound, and InputError for invalid tags."""
         gone = {tag.casefold() for tag in checked_tags(tags)}
 
         def change(record: CaptureRecord) -> CaptureRecord:
@@ -251,7 +250,7 @@ class Captures:
         self._store.remove_capture(identity)
 
     def holdings(self, identity: str) -> HoldingsOut:
-        """Returns what removing a capture would take away and what would stay. Raises NotFound."""
+        """Returns which data a removal of the capture would delete and which would stay. Raises NotFound."""
         record = self._store.capture(identity)
         of_capture = self._jobs.find(capture=identity, limit=100_000)
         held = max(

@@ -1,7 +1,7 @@
-"""Delivers results to object stores: a job's permitted places, and the job engine's record of a delivery.
+"""Delivers results to object stores: checks the destination, and reads the job engine's record of a delivery.
 
-A delivery is a workflow of the job engine: it survives restarts, and waits for a store that does not answer. A result
-lies in a folder named by its job's id; the manifest, ``delivery.json``, is written last.
+A delivery is a workflow of the job engine: it survives restarts, and waits while a store does not answer. A result lies
+in a folder named by its job's id; the manifest, ``delivery.json``, is written last.
 """
 
 import time
@@ -37,8 +37,8 @@ UNDER_WAY = ("waiting", "delivering")
 
 
 def destination(url: str, settings: ServiceSettings) -> str:
-    """Returns a place named by a caller, with a slash at its end. Raises Forbidden if the service has no place to
-    deliver to, and InvalidInput ("url-refused")."""
+    """Returns a destination named by a caller, with a slash at its end. Raises Forbidden if the service allows no
+    deliveries, and InvalidInput ("url-refused")."""
     if not settings.deliver_prefixes:
         raise Forbidden("deliveries-off", compose("deliveries-off"))
     place = url if url.endswith("/") else f"{url}/"
@@ -62,7 +62,7 @@ def delivery_id(job_id: str) -> str:
 
 
 def place_of(wanted: DeliveryRequest) -> str:
-    """Returns the place where a job's result lies once it is delivered."""
+    """Returns the location of a job's delivered result."""
     return f"{wanted['to']}{wanted['job_id']}/"
 
 
@@ -95,7 +95,7 @@ class Deliveries:
 def delivery_of(
     job_id: str, state: str, request: JobRequest | None, begun: Mapping[str, DeliveryOut]
 ) -> DeliveryOut | None:
-    """Returns the delivery of a job in this state: the one that has begun, otherwise the one that the job requests."""
+    """Returns the delivery of a job in this state: the one that was begun, otherwise the one that the job requests."""
     if job_id in begun or request is None or "deliver_to" not in request:
         return begun.get(job_id)
     place = f"{request['deliver_to']}{job_id}/"

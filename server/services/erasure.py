@@ -17,7 +17,7 @@ CANCEL_S = 5.0  # a cancelled job lets go of its files within one second
 
 
 class HoldingsOut(Answer):
-    """Lists what is stored of a capture. A removal deletes the pictures, an erasure everything."""
+    """Lists the stored data of a capture. A removal deletes the pictures, an erasure everything."""
 
     pictures: int
     bytes: int = Field(description="of images, clean plates and caches")

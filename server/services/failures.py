@@ -38,7 +38,7 @@ class JobFailed(EigenheadError):
         return self.detail.text
 
     def __setstate__(self, state: object) -> None:
-        """Ignores attributes, which earlier versions also stored as texts; the arguments hold all of it."""
+        """Ignores attributes, which earlier versions also stored as texts; the arguments contain the same data."""
 
 
 class _PlainUnpickler(pickle.Unpickler):
@@ -68,7 +68,7 @@ def _read(kept: Message | Kept) -> Message:
 
 def failure(row: WorkflowStatus) -> JobError:
     """Returns why the job of a workflow's row failed. An error other than JobFailed is logged and becomes
-    "internal-error"; a job that took too many workers down becomes "worker-died"."""
+    "internal-error"; a job that killed too many workers becomes "worker-died"."""
     error = row.error
     if (failed := restored(error)) is not None:
         return JobError(type=URN + failed.kind, detail=failed.detail, errors=failed.errors)

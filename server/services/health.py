@@ -93,7 +93,7 @@ def _queues(service: Service) -> CheckOut:
 
 def check_egl(service: Service) -> None:
     """Makes an OpenGL context in a child process and stores the finding for ``readiness``. This takes a second or more,
-    during which the call blocks; a process does it once."""
+    during which the call blocks; each process does it once."""
     try:
         with service.children.one() as child:
             service.known["egl"] = CheckOut(ok=True, detail=verbatim(child.remote(try_egl)()))
@@ -123,7 +123,7 @@ def _retention(service: Service) -> CheckOut:
 
 def check_store(service: Service) -> None:
     """Asks the stores of captures and results whether they answer, and stores the finding for ``readiness``. Blocks
-    while a store does not answer. Jobs wait for such a store, so the service stays ready."""
+    while a store does not answer. Jobs wait for an unreachable store, so the service stays ready."""
     places = store_places(service)
     if not places:
         return
@@ -157,7 +157,7 @@ def _watched(service: Service) -> list[WatchedObjects]:
 
 
 def exposition(service: Service) -> bytes:
-    """Measures what is not counted as it happens. Returns all metrics in Prometheus' text format."""
+    """Measures the metrics that are not counted as events happen. Returns all metrics in Prometheus' text format."""
     metrics, index = service.metrics, service.jobs.index
     queued, slots = index.queued(), slots_by_queue(service.engine, service.settings.silent_s)
     for gauge in (metrics.queued, metrics.oldest, metrics.slots):
@@ -181,7 +181,7 @@ def exposition(service: Service) -> bytes:
 
 
 def _measure_stores(service: Service) -> None:
-    """Sets what this process asked of its object stores, if it has any, and whether they answered last."""
+    """Sets the metrics of requests to object stores, if there are any, and whether the stores answered last."""
     operations, seconds = Counter[tuple[str, str]](), Counter[str]()
     for store in _watched(service):
         service.metrics.store_up.labels("results").set(_store(service).detail.code == "store-answers")

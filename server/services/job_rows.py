@@ -1,4 +1,4 @@
-"""Translates the job engine's rows of jobs: names of its workflows, and the contents of its rows in our terms."""
+"""Translates the job engine's rows: names of its workflows, and the contents of its rows in the service's terms."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -31,12 +31,12 @@ FINISHED = ("succeeded", "failed", "cancelled")
 
 
 def enqueue_options(workflow: str, queue: str, identity: str) -> EnqueueOptions:
-    """Returns how the job engine is to queue a workflow under an id."""
+    """Returns the job engine's options to queue a workflow under an id."""
     return {"workflow_name": workflow, "queue_name": queue, "workflow_id": identity, "app_version": APPLICATION_VERSION}
 
 
 def by_state(query: JobQuery) -> JobQuery:
-    """Returns a query in which words that name states select jobs in those states."""
+    """Returns a query in which search words that are names of states select jobs in those states."""
     words = query.sought.split()
     states = [word.casefold() for word in words if word.casefold() in STATUSES]
     if not states:
@@ -53,5 +53,5 @@ def request_of(row: WorkflowStatus) -> JobRequest | None:
 
 
 def moment(milliseconds: int | None) -> str | None:
-    """Returns a time in ms since 1970 as text."""
+    """Converts a time in ms since 1970 to text."""
     return None if milliseconds is None else moment_of(milliseconds)

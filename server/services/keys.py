@@ -1,7 +1,7 @@
-"""Manages API keys and their scopes; the scopes state which actions a caller may do.
+"""Manages API keys and their scopes, which state the actions that a caller may do.
 
-A key is ``eh_<id>_<secret>``. The database holds the SHA-256 of the secret alone. The secret has 256 random bits, so a
-slow hash would not make it harder to guess. Without any key the service answers its own machine only and refuses to
+A key is ``eh_<id>_<secret>``. The database holds only the SHA-256 of the secret. The secret has 256 random bits, so a
+slow hash would not make it harder to guess. Without any key the service answers only its own machine and refuses to
 listen to other machines.
 """
 
@@ -118,8 +118,8 @@ class Keys:
 
 
 def check_address(settings: ServiceSettings, keys: Keys) -> None:
-    """Raises KeylessAddress if the service would listen to other machines without an API key, and KeysLost if the keys
-    are gone though nobody removed them."""
+    """Raises KeylessAddress if the service would listen to other machines without an API key, and KeysLost if the
+    database lost the keys."""
     if keys.any():
         note_keys(settings.data, keys)
     elif not settings.is_private:

@@ -32,7 +32,7 @@ class FileOut(Answer):
 
 
 class DeliveryOut(Answer):
-    """States where a job's result is delivered."""
+    """States the destination and progress of a delivery of a job's result."""
 
     to: str = Field(description="where the files lie once they are delivered; delivery.json is the last of them")
     state: Literal["waiting", "delivering", "delivered", "failed", "cancelled"]
@@ -174,7 +174,7 @@ class RigOut(Answer):
 
 
 class CameraSettingsOut(Answer):
-    """Holds the settings requested of a camera (null: the camera decides), and which of them it did not accept."""
+    """Holds the settings requested of a camera (null: the camera decides), and which of them it rejected."""
 
     exposure_ms: float | None
     gain_db: float | None
@@ -206,7 +206,7 @@ class NewWebhookOut(WebhookOut):
 
 
 def moment_now() -> str:
-    """Returns the time as ``moment_of`` writes it."""
+    """Returns the current time in the form of ``moment_of``."""
     return moment_of(1000.0 * time.time())
 
 

@@ -1,8 +1,8 @@
 """Manages results of jobs in an object store, and the copies in the data folder.
 
-If a store is configured, a job has succeeded only once its result is also there, and the data folder is a cache: large
-files that were unused longest are removed first, and fetched again on request. Small ones (reports, pictures of tables
-and sheets) stay. Without a store the data folder holds everything.
+If a store is configured, a job succeeds only after its result is in the store, and the data folder is a cache: the
+least recently used large files are removed, and fetched again on request. Small files (reports, pictures of tables and
+sheets) stay. Without a store the data folder holds all files.
 """
 
 import os
@@ -34,8 +34,7 @@ log = structlog.get_logger()
 
 
 class Results:
-    """Keeps the results of jobs. ``objects``: the store where they lie, None for the data folder alone. Methods
-    block."""
+    """Keeps the results of jobs. ``objects``: the store of results; None: only the data folder. Methods block."""
 
     def __init__(self, store: Store, settings: ServiceSettings) -> None:
         place = settings.results_store
@@ -51,7 +50,7 @@ class Results:
         wanted: Callable[[], bool],
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Stores a result, and waits for a store that is away. Raises Cancelled once the job is not ``wanted``,
+        """Stores a result, and waits while the store is unreachable. Raises Cancelled once the job is not ``wanted``,
         and what ``pause`` raises."""
         if self.objects is None:
             return
@@ -91,7 +90,7 @@ class Results:
                 self.damaged.add(said)
 
     def link(self, job_id: str, name: str) -> str | None:
-        """Returns a signed address of a file of a result, for ``LINK_S`` seconds; None where the store has no such
+        """Returns a signed address of a file of a result, valid for ``LINK_S`` seconds; None if the store has no such
         addresses, or does not have the file yet. Raises Unavailable."""
         if self.objects is None:
             return None
@@ -105,21 +104,21 @@ class Results:
         return self._store.folder("jobs", job_id) / "result"
 
     def erase(self, job_id: str) -> None:
-        """Removes a result, in the store with every version. Raises Unavailable where the store does not do it."""
+        """Removes a result with all its versions in the store. Raises Unavailable if the store fails."""
         if self.objects is not None:
             self.objects.erase(f"{job_id}/")
         self._store.remove(self._store.folder("jobs", job_id))
 
     def discard(self, job_id: str) -> None:
-        """Removes what a cancelled job has made; a store that is away keeps it until the job is removed."""
+        """Removes the result of a cancelled job; an unreachable store keeps it until the job is removed."""
         if self.objects is not None:
             with suppress(Refused):
                 self.objects.erase(f"{job_id}/")
         shutil.rmtree(self._store.folder("jobs", job_id), ignore_errors=True)
 
     def bound(self, most: int, files_of: Callable[[str], Mapping[str, FileEntry]]) -> int:
-        """Removes large files from the data folder that were not used for long, until all of them take ``most`` bytes.
-        Each is compared with its object before, and stored where it lacks one. Returns how many went."""
+        """Removes the least recently used large files from the data folder, until all of them take at most ``most``
+        bytes. Each file is first compared with its object, and stored if the store lacks it. Returns their number."""
         if self.objects is None:
             return 0
         found, removed = sorted(self._large()), 0
@@ -156,7 +155,7 @@ class Results:
             part.replace(path)
 
     def _large(self) -> Iterator[tuple[float, int, str, Path]]:
-        """Yields when each large file was used, its size, job and path."""
+        """Yields the last use, size, job and path of each large file."""
         for job_id in self._store.ids("jobs"):
             for path in (self._store.folder("jobs", job_id) / "result").rglob("*"):
                 with suppress(FileNotFoundError):

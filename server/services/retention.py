@@ -1,13 +1,13 @@
 """Implements retention: removes old jobs, captures and caches by age, by count and by free space.
 
-It never touches what a queued or running job needs, nor files that the service did not make itself. It trusts the clock
-only as far as the last sweep and the machine's uptime bear it out: where the clock seems to have jumped, nothing is
-removed until somebody has looked (``STOPPED``).
+It never removes data that a queued or running job needs, or files that the service did not make itself. If the clock
+has jumped, compared with the last sweep and the machine's uptime, nothing is removed until an operator has intervened
+(``STOPPED``).
 
-From object stores goes what nothing claims: results of jobs that were removed while a worker still wrote, and results
-and captures' files that a restored database lacks. Several services may do this at once. The row of a job is written
-before its result, and the store is listed before the rows are read, so that a result is never taken for one without a
-job. A database collects only where its own results lie.
+It removes unreferenced data from object stores: results of jobs that were removed while a worker still wrote, and
+results and captures' files that a restored database lacks. Several services may do this at once. The row of a job is
+written before its result, and the store is listed before the rows are read, so a new result is never mistaken for one
+without a job. Each database removes only results of its own store.
 """
 
 import json
@@ -52,8 +52,8 @@ log = structlog.get_logger()
 
 
 def clear_caches(service: Service) -> int:
-    """Removes the caches of all captures that no queued or running job needs. Caches are made anew on demand. Returns
-    how many captures had one."""
+    """Removes the caches of all captures that no queued or running job needs. Caches are rebuilt on demand. Returns how
+    many captures had a cache."""
     store, removed = service.store, 0
     for identity in store.ids("cache/captures"):
         if not service.jobs.active(capture=identity):
@@ -63,8 +63,8 @@ def clear_caches(service: Service) -> int:
 
 
 def sweep(service: Service) -> dict[str, int]:
-    """Removes everything that the settings no longer keep, and what crashes left behind. Returns how many things of
-    each kind were removed: none while the clock is in doubt. Results that are missing are noted for ``readiness``."""
+    """Removes everything that the settings no longer keep, and remains of crashes. Returns the number of removed
+    objects of each kind: zero while the clock is in doubt. Results that are missing are noted for ``readiness``."""
     if not _trusts_clock(service):
         return {}
     gone = {"leftovers": service.store.sweep(LEFTOVER_S), "uploads": service.uploads.sweep()}
@@ -85,7 +85,7 @@ def sweep(service: Service) -> dict[str, int]:
 def _trusts_clock(service: Service) -> bool:
     """Compares the clock with the last sweep's. Since then the clock may have advanced by at most a day more than the
     machine ran; after a restart of the machine any advance is accepted, unless half of all records, and at least
-    ``MANY``, would be removed at once. Otherwise ``STOPPED`` is written, and holds until somebody removes it."""
+    ``MANY``, would be removed at once. Otherwise ``STOPPED`` is written, and is valid until somebody removes it."""
     stopped, path = service.settings.data / STOPPED, service.settings.data / LAST_SWEEP
     now, up, boot = time.time(), time.clock_gettime(time.CLOCK_BOOTTIME), BOOT.read_text().strip()
     with suppress(FileNotFoundError, ValueError, KeyError, TypeError):
@@ -225,7 +225,7 @@ def _caches(service: Service) -> int:
 
 
 def _unclaimed(service: Service) -> int:
-    """Removes from the stores what no job and no capture of this database claims, a few times a day."""
+    """Removes unreferenced objects of this database from the stores, a few times a day."""
     days, results, blobs = service.settings.keep_unclaimed_days, service.jobs.results, service.store.blobs
     if days is None or time.monotonic() - results.collected < min(COLLECT_S, days * DAY_S):
         return 0
@@ -239,7 +239,7 @@ def _unclaimed(service: Service) -> int:
 
 
 def _orphans(service: Service) -> int:
-    """Removes attempts that a killed worker left in ended jobs, and folders of jobs that are not known any more."""
+    """Removes temporary folders of killed workers in ended jobs, and folders of unknown jobs."""
     removed = 0
     for job_id in service.store.ids("jobs"):
         folder = service.store.folder("jobs", job_id)
@@ -263,7 +263,7 @@ def _ended(service: Service, job_id: str) -> bool:
 
 
 def _deliveries(service: Service) -> int:
-    """Removes messages to webhooks that were delivered, or given up, a day ago."""
+    """Removes webhook messages that were delivered, or given up, a day ago."""
     before = datetime.fromtimestamp(time.time() - DAY_S, UTC).isoformat()
     client = service.jobs.client
     rows = client.list_workflows(name=DELIVERY, completed_before=before, load_input=False, load_output=False)
@@ -273,8 +273,8 @@ def _deliveries(service: Service) -> int:
 
 
 def _find_missing(service: Service) -> None:
-    """Finds results that somebody else removed or changed, or that are missing from a backup, for readiness. One job's
-    files are compared at each sweep, in turn."""
+    """Finds results that somebody else removed or changed, or that are missing from a backup, for readiness. Each sweep
+    compares the files of one job, in turn."""
     missing, done = service.jobs.without_result(), service.jobs.index.newest_first(STATUSES["succeeded"])
     damaged = service.jobs.results.damaged
     if done:
@@ -304,9 +304,9 @@ def collect(
     scratch: Path,
     is_name: Callable[[str], object] = is_id,
 ) -> int:
-    """Removes the results of jobs that are not known and were written more than ``days`` ago. ``owner`` names the
-    database, ``known`` returns those of the ids that are jobs of it, ``is_name`` tells what may be an id. Returns of
-    how many jobs. A store that is away ends it; the next call goes on."""
+    """Removes the results of unknown jobs that were written more than ``days`` days ago. ``owner`` names the database,
+    ``known`` returns which ids are jobs of it, and ``is_name`` says whether a name may be an id. Returns the number of
+    jobs whose results were removed. If the store is unreachable, it stops, and the next call continues."""
     removed = 0
     try:
         if not _owns(objects, owner, scratch):
@@ -323,7 +323,7 @@ def collect(
 
 
 def _owns(objects: ObjectStore, owner: str, scratch: Path) -> bool:
-    """Tells whether the store's results are this database's; the first database that looks becomes their owner."""
+    """Returns whether the store's results belong to this database; the first database that checks becomes the owner."""
     with TemporaryDirectory(dir=scratch) as folder:
         path = Path(folder) / OWNER
         try:

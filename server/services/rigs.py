@@ -1,6 +1,6 @@
 """Implements the rig behind ``POST /v1/captures``: the simulated studio, or real cameras that a rig.toml names.
 
-The calibration in use lies in ``<data>/rig/cameras.json``. Every later capture gets a copy of it. Until there is one,
+The calibration in use lies in ``<data>/rig/cameras.json``. Every later capture gets a copy of this file. Without it,
 captures get the default: the studio's layout, or the file that rig.toml names.
 """
 
@@ -45,7 +45,7 @@ class RealRig:
     """Takes shots with the cameras of a rig.toml, one at a time.
 
     The cameras are opened at the first use and stay open. If opening fails, the next use tries again. Settings that the
-    operator changed lie beside the calibration in adjusted.json and hold after a restart.
+    operator changed are stored beside the calibration in adjusted.json and apply after a restart.
     """
 
     def __init__(self, path: Path, calibration: Path) -> None:
@@ -57,8 +57,8 @@ class RealRig:
         self._lock = threading.RLock()
 
     def describe(self) -> RigOut:
-        """Returns the state of the rig. Cameras that were not used yet are "closed", which is no fault; a missing
-        calibration is one."""
+        """Returns the state of the rig. Unused cameras are "closed", which is not a fault; a missing calibration is a
+        fault."""
         with self._lock:
             states = {} if self._session is None else self._session.states()
             error = None if self._session is None else self._session.trigger_error()
@@ -127,7 +127,7 @@ class RealRig:
 
     def camera_settings(self, camera: str) -> CameraSettingsOut:
         """Returns the settings requested of a camera, by rig.toml or by the operator, and those that the driver did not
-        take. Raises NotFound for an unknown camera."""
+        accept. Raises NotFound for an unknown camera."""
         check_camera(camera, self._config.names)
         wanted = next(found for found in self._config.cameras if found.name == camera)
         with self._lock:
@@ -138,8 +138,8 @@ class RealRig:
         )
 
     def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettingsOut:
-        """Changes settings of a camera and stores them in adjusted.json. An open rig is closed and opened again, since
-        drivers take settings when they open. Raises NotFound and InputError."""
+        """Changes settings of a camera and stores them in adjusted.json. An open rig is closed and opened again,
+        because drivers apply settings when they open. Raises NotFound and InputError."""
         self.camera_settings(camera)
         with self._lock:
             before = self._adjustment()
@@ -165,7 +165,7 @@ class RealRig:
         return RigAdjustment({})
 
     def _adjust(self, wanted: RigAdjustment) -> None:
-        """Stores the adjustment; an open rig is opened anew, because drivers take settings only then."""
+        """Stores the adjustment; an open rig is opened again, because drivers apply settings only then."""
         config = adjusted(self._from_file, wanted.cameras, wanted.lights)
         self._adjusted.parent.mkdir(exist_ok=True)
         write_atomically(self._adjusted, json.dumps(RIG_ADJUSTMENT.document(wanted), indent=1).encode())
@@ -244,8 +244,8 @@ class RealRig:
 
 
 class SimulatedRig:
-    """Takes shots of the simulated studio, one at a time. A child process with an OpenGL context of its own renders
-    them. The true shape of each subject is written beside its capture."""
+    """Takes shots of the simulated studio, one at a time. A child process with its own OpenGL context renders them. The
+    true shape of each subject is written beside its capture."""
 
     def __init__(self, calibration: Path) -> None:
         self._calibration = calibration
@@ -303,8 +303,8 @@ class SimulatedRig:
         raise Conflict("simulated-rig", compose("simulated-rig-fixed"))
 
     def take_background(self) -> CleanPlates:
-        """Takes no pictures, since the studio takes clean plates with every shot. Returns its cameras and a note that
-        says so."""
+        """Takes no pictures, since the studio takes clean plates with every shot. Returns its cameras and a note on
+        this."""
         return CleanPlates(self._rig().names, 2, compose("hint-studio-plates"))
 
     def plates(self) -> list[PlatesVersion]:
@@ -337,13 +337,13 @@ RigBackend = RealRig | SimulatedRig
 
 
 def check_camera(camera: str, names: tuple[str, ...]) -> None:
-    """Raises NotFound for a camera that is none of the rig's."""
+    """Raises NotFound for a camera that the rig does not have."""
     if camera not in names:
         raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
 
 
 def check_names(rig: Rig, names: tuple[str, ...]) -> None:
-    """Raises Conflict unless a calibration has exactly the cameras ``names``; it names the differences."""
+    """Raises Conflict naming the differences if a calibration does not have exactly the cameras ``names``."""
     if set(rig.names) != set(names):
         differing = sorted(set(rig.names) ^ set(names))
         faults = [compose("camera-in-one-alone", camera=name) for name in differing]

@@ -37,8 +37,8 @@ from server.tasks.export_archive import export_archive
 
 
 class CheckOut(Answer):
-    """Holds one check of the service: whether it passed and, if not, what to do. ``starting``: it will pass soon by
-    itself."""
+    """Holds one check of the service: whether it passed and, if not, the remedy. ``starting``: it will soon pass
+    without intervention."""
 
     ok: bool
     detail: Said
@@ -78,9 +78,9 @@ class Service:
         self.engine.dispose()
 
     def accept_pictures(self, source: str, archive: Path, folder: Path, label: str) -> CalibrationOut:
-        """Unpacks an archive of pictures and queues a calibration: of IMAGES/ and board.toml or, if ``source`` is
-        "scene", of photographs. ``folder`` is a folder of ``Store.incoming``. Raises InputError naming every fault, and
-        DiskFull."""
+        """Unpacks an archive of pictures and queues a calibration, from IMAGES/ and board.toml or, if ``source`` is
+        "scene", from photographs. ``folder`` is a folder of ``Store.incoming``. Raises InputError naming every fault,
+        and DiskFull."""
         limits, target = self.captures.archive_limits(archive), folder / "calibration" / "pictures"
         target.mkdir(parents=True)
         with self.children.one() as child:
@@ -103,8 +103,7 @@ class Service:
         return self.rig.describe()
 
     def cancel(self, job_id: str) -> JobOut:
-        """Cancels a job and queues messages to the webhooks about that. A finished job stays as it is. Raises
-        NotFound."""
+        """Cancels a job and queues webhook messages about it. A finished job stays as it is. Raises NotFound."""
         job, did = self.jobs.cancel(job_id)
         if did:
             webhook = (self.jobs.request(job_id) or {}).get("webhook")
@@ -112,9 +111,9 @@ class Service:
         return job
 
     def deliver(self, job_id: str, to: str | None = None) -> JobOut:
-        """Delivers the result of a job to a place in an object store, by default the place that the job was submitted
-        with. Raises NotFound, InputError without a place, InvalidInput for one that is not allowed, and Conflict for a
-        job without result and while it is being delivered."""
+        """Delivers the result of a job to a location in an object store, by default the job's own destination. Raises
+        NotFound, InputError without a location, InvalidInput for a forbidden location, and Conflict if the job has no
+        result or the delivery runs."""
         self.jobs.files(job_id)
         request = self.jobs.request(job_id) or {}
         if (place := to or request.get("deliver_to")) is None:

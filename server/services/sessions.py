@@ -1,4 +1,4 @@
-"""Manages sessions, that is captures of one subject with the note of consent, and their erasure."""
+"""Manages sessions (captures of one subject with a note of consent) and their erasure."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -62,7 +62,7 @@ class Sessions:
         return page.of(found)
 
     def captures_of_subject(self, session: str | None) -> list[str]:
-        """Lists the ids of all captures of the person whom a session shows, other sessions included. The list is empty
+        """Lists the ids of all captures of a session's subject, including those of other sessions. The list is empty
         for None and for an unknown session."""
         if session is None or (record := self._record(session)) is None:
             return []
@@ -70,7 +70,7 @@ class Sessions:
         return [capture for some in self._library.captures_of(sessions).values() for capture in some]
 
     def _record(self, identity: str) -> SessionRecord | None:
-        """Returns the record, None if it was removed since the index was read."""
+        """Returns the record; None if it was removed after the index was read."""
         with suppress(NotFound):
             return self._store.session(identity)
         return None
@@ -93,7 +93,7 @@ class Sessions:
         database.
 
         The session's record is removed last, so an interrupted erasure can be repeated. Captures that arrive meanwhile
-        are removed, too. Raises NotFound, and Unavailable while a worker still writes.
+        are removed too. Raises NotFound, and Unavailable while a worker still writes.
         """
         self._store.session(identity)
         self._erase_captures(identity)

@@ -50,7 +50,7 @@ class StorageOut(Answer):
 
 
 class StorageCount:
-    """Counts the bytes in the data folder in a thread of its own, since a large folder takes long. The count is kept
+    """Counts the bytes in the data folder in a separate thread, because a large folder takes long. The count is kept
     for ``COUNT_AGAIN_S`` seconds."""
 
     def __init__(self, store: Store, jobs: Jobs, settings: ServiceSettings) -> None:
@@ -60,7 +60,7 @@ class StorageCount:
         self._at: float | None = None
 
     def use(self) -> StorageOut:
-        """Returns the last count and the disk's present free space. Starts a new count if the last is old, and does not
+        """Returns the last count and the disk's current free space. Starts a new count if the last is old, and does not
         wait for it."""
         old = self._at is None or time.time() - self._at > COUNT_AGAIN_S
         if old and self._looking.acquire(blocking=False):
@@ -87,8 +87,8 @@ class StorageCount:
 
 
 def count(data: Path) -> list[KindOut]:
-    """Counts bytes and things in the data folder, by kind. The kind "other" is everything else in the folder, the
-    database and models included."""
+    """Counts bytes and objects in the data folder, by kind. The kind "other" contains all remaining files, including
+    the database and models."""
     known = {folder for folders in KINDS.values() for folder in folders}
     found = []
     for kind, folders in KINDS.items():

@@ -1,8 +1,8 @@
-"""Looks after the store of captures: what waits for it goes there, what is dead is removed, and what it has goes from
-the data folder where that holds too much.
+"""Maintains the object store of captures: sends waiting files, removes unreferenced ones, and limits the copies in the
+data folder.
 
-A data folder whose captures have no records is a worker's own. Such a folder is only a cache: erased captures are
-removed from it, too.
+A data folder whose captures have no records belongs to a worker. It is only a cache: erased captures are also removed
+from it.
 """
 
 import time
@@ -25,8 +25,8 @@ log = structlog.get_logger()
 
 
 def tend_captures(store: Store, jobs: Jobs, most: int) -> int:
-    """Stores captures that wait for the store, removes what nothing refers to any more, and bounds the data folder. If
-    the store does not answer, the next call continues. Returns how many blobs were removed."""
+    """Stores captures that wait for the store, removes unreferenced blobs, and limits the data folder. If the store
+    does not answer, the next call continues. Returns how many blobs were removed."""
     blobs, removed = store.blobs, 0
     if blobs is None:
         return 0
@@ -45,8 +45,8 @@ def tend_captures(store: Store, jobs: Jobs, most: int) -> int:
 
 
 def bound_captures(store: Store, most: int, is_used: Callable[[str], bool]) -> int:
-    """Removes large files of captures that were not used for long from the data folder, until all of them take ``most``
-    bytes. Each is first compared with its object. Returns the number of their captures."""
+    """Removes the least recently used large files of captures from the data folder, until all of them take at most
+    ``most`` bytes. Each is first compared with its object. Returns the number of their captures."""
     assert store.blobs is not None
     found, total, removed = [], 0, 0
     for identity in store.ids("captures"):
@@ -72,7 +72,7 @@ def bound_captures(store: Store, most: int, is_used: Callable[[str], bool]) -> i
 
 
 def forget_erased(store: Store) -> int:
-    """Removes from a worker's own data folder the captures that the service has no more. Returns how many they were."""
+    """Removes from a worker's data folder the captures that the service no longer has. Returns their number."""
     assert store.blobs is not None
     mine = {*store.ids("captures"), *store.ids("cache/captures")}
     mine = {identity for identity in mine if not (store.folder("captures", identity) / "record.json").exists()}

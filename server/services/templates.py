@@ -1,4 +1,4 @@
-"""Lists templates for callers of the service: their names, how well they fit, and their models."""
+"""Lists templates for callers of the service: their names, their accuracy, and their models."""
 
 from collections.abc import Mapping
 
@@ -10,8 +10,8 @@ from server.services.answer import Answer
 
 
 class RegistrationOut(Answer):
-    """Describes how well a template was fitted to its model. Distances are in mm: the median, and the value that 95 %
-    of vertices stay below (``p95``)."""
+    """Describes how accurately a template was fitted to its model. Distances are in mm: the median, and the value that
+    95 % of vertices stay below (``p95``)."""
 
     skin_share: float = Field(ge=0, le=1, description="of its vertices, on the model's skin; the others follow it")
     face_covered_share: float = Field(ge=0, le=1, description="of the model's face, that it shows")

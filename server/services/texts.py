@@ -1,5 +1,5 @@
 """Checks the texts that people enter: names, labels, notes, and tags by which they find captures. HTTP, forms and the
-console all call this."""
+console all use these checks."""
 
 import re
 import unicodedata
@@ -20,8 +20,8 @@ UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")  # Unicode's classes of cont
 
 def check_texts(texts: Mapping[str, str | None], subject: str = "form") -> None:
     """Raises InputError naming the field of every text that is longer than ``TEXT_MOST`` characters or holds characters
-    that a database cannot store. Fields that are None are skipped. ``subject`` names in the error the owner of the
-    fields ("form", "request")."""
+    that a database cannot store. Fields that are None are skipped. ``subject`` is the owner of the fields in the error
+    ("form", "request")."""
     faults = []
     for name, text in texts.items():
         if text is not None and len(text) > TEXT_MOST:
@@ -33,7 +33,7 @@ def check_texts(texts: Mapping[str, str | None], subject: str = "form") -> None:
 
 
 def checked_tags(tags: Iterable[str]) -> tuple[str, ...]:
-    """Returns the tags in one spelling (Unicode NFC, single blanks), in their order. Of tags that differ in case only,
+    """Returns the tags in one spelling (Unicode NFC, single blanks), in their order. Of tags that differ only in case,
     the first is kept. Raises InputError naming every fault."""
     found: dict[str, str] = {}
     faults = []

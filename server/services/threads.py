@@ -23,7 +23,7 @@ AGAIN_S = 30  # Retry-After of one that is refused
 
 
 class Threads:
-    """Runs blocking functions in two thread pools apart from the web framework's. Fifty waiting uploads then do not
+    """Runs blocking functions in two thread pools separate from the web framework's. Fifty waiting uploads then do not
     delay a request for a job's status.
 
     ``checks``: number of checks at once (one key may use all but one); ``check_s``: longest duration of one.
@@ -47,7 +47,7 @@ class Threads:
         hung_up: Callable[[], Awaitable[None]] | None = None,
     ) -> T:
         """Runs a function that unpacks or checks an upload in a thread and returns its result. Its work in child
-        processes ends after ``check_s`` seconds, or once ``hung_up()`` has returned because nobody waits for it.
+        processes ends after ``check_s`` seconds, or once ``hung_up()`` has returned (the client is gone).
 
         At most ``checks`` run at once; others wait. Raises TooMany if too many requests of this key wait, InvalidInput
         if the time or the memory does not suffice, and Conflict if the client has disconnected.

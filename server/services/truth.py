@@ -13,8 +13,8 @@ from rig.mesh import Mesh
 
 
 def error_mm(truth: Path, result: Path) -> dict[str, float]:
-    """Computes the distance (mm) from the true face region to the surface of ``result`` as delivered, without aligning
-    both. Returns mean, median and maximum, weighted by area."""
+    """Computes the distance (mm) from the true face region to the surface of ``result``, without aligning the two.
+    Returns mean, median and maximum, weighted by area."""
     from pipeline.head_model.subdivision import vertex_areas
 
     head, face = read_mesh(truth / "head.ply"), np.load(truth / "face_mask.npy")

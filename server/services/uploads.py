@@ -1,4 +1,4 @@
-"""Resumable uploads (tus 1.0) on disk: ``uploads/<id>/upload.json`` and ``uploads/<id>/data``."""
+"""Manages resumable uploads (tus 1.0) on disk: ``uploads/<id>/upload.json`` and ``uploads/<id>/data``."""
 
 import fcntl
 import json
@@ -30,8 +30,8 @@ class ResumableUploads:
 
     def create(self, length: int, fields: dict[str, str], key: str) -> UploadRecord:
         """Makes an upload of ``length`` bytes and returns its record. ``fields`` describe the future capture, ``key``
-        is the id of the caller's API key. Raises TooLarge, TooMany if the key has as many unfinished uploads as it may,
-        and DiskFull if the disk cannot take it beside other unfinished uploads."""
+        is the id of the caller's API key. Raises TooLarge, TooMany if the key has too many unfinished uploads, and
+        DiskFull if the disk has no space for it and the other unfinished uploads."""
         if length > self._settings.body_bytes:
             raise too_large(self._settings)
         unfinished = [*self._unfinished()]
@@ -60,8 +60,8 @@ class ResumableUploads:
         raise NotFound(compose("thing-upload"), identity)
 
     def offset(self, record: UploadRecord) -> int:
-        """Returns how many bytes of an upload were received. Once the capture was made, that is all of them, although
-        the data is deleted already."""
+        """Returns how many bytes of an upload were received. After the capture was made this is the full length,
+        although the data was deleted."""
         if record.capture is not None:
             return record.length
         return self.data(record).stat().st_size
@@ -98,7 +98,7 @@ class ResumableUploads:
         self._store.remove(self._store.folder("uploads", identity))
 
     def sweep(self) -> int:
-        """Removes expired uploads to which nobody is writing. Returns how many."""
+        """Removes expired uploads to which no process is writing. Returns how many."""
         removed = 0
         for identity in self._store.ids("uploads"):
             try:

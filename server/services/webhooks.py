@@ -84,7 +84,7 @@ class Webhooks:
 
     def announce_batch(self, batch_id: str, round_number: int, enqueue: Callable[..., Any]) -> None:
         """Queues a message for each webhook that a batch has finished. A retry of failed jobs begins the batch's next
-        round; for each round a webhook gets one message, even if the call is repeated."""
+        round; a webhook gets one message for each round, even if the call is repeated."""
         for hook in self.all():
             identity = f"hook-{hook.id}-{batch_id}-{round_number}"
             what: WebhookMessage = {"webhook": hook.id, "type": "batch.finished", "batch_id": batch_id, "id": identity}
@@ -118,7 +118,7 @@ class Webhooks:
         return httpx.post(hook.url, content=body, headers=headers, timeout=TIMEOUT_S).raise_for_status().status_code
 
     def _post_own(self, message: WebhookMessage, hook: JobWebhook) -> int:
-        """Posts to an address that a caller named, and checks it now, as it may have changed since the job was made."""
+        """Posts to an address that a caller named, and checks it again, because it may have changed meanwhile."""
         aim = target(hook["url"], self._origins)
         body, headers = _signed(message, hook["secret"])
         with httpx.Client(trust_env=False, timeout=TIMEOUT_S) as client:

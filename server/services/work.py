@@ -1,4 +1,4 @@
-"""Declares the request for a job, and checks whether it can be done."""
+"""Declares the request for a job, and checks whether the job is possible."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class ReconstructionRequest:
 
     def check(self) -> None:
         """Raises InputError naming an invalid job name, an unknown model, every wrong setting and a template that the
-        model does not have. So no job fails because of them hours later."""
+        model does not have. So no job fails hours later because of them."""
         check_texts({"name": self.name}, "request")
         model, settings = self._model_faults(), self._settings_faults()
         if model and settings:

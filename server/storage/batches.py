@@ -1,7 +1,7 @@
-"""Stores batches in the database: the work of each, and the job of each capture.
+"""Stores batches in the database: each batch's request, and the job of each capture.
 
-A batch is a row, each of its captures an item. An item without a job waits. The state of a job is never copied: queries
-join the job engine's own row, so counts always agree with the jobs. Times are milliseconds since 1970.
+A batch is a row, and each of its captures is an item. An item without a job is waiting. The state of a job is never
+copied: queries join the job engine's own row, so counts always agree with the jobs. Times are milliseconds since 1970.
 """
 
 import json
@@ -27,9 +27,9 @@ NONE = "-"  # in the place of a job's id: none is to be made, since the capture 
 
 @dataclass(frozen=True, slots=True)
 class BatchRow:
-    """Holds a batch. ``wish`` is its owner's wish: running, paused or cancelled. ``finished`` is the time at which no
-    work was left (ms since 1970), None before. ``rounds`` grows whenever it finishes and whenever its failed jobs are
-    tried again."""
+    """Holds a batch. ``wish`` is the state that its owner requested: running, paused or cancelled. ``finished`` is the
+    time at which no work remained (ms since 1970), None before. ``rounds`` grows whenever it finishes and whenever its
+    failed jobs are tried again."""
 
     id: str
     created: int
@@ -48,8 +48,7 @@ class BatchRow:
 
 @dataclass(frozen=True, slots=True)
 class BatchItem:
-    """Holds one capture of a batch, None if it was erased, and the latest job that makes its head, None while it
-    waits."""
+    """Holds one capture of a batch (None if it was erased) and the latest job for its head (None while it waits)."""
 
     position: int
     capture_id: str | None
@@ -160,8 +159,8 @@ class BatchIndex:
     def waiting_within(self, connection: sa.Connection, identity: str, limit: int) -> list[BatchItem]:
         """Returns the first ``limit`` items of a batch that have no job; none if the batch is not running.
 
-        Locks the batch's row until the end of the caller's transaction, so that no other process gives these items jobs
-        or changes the batch's wish.
+        Locks the batch's row until the end of the caller's transaction, so that no other process assigns jobs to these
+        items or changes the batch's ``wish``.
         """
         runs = sa.select(batches.c.id).where(batches.c.id == identity, batches.c.wish == "running")
         if connection.scalar(runs.with_for_update()) is None:
@@ -193,8 +192,8 @@ class BatchIndex:
         return found
 
     def settle_recall(self, identity: str, job_id: str, *, taken: bool) -> None:
-        """Removes the mark from a job. If it was withdrawn (``taken``), its capture waits again; otherwise it had ended
-        before and stays."""
+        """Removes the mark from a job. If the job was withdrawn (``taken``), its capture waits again; otherwise the job
+        had ended before and stays."""
         changed = {"recalled": False, "job_id": None} if taken else {"recalled": False}
         self._change_items(identity, [job_id], changed)
 
@@ -204,8 +203,8 @@ class BatchIndex:
             return {*connection.scalars(sa.select(batches.c.id).where(batches.c.finished.is_(None), _has_waiting()))}
 
     def change(self, identity: str, wish: Wish) -> bool:
-        """Stores whether a batch is to run, to pause or to be cancelled. Returns False, without any change, if the
-        batch has finished or was cancelled before."""
+        """Stores the requested state of a batch: running, paused or cancelled. Returns False, without any change, if
+        the batch has finished or was cancelled before."""
         change = sa.update(batches).where(batches.c.id == identity, batches.c.finished.is_(None))
         with self._engine.begin() as connection:
             return bool(connection.execute(change.where(batches.c.wish != "cancelled").values(wish=wish)).rowcount)
@@ -222,7 +221,7 @@ class BatchIndex:
 
     def retry(self, identity: str, statuses: Collection[str]) -> int:
         """Makes all items wait again whose job has one of the job engine's ``statuses``, and reopens the batch. Returns
-        how many."""
+        the number of items."""
         item, job = batch_items.c, self._status.c
         joined = batch_items.join(self._status, job.workflow_uuid == item.job_id)
         query = sa.select(item.job_id).select_from(joined).where(item.batch_id == identity, job.status.in_(statuses))
@@ -233,8 +232,8 @@ class BatchIndex:
         return len(failed)
 
     def forget_captures(self, captures: Collection[str]) -> None:
-        """Removes the ids of erased captures and of their jobs from all batches; removes the label and the place of a
-        batch without other captures, since they may name the subject."""
+        """Removes the ids of erased captures and of their jobs from all batches; removes the label and the destination
+        of a batch without other captures, because they may name the subject."""
         item = batch_items.c
         with self._engine.begin() as connection:
             for some in portions(captures):
@@ -266,14 +265,15 @@ class BatchIndex:
 
 
 def _has_waiting() -> sa.ColumnElement[bool]:
-    """Returns the SQL condition that items wait, made of two parts with an index each."""
+    """Returns the SQL condition that items wait, made of two parts so that each can use an index."""
     item = batch_items.c
     those = item.batch_id == batches.c.id
     return sa.or_(sa.exists().where(those, item.job_id.is_(None)), sa.exists().where(those, RECALLED))
 
 
 def _in_state(state: BatchState) -> sa.ColumnElement[bool]:
-    """Returns the SQL condition for a state: a cancelled batch stays so; any other is finished once no work is left."""
+    """Returns the SQL condition for a state: a cancelled batch stays cancelled; any other is finished once no work
+    remains."""
     table = batches.c
     if state == "cancelled":
         return table.wish == state

@@ -1,8 +1,8 @@
 """Stores files of captures in an object store: each content once, under ``<its SHA-256>-<16 hex digits>/content``.
 
-The database maps captures to blobs; workers without the service's data folder read both. A blob without references is
-marked dead in the same transaction and is never used again: equal content that comes later gets a new name. So any
-number of processes may remove dead blobs at any time, and never remove one in use.
+The database maps captures to blobs; workers without the service's data folder read both database and store. A blob
+without references is marked dead in the same transaction and is never used again: equal content that comes later gets a
+new name. So any number of processes may remove dead blobs at any time, and never remove one in use.
 """
 
 import os
@@ -36,7 +36,7 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """Holds the name of a blob, and the SHA-256 and size of its content. ``stored``: it is in the store."""
+    """Holds the name of a blob, and the SHA-256 and size of its content. ``stored``: whether the store has it."""
 
     id: str
     sha256: str
@@ -45,20 +45,20 @@ class Blob:
 
     @property
     def key(self) -> str:
-        """Returns the key of its object."""
+        """Returns the blob's object key."""
         return f"{self.id}/content"
 
 
 class CaptureBlobs:
     """Stores and fetches the files of captures. Methods block, and may be called by several processes at once. Each
-    raises StoreUnavailable if the store fails, and StoreDenied if it refuses."""
+    method raises StoreUnavailable if the store fails, and StoreDenied if it refuses."""
 
     def __init__(self, objects: WatchedObjects, engine: sa.Engine) -> None:
         self.objects, self._engine = objects, engine
 
     def keep(self, capture: str, folder: Path, inputs: Mapping[str, str]) -> None:
-        """Stores the files of a capture that lie in ``folder``; ``inputs`` is their SHA-256 by name. Once all are
-        there, others may fetch them. Contents that are in the store are not sent again."""
+        """Stores the files of a capture that lie in ``folder``; ``inputs`` is their SHA-256 by name. Other processes
+        can fetch the files once all of them are stored. Contents that the store already has are not sent again."""
         claimed = self._claim(capture, inputs, lambda name: (folder / name).stat().st_size)
         used = {blob.id: (name, blob) for name, blob in claimed.items()}
         sent = list[str]()
@@ -87,7 +87,7 @@ class CaptureBlobs:
         return True
 
     def files(self, capture: str) -> dict[str, Blob]:
-        """Returns the blobs of a capture by the names of its files; none until all of them are in the store."""
+        """Returns the blobs of a capture by the names of its files; empty until all of them are in the store."""
         query = sa.select(capture_files.c.name, capture_files.c.arrived, blobs).join(
             blobs, blobs.c.id == capture_files.c.blob_id
         )
@@ -128,14 +128,14 @@ class CaptureBlobs:
         return same
 
     def release(self, capture: str, *, later: bool = False) -> None:
-        """Removes blobs that only this capture uses from the store, with every version; ``later``: with the next sweep.
-        A call that fails is completed by a second one."""
+        """Removes blobs that only this capture uses from the store, with every version; with ``later`` the next sweep
+        does it. A call that fails is completed by a second one."""
         self._claim(capture, {}, lambda _: 0)
         if not later:
             self.bury()
 
     def bury(self) -> int:
-        """Removes all dead blobs. Returns how many."""
+        """Removes all dead blobs. Returns their number."""
         with self._engine.connect() as connection:
             dead = connection.scalars(sa.select(blobs.c.id).where(blobs.c.dead)).all()
         for blob in dead:
@@ -180,7 +180,7 @@ class CaptureBlobs:
         return found
 
     def _claim(self, capture: str, inputs: Mapping[str, str], size: Callable[[str], int]) -> dict[str, Blob]:
-        """Registers these as the files of a capture, and marks as dead the blobs that only it had. Locks rows in the
+        """Registers the files of a capture, and marks as dead the blobs that only this capture had. Locks rows in the
         order of their names, so that two services do not deadlock."""
         mine = sa.select(capture_files.c.blob_id).where(capture_files.c.capture_id == capture)
         alike = sa.and_(blobs.c.sha256.in_(set(inputs.values())), ~blobs.c.dead)
@@ -207,7 +207,7 @@ class CaptureBlobs:
         return {name: usable[sha256] for name, sha256 in inputs.items()}
 
     def _take_back(self, sent: Collection[str]) -> None:
-        """Removes the sent files of a capture that was removed meanwhile, since nobody else would."""
+        """Removes the sent files of a capture that was removed meanwhile."""
         with self._engine.connect() as connection:
             alive = {*connection.scalars(sa.select(blobs.c.id).where(blobs.c.id.in_(sent), ~blobs.c.dead))}
         for blob in sent:
@@ -236,7 +236,7 @@ def open_capture_blobs(settings: ServiceSettings, engine: sa.Engine) -> CaptureB
 
 
 def _is_there(path: Path, sha256: str) -> bool:
-    """Returns whether a file exists. Small ones are compared, since they may be replaced."""
+    """Returns whether a file exists. Small files are also compared by content, because they may be replaced."""
     with suppress(FileNotFoundError, NotADirectoryError):
         return path.stat().st_size > SMALL_BYTES or sha256_of(path) == sha256
     return False

@@ -38,7 +38,7 @@ T = TypeVar("T")
 
 
 def portions(values: Iterable[T]) -> Iterator[list[T]]:
-    """Yields the values in lists of ``AT_ONCE`` at most."""
+    """Yields the values in lists of at most ``AT_ONCE``."""
     listed = list(values)
     return (listed[start : start + AT_ONCE] for start in range(0, len(listed), AT_ONCE))
 
@@ -209,7 +209,7 @@ identities = sa.Table(  # one row: what a store of results knows the database by
 
 @event.listens_for(sa.Engine, "connect")
 def _delete_securely(connection: Any, record: Any) -> None:
-    """Makes SQLite overwrite deleted rows, those of the job engine's own connections included."""
+    """Makes SQLite overwrite deleted rows, also for the job engine's own connections."""
     if isinstance(connection, sqlite3.Connection):
         connection.execute("PRAGMA secure_delete=ON")
 
@@ -262,7 +262,7 @@ def check_pages(engine: sa.Engine, place: str) -> None:
 
 
 def _add_columns(engine: sa.Engine) -> None:
-    """Adds missing columns to tables of an earlier version; all of those may be empty."""
+    """Adds missing columns to tables of an earlier version; all of these columns may be empty."""
     for table, name in ((job_index, "words"), (batches, "deliver_to")):
         if name not in {column["name"] for column in sa.inspect(engine).get_columns(table.name)}:
             with engine.begin() as connection:
@@ -270,7 +270,7 @@ def _add_columns(engine: sa.Engine) -> None:
 
 
 def database_identity(engine: sa.Engine) -> str:
-    """Returns the name that a database gave to itself, which never changes."""
+    """Returns the permanent name that a database gave itself."""
     with suppress(IntegrityError), engine.begin() as connection:  # another process was first
         if connection.scalar(sa.select(identities.c.name)) is None:
             connection.execute(sa.insert(identities).values(row=1, name=secrets.token_hex(16)))
@@ -279,8 +279,8 @@ def database_identity(engine: sa.Engine) -> str:
 
 
 def scrub(engine: sa.Engine) -> None:
-    """Overwrites what deleted rows left in the database's files, names of people included. Pages that another
-    connection is reading stay until the next call."""
+    """Overwrites remains of deleted rows in the database's files, which may contain names of people. Pages that another
+    connection is reading are overwritten at the next call."""
     if engine.dialect.name != "sqlite":
         tables = ", ".join(table.name for table in (capture_index, capture_tags, session_index, job_index, batches))
         tables += "".join(f", dbos.{name}" for name in ENGINE_TABLES)
@@ -318,5 +318,5 @@ def now_sql(engine: sa.Engine | sa.Connection) -> sa.ColumnElement[float]:
 
 
 def insert_into(engine: sa.Engine | sa.Connection, table: sa.Table) -> "sqlite.Insert | postgresql.Insert":
-    """Returns an insertion that may say what happens on a conflict."""
+    """Returns an SQL insertion that can state what happens on a conflict."""
     return sqlite.insert(table) if engine.dialect.name == "sqlite" else postgresql.insert(table)

@@ -1,4 +1,4 @@
-"""Stores the events of each job in order, from which progress, remaining time and the event stream of HTTP are read.
+"""Stores the events of each job in order; progress, remaining time and HTTP's event stream are read from them.
 
 Failed jobs are counted by kind for the metrics; the counts stay when retention removes the jobs, so that alerts can use
 them."""
@@ -30,15 +30,15 @@ class JobEvent:
 
 class EventLog:
     """Reads and writes the events of jobs. Within a job their numbers grow from 1, even if another worker takes the job
-    over. A number is missing where its event was superseded. The last event is the job's end, under ``END``."""
+    over. A number is missing where its event was superseded. The last event is the job's end, with the key ``END``."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
 
     def append(self, job_id: str, document: EventDocument, instead_of: int | None = None) -> int | None:
         """Adds an event to a job under the next number, which it returns. ``instead_of``: the number of an event that
-        the new one supersedes. If another writer takes the next number first, it tries again, twenty times; after that,
-        and if the database does not answer, the event is dropped and it returns None, since the next one holds more."""
+        the new one supersedes. If another writer takes the next number first, it tries again, up to twenty times; then,
+        or if the database does not answer, it drops the event and returns None, because the next event holds more."""
         event, text = events.c, json.dumps(document)
         following = sa.select(sa.func.coalesce(sa.func.max(event.seq), 0) + 1)
         following = following.where(event.job_id == job_id, event.seq < END)
@@ -72,7 +72,7 @@ class EventLog:
         return is_first
 
     def replace_end(self, job_id: str, document: EventDocument) -> None:
-        """Adds the end of a job in place of one that a worker wrote and that then did not happen."""
+        """Adds the end of a job in place of an end that a worker wrote too early."""
         insert = self._end(job_id, document)
         new = {"document": insert.excluded.document, "at": insert.excluded.at}
         with self._engine.begin() as connection:

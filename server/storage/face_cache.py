@@ -49,8 +49,8 @@ def _key(inputs: Mapping[str, str]) -> str:
 
 @cache
 def code_digest(rooms: tuple[str, ...]) -> str:
-    """Returns the SHA-256 of all code in the named rooms (paths below ``pipeline``), which is part of a cached file's
-    name: a new version of the code makes the file anew. It is computed once a process."""
+    """Returns the SHA-256 of all code in the named folders (paths below ``pipeline``), which is part of a cached file's
+    name, so that new code invalidates the cache. Each process computes it once."""
     digest = hashlib.sha256()
     for path in sorted(path for room in rooms for path in (PIPELINE / room).glob("*.py")):
         digest.update(path.read_bytes())

@@ -18,7 +18,7 @@ def move_durably(folder: Path, target: Path) -> None:
 
 
 def folder_bytes(folder: Path) -> int:
-    """Returns the size in bytes of all files below a folder but those removed meanwhile; links are not followed."""
+    """Returns the size in bytes of all files below a folder, except those removed meanwhile; links are not followed."""
     total = 0
     for path, _, names in os.walk(folder):
         for name in names:
@@ -36,7 +36,7 @@ def newest(path: Path) -> float:
 
 
 def sync_folder(folder: Path) -> None:
-    """Writes the names in a folder to the disk."""
+    """Flushes the names in a folder to the disk."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

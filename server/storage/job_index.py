@@ -1,6 +1,6 @@
-"""Finds jobs by the service's index rows, beside the job engine's own table, which alone holds a job's state.
+"""Finds jobs by the service's index rows, beside the job engine's own table, which holds the states of jobs.
 
-The engine's table is read only here and in ``batches``, by columns that its migrations keep. Everything else goes
+The engine's table is read only here and in ``batches``, by columns that its migrations keep. All other access goes
 through the engine's client.
 """
 
@@ -25,7 +25,7 @@ JobOrder = Literal["-created", "created", "-finished", "finished"]
 @dataclass(frozen=True, slots=True)
 class JobQuery:
     """Describes which jobs are listed and in what order. Every word of ``sought`` must occur in the job's name, model,
-    method, level of detail or id, or in its capture. ``statuses`` are the job engine's."""
+    method, level of detail or id, or in its capture. ``statuses`` are statuses of the job engine."""
 
     sought: str = ""
     statuses: Sequence[str] | None = None
@@ -52,7 +52,7 @@ class JobIndex:
         self._status = engine_jobs(engine)
 
     def add(self, job_id: str, request: JobRequest, session: str | None) -> None:
-        """Adds a job to the index. Does nothing if the index has it already."""
+        """Adds a job to the index, unless the index already has it."""
         with suppress(IntegrityError), self._engine.begin() as connection:
             self.add_within(connection, job_id, request, session)
 
@@ -63,13 +63,13 @@ class JobIndex:
         connection.execute(sa.insert(job_index).values(**row, words=words_of_job(request)))
 
     def remove(self, job_id: str) -> None:
-        """Removes a job from the index. Does nothing if it is not there."""
+        """Removes a job from the index, if it is there."""
         with self._engine.begin() as connection:
             connection.execute(sa.delete(job_index).where(job_index.c.job_id == job_id))
 
     def complete(self, requests_of: Callable[[list[str]], Mapping[str, JobRequest]]) -> int:
-        """Fills in the words that searches compare, for index rows that an earlier version wrote without them.
-        ``requests_of`` returns the requests of jobs by id. Returns how many rows there were."""
+        """Fills in the searchable words in index rows that an earlier version wrote without them. ``requests_of``
+        returns the requests of jobs by id. Returns how many rows there were."""
         with self._engine.connect() as connection:
             bare = [*connection.scalars(sa.select(job_index.c.job_id).where(job_index.c.words.is_(None)))]
         for some in portions(bare):
@@ -139,8 +139,8 @@ class JobIndex:
         return places
 
     def of_captures(self, captures: Collection[str]) -> dict[str, list[tuple[str, str]]]:
-        """Returns id and status, in the job engine's words ("PENDING"), of the jobs of each of the captures, newest
-        first. A capture without jobs has an empty list."""
+        """Returns id and status (as the job engine names it, such as "PENDING") of the jobs of each of the captures,
+        newest first. A capture without jobs has an empty list."""
         found: dict[str, list[tuple[str, str]]] = {capture: [] for capture in captures}
         status = self._status.c
         joined = job_index.join(self._status, status.workflow_uuid == job_index.c.job_id)

@@ -1,8 +1,8 @@
-"""Indexes captures and sessions in the database, so that one query returns a page even of a hundred thousand.
+"""Indexes captures and sessions in the database, so that one query returns a page of even a hundred thousand.
 
 The records in the data folder are authoritative, and each write of a record also writes its row. ``Library.reconcile``,
-called at each start, corrects rows that differ: after a backup was restored, a record was removed by hand, or with a
-data folder of an earlier version.
+called at each start, corrects rows that differ after a backup was restored, a record was removed by hand, or an earlier
+version wrote the data folder.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -59,7 +59,7 @@ class Library:
         self._drop(TABLES[kind], [identity])
 
     def scrub(self) -> None:
-        """Overwrites what deleted rows left in the database's files, names of people included."""
+        """Overwrites remains of deleted rows in the database's files, which may contain names of people."""
         scrub(self._engine)
 
     def captures(self, query: CaptureQuery, limit: int, cursor: str | None = None) -> Page[str]:
@@ -157,8 +157,8 @@ class Library:
     def subjects(
         self, sought: str, order: SubjectOrder, limit: int, cursor: str | None = None, tag: str | None = None
     ) -> Page[tuple[str, ...]]:
-        """Returns one page of subjects, each as the ids of its sessions, newest first. Sessions of one name are one
-        subject; a session without a name is a subject by itself. A subject is as new as its newest session.
+        """Returns one page of subjects, each as the ids of its sessions, newest first. Sessions with the same name are
+        one subject; a session without a name is a subject of its own. A subject is as new as its newest session.
 
         ``tag``: only subjects with a capture that has this tag. Raises InputError for a cursor of another list.
         """
@@ -188,8 +188,8 @@ class Library:
         return page.of(there)
 
     def reconcile(self, changes: Callable[[str], Mapping[str, int]], found: Callable[[str, str], Record | None]) -> int:
-        """Makes the index agree with the records in the data folder. Returns how many rows differed. A record that no
-        row can hold is left out and logged. ``changes`` and ``found`` are those of the ``Store``."""
+        """Makes the index agree with the records in the data folder. Returns how many rows differed. A record that does
+        not fit a row is left out and logged. ``changes`` and ``found`` are those of the ``Store``."""
         mended = 0
         for kind, table in TABLES.items():
             with self._engine.connect() as connection:

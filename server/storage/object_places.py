@@ -1,9 +1,9 @@
-"""Provides places in object stores: which ones a caller may name, and the store of each (a folder or a bucket).
+"""Opens object stores (a folder or a bucket), and checks which locations a caller may name.
 
-Buckets are S3-compatible and reached through botocore (the extra ``s3``). Credentials are those of AWS's own chain:
+Buckets are S3-compatible and reached through botocore (the extra ``s3``). Credentials come from AWS's usual sources:
 variables, profile, or the role of machine, container or pod. Files of more than one part are uploaded in parts; the
-object appears when the last request completes it. Each request carries the SHA-256 of its bytes, and each object stores
-that of its whole content in its metadata; every read is compared with it.
+object appears when the last request completes it. Each request carries the SHA-256 of its bytes, and each object has
+the SHA-256 of its content in its metadata; every read is compared with it.
 """
 
 import base64
@@ -46,7 +46,7 @@ T = TypeVar("T")
 
 @lru_cache
 def _client(endpoint: str | None, region: str | None, timeout_s: float) -> Any:
-    """Makes a client, which threads may share, within about a second."""
+    """Makes a client, which threads may share; this takes up to a second."""
     from botocore.config import Config
     from botocore.session import Session
 
@@ -66,8 +66,8 @@ def _client(endpoint: str | None, region: str | None, timeout_s: float) -> Any:
 
 
 class DamagedTransfer(StoreUnavailable):
-    """Reports bytes that were cut off or changed in transit. They are sent again at once; the client itself repeats
-    requests that got no answer."""
+    """Reports bytes that were cut off or changed in transit. The transfer is repeated at once; the client itself
+    repeats requests without an answer."""
 
 
 class S3Objects:
@@ -191,8 +191,8 @@ class S3Objects:
         return digest.hexdigest()
 
     def _fetch(self, key: str, path: Path, sha256: str | None, admit: Admission) -> str:
-        """Reads an object once. The client itself compares with a checksum that the store sends; if an object lacks our
-        metadata, an ETag of 32 digits is the MD5 of the bytes, unless they are encrypted with a key of one's own."""
+        """Reads an object once. The client itself verifies the store's checksum; if an object lacks eigenhead's
+        metadata, an ETag of 32 digits is the MD5 of the bytes, unless they are encrypted with a customer's key."""
         with self._asking(key):
             answer = self._client.get_object(**self._at(key))
             md5 = hashlib.md5(usedforsecurity=False)
@@ -210,7 +210,7 @@ class S3Objects:
 
     @contextmanager
     def _asking(self, key: str) -> Iterator[None]:
-        """Converts the client's exceptions to ours."""
+        """Converts the client's exceptions to those of this project."""
         from botocore.exceptions import (
             BotoCoreError,
             ClientError,
@@ -265,7 +265,7 @@ def key_faults(key: str) -> list[Message]:
 
 
 def locate(url: str, prefixes: Collection[str]) -> tuple[str, str]:
-    """Returns the allowed prefix that ``url`` lies below, and its key there. Raises InvalidInput ("url-refused")."""
+    """Returns the allowed prefix that contains ``url``, and the key below it. Raises InvalidInput ("url-refused")."""
     if not OBJECT_PREFIX.match(f"{url}/"):
         raise UrlRefused(compose("object-url-none"))
     for prefix in sorted(prefixes, key=len, reverse=True):

@@ -24,7 +24,7 @@ BLOCK_BYTES = 1 << 20
 
 
 class StoreUnavailable(Unavailable):
-    """Reports a store that does not answer, or returns damaged bytes; it may recover by itself."""
+    """Reports a store that does not answer, or returns damaged bytes; it may recover without intervention."""
 
     def __init__(self, place: str, reason: Message | str) -> None:
         detail = compose("store-unavailable", place=place, reason=_short(reason))
@@ -32,7 +32,7 @@ class StoreUnavailable(Unavailable):
 
 
 class StoreDenied(InvalidInput):
-    """Reports a store that refuses a request, and will refuse it until its operator changes something."""
+    """Reports a store that refuses a request until its operator changes something."""
 
     def __init__(self, place: str, reason: Message | str) -> None:
         super().__init__("store-denied", compose("store-denied", place=place, reason=_short(reason)))
@@ -62,9 +62,9 @@ class StoredObject:
 
 
 class ObjectStore(Protocol):
-    """Stores objects below one place. Methods block, and may be called by several threads and processes at once.
+    """Stores objects below one location. Methods block, and may be called by several threads and processes at once.
 
-    Each raises StoreUnavailable if the store fails, and StoreDenied if it refuses.
+    Each method raises StoreUnavailable if the store fails, and StoreDenied if it refuses.
     """
 
     def put(self, key: str, path: Path, sha256: str) -> None:
@@ -86,8 +86,8 @@ class ObjectStore(Protocol):
         ...
 
     def link(self, key: str, name: str, seconds: int) -> str | None:
-        """Returns an address that gives anybody the object for this time, as a file of this name. Returns None if the
-        store has no such addresses. Raises ObjectMissing."""
+        """Returns an address where anybody can get the object for ``seconds``, as a file with this name. Returns None
+        if the store has no such addresses. Raises ObjectMissing."""
         ...
 
     def erase(self, prefix: str) -> int:
@@ -101,7 +101,7 @@ def _short(reason: Message | str) -> Message | str:
 
 
 class FolderObjects:
-    """Stores objects in a folder, perhaps of another machine. The folder must exist: one that is not mounted is not
+    """Stores objects in a folder, possibly on another machine. The folder must exist: if it is not mounted, it is not
     created in its mount point."""
 
     def __init__(self, root: Path) -> None:

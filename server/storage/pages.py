@@ -1,8 +1,8 @@
 """Reads pages of a list: the query, a cursor that marks where a page ended, and the condition for rows that come after.
 
-A list continues after the *place* of its last row (the value it is sorted by and, between equal values, the id), not
-after a number of rows. So rows that are added or removed meanwhile neither repeat nor drop others, and the last page is
-as fast as the first.
+A list continues after the position of its last row (the sort value and, between equal values, the id), not after a
+number of rows. So rows that are added or removed meanwhile neither repeat nor drop others, and the last page is as fast
+as the first.
 """
 
 import base64
@@ -33,7 +33,7 @@ class Page(Generic[T]):
     total: int
 
     def of(self, items: Iterable[V]) -> "Page[V]":
-        """Returns the page with these items instead of its own."""
+        """Returns this page with other items."""
         return Page(tuple(items), self.next, self.total)
 
 
@@ -69,7 +69,7 @@ def cursor_of(value: Value, identity: str, total: int) -> str:
 
 
 def place_of(cursor: str) -> tuple[str | int, str, int]:
-    """Decodes a cursor to what ``cursor_of`` encoded. Raises InputError for a text that is none."""
+    """Decodes a cursor to the values that ``cursor_of`` encoded. Raises InputError for a text that is not a cursor."""
     try:
         value, identity, total = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
         text = f"{value}{identity}".encode()  # half of a surrogate pair is JSON and nothing that a database takes
@@ -87,7 +87,7 @@ def _is_whole(part: object) -> bool:
 
 
 def no_cursor() -> InputError:
-    """Returns the error for a text that is no cursor of this list."""
+    """Returns the error for a text that is not a cursor of this list."""
     return InputError("cursor", [compose("cursor-of-other-list")])
 
 

@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 def _read_fault(value: object) -> Fault:
-    """Reads a fault; in earlier versions its detail is a text."""
+    """Reads a fault; earlier versions stored its detail as text."""
     if isinstance(value, Fault):
         return value
     if not isinstance(value, Mapping) or not isinstance(value.get("code"), str):
@@ -137,8 +137,8 @@ class UploadRecord:
 
 @dataclass(frozen=True, slots=True)
 class RigAdjustment:
-    """Holds the settings of cameras, by name, and the lamps of a shot that the operator changed from rig.toml. None: as
-    in rig.toml."""
+    """Holds the settings of cameras, by name, and the lamps of a shot that the operator changed. None: the value of
+    rig.toml."""
 
     cameras: dict[str, dict[str, float | None]]
     lights: tuple[int, ...] | None = None
@@ -205,7 +205,7 @@ class JobWebhook(TypedDict):
 
 
 class JobRequest(TypedDict):
-    """Holds the work of a job, as the job engine stores it."""
+    """Holds the request for a job, as the job engine stores it."""
 
     capture_id: str
     model: str | None
@@ -218,7 +218,7 @@ class JobRequest(TypedDict):
 
 class DeliveryRequest(TypedDict):
     """Holds the destination of a job's result, as the job engine stores it. ``to`` ends with a slash; ``until``: when
-    to give up (s since 1970); ``webhook``: the job's own."""
+    to give up (s since 1970); ``webhook``: the job's own webhook."""
 
     job_id: str
     to: str
@@ -248,7 +248,7 @@ class WebhookMessage(TypedDict):
 
 class EventDocument(TypedDict, total=False):
     """Holds one event of a job: its stage, with progress (0 to 1) and remaining time (s) of the whole job, or a new
-    state. ``camera_moved``: cameras that no longer stand where they were calibrated."""
+    state. ``camera_moved``: cameras that no longer have their calibrated poses."""
 
     state: str
     stage: str

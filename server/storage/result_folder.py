@@ -1,8 +1,8 @@
-"""Replaces the result in a folder that a user named, so that the folder never holds half a result.
+"""Replaces the result in a folder that a user named, without ever leaving a partial result.
 
-The new result is written beside the folder and moved in when it is complete, file by file, report.json last: the folder
-itself may be a mount or a shell's working directory. All files of an earlier result are removed. Files that belong to
-no result stay.
+The new result is written beside the folder and moved in file by file when it is complete, report.json last, because the
+folder itself may be a mount or a shell's working directory. All files of an earlier result are removed. Files that
+belong to no result stay.
 """
 
 import re

@@ -1,8 +1,8 @@
-"""Caches the silhouettes of a capture on disk, for restarts with other settings and for the operator's pages.
+"""Caches the silhouettes of a capture on disk, for jobs with other settings and for the operator's pages.
 
 A file's name is the SHA-256 of everything that its content depends on: the capture's files and the code. Cached
-silhouettes equal those that ``segment`` returned, bit for bit. They show a face: ``Store.remove_capture`` erases them
-with their capture. A file that cannot be read is made anew. One that cannot be written is not cached.
+silhouettes equal those that ``segment`` returned bit for bit. They show a face: ``Store.remove_capture`` erases them
+with their capture. An unreadable file is made again. A file that cannot be written is not cached.
 """
 
 import dataclasses
@@ -97,8 +97,8 @@ def _decoded(data: bytes) -> dict[str, Silhouette]:
 
 
 def _steps(values: Float32[np.ndarray, "h w"]) -> bytes:
-    """Returns differences of bit patterns along rows, highest bytes first: distances rise evenly, which compresses
-    well."""
+    """Returns differences of bit patterns along rows, highest bytes first: distances rise evenly, so the differences
+    compress well."""
     bits = np.ascontiguousarray(values).view(np.int32)
     return np.diff(bits, axis=1, prepend=np.int32(0)).view(np.uint8).reshape(-1, 4).T.tobytes()
 

@@ -21,8 +21,7 @@ OUTCOMES = {ObjectMissing: "missing", StoreUnavailable: "unavailable", StoreDeni
 
 
 class WatchedObjects:
-    """Passes everything on to an object store, and counts it: operations by name and outcome, and their seconds by
-    name."""
+    """Forwards all calls to an object store, and counts operations by name and outcome, and their seconds by name."""
 
     def __init__(self, objects: ObjectStore) -> None:
         self._objects, self._lock = objects, threading.Lock()
@@ -40,7 +39,7 @@ class WatchedObjects:
             return dict(self._seconds)
 
     def probe(self) -> None:
-        """Asks the store for a list of nothing. Raises StoreUnavailable and StoreDenied."""
+        """Requests an empty list from the store. Raises StoreUnavailable and StoreDenied."""
         next(self.entries("none/"), None)
 
     def put(self, key: str, path: Path, sha256: str) -> None:
@@ -75,7 +74,7 @@ class WatchedObjects:
 
     @contextmanager
     def _counting(self, operation: str) -> Iterator[None]:
-        """Counts what happens in its block as one operation."""
+        """Counts the block as one operation."""
         began, outcome = time.monotonic(), "refused"
         try:
             yield

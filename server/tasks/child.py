@@ -1,4 +1,4 @@
-"""Implements a warm child process that does one task after the other.
+"""Implements a child process that stays alive and does one task after the other.
 
 Heavy work (reconstruction, checking images, rendering the simulated studio) runs outside the process that answers
 requests or sends a worker's heartbeat. So neither a GL context nor Python's interpreter lock delays that process, a
@@ -80,7 +80,7 @@ class WorkerContext:
 
 
 class Child:
-    """Runs pieces of work in one child process, which starts at the first one. Two threads must not use it at once.
+    """Runs tasks in one child process, which starts at the first one. Two threads must not use it at once.
 
     ``variables``: environment variables of the child, which override those of this process; ``memory``: bytes that it
     may allocate (0: any number), beyond which its work fails as "out-of-memory".
@@ -127,15 +127,15 @@ class Child:
 
     @property
     def runs(self) -> bool:
-        """Returns whether the child has started and was not killed, so that the next piece of work begins at once."""
+        """Returns whether the child process is alive, so that the next task begins at once."""
         return self._process is not None
 
     def close(self) -> None:
-        """Kills the child process. The next piece of work starts another."""
+        """Kills the child process. The next task starts a new one."""
         self._kill()
 
     def start(self) -> None:
-        """Starts the child process before the first piece of work needs it."""
+        """Starts the child process before the first task needs it."""
         self._started()
 
     def _started(self) -> Connection:
@@ -187,7 +187,7 @@ class ChildProcessPool:
     """Lends a fixed number of child processes to many threads. Each child serves one thread at a time.
 
     A child whose task is abandoned is killed, and its successor needs a second to start: each caller gets the child
-    that worked for him last, so only those who abandon tasks wait.
+    that worked for the same caller last, so that only callers who abandon tasks wait.
     """
 
     def __init__(self, count: int, niceness: int = 0, memory: int = 0) -> None:
@@ -197,8 +197,8 @@ class ChildProcessPool:
 
     @contextmanager
     def one(self, timeout_s: float | None = None) -> Iterator[Child]:
-        """Yields a child that no other thread uses during the block: that of ``CALLER``, a child of nobody, or a
-        running one. Raises queue.Empty if none is free within ``timeout_s`` seconds."""
+        """Yields a child that no other thread uses during the block: the one last used by ``CALLER``, an unused one, or
+        a running one. Raises queue.Empty if no child is free within ``timeout_s`` seconds."""
         caller = CALLER.get()
         with self._freed:
             if not self._freed.wait_for(lambda: self._free, timeout_s):
@@ -241,14 +241,14 @@ def _described(error: BaseException) -> tuple[str, str, Message, str, tuple[Mess
 
 
 def _lacks_memory(error: BaseException) -> bool:
-    """Returns whether memory was refused: by Python, by OpenCV (its StsNoMem is -4), or for a thread's stack."""
+    """Returns whether memory was refused: by Python, by OpenCV (StsNoMem, -4), or for a thread's stack."""
     no_thread = isinstance(error, RuntimeError) and "start new thread" in str(error)
     return isinstance(error, MemoryError) or getattr(error, "code", None) == -4 or no_thread
 
 
 def serve(connection: Connection) -> None:
-    """Runs the main loop of a child process; does not return. The first thread works, as a GL context requires. A
-    second one receives requests and cancellations, and ends the process when the parent is gone."""
+    """Runs the main loop of a child process; does not return. The main thread does the tasks, as a GL context requires.
+    A second thread receives requests and cancellations, and ends the process when the parent process has ended."""
     requests: queue.Queue[bytes] = queue.Queue()
     stop = threading.Event()
 

@@ -16,7 +16,7 @@ def try_egl(context: WorkerContext, report: Progress) -> str:
 
 
 def try_compute(context: WorkerContext, report: Progress) -> str:
-    """Opens a compute device and returns a sentence on whether jobs use it by default. Raises ComputeUnavailable."""
+    """Opens a compute device and returns a text that says if jobs use it by default. Raises ComputeUnavailable."""
     from rig.render.compute import ComputeDevice, is_software
 
     with ComputeDevice.create() as device:

@@ -86,8 +86,8 @@ def _read_result(result: Path) -> tuple[Mapping[str, str], Mesh]:
 
 
 def _take_over_found(result: Path, kept: Path) -> str | None:
-    """Copies cameras and masks that a reconstruction found, so that the data set has the world frame of its head.
-    Returns the front camera that was chosen for it."""
+    """Copies the cameras and masks that a reconstruction estimated, so that the data set has the world frame of its
+    head. Returns the front camera that the reconstruction used."""
     from server.tasks.photographs import CACHE, CAMERAS, FIGURES, PAGE
 
     kept.mkdir(parents=True, exist_ok=True)

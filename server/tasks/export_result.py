@@ -45,7 +45,7 @@ from rig.messages.message import compose, verbatim
 def export_result(folder: Path, out: Path, outputs: OutputSettings) -> list[str]:
     """Writes the files that ``outputs`` names of the result in ``folder`` to ``out``, and returns their names.
 
-    Raises InputError for a folder that is no result or whose model is not at hand, and what the writers raise.
+    Raises InputError for a folder without a result or whose model is not installed, and what the writers raise.
     """
     head_model = load_model(identity_of(folder).model)
     if outputs.morphs and not head_model.expressions.names:
@@ -65,8 +65,8 @@ def export_result(folder: Path, out: Path, outputs: OutputSettings) -> list[str]
 
 
 def _read_reconstruction(folder: Path, model: HeadModel, outputs: OutputSettings) -> Reconstruction:
-    """Returns the reconstruction that a result folder describes. Fields that only its photographs could fill are empty.
-    Raises InputError."""
+    """Returns the reconstruction that a result folder describes. Fields that need the photographs are empty. Raises
+    InputError."""
     visit, report = read_visit(folder, model.name), read_report(folder)
     mesh, head_from_world = visit.measured.mesh_world, visit.measured.head_from_world
     try:
@@ -121,7 +121,7 @@ def _eye(eye: EyeReport) -> Iris | UnseenEye:
 
 def _read_textures(folder: Path, bare: Texturing, model: HeadModel, mesh: Mesh, outputs: OutputSettings) -> Texturing:
     """Returns the texturing with the head's texture, the maps of its skin, and its albedo if that is wanted. A missing
-    albedo is estimated without other views, so highlights stay in it."""
+    albedo is estimated from the texture alone, so highlights stay in it."""
     image = _head_image(folder)
     if image is None:
         return bare

@@ -1,6 +1,6 @@
 """Finds the faces in a capture's pictures, for the operator's pages; runs in a child process.
 
-Pictures are read one after the other and reduced at once, since the networks see a face in 192 pixels.
+Pictures are read one after the other and reduced at once, because the networks use only 192 pixels of a face.
 """
 
 from collections.abc import Callable, Mapping
@@ -66,8 +66,8 @@ def describe(
     subject: "SubjectFaces", rig: Rig, recorded: Rig, suggest: "Callable[[MatchedFaces], PixelsOfPoints]"
 ) -> JsonObject:
     """Converts the faces found with the reduced cameras ``rig`` to pixels of the picture files, whose cameras are
-    ``recorded``: ``faces`` of every picture, the subject's first, and the pixels ``suggested`` for the seven feature
-    points (none where no face is certain)."""
+    ``recorded``. The result has the ``faces`` of every picture, the subject's first, and the pixels ``suggested`` for
+    the seven feature points, if any."""
     matched = subject.matched
     faces: dict[str, list[JsonObject]] = {}
     for name, seen in subject.found.items():
@@ -78,8 +78,8 @@ def describe(
 
 
 def _face_of(face: "FaceDetection", camera: Camera, recorded: Camera, best: "FaceDetection | None") -> JsonObject:
-    """Describes one face in pixels of the picture's file. ``is_subject``: the views agree that it is the subject's;
-    ``roll_deg``: how far it is turned clockwise in the picture."""
+    """Describes one face in pixels of the picture's file. ``is_subject``: the views agree that it is the subject's
+    face; ``roll_deg``: its clockwise rotation in the picture."""
     points = file_pixels(face.landmarks_px, camera, recorded)
     return {
         "box_px": _plain(np.concatenate([points.min(axis=0), points.max(axis=0)])),
@@ -91,7 +91,7 @@ def _face_of(face: "FaceDetection", camera: Camera, recorded: Camera, best: "Fac
 
 
 def _suggested(context: WorkerContext, face: "MatchedFaces", rig: Rig, recorded: Rig) -> PixelsOfPoints:
-    """Returns the seven points by landmarks of the default model; none if the face has no such points."""
+    """Returns the seven points from landmarks of the default model; empty if the face does not determine them."""
     from pipeline.alignment.feature_checks import suggest_points
     from pipeline.faces.landmark_map import NoLandmarkMap, landmark_map
     from pipeline.head_model.landmarks import SEVEN_POINTS
@@ -110,5 +110,5 @@ def _suggested(context: WorkerContext, face: "MatchedFaces", rig: Rig, recorded:
 
 
 def _plain(values: Float[np.ndarray, " n"]) -> list[float]:
-    """Rounds to a tenth of a pixel."""
+    """Rounds pixel coordinates to a tenth."""
     return [round(float(value), 1) for value in values]

@@ -1,7 +1,7 @@
 """Checks an uploaded archive or a capture folder before it is accepted; runs in a child process.
 
-Files are checked camera by camera, so a rig of 64 large cameras needs the memory of one; outlines of an upload are
-checked at the working size of jobs, or smaller.
+Files are checked camera by camera, so that a rig of 64 large cameras needs the memory of one; outlines are checked at
+the reduced size of jobs, or smaller.
 """
 
 import json
@@ -77,7 +77,7 @@ def ingest_archive(
     """Unpacks the archive of a capture, checks it, and leaves in ``folder`` exactly the capture's files. Photographs
     without cameras are calibrated first.
 
-    Returns the content for the capture's record. Raises InputError naming every fault; the folder is useless then.
+    Returns the content for the capture's record. Raises InputError naming every fault; the folder is then unusable.
     """
     target = Path(folder)
     unpacked = target.with_name(target.name + ".unpacked")
@@ -102,7 +102,7 @@ def ingest_archive(
 
 
 def _beside(face: FaceSighting | None, findings: tuple[ReportWarning, ...]) -> FaceSighting | None:
-    """Drops remarks on the face in small pictures that the full check also makes."""
+    """Drops remarks on the face in reduced pictures that the full check also makes."""
     said = {finding.code for finding in findings}
     return face and replace(face, remarks=tuple(remark for remark in face.remarks if remark.code not in said))
 
@@ -111,8 +111,8 @@ def _outline_findings(
     root: Path, cameras: int, networks: FaceNetworks | None, report: Progress
 ) -> tuple[ReportWarning, ...]:
     """Returns the warnings of ``eigenhead check``. Raises InputError for cameras that contradict the pictures. Too few
-    usable outlines are a warning here, because they depend on photographs that nobody can take again, and on a job's
-    settings."""
+    usable outlines are only a warning here, because the photographs cannot be taken again, and other settings may
+    help."""
     from pipeline.settings import Settings
     from pipeline.view_checks.usable_views import TooFewViews
 
@@ -156,8 +156,8 @@ def check_views(
 
 
 def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportWarning, ...]:
-    """Estimates cameras.json and calibration.json for photographs without cameras, and keeps only the photographs that
-    joined. Raises InputError with the views that did not."""
+    """Estimates cameras.json and calibration.json for photographs without cameras, and keeps only the registered
+    photographs. Raises InputError with the views that could not be registered."""
     from calibration.result import CalibrationRefused
 
     files = [path for path in picture_folder(root).rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
@@ -174,7 +174,7 @@ def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportW
 
 
 def _filed_names(root: Path) -> dict[str, str]:
-    """Maps the names in the archive to those that the service uses: images/<camera>.<ext>, masks/<camera>.<ext>,
+    """Maps the names in the archive to the service's names: images/<camera>.<ext>, masks/<camera>.<ext>,
     texture_sets/<set>/<camera>.<ext>, background/<camera>.<ext> or background/<camera>/<anything>."""
     (rig_file, *_), read, files, _ = open_capture(root)
     filed = {rig_file.name: CAMERAS} if rig_file == entry(root, CAMERAS) else {}
@@ -189,7 +189,7 @@ def _filed_names(root: Path) -> dict[str, str]:
 
 
 def _leave_out(root: Path, rig: Rig) -> None:
-    """Removes the files of views that did not join; the warnings name these views."""
+    """Removes the files of views that could not be registered; the warnings name these views."""
     sets = [path for path in (root / TEXTURE_SETS).glob("*") if path.is_dir()]
     for folder in (picture_folder(root), *(root / kind for kind in BESIDE_PICTURES), *sets):
         for path in [*folder.iterdir()] if folder.is_dir() else ():
@@ -199,7 +199,7 @@ def _leave_out(root: Path, rig: Rig) -> None:
 
 
 def _with_calibration(found: CaptureContent, root: Path, warnings: tuple[ReportWarning, ...]) -> CaptureContent:
-    """Adds the figures of the calibration, from which a job reads remarks on it."""
+    """Adds the figures of the calibration, which a job reads for its warnings."""
     inputs = dict(sorted({**found.inputs, FIGURES: sha256_of(root / FIGURES)}.items()))
     return replace(found, inputs=inputs, bytes=found.bytes + (root / FIGURES).stat().st_size, warnings=warnings)
 
@@ -208,7 +208,7 @@ def ingest_folder(
     context: WorkerContext, report: Progress, *, folder: str, image_pixels: int, measured: bool = False
 ) -> CaptureContent:
     """Checks a capture folder that the service itself has written, and returns its content. ``measured``: the pictures
-    were measured at the shot, so only the subject's place is looked for. Raises InputError naming every fault."""
+    were measured at the shot, so only the subject is located. Raises InputError naming every fault."""
     return check_capture(Path(folder), image_pixels, report, measured=measured, networks=_face_networks(context))
 
 
@@ -307,7 +307,7 @@ def _camera_digests(root: Path, rig_file: Path, rig: Rig) -> dict[str, str]:
 def _face_of(
     small: Mapping[str, tuple[ImageRgb, Camera]], rig: Rig, networks: FaceNetworks, *, is_metric: bool
 ) -> FaceSighting:
-    """Finds the subject's face in small pictures. ``is_metric``: the cameras are in millimetres."""
+    """Finds the subject's face in reduced pictures. ``is_metric``: the cameras are in millimetres."""
     images = {name: image for name, (image, _) in small.items()}
     reduced = Rig(tuple(camera for _, camera in small.values()))
     limits = EYE_DISTANCE_MM if is_metric else None
@@ -317,7 +317,7 @@ def _face_of(
 
 
 def _view_of(shot: Capture, name: str, measured: bool) -> dict[str, ViewCheck]:
-    """Judges the camera's picture; returns nothing if it cannot be read."""
+    """Checks one camera's picture; returns an empty mapping if it cannot be read."""
     image = shot.images.get(name)
     if image is None:
         return {}
@@ -333,9 +333,9 @@ def _read_view(
     files: ShotFiles,
     digests: dict[str, str],
 ) -> tuple[Capture, bool]:
-    """Reads the files of the one camera of ``rig``, at most two of its pictures at once, adds their SHA-256 to
-    ``digests``, and unusable files to ``lost``. Returns the picture with its first plate and its mask, and whether the
-    picture equals one of its clean plates pixel for pixel, which noise makes impossible for a real shot."""
+    """Reads the files of the single camera of ``rig``, at most two pictures at once, adds their SHA-256 to ``digests``,
+    and unusable files to ``lost``. Returns the picture with its first plate and its mask, and whether the picture
+    equals one of its clean plates pixel for pixel, which noise makes impossible for a real shot."""
     (name,) = rig.names
     first, *others = files.plates.get(name, ()) or (None,)
     plates = {} if first is None else {name: (first,)}

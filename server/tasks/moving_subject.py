@@ -1,8 +1,8 @@
 """Moves a subject of the simulated studio: it nods, turns, speaks and blinks, or sits still.
 
-In: a person of a head model, a rig and a number of frames. Out: the pictures of every frame, and their ground truth:
-weights, pose and vertices. Backdrops, sensors, light, hair and shirt stay as they are over all frames; hair and shirt
-turn with the head. The noise of every picture is its own.
+It takes a person of a head model, a rig and a number of frames. It makes the pictures of every frame, and their ground
+truth: weights, pose and vertices. Backdrops, sensors, light, hair and shirt stay as they are over all frames; hair and
+shirt turn with the head. Every picture has its own noise.
 """
 
 import io
@@ -72,7 +72,7 @@ class Person:
 
 
 def move(person: Person, frames: int, centre_world: Float[np.ndarray, " 3"], *, still: bool = False) -> list[Pose]:
-    """Returns a person's states at ``frames`` times, ``1 / FPS`` s apart. ``still``: it keeps its first pose."""
+    """Returns a person's states at ``frames`` times, ``1 / FPS`` s apart. ``still``: all have the first pose."""
     rng = np.random.default_rng((person.seed, 1))
     time, phases = np.arange(frames) / FPS, rng.uniform(0.0, 2.0 * np.pi, 6)
     swings = np.sin(2.0 * np.pi * np.outer(time, (0.45, 0.21, 0.13, 0.17, 0.11, 0.07)) + phases)
@@ -129,7 +129,7 @@ class Film:
         return {name: replace(view, subject=light[name]) for name, view in self._views.items()}
 
     def plates(self, count: int, first: Pose) -> dict[str, list[ImageRgb]]:
-        """Returns clean plates of every camera. ``first``: the person's pose in a film of which no frame is lit yet."""
+        """Returns clean plates of every camera. ``first``: the person's pose if no frame of the film is lit yet."""
         if not self._views:
             self.light(first)
         rngs = np.random.default_rng((self.person.seed, 5)).spawn(len(self.rig))
@@ -154,7 +154,7 @@ class Film:
 def film(
     film: Film, poses: Mapping[int, Pose], report: Callable[[float], None]
 ) -> Iterator[tuple[int, dict[str, ImageRgb]]]:
-    """Yields the numbers and pictures of all poses. A pose that is that of the frame before is not lit anew."""
+    """Yields the numbers and pictures of all poses. A pose that equals the previous one is not lit again."""
     before, views = None, {}
     for done, (number, pose) in enumerate(poses.items()):
         report(done / len(poses))
@@ -174,9 +174,9 @@ def simulate_sequence(
     still: bool = False,
 ) -> Path:  # fmt: skip
     """Films a person and writes the folder of a sequence: cameras.json, images/<camera>/<frame>.png, background/ and
-    times.csv. Frames that an earlier call of the same film has written are left. Returns the folder of the truth beside
-    it, with cameras.json and truth.npz: names of expressions, weights (frames, expressions), rotations, translations
-    (mm), vertices (frames, v, 3; world, mm), face (v)."""
+    times.csv. Frames that an earlier call for the same film has written are kept. Returns the folder of the truth
+    beside it, with cameras.json and truth.npz: names of expressions, weights (frames, expressions), rotations,
+    translations (mm), vertices (frames, v, 3; world, mm), face (v)."""
     studio, poses = Film(person, rig, preset, renderer), move(person, frames, rig.centre_world(), still=still)
     lines = ["frame,time_s", *(f"{number:05},{number / FPS:.6f}" for number in range(frames))]
     write_rig(rig, out / "cameras.json")

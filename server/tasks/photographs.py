@@ -68,7 +68,7 @@ def photographs_alone(folder: Path) -> bool:
 def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Progress) -> Prepared:
     """Reads a capture folder. If it has no cameras, they are estimated from its photographs and written to ``kept``.
 
-    Raises InputError naming every fault, and CalibrationRefused naming the views that do not join and what to add.
+    Raises InputError naming every fault, and CalibrationRefused naming the unregistered views and what to add.
     """
     if not photographs_alone(folder):
         return Prepared(*read_scaled_capture(folder), ())
@@ -168,7 +168,7 @@ def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
 
 def keep_masks(kept: Path, capture: Capture, rig: Rig, *, report: Progress) -> dict[str, Silhouette]:
     """Returns the silhouettes of a capture. Masks that were estimated from the photographs alone are also written to
-    masks/ in ``kept``. A second run finds them in the hidden folder ``CACHE`` there."""
+    masks/ in ``kept``. A second run reads these masks from the hidden folder ``CACHE``."""
     from pipeline.segmentation.segment import segment
     from server.storage.silhouette_cache import SUFFIX, segment_once
 
@@ -189,13 +189,13 @@ def keep_masks(kept: Path, capture: Capture, rig: Rig, *, report: Progress) -> d
 
 
 def _of_file(mask: Bool[np.ndarray, "h w"], k: Intrinsics) -> UInt8[np.ndarray, "y x"]:
-    """Returns a mask in the size of its picture's file, since the picture may have been read smaller."""
+    """Returns a mask at the size of its picture's file, because the picture may have been reduced."""
     large = cv2.resize(mask.astype(np.uint8) * np.uint8(255), (k.width, k.height), interpolation=cv2.INTER_LINEAR)
     return (large > 127).astype(np.uint8) * np.uint8(255)
 
 
 def _made_of(root: Path, front: str | None) -> dict[str, str]:
-    """Returns the SHA-256 of everything that a calibration depends on."""
+    """Returns the SHA-256 of every input of a calibration."""
     from importlib.metadata import version
 
     files = [path for path in sorted(picture_folder(root).rglob("*")) if is_picture(path)]

@@ -37,8 +37,8 @@ class Prepared(NamedTuple):
 
 
 def compile_kernel(context: WorkerContext, report: Progress, *, line: str) -> bool:
-    """Compiles the loop that a line of the list names, in a child process. Returns whether the code could be kept on
-    disk; if not, the log says so."""
+    """Compiles the loop that a line of the list names, in a child process. Returns whether the code could be stored on
+    disk; if not, a log line says so."""
     from pipeline.compute.kernel_list import Kernel
 
     kernel = Kernel.from_line(line)
@@ -73,7 +73,7 @@ def prepare_kernels(report: Progress, settings: "Settings | None" = None) -> Pre
 
 
 class _Work:
-    """Hands groups of kernels to several threads, each of which has a child process."""
+    """Distributes groups of kernels to several threads, each of which has a child process."""
 
     def __init__(self, groups: "list[list[Kernel]]", total: int, report: Progress) -> None:
         self._groups, self._total, self._report = deque(groups), total, report
@@ -104,7 +104,7 @@ class _Work:
 
 
 def _can_keep() -> bool:
-    """Returns whether the cache folder can be written; if not, a line in the log states it."""
+    """Returns whether the cache folder can be written; if not, a log line says so."""
     from rig.jit import say_not_kept
 
     try:

@@ -59,8 +59,8 @@ class JobProgress:
         return (self._rest_of_stage() + self._to_come()) * self._pace()
 
     def progress(self) -> float:
-        """Returns the fraction of the job that is done, 0 to 0.99. It never falls. Each stage counts by its expected
-        time."""
+        """Returns the fraction of the job that is done, 0 to 0.99. It never decreases. Each stage counts by its
+        expected time."""
         done = sum(took for stage, took in self._expected.items() if stage in self.seconds and stage != self._visit)
         expected_s, spent = self._expected.get(self._visit, 0.0), self._spent_s() / self._pace()
         now = done + expected_s * spent / max(spent + self._rest_of_stage(), 1e-9)
@@ -68,7 +68,7 @@ class JobProgress:
         return self._progress
 
     def _rest_of_stage(self) -> float:
-        """Returns the expected seconds of the stage's rest: by its usual duration or, if more, by its own fraction."""
+        """Returns the expected remaining seconds of the stage: by its usual duration or its fraction, if larger."""
         spent, usual = self._spent_s() / self._pace(), self._expected.get(self._visit, 0.0)
         rest = max(usual - spent, OVERTIME * usual)
         if FRACTION_LEAST < self._fraction < 1:
@@ -103,8 +103,8 @@ class JobProgress:
 
 class ProgressMeter:
     """Writes the progress and remaining time of a job to its events: when a stage begins, and then at most every
-    ``every_s`` seconds. The event of a stage's beginning stays; any other replaces the one before it, so a long job has
-    as few events as a short one."""
+    ``every_s`` seconds. The event of a stage's beginning stays; any other event replaces the previous one, so a long
+    job has as few events as a short one."""
 
     def __init__(self, log: "EventLog", job_id: str, progress: JobProgress, every_s: float = EVERY_S) -> None:
         self._log, self._job_id, self._progress, self._every_s = log, job_id, progress, every_s

@@ -1,8 +1,8 @@
-"""The task of a job: it reads files, calls ``reconstruct()`` and writes files.
+"""Implements the task of a job: it reads files, calls ``reconstruct()`` and writes files.
 
-Both kinds of job end in ``run_job``: a service's, in a worker's child process, whose capture was checked and stored
-before, and the command line's, of a capture on a user's disk: archives are unpacked; cameras and masks that are missing
-are estimated and kept.
+``run_job`` runs both kinds of job: a service's, in a worker's child process, for a checked and stored capture; and the
+command line's, for a capture on a user's disk, whose archive is unpacked and whose missing cameras and masks are
+estimated.
 """
 
 import os
@@ -207,9 +207,9 @@ MOST_THREADS = 8  # of a processor that a GPU is faster than: of an H200 two thr
 
 
 def matching_device(context: WorkerContext, chosen: "Settings", renderer: "Renderer") -> "ComputeDevice | None":
-    """Opens the compute device that ``chosen.device`` names, once a process. Returns None if the processor compares:
-    with the device ``cpu``, and with ``auto`` if there is no GPU or more than ``MOST_THREADS`` threads. Raises
-    ComputeUnavailable if ``gl`` was chosen and is missing."""
+    """Opens the compute device that ``chosen.device`` names, once in each process. Returns None if the CPU compares
+    photographs: with the device ``cpu``, and with ``auto`` if there is no GPU or more than ``MOST_THREADS`` threads.
+    Raises ComputeUnavailable if ``gl`` was chosen and is missing."""
     from pipeline.compute.threads import thread_count
     from rig.render.compute import open_device
 
@@ -224,7 +224,7 @@ def matching_device(context: WorkerContext, chosen: "Settings", renderer: "Rende
 
 
 def _with_scale(warnings: "tuple[ReportWarning, ...]", scale_sigma: float) -> "tuple[ReportWarning, ...]":
-    """Adds a warning of an estimated scale, unless the calibration has warned of it."""
+    """Adds a warning that the scale is estimated, unless the calibration already has one."""
     if scale_sigma <= SURE_SCALE or any(warning.code == "scale-assumed" for warning in warnings):
         return warnings
     return (compose("scale-assumed", scale=compose("scale-estimated", share=scale_sigma)), *warnings)

@@ -28,9 +28,9 @@ def refine_locally(
     captures: Sequence[Path], *, calibration: Path | None, focal: bool, model: str | None, report: Progress
 ) -> RefinementRun:
     """Refines the common calibration of the captures, or the file ``calibration``, by the captures' silhouettes; with a
-    head ``model`` also by the rims of fitted heads. ``focal``: refines focal lengths, too.
+    head ``model`` also by the rims of fitted heads. ``focal``: whether to refine focal lengths too.
 
-    A camera that moved according to the drift watch is left out of that capture: it must be calibrated anew with the
+    A camera that moved according to the drift watch is left out of that capture: it must be calibrated again with the
     board. Raises InputError for captures that cannot be read or are not of one rig, TooFewCaptures for fewer than two
     and, with a model, TooFewFeatures, WrongFeatures and NoSubject.
     """

@@ -18,7 +18,7 @@ def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: in
     """Takes a shot of the simulated studio: writes the capture to ``folder/files`` and the true head to
     ``folder/truth``. Returns the shot's certificate.
 
-    Without a seed each shot shows another subject. The capture has no feature points, since operators pick them.
+    Without a seed each shot shows another subject. The capture has no feature points, because operators pick them.
     """
     from pipeline.head_model.model import load_model
     from rig.formats.captures.capture_folder import write_capture

@@ -1,8 +1,8 @@
 """Learns how long each stage of a reconstruction takes on this machine, for each kind of job.
 
 A job's seconds are first computed from its products and the pixels of its photographs (``COSTS_S``); the learnt values
-are factors by which each stage takes longer here. The service's workers and the command line share one file,
-``cache_folder()/stage-paces.json``.
+are the factors by which each stage takes longer on this machine. The service's workers and the command line share one
+file, ``cache_folder()/stage-paces.json``.
 """
 
 import json
@@ -51,7 +51,7 @@ def kind_of(settings: Settings) -> str:
 
 
 def megapixels_of(capture: Path) -> float:
-    """Returns the megapixels that a job reads of a capture's folder, by its first photograph; ``USUAL_MEGAPIXELS`` for
+    """Returns the megapixels that a job reads of each photograph, by the capture's first one; ``USUAL_MEGAPIXELS`` for
     an archive and for unreadable files."""
     with suppress(InputError, OSError):
         if pictures := listed_pictures(picture_folder(capture_root(capture))):
@@ -72,8 +72,8 @@ def first_guess(settings: Settings, megapixels: float = USUAL_MEGAPIXELS) -> dic
 
 
 class StageDurations:
-    """Learns how many times longer than the first guess each stage of a job takes, and stores that in ``file``. If the
-    file cannot be written, the values last as long as this process."""
+    """Learns how much longer than the first guess each stage takes, as a factor, and stores the factors in ``file``. If
+    the file cannot be written, the values last as long as this process."""
 
     def __init__(self, file: Path | None = None) -> None:
         self._file = file or cache_folder() / "stage-paces.json"
@@ -88,7 +88,7 @@ class StageDurations:
         return {stage: known.get(stage, usual) * seconds for stage, seconds in guess.items()}
 
     def learn(self, settings: Settings, seconds: Mapping[str, float], megapixels: float = USUAL_MEGAPIXELS) -> None:
-        """Mixes the measured seconds of a job's stages into the expectation for its kind, with the weight
+        """Mixes the measured seconds of a job's stages into the expected values of its kind, with the weight
         ``LEARNING``."""
         learnt, guess = self._read(), first_guess(settings, megapixels)
         before, stages = learnt.get(kind_of(settings), {}), guess.keys() & seconds.keys()

@@ -63,7 +63,7 @@ def subject_of(text: str, model: HeadModel, rng: np.random.Generator, expression
 @dataclass(frozen=True, slots=True)
 class SubjectChoice:
     """Describes the subject in the studio: the text and the expression that ``subject_of`` reads, and the gaze (azimuth
-    and elevation), None for the model's own eyes."""
+    and elevation), or None for the model's own eyes."""
 
     text: str
     expression: Sequence[str] = ()
@@ -75,8 +75,8 @@ class SubjectChoice:
 
 
 def turn_eyes(subject: Subject, gaze_deg: tuple[float, float] | None, seed: int) -> Subject:
-    """Returns a subject with eyeballs that look along ``gaze_deg`` (azimuth and elevation) and have a colour drawn by
-    ``seed``; if that is None, the subject itself. Raises InputError for a head without landmarks."""
+    """Returns a subject with eyeballs that look along ``gaze_deg`` (azimuth and elevation) and whose colour ``seed``
+    determines; without a gaze it returns the subject itself. Raises InputError for a head without landmarks."""
     return subject if gaze_deg is None else with_gaze(subject, *gaze_deg, np.random.default_rng((seed, 1)))
 
 

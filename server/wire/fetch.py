@@ -1,5 +1,5 @@
-"""Fetches a capture whose address a caller names: an archive from another server, or from an object store an archive
-under one key or the files below a prefix.
+"""Fetches a capture from an address that a caller names: an archive from another server, or from an object store an
+archive or all files below a prefix.
 
 The address is checked (server.origins, server.storage.object_places), bytes and seconds are limited, and the data are
 written straight to the data folder.
@@ -95,9 +95,8 @@ def fetch_stored_capture(url: str, folder: Path, store: Store, settings: Service
     """Fetches the capture at an object store's ``url`` into ``folder`` and returns its archive: the object itself, or
     where the URL ends with a slash one of all objects below it.
 
-    Raises InvalidInput for a place that is not allowed ("url-refused"), where there is nothing ("object-missing") and
-    for a store that is slow ("import-failed"), TooLarge, DiskFull, and Unavailable where the store does not do its
-    part."""
+    Raises InvalidInput for a forbidden location ("url-refused"), a missing object ("object-missing") and a slow store
+    ("import-failed"), TooLarge, DiskFull, and Unavailable if the store fails."""
     prefix, key = locate(url, settings.import_prefixes)
     objects, archive = open_objects(prefix, settings), folder / "upload"
 
@@ -131,7 +130,7 @@ def _listed(url: str, objects: ObjectStore, prefix: str, settings: ServiceSettin
 def _pack(
     objects: ObjectStore, entries: Mapping[str, StoredObject], archive: Path, admit: Admission, most_s: float
 ) -> None:
-    """Packs objects as an archive. Their names are judged when it is unpacked, as those of any upload."""
+    """Packs objects as an archive. Unpacking the archive checks their names, as for any upload."""
     ends, part = time.monotonic() + most_s, archive.with_suffix(".part")
     with tarfile.open(archive, "w") as packed:
         for name, entry in entries.items():

@@ -1,8 +1,8 @@
 """Receives multipart bodies straight into the data folder.
 
-python-multipart parses, and bounds the headers of a part; its form parser and the framework's are not used, for three
-reasons: key and free space are checked before the first byte, no file is held in memory or in a temporary folder
-elsewhere, and every write happens in a thread."""
+python-multipart parses, and limits the headers of a part. Its form parser and the framework's are not used for three
+reasons: API key and free space are checked before the first byte, no file is held in memory or in another temporary
+folder, and every write happens in a thread."""
 
 from collections.abc import Collection, Iterable
 from functools import partial
@@ -180,8 +180,8 @@ def check_fields(names: Iterable[str], known: Collection[str]) -> None:
 async def receive_capture(
     service: Service, request: Request, key: str, known: Collection[str] = ABOUT
 ) -> tuple[CaptureRecord, dict[str, str]]:
-    """Receives an archive in a multipart body and makes a capture of it. ``key`` is the caller's. Returns the capture's
-    record and the form's fields.
+    """Receives an archive in a multipart body and makes a capture of it. ``key`` is the id of the caller's API key.
+    Returns the capture's record and the form's fields.
 
     Raises InputError for fields that are not in ``known`` and for faults of the archive, and what ``receive_multipart``
     and ``Captures.accept`` raise.

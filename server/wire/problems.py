@@ -85,7 +85,7 @@ STATUS_OF: dict[type[Refused], int] = {
 
 
 def status_of(refusal: type[Refused]) -> int:
-    """Returns the HTTP status of a class of refusals: its own in ``STATUS_OF``, or that of its nearest ancestor."""
+    """Returns the HTTP status of a class of refusals from ``STATUS_OF``, by the class or its nearest ancestor."""
     return next(STATUS_OF[kind] for kind in refusal.__mro__ if kind in STATUS_OF)
 
 
@@ -155,8 +155,8 @@ def problem_from(error: Exception) -> Problem:
 
 
 def _fault_of(error: Mapping[str, Any]) -> Message:
-    """Words a fault found by pydantic. For a body that is no JSON, pydantic's text is not helpful, so it is worded
-    here."""
+    """Words a fault found by pydantic. For a body that is not JSON, pydantic's text is unhelpful, so this function
+    writes its own."""
     where, fault = ".".join(map(str, error["loc"])), error["msg"]
     if error["loc"] == ("body",) and error["type"] == "model_attributes_type":
         fault = compose("no-json-object")
@@ -202,7 +202,7 @@ def _methods_of(routes: Sequence[APIRoute], path: str) -> list[str]:
 
 
 def sent_file(*media_types: str) -> Responses:
-    """Returns the OpenAPI ``responses`` of a route that sends a file: whole, in part, or not again."""
+    """Returns the OpenAPI ``responses`` of a route that sends a whole file, a part of it, or 304."""
     content = {media_type: {} for media_type in media_types}
     partial = {"description": "Partial Content", "content": content}
     return {200: {"content": content}, 206: partial, 304: {"description": "Not Modified"}}

@@ -37,8 +37,8 @@ def send_file(request: Request, file: StoredFile) -> Response:
     """Returns the response that carries a file: status 200, 206 for one byte range, or 304 if the client has it
     already.
 
-    Raises a 416 problem for a range beyond the file, 404 if the file is missing, and 500 if its content is not what was
-    stored. Other forms of the Range header are ignored, as RFC 9110 allows.
+    Raises a 416 problem for a range beyond the file, 404 if the file is missing, and 500 if its content has changed.
+    Other forms of the Range header are ignored, as RFC 9110 allows.
     """
     path, etag = file.path, f'"{file.sha256}"'
     if not path.is_file():
@@ -55,7 +55,7 @@ def send_archive(
     request: Request, folder: Path, files: Mapping[str, FileEntry], name: str | None = "result.zip"
 ) -> Response:
     """Returns the response that carries the named files below ``folder`` as one uncompressed .zip, or 304 if the client
-    has it already. The .zip holds no times, so that equal files give equal bytes.
+    has it already. The .zip contains no times, so that equal files give equal bytes.
 
     ``name`` is the file name that a browser suggests. With None the page's link decides. Raises a 500 problem that
     names every file whose content is not what was stored.
@@ -84,7 +84,7 @@ def _refuse_damaged(files: Sequence[StoredFile]) -> None:
 
 
 def _is_at_client(request: Request, etag: str) -> bool:
-    """Tells whether If-None-Match names the file. Proxies that compress mark its tag as weak (RFC 9110, 13.1.2)."""
+    """Returns whether If-None-Match names the file. Proxies that compress mark its tag as weak (RFC 9110, 13.1.2)."""
     held = re.split(r"\s*,\s*", request.headers.get("if-none-match", ""))
     return held == ["*"] or etag in (tag.removeprefix("W/") for tag in held)
 
@@ -101,7 +101,7 @@ def _zipped(folder: Path, names: list[str]) -> Iterator[bytes]:
 
 
 class _Sent(io.RawIOBase):
-    """Collects the bytes that the zip writer wrote and that were not sent yet. It cannot seek, so zipfile writes a
+    """Collects the bytes that the zip writer wrote and that are not sent yet. It cannot seek, so zipfile writes a
     stream."""
 
     def __init__(self) -> None:

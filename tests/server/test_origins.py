@@ -70,7 +70,7 @@ def test_a_named_origin_may_be_private_and_no_other_port_or_scheme_of_it(monkeyp
             (f"https://{host}/a", "no URL")
             for host in ("a..b", ".", "xn--", f"{'a' * 80}.example", "☃☃.example", "[::1")
         ],
-        *[(f"https://{host}/a", "no host that there can be") for host in ("[", "a b", "a%00b")],
+        *[(f"https://{host}/a", "an impossible host") for host in ("[", "a b", "a%00b")],
         ("https://user:word@store.example/a", "user name"),
         ("http://store.example/a", "did not allow"),  # any public one: by TLS, on its port
         ("https://store.example:22/a", "did not allow"),

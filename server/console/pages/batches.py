@@ -25,7 +25,7 @@ class BatchesPage(Page, component="batches.js"):
     """Shows the list of batches, and the selected one with its progress and failed jobs."""
 
     def look(self) -> JsonObject:
-        """Returns the state of the page: a page of the list, and the selected batch (even if it is on another page)
+        """Returns the state of the page: one page of the list, and the selected batch (even if it is on another page)
         with its newest failed jobs. ``parquet``: whether Parquet tables can be made."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
         state: JsonObject = shared.get(
@@ -42,7 +42,7 @@ class BatchesPage(Page, component="batches.js"):
 
 
 def batches_state(service: Service, requested: Mapping[str, str | None]) -> JsonObject:
-    """Returns one page of the list of batches, newest first. ``total`` counts those on all pages."""
+    """Returns one page of the list of batches, newest first. ``total`` counts the batches on all pages."""
     state = cast(BatchState, requested["state"]) if requested["state"] in get_args(BatchState) else None
     page = service.batches.page(requested["find"] or "", state, SHOWN, requested["after"])
     return {"batches": [batch.model_dump() for batch in page.items], "next": page.next, "total": page.total}

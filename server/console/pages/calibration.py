@@ -30,7 +30,7 @@ class Shots:
         self.taken: list[tuple[str, Corners]] = []
 
     def add(self, board: Mapping[str, object], capture: str, corners: Corners) -> None:
-        """Adds a shot: the id of its capture, and the corners found in each camera's picture."""
+        """Adds a shot: the id of its capture, and the corners detected in each camera's picture."""
         with self._lock:
             self.board, self.taken = board, [*self.taken, (capture, corners)]
 
@@ -156,15 +156,15 @@ def calibrate(page: Page, event: JsonObject) -> Message:
 
 
 def use(page: Page, event: JsonObject) -> Message:
-    """Uses a calibration for every later capture; with ``poor`` even one of which the operator has read what it lacks.
-    Raises NotFound, and Conflict as ``Service.use_calibration`` does."""
+    """Selects a calibration for every later capture; with ``poor`` even one with the verdict poor, whose faults the
+    operator has read. Raises NotFound, and Conflict as ``Service.use_calibration`` does."""
     page.service.use_calibration(event["id"], poor=event.get("poor", False))
     _forget()
     return compose("calibration-taken-into-use")
 
 
 def remove(page: Page, event: JsonObject) -> None:
-    """Removes a calibration after the time to undo that has passed. Raises NotFound."""
+    """Removes a calibration after the time to undo has passed. Raises NotFound."""
     service, identity = page.service, event["id"]
     calibration = service.calibrations.get(identity)
     title = compose("calibration-named", name=calibration.label or identity[-6:])

@@ -1,7 +1,7 @@
-"""The page Captures: the list, uploads, outlines over the images, jobs to start, and removal with undo.
+"""Implements the page Captures: the list, uploads, outlines over the images, starting jobs, and removal with undo.
 
-What a form asks before a job is queued becomes a request here. A preset is a named choice of a job's settings; whoever
-needs other settings writes a settings document."""
+The values of its form become a job request here. A preset is a named choice of a job's settings; for other settings the
+user writes a settings document."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -34,8 +34,8 @@ SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are fou
 
 
 def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JsonObject]]:
-    """Returns the jobs of each capture, newest first, with the progress (0 to 1) of those that run. Jobs that are being
-    removed are left out."""
+    """Returns the jobs of each capture, newest first, with the progress (0 to 1) of those that run. Jobs whose removal
+    waits are left out."""
     found = service.jobs.of_captures(captures)
     running = [job for jobs in found.values() for job, state in jobs if state == "running"]
     progress = {job.id: job.progress for job in service.jobs.of(running)}
@@ -64,8 +64,8 @@ def capture_line(record: CaptureRecord, jobs: list[JsonObject]) -> JsonObject:
 
 
 def sync_line(shot: Mapping[str, object]) -> JsonObject:
-    """Makes a sentence on how nearly the pictures of a shot show the same moment, and tells whether they do (``good``).
-    ``shot`` is its certificate."""
+    """Writes a sentence on the time differences of a shot's pictures, with ``good`` if they are small. ``shot`` is its
+    certificate."""
     lines = sync_of(shot)
     late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
     if late:
@@ -97,7 +97,7 @@ def sessions_list(service: Service, chosen: str | None = None) -> list[JsonObjec
 
 
 def session_line(session: SessionOut) -> JsonObject:
-    """Converts a session to an entry of a list. ``captures`` counts them, without those that are being removed."""
+    """Converts a session to an entry of a list. ``captures`` is their number, without captures whose removal waits."""
     return session.model_dump() | {"captures": sum(capture not in removals for capture in session.captures)}
 
 
@@ -135,7 +135,7 @@ PRESETS = (
 
 
 def settings_of(preset: str | None) -> Mapping[str, object]:
-    """Returns the settings of the preset with this id. None and an unknown id give those of the preset Standard."""
+    """Returns the settings of the preset with this id. None and an unknown id select the preset Standard."""
     return next((known.settings for known in PRESETS if known.id == (preset or "")), {})
 
 
@@ -145,15 +145,15 @@ def preset_lines() -> list[JsonObject]:
 
 
 def template_lines() -> list[JsonObject]:
-    """Converts the templates whose model is at hand to entries of a form's list."""
+    """Converts the templates whose model is installed to entries of a form's list."""
     return [
         {"name": template.name, "models": list(template.models)} for template in templates_at_hand() if template.models
     ]
 
 
 def chosen_work(event: JsonObject) -> ReconstructionRequest:
-    """Returns the request that a form describes: model, preset (``method``) and template. What is not chosen is left to
-    the service's defaults."""
+    """Returns the request that a form describes: model, preset (``method``) and template. Values that the form leaves
+    out get the service's defaults."""
     settings, template = dict(settings_of(event.get("method"))), event.get("template")
     if template:
         settings["outputs"] = cast(dict[str, object], settings.get("outputs", {})) | {"template": template}
@@ -176,8 +176,8 @@ class CapturesPage(Page, component="captures.js"):
 
 
 def captures_state(service: Service, requested: Mapping[str, str | None]) -> JsonObject:
-    """Returns one page of the captures that match what is requested, each with its jobs. Captures that are being
-    removed are left out. ``chosen``: the selected capture, even if it is on another page of the list."""
+    """Returns one page of the captures that match what is requested, each with its jobs. Captures whose removal waits
+    are left out. ``chosen``: the selected capture, even if it is on another page of the list."""
     order = cast(CaptureOrder, requested["sort"] if requested["sort"] in get_args(CaptureOrder) else "-created")
     query = CaptureQuery(
         requested["find"] or "", requested["session"], requested["verdict"], tag=requested["tag"], order=order
@@ -224,8 +224,8 @@ def sample(page: Page, event: object) -> Message:
 
 
 def edit(page: Page, event: JsonObject) -> None:
-    """Changes label, expression, session or tags (with commas between) of a capture; what the form lacks stays. Raises
-    NotFound and InputError."""
+    """Changes label, expression, session or tags (separated by commas) of a capture; fields missing from the form stay.
+    Raises NotFound and InputError."""
     changes: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
     tags = typed_tags(event["tags"]) if "tags" in event else None
     page.service.captures.edit(event["id"], changes, tags=tags)
@@ -261,8 +261,8 @@ def erase_capture(page: Page, event: JsonObject) -> Message:
 
 
 def discard(page: Page, event: JsonObject) -> None:
-    """Removes a capture after the time to undo that has passed; the message says how many heads stay. Raises NotFound,
-    and Conflict while a queued or running job needs it."""
+    """Removes a capture after the time to undo has passed; the message states how many heads stay. Raises NotFound, and
+    Conflict while a queued or running job needs it."""
     service, identity = page.service, event["id"]
     record = service.captures.check_unused(identity)
     heads = len(service.captures.holdings(identity).heads)
@@ -273,8 +273,8 @@ def discard(page: Page, event: JsonObject) -> None:
 
 
 def bulk(page: Page, event: JsonObject) -> Message | None:
-    """Does one ``action`` to all ticked captures, ``ids``. ``id``: the session to move them to, empty for none. Where
-    it is refused for some, the others are done, and InvalidInput is raised with the reasons."""
+    """Applies one ``action`` to all ticked captures, ``ids``. ``id``: the session to move them to, empty for none. If
+    it is refused for some captures, it is applied to the others, and InvalidInput is raised with the reasons."""
     service, ids, action = page.service, event["ids"], event["action"]
     if action == "reconstruct":
         permit(page.caller, "submit")

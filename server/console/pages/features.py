@@ -1,6 +1,6 @@
-"""The page Features: the operator picks the seven points of the paper's section 4.2, and others, in some views.
+"""Implements the page Features, where the operator picks the paper's seven points (section 4.2) and others in views.
 
-This step is optional: without points the pipeline finds the alignment by itself.
+This step is optional: without points the pipeline finds the alignment itself.
 """
 
 import threading
@@ -52,8 +52,8 @@ class Drafts:
         self._most, self._kept = most, OrderedDict[tuple[str, str], Points]()
 
     def keep(self, caller: str, picked: Picked) -> None:
-        """Keeps the points of a page for a caller, or drops the draft if all are saved. Beyond the limit the oldest
-        drafts are dropped."""
+        """Stores the points of a page for a caller, or drops the draft if all points are saved. Beyond the limit the
+        oldest drafts are dropped."""
         self._kept.pop((caller, picked.capture), None)
         if picked.points != picked.saved:
             self._kept[caller, picked.capture] = picked.points
@@ -69,8 +69,8 @@ drafts = Drafts()
 
 
 class FeaturesPage(Page, component="features.js"):
-    """Shows the views of one capture, in which feature points are picked. Points belong to one open page until they are
-    saved."""
+    """Shows the views of one capture, in which feature points are picked. Each open page has its own points until they
+    are saved."""
 
     picked: Picked | None = None
 
@@ -88,7 +88,7 @@ class FeaturesPage(Page, component="features.js"):
         return {"captures": captures, "capture": self._picking(chosen)}
 
     def _picking(self, capture_id: str) -> JsonObject:
-        """Returns the points of one capture and the aids for picking more; pixels are those of the picture files.
+        """Returns the points of one capture and the aids for picking more, in pixels of the picture files.
 
         ``names``: all points, first the seven of section 4.2; ``suggested``: suggestions that nobody has accepted yet;
         ``dirty``: some points are not saved; ``is_contradictory``: contradictions must be confirmed before the points
@@ -164,7 +164,7 @@ landmarks = Landmarks()
 
 
 def place(page: FeaturesPage, event: JsonObject) -> None:
-    """Sets one ``point`` in the view of one ``camera``, or removes it there if ``at`` is None. Nothing is saved yet."""
+    """Sets one ``point`` in the view of one ``camera``, or removes it there if ``at`` is None. Saves nothing yet."""
     picked = page.of_capture()
     points = {name: dict(views) for name, views in picked.points.items()}
     views = points.setdefault(event["point"], {})
@@ -178,8 +178,8 @@ def place(page: FeaturesPage, event: JsonObject) -> None:
 
 
 def suggest(page: FeaturesPage, event: object) -> Message:
-    """Suggests all seven points in every view that shows the face. Suggestions are neither saved nor used until
-    somebody accepts them. Raises InvalidInput if no face is certain, and what ``found_faces`` raises."""
+    """Suggests all seven points in every view that shows the face. Suggestions are neither saved nor used until the
+    user accepts them. Raises InvalidInput if no face is certain, and what ``found_faces`` raises."""
     picked = page.of_capture()
     suggested = found_faces(page.service, picked.capture)["suggested"]
     if not suggested:
@@ -204,8 +204,8 @@ def reject(page: FeaturesPage, event: JsonObject) -> None:
 
 
 def save(page: FeaturesPage, event: JsonObject) -> Message | None:
-    """Stores the points of the page. If views contradict each other, nothing is stored and None is returned until the
-    event comes again with ``sure``. Raises what ``Captures.put_features`` raises."""
+    """Stores the points of the page. If views contradict each other, it stores nothing and returns None until the user
+    confirms (event with ``sure``). Raises what ``Captures.put_features`` raises."""
     picked = page.of_capture()
     points = picked.points
     if not event.get("sure") and contradictions(page):

@@ -56,7 +56,7 @@ class JobsPage(Page, component="jobs.js"):
 
 def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JsonObject:
     """Returns one page of the jobs that match the request: running jobs, then the queue in its order, then ended jobs,
-    newest first. ``waiting``: how many more wait."""
+    newest first. ``waiting`` is the number of further waiting jobs."""
     sought, after = requested["find"] or "", requested["after"]
     order = cast(JobOrder, requested["sort"] if requested["sort"] in get_args(JobOrder) else "-created")
     state = requested["state"] if requested["state"] in STATUSES else None
@@ -78,8 +78,8 @@ def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JsonObj
 
 
 def active_jobs(service: Service, sought: str, batch: str | None, *, running: bool = True) -> tuple[list[JobOut], int]:
-    """Returns the running jobs and the next ones, ``SHOWN`` at most, and how many more wait. ``running``: include the
-    running jobs."""
+    """Returns the running jobs and the next ones, ``SHOWN`` at most, and how many more wait. ``running``: whether to
+    include running jobs."""
     query = JobQuery(sought, ACTIVE if running else STATUSES["queued"], batch=batch)
     matching = service.jobs.page(query, SOUGHT_MOST)
     jobs = sorted(matching.items, key=lambda job: (job.state != "running", job.ahead or 0, job.id))
@@ -159,16 +159,16 @@ def cancel(page: Page, event: JsonObject) -> None:
 
 
 def delete(page: Page, event: JsonObject) -> None:
-    """Removes a job with its result after the time to undo that has passed. Raises NotFound."""
+    """Removes a job with its result after the time to undo has passed. Raises NotFound."""
     service, identity = page.service, event["id"]
     service.jobs.get(identity)
     remove_later(identity, lambda: service.jobs.delete(identity), compose("job-named", job=identity[-6:]), "submit")
 
 
 def bulk(page: Page, event: JsonObject) -> Message:
-    """Does one ``action`` (cancel, restart, remove) to all ticked jobs, ``ids``. Where it is refused for some, the
-    others are done, and InvalidInput is raised with the reasons. Raises Conflict if none of those to be removed has
-    ended."""
+    """Applies one ``action`` (cancel, restart, remove) to all ticked jobs, ``ids``. If it is refused for some jobs, it
+    is applied to the others, and InvalidInput is raised with the reasons. Raises Conflict if all jobs to be removed are
+    still active."""
     service, action = page.service, event["action"]
     if action == "remove":
         ended = [job.id for job in service.jobs.of(event["ids"]) if job.state in FINISHED]

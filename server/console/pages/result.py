@@ -29,8 +29,8 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
     """Shows one head in 3D with its figures, and the heads to choose from."""
 
     def look(self) -> JsonObject:
-        """Returns the shown head and the heads to choose from: the newest that match the search, those of the same
-        subject, and the shown one, which stays when new heads arrive. ``total``: how many match."""
+        """Returns the shown head, which stays when new heads arrive, and the heads to choose from: the newest that
+        match the search, and those of the same subject. ``total`` is the number of matches."""
         sought, chosen = self.choice.get("find") or "", self.choice.get("job")
         results, total = shared.get(("results", sought), 1.0, lambda: newest_heads(self.service, sought))
         if chosen is None:

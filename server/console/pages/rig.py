@@ -62,7 +62,7 @@ def shot_taken(service: Service, identity: str | None) -> JsonObject | None:
 
 def rig_state(service: Service) -> JsonObject:
     """Returns the part of the page beside the live pictures, which is the same for all callers: drivers, the last
-    shot's sync, cameras that have moved, calibration and clean plates."""
+    shot's sync, moved cameras, calibration and clean plates."""
     rig = service.rig.describe()
     last = service.captures.newest()
     sync = {} if last is None or last.shot is None else sync_of(last.shot)
@@ -85,8 +85,8 @@ def rig_state(service: Service) -> JsonObject:
 
 
 def plates_shown(versions: list[PlatesVersion]) -> JsonObject | None:
-    """Returns when the clean plates in use were taken, the version before them, and a newer one that was refused, from
-    their versions, newest first. Returns None if no version is in use, as in the simulated studio."""
+    """Returns when the clean plates in use were taken, the previous version, and a newer refused one, given all
+    versions, newest first. Returns None if no version is in use, as in the simulated studio."""
     in_use = next((version for version in versions if version.in_use), None)
     if in_use is None:
         return None
@@ -102,8 +102,8 @@ def _plates_line(version: PlatesVersion | None) -> JsonObject | None:
 
 
 def calibration_in_use(service: Service) -> JsonObject | None:
-    """Returns label, time and RMS reprojection error (px) of the calibration that every capture gets; None if this
-    service did not make it."""
+    """Returns label, time and RMS reprojection error (px) of the calibration in use; None if this service did not make
+    it."""
     if service.calibrations.in_use() is None:
         return None
     used = next((one for one in known_calibrations(service, 2.0) if one.in_use), None)
@@ -133,7 +133,7 @@ def read_report(service: Service, job_id: str) -> Report | None:
 
 
 def capture(page: Page, event: Mapping[str, str | None]) -> Message:
-    """Takes a shot and shows it for a decision. Raises what ``Captures.take`` raises."""
+    """Takes a shot and shows it for a decision."""
     record = page.service.captures.take(CaptureMetadata.of(event))
     page.choice["shot"] = record.id
     shared.forget("rig")
@@ -149,8 +149,8 @@ def keep(page: Page, event: object) -> None:
 
 
 def retake(page: Page, event: JsonObject) -> None:
-    """Removes the shot that was shown for a decision, after the time to undo that. The page then counts down to the
-    next one."""
+    """Removes the shot that was shown for a decision, after the time to undo, while the page counts down to the next
+    shot."""
     discard(page, event)
     page.choice["shot"] = None
 

@@ -38,7 +38,7 @@ class ServicePage(Page, component="service.js"):
 
     def look(self) -> JsonObject:
         """Returns the state of the page. Only callers with the scope admin see the keys. ``open``: there are no API
-        keys, so that whoever sits at this machine may do everything."""
+        keys, so everybody at this machine may do everything."""
         admin, service, data = self.caller.may("admin"), self.service, str(self.service.store.data.resolve())
         return {
             "keys": [*key_lines(service, self.caller)] if admin else None,
@@ -124,8 +124,8 @@ def clear(page: ServicePage, event: object) -> Message:
 
 
 def remove_failed(page: ServicePage, event: object) -> Message:
-    """Removes the failed and cancelled jobs, at most ``REMOVED_AT_ONCE``, after the time to undo that has passed.
-    Raises Conflict if there are none."""
+    """Removes the failed and cancelled jobs, at most ``REMOVED_AT_ONCE``, after the time to undo has passed. Raises
+    Conflict if there are none."""
     jobs = page.service.jobs
     ids = [job.id for job in jobs.page(JobQuery("", FAILED), REMOVED_AT_ONCE).items]
     if not ids:
@@ -136,7 +136,7 @@ def remove_failed(page: ServicePage, event: object) -> Message:
 
 
 def sweep_now(page: ServicePage, event: object) -> Message:
-    """Removes now what retention would remove at its next turn. The message states how much that was."""
+    """Removes now what retention would remove at its next turn. The message states how much was removed."""
     gone = {kind: count for kind, count in sweep(page.service).items() if count}
     forget_storage(page.service)
     removed = [compose("gone-of-kind", count=count, kind=kind) for kind, count in gone.items()]

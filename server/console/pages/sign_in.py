@@ -17,7 +17,7 @@ WRONG_PAUSE_S = 1.0  # after a key that is nobody's
 
 class SignIn(Element, component="sign_in.js"):
     """Shows the form for an API key. A valid key's id is stored in the browser's session, and the page of the rig
-    opens. After a wrong one the form waits a second, which slows guessing."""
+    opens. After a wrong key the form waits a second, which slows guessing."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -32,7 +32,7 @@ def rig_live(
 ) -> Response | LiveOut:
     """Returns the subject's head, lamps of each camera, and instructions before a shot.
 
-    The cameras take pictures only while somebody asks, so the first answers have no head. With ``Accept:
+    The cameras take pictures only while clients send requests, so the first answers have no head. With ``Accept:
     text/event-stream`` each new state is sent as an event ``look``."""
     if EVENTS in accept:
         return StreamingResponse(_events(service, seconds), media_type=EVENTS, headers=UNKEPT)

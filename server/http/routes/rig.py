@@ -104,8 +104,8 @@ def set_lights(service: ServiceOf, caller: Taker, wanted: Lights) -> Lights:
 def take_background(service: ServiceOf, caller: Taker) -> BackgroundOut:
     """Takes new clean plates of the empty studio and uses them for later captures.
 
-    If that fails (503), or if the new plates show a person whom the old ones do not (409), the old ones stay in use.
-    After a 409 the new plates are kept, and ``PUT`` can select them nevertheless.
+    If this fails (503), or if the new plates show a person whom the old ones do not (409), the old plates stay in use.
+    After a 409 the new plates are stored, and ``PUT`` can select them nevertheless.
     """
     service.store.reserve(0, service.settings.free_bytes)
     return BackgroundOut.model_validate(service.rig.take_background())

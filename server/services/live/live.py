@@ -1,9 +1,9 @@
-"""Computes the subject's head while somebody watches.
+"""Computes the subject's head while clients request it.
 
-One thread takes pictures, unless the console's live view provides its own; another sends them to a child process
-(``looking``) and publishes the result. The next pictures are requested early enough to arrive when the child is done.
-The child has priority over a job and takes at most a quarter of its two cores; a child that dies or hangs is replaced
-at the next pictures. ``IDLE_S`` after the last request, threads and child end.
+One thread takes pictures, unless the console's live view provides them; another thread sends them to a child process
+(``looking``) and publishes the result. The next pictures are requested early enough to arrive when the child process is
+done. The child process has priority over a job and takes at most a quarter of its two cores; one that dies or hangs is
+replaced at the next pictures. ``IDLE_S`` seconds after the last request, threads and child process end.
 """
 
 import threading
@@ -45,7 +45,7 @@ log = structlog.get_logger()
 @dataclass(frozen=True, slots=True)
 class Moment:
     """Holds the pictures of one moment, some of them as JPEG files, and the earliest time at which they may have been
-    taken (s, of ``time.monotonic``). ``fault``: why there are none."""
+    taken (s, of ``time.monotonic``). ``fault``: why there are no pictures."""
 
     taken_s: float
     pictures: Mapping[str, bytes | ImageRgb]
@@ -53,7 +53,7 @@ class Moment:
 
 
 class Live:
-    """Finds the head while somebody asks for it. ``rig_toml`` describes the rig; None: the simulated studio."""
+    """Finds the head while clients request it. ``rig_toml`` describes the rig; None: the simulated studio."""
 
     def __init__(self, rig: RigBackend, rig_toml: Path | None) -> None:
         self._rig = rig
@@ -84,7 +84,7 @@ class Live:
         return shown[1] if shown is not None and now_s - shown[0] < FRESH_S else nothing(compose("live-starting"))
 
     def offer(self, pictures: Mapping[str, bytes], taken_s: float) -> LiveOut:
-        """Takes pictures from the live view, so that the cameras need not be asked twice, and returns the newest
+        """Receives pictures from the live view, so that the cameras need not take them twice, and returns the newest
         result."""
         self._offered_s = time.monotonic()
         self._hand_on(Moment(taken_s, pictures))
@@ -183,7 +183,7 @@ class Live:
 
 
 def nothing(why: Message) -> LiveOut:
-    """Returns a result in which nothing was found."""
+    """Returns a result without a head, for the reason ``why``."""
     return LiveOut(
         time="", age_s=0.0, number=0, cameras={}, head=None, steady=False, words=[word_out(Word(why))], ready=False
     )

@@ -1,7 +1,7 @@
-"""Finds the head in one set of pictures, in a child process that keeps the head from set to set.
+"""Finds the head in one set of pictures after the other, in a child process that remembers the last head.
 
-Pictures come reduced. Light and sharpness are measured on them, sharpness in every other camera in turn; the face is
-found in them at ``SMALL_PX``. A missing face is searched anew, in one camera for each set.
+The pictures are already reduced. Light and sharpness are measured on the pictures, sharpness for one camera in each
+set; faces are searched at ``SMALL_PX``. A missing face is searched again in one camera for each set.
 """
 
 from collections.abc import Mapping
@@ -103,7 +103,7 @@ def _fits(camera: Camera, image: ImageRgb) -> bool:
 
 
 def _small(image: ImageRgb, camera: Camera) -> tuple[ImageRgb, Camera]:
-    """Returns a picture reduced to ``SMALL_PX``, and without lens distortion if the camera is calibrated."""
+    """Returns a picture reduced to ``SMALL_PX``, without lens distortion if the camera is calibrated."""
     at_size = replace(camera, intrinsics=camera.intrinsics.at_size(image.shape[1], image.shape[0]))
     if camera.recorded is not None:
         image = camera.recorded.undistort(image, at_size.intrinsics.matrix())
@@ -152,7 +152,7 @@ def _find(context: WorkerContext, kept: Kept, small: Mapping[str, ImageRgb], rig
 
 
 def _same(before: Rig, now: Rig) -> bool:
-    """Returns whether two rigs have the same cameras with the same poses, except those without a picture now."""
+    """Returns whether two rigs have the same cameras with the same poses, ignoring cameras without a picture."""
     return all(camera.name in before and _placed(camera) == _placed(before[camera.name]) for camera in now)
 
 
@@ -168,7 +168,7 @@ def _alike(thumbs: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]) -
 
 
 def _lit(image: ImageRgb, plate: Float[np.ndarray, "h w"] | None) -> CameraSeen:
-    """Measures a picture's brightness relative to its clean plate, since most of it is background."""
+    """Measures a picture's brightness relative to its clean plate, because most of the picture is background."""
     light = exposure(image)
     share = None if plate is None else float(np.median(_light(image) / plate))
     return CameraSeen(light.mean, share, float(light.clipped_share), None)
@@ -198,8 +198,8 @@ def _with_head(seen: CameraSeen, camera: Camera, head: LiveHead) -> CameraSeen:
 def _measure_sharpness(
     kept: Kept, seen: dict[str, CameraSeen], images: Mapping[str, ImageRgb], rig: Rig, head: LiveHead
 ) -> None:
-    """Measures the sharpness of the head's face in every other camera in turn, and adds the known value of each camera.
-    A moving head is not measured: its blur is not the lens's."""
+    """Measures the sharpness of the face in one camera for each set of pictures, and adds the last known value of every
+    camera. It does not measure a moving head, whose blur is not the lens's."""
     before, kept.points = kept.points, head.points_world
     still = before is not None and float(np.linalg.norm(kept.points - before, axis=1).mean()) < STILL_MM
     kept.count += still
@@ -224,7 +224,7 @@ def _blur_px(image: ImageRgb, face: Float[np.ndarray, "n 2"]) -> float | None:
 def _search_stranger(
     context: WorkerContext, kept: Kept, seen: dict[str, CameraSeen], small: Mapping[str, tuple[ImageRgb, Camera]]
 ) -> None:
-    """Searches a face in one camera, in turn, that should show the head's and does not."""
+    """Searches for a face in one of the cameras, in turn, that should show the head but do not."""
     lacking = [name for name, camera in seen.items() if camera.face is False and not camera.stranger and name in small]
     if lacking:
         kept.searched += 1

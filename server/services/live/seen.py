@@ -72,7 +72,7 @@ class Seen:
 
 
 class LampsOut(Answer):
-    """States of one camera whether it shows the face, is sharp, is well exposed, has the head in its middle, and
+    """States for one camera whether it shows the face, is sharp, is well exposed and has the head in its middle, and
     whether the face looks at it. null: unknown, or not required."""
 
     face: bool | None
@@ -116,6 +116,6 @@ class LiveOut(Answer):
 
 
 def word_out(word: Word) -> WordOut:
-    """Returns an instruction as it is answered."""
+    """Converts an instruction to its form in an answer."""
     message = MessageOut.model_validate(word.message)
     return WordOut(code=message.code, text=word.message.text, camera=word.camera, message=message)

@@ -1,7 +1,7 @@
-"""Converts the findings of one set of pictures to lamps of cameras and instructions before a shot.
+"""Converts the findings of one set of pictures to each camera's indicator lamps and to instructions before a shot.
 
-All limits are stated here. Most instructions follow once their reason has lasted ``HOLD_S``, so a blink has no effect;
-they end with it.
+This module defines all limits for them. Most instructions appear after their cause has lasted ``HOLD_S`` seconds, so a
+blink has no effect, and disappear with it.
 """
 
 from collections import deque
@@ -30,7 +30,7 @@ LOOKING = 0.5  # cosine: both eyes are seen
 
 
 class Speaker:
-    """Converts one set of findings after the other to lamps and instructions. Remembers a second of them."""
+    """Converts successive sets of findings to lamps and instructions. It remembers the findings of the last second."""
 
     def __init__(self) -> None:
         self._since: dict[tuple[str, str | None], float] = {}
@@ -46,7 +46,7 @@ class Speaker:
         return tuple(word for word, key, least_s in triples if time_s - self._since[key] >= least_s)
 
     def steady(self, head: HeadOut | None, time_s: float) -> bool:
-        """Returns whether the head has kept its pose for ``STEADY_S``."""
+        """Returns whether the head has kept its pose for ``STEADY_S`` seconds."""
         if head is None:
             self._poses.clear()
             return False
@@ -77,7 +77,7 @@ def lamps_of(seen: Seen) -> dict[str, LampsOut]:
 
 
 def reasons_of(seen: Seen) -> Iterator[Word]:
-    """Yields the instructions from these findings alone, those for the subject first."""
+    """Yields the instructions that follow from these findings alone, those for the subject first."""
     if not seen.calibrated:
         yield Word(compose("live-uncalibrated"))
     elif not seen.cameras:
@@ -129,7 +129,7 @@ def _of_camera(name: str, camera: CameraSeen) -> Iterator[Word]:
 
 
 def _light(seen: Seen) -> Iterator[tuple[str, Word]]:
-    """Yields cameras of wrong brightness, relative to their clean plates or else to the other cameras."""
+    """Yields an instruction for each camera with a wrong brightness, relative to its clean plate or to the others."""
     against = {name: camera.light for name, camera in seen.cameras.items() if camera.light is not None}
     plated = len(against) == len(seen.cameras)
     ratios = against if plated else {name: camera.mean / LEVEL for name, camera in seen.cameras.items()}

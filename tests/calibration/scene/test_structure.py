@@ -37,9 +37,9 @@ def test_observed_pixels_have_their_origin_in_a_pixels_centre() -> None:
     ("name", "reason"),
     [
         ("dark", "only 12 distinct points in it"),
-        ("alone", "none of its 900 points is found in another view"),
-        ("far", "it has at most 20 points in common with another view (near)"),
-        ("farther", "it has at most 30 points in common with another view (far, which did not join either)"),
+        ("alone", "none of the view's 900 points is found in another view"),
+        ("far", "the view has at most 20 points in common with another view (near)"),
+        ("farther", "the view has at most 30 points in common with another view (far, which did not join either)"),
     ],
 )
 def test_a_view_that_does_not_join_is_told_why(name: str, reason: str) -> None:

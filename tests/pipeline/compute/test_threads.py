@@ -66,7 +66,7 @@ def test_without_the_variable_it_is_a_thread_for_each_cpu(monkeypatch: pytest.Mo
 @pytest.mark.parametrize("value", ["0", "-1", "two", "1.5", "513", "9" * 5000, "²"])
 def test_what_is_no_number_of_threads_is_refused(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EIGENHEAD_THREADS", value)
-    with pytest.raises(InputError, match=r"EIGENHEAD_THREADS: is .* whole number from 1 to 512"):
+    with pytest.raises(InputError, match=r"EIGENHEAD_THREADS: the variable is .* whole number from 1 to 512"):
         thread_count()
 
 

@@ -125,7 +125,7 @@ def test_check_has_a_row_for_every_camera(studio: StudioDevices, config: RigConf
     assert 0 < float(rows["cam00"]["fps"]) < 15
     assert rows["cam00"]["sync"].endswith(" ms")
     assert rows["cam00"]["remark"] == "ok"
-    assert rows["cam01"]["remark"].startswith("moved: its background lies")
+    assert rows["cam01"]["remark"].startswith("moved: the background lies")
 
 
 def test_check_of_a_rig_that_is_not_there(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_captures_are_found_below_a_folder_and_nothing_else(shots: Path) -> None
 def test_a_folder_without_captures_and_one_that_is_a_capture_are_refused(shots: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is a capture itself: name the folder above it"):
         find_captures(shots / "monday" / "anna", tmp_path / "out")
-    with pytest.raises(InputError, match="notes: holds no capture"):
+    with pytest.raises(InputError, match="notes: the folder holds no capture"):
         find_captures(shots / "notes", tmp_path / "out")
 
 
@@ -103,11 +103,11 @@ def test_every_fault_of_a_list_is_named_with_its_line(shots: Path) -> None:
         (5, "names no capture"),
         (6, "settings: cannot be read"),
         (7, "no.toml: cannot be read"),
-        (8, "6 cells, and the first row names 4 columns"),
+        (8, "the row has 6 cells, but the first row names 4 columns"),
         (9, "[]: cannot be read"),
     ]:
         assert [fault for fault in faults if fault.startswith(f"line {line}: ") and words in fault], (line, faults)
-    assert "line 2, line 6 have the same name, monday/anna: say another one in the column name" in faults
+    assert "line 2, line 6 have the same name, monday/anna: write another one in the column name" in faults
     assert [fault for fault in faults if fault.startswith("line 7: '../up' cannot name a folder")]
     assert [
         fault for fault in faults if fault.startswith("monday/anna/deep would lie within the result of monday/anna")

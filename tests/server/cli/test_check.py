@@ -229,5 +229,5 @@ def test_a_wrong_variable_is_no_fault_of_the_capture(
 ) -> None:
     write_capture(tmp_path / "shot", *masked)
     monkeypatch.setenv("EIGENHEAD_THREADS", "-4")
-    with pytest.raises(WrongVariable, match="EIGENHEAD_THREADS: is '-4'"):
+    with pytest.raises(WrongVariable, match="EIGENHEAD_THREADS: the variable is '-4'"):
         found_in(tmp_path / "shot")

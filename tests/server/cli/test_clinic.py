@@ -60,7 +60,7 @@ def test_a_folder_that_is_no_result_is_refused(tmp_path: Path) -> None:
     for words in (*exports, ["compare", str(tmp_path), str(tmp_path)]):
         done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
         assert done.exit_code == 1
-        assert "report.json: is not there: name the folder of a result" in str(done.exception)
+        assert "report.json: the file is not there: name the folder of a result" in str(done.exception)
         assert not [*(tmp_path / "out").glob("*")]
 
 

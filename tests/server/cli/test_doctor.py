@@ -71,7 +71,7 @@ def test_it_judges_the_number_of_threads(
     monkeypatch.setenv("EIGENHEAD_THREADS", "many")
     found = examine(data=tmp_path)
     assert not found["cores"]["ok"]
-    assert "EIGENHEAD_THREADS: is 'many'; give a whole number from 1 to 512" in found["cores"]["detail"]
+    assert "EIGENHEAD_THREADS: the variable is 'many'; give a whole number from 1 to 512" in found["cores"]["detail"]
 
 
 def test_captures_without_their_database_are_told(examine: Callable[..., dict], tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def judged(captures: list[Path], reference: Path, out: Path) -> None:
 def test_a_bad_reference_is_named_before_anything_is_reconstructed(tmp_path: Path) -> None:
     capture, scan = small_capture(tmp_path / "shot"), tmp_path / "scan.obj"
     scan.write_bytes(obj_bytes(Mesh(mannequin().vertices / 10, mannequin().faces)))
-    with pytest.raises(InputError, match=r"scan\.obj: is .* which is a head in cm"):
+    with pytest.raises(InputError, match=r"scan\.obj: .* which is a head in cm"):
         judged([capture], scan, tmp_path / "out")
     with pytest.raises(InputError, match="more than one is called shot"):
         judged([capture, tmp_path / "other" / "shot"], scan, tmp_path / "out")

@@ -33,7 +33,7 @@ def test_what_cannot_be_wrapped_is_told_before_anything_is_written(data: Path) -
     (data / "points.json").write_text('{"points": {"pronasale": [0, 0, 0]}}')
     for words, kind, text in (
         (["--template", "nobody"], EigenheadError, "known are low"),
-        (["--template", "low"], InputError, "points.ply: holds no triangles"),
+        (["--template", "low"], InputError, "points.ply: the mesh holds no triangles"),
         (["--template", "low", "--landmarks", str(data / "points.json")], InputError, "holds no triangles"),
     ):
         fault = wrap(data / "points.ply", *words)

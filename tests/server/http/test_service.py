@@ -39,7 +39,7 @@ def test_requests_that_make_no_sense_are_4xx_problems(http: httpx.Client, captur
     misplaced = http.post("/v1/captures", files={"file": b"x"})
     assert (misplaced.status_code, "POST /v1/captures/uploads" in misplaced.json()["detail"]) == (415, True)
     form = http.post("/v1/captures", data={"label": "x"})
-    assert form.json()["errors"] == ["body: is no JSON object; send one, as application/json"]
+    assert form.json()["errors"] == ["body: the request is no JSON object; send one, as application/json"]
     cut = http.patch("/v1/captures/x", content=b'{"label": ', headers={"content-type": "application/json"})
     assert "is no JSON" in cut.json()["errors"][0]
 

@@ -109,5 +109,5 @@ def test_shapes_of_a_model_without_expressions_are_refused(monkeypatch: pytest.M
     rigid = replace(load_model(), expressions=Expressions((), np.zeros((0, 1, 3), np.float32)))
     monkeypatch.setattr("server.tasks.export_result.load_model", lambda _: rigid)
     (tmp_path / "report.json").write_text(json.dumps({"model": {"name": rigid.name, "sha256": rigid.sha256}}))
-    with pytest.raises(InputError, match="morphs: cannot be written: the model makehuman-138 has no expressions"):
+    with pytest.raises(InputError, match="cannot be written, because the model makehuman-138 has no expressions"):
         export_result(tmp_path, tmp_path / "out", OutputSettings(formats=("glb",), morphs=True))

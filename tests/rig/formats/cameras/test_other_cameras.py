@@ -70,7 +70,7 @@ def test_an_unknown_format_and_a_yaml_of_opencv_without_cameras_are_named(tmp_pa
     with pytest.raises(InputError, match="'ply' is not one of eigenhead, colmap"):
         write_rig_file(fan(), tmp_path / "x", "ply")
     (tmp_path / "board.yml").write_text("%YAML:1.0\n---\nsquare: 25.\n")
-    with pytest.raises(InputError, match=r"board\.yml: holds no camera; wanted are K_<name>, dist_<name>, R_<name>"):
+    with pytest.raises(InputError, match=r"board\.yml: .* no camera; expected K_<name>, dist_<name>, R_<name>"):
         read_rig_file(tmp_path / "board.yml")
 
 

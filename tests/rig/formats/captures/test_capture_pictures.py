@@ -90,7 +90,7 @@ def test_an_alpha_is_not_decoded_where_the_header_says_too_much(tmp_path: Path) 
     ("change", "remedy"),
     [
         ({"width": HEIGHT, "height": WIDTH}, "exchange the camera's width and height"),  # of cx 31.5, cy 23.5
-        ({"width": HEIGHT, "height": WIDTH, "cx": 23.5, "cy": 31.5}, "it was turned by 90 degrees; turn it back"),
+        ({"width": HEIGHT, "height": WIDTH, "cx": 23.5, "cy": 31.5}, "turned by 90 degrees; turn it back"),
         ({"width": 2 * WIDTH, "height": 2 * HEIGHT}, "use pictures of the calibrated size"),
         ({"width": WIDTH + 9}, f"its camera is {WIDTH + 9} x {HEIGHT}"),
     ],
