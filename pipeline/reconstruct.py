@@ -46,8 +46,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
 
 def start_reconstruction(context: ReconstructionContext, run: Recorder | None = None) -> Generator[Any, HeadFit, None]:
     """Runs a reconstruction, and yields the fitted head. The caller sends back a head, perhaps fitted to several
-    captures of one person, with which the generator continues; then it yields the result. ``run`` collects the
-    warnings."""
+    captures; the generator continues with this head, and yields the result. ``run`` collects the warnings."""
     if "usdz" in context.settings.outputs.formats:
         check_usd()
     run = run or Recorder(context)

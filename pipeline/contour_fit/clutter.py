@@ -17,8 +17,8 @@ CELL_PX, CLUTTER_CELLS = 4, 3  # clutter reaches 12 px beyond where it was found
 
 
 def downweight_outside_contour(problem: ContourProblem, evidence: StageEvidence, rim: Rim, level: str) -> Rim:
-    """Reduces the weight of rim samples on cranium, ears and neck. Such a sample counts only if the model sticks out of
-    the silhouette, and then with ``OUTSIDE_SHARE`` of its weight."""
+    """Reduces the weight of rim samples on cranium, ears and neck. A sample on these parts counts only if the model
+    sticks out of the silhouette, and then with ``OUTSIDE_SHARE`` of its weight."""
     face = face_of(problem, evidence, level)[rim.corner].all(axis=1)
     share = np.where(rim.residual > 0, OUTSIDE_SHARE, 0.0)
     return replace(rim, length=np.where(face, rim.length, share * rim.length))

@@ -1,9 +1,9 @@
 """Fits a head model to outlines by Levenberg-Marquardt. The paper's section 4.4 uses another cost and a simplex.
 
-The solver needs the silhouettes' signed distances, a start pose and, if there are any, feature points. It returns
-coefficients, pose, camera corrections and their covariance. The modules ``*_term`` give the equations. The scale of the
-robust loss shrinks step by step, since a start that is 20 px off needs a large scale. While the scale is large, the
-prior keeps the shape from following clutter.
+The solver needs the silhouettes' signed distances, a start pose and, if there are any, feature points. The solver
+returns coefficients, pose, camera corrections and their covariance. The modules ``*_term`` give the equations. The
+scale of the robust loss shrinks step by step, since a start that is 20 px off needs a large scale. While the scale is
+large, the prior keeps the shape from following clutter.
 """
 
 from collections.abc import Callable, Mapping
@@ -77,8 +77,8 @@ def solve_contour(
     landmarks: LandmarkObservations | None = None,
     report: Progress = discard_progress,
 ) -> ContourSolution:
-    """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes. It fits the
-    first ``settings.modes`` modes and, once these have converged, all of them. ``features`` are clicked pixels by
+    """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes. The solver fits
+    the first ``settings.modes`` modes and, once these have converged, all of them. ``features`` are clicked pixels by
     camera and landmark; ``landmarks`` are triangulated landmarks of the face. The function ``finish`` computes the
     covariance."""
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)
@@ -173,8 +173,8 @@ def normal_equations(solved: ContourSolution) -> NormalEquations:
 
 
 def hold_at_bounds(solved: ContourSolution, equations: NormalEquations) -> None:
-    """Adds terms to the normal equations, in place, that keep expression weights at their bound 0. There the posterior
-    is exponential instead of Gaussian, and its standard deviation is 1 / (slope of the cost)."""
+    """Adds terms to the normal equations, in place, that keep expression weights at their bound 0. At a bound the
+    posterior is exponential instead of Gaussian, and its standard deviation is 1 / (slope of the cost)."""
     posed = np.asarray(solved.problem.model.posed, int)
     if len(posed) and posed[-1] < solved.stage.modes:
         held = posed[(solved.state.coefficients[posed] <= 0.0) & (equations.gradient[posed] > 0.0)]
@@ -229,7 +229,7 @@ def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_
 def judged_by(wider_model: HeadModel, wider: Fit, model: HeadModel, fit: Fit) -> Fit:
     """Returns ``fit`` with a misfit (mm, along the normals) from its comparison with ``wider``, a fit of more modes to
     the same outlines. The squared misfit is the squared distance between the two fits plus the excess of the wider
-    fit's variance. Both fits must have a covariance."""
+    fit's variance. The fits ``fit`` and ``wider`` must have a covariance."""
     cage = fit.world_from_head.apply(model.cage(fit.coefficients))
     normals = vertex_normals(cage, model.levels["cage"].faces)
     apart = ((wider.world_from_head.apply(wider_model.cage(wider.coefficients)) - cage) * normals).sum(axis=1)

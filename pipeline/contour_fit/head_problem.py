@@ -1,7 +1,7 @@
 """Builds the least-squares problem of one stage from its terms: rim, feature points, photographs and priors.
 
-A feature point's residual is ``(pi(X) - picked) / sigma`` in both image axes. Its sigma combines the noise of a click
-with the projected variation of the landmark between heads. The robust loss is Geman and McClure's.
+A feature point's residual is ``(pi(X) - picked) / sigma`` in both image axes. The feature point's sigma combines the
+noise of a click with the projected variation of the landmark between heads. The robust loss is Geman and McClure's.
 """
 
 from dataclasses import dataclass

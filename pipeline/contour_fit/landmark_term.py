@@ -58,7 +58,8 @@ class LandmarkTerm:
 
     def at(self, state: State) -> Residuals:
         """Returns the differences between the head's landmarks and the triangulated landmarks, in standard deviations.
-        They are one residual under Geman and McClure's loss, so that all landmarks lose their weight together."""
+        The differences form one residual under Geman and McClure's loss, so that all landmarks lose their weight
+        together."""
         observed = self.observed
         moved = np.einsum("m,mnc->nc", state.coefficients, observed.basis[: len(state.coefficients)])
         points = state.world_from_head.apply(observed.mean + moved)

@@ -1,15 +1,15 @@
 """Computes the uncertainty of a fitted head: its Laplace posterior and the standard deviation of every vertex.
 
 Where no photograph constrains the surface, mostly under hair, the posterior equals the prior, so the prior's variance
-must be right. There a head of the model's population deviates by half of the kernel's standard deviation, a head of
-another population by its double. ``with_estimated_prior`` therefore estimates the prior's variance from the
+must be right. Under hair a head of the model's population deviates by half of the kernel's standard deviation, a head
+of another population by its double. ``with_estimated_prior`` therefore estimates the prior's variance from the
 coefficients that the photographs determine (the evidence framework; MacKay 1992, *Bayesian interpolation*,
 https://doi.org/10.1162/neco.1992.4.3.415).
 
 Two errors that no coefficient describes are added. The kernel moves the surface along its normals only, but landmarks
-of real heads also shift along the surface. This shift gets the standard deviation that the kernel has along the normal
-(``Fit.sliding_mm``). The second error is relief finer than the modes. A fit of eigenheads alone contains neither error
-(see ``with_span_misfit``).
+of real heads also shift along the surface. The shift along the surface gets the standard deviation that the kernel has
+along the normal (``Fit.sliding_mm``). The second additional error is relief finer than the modes. A fit of eigenheads
+alone contains neither error (see ``with_span_misfit``).
 """
 
 import math

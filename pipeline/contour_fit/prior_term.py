@@ -5,10 +5,11 @@ Most faces are neutral or combine few expressions. The prior of an expression's 
 
     p(w) ~ (1 + w / t)^-2 N(w; 0, 1),    0 <= w <= 1
 
-The first factor is Lomax's distribution (1954) of shape 1, whose median is t. It suppresses small weights that explain
-little, and hardly penalises large weights, unlike a Gaussian or an exponential prior. The normal equations replace the
-cost's logarithm by its tangent, which lies above it, so a step that lowers the tangent also lowers the logarithm
-(Candes, Wakin and Boyd 2008, *Enhancing sparsity by reweighted l1 minimization*). ``head_problem`` bounds the weights.
+The first factor of the prior is Lomax's distribution (1954) of shape 1, whose median is t. Lomax's distribution
+suppresses small weights that explain little, and hardly penalises large weights, unlike a Gaussian or an exponential
+prior. The normal equations replace the cost's logarithm by its tangent, which lies above it, so a step that lowers the
+tangent also lowers the logarithm (Candes, Wakin and Boyd 2008, *Enhancing sparsity by reweighted l1 minimization*).
+``head_problem`` bounds the weights.
 
 The priors of the coefficients, of log scale and of each camera's correction are Gaussian.
 """
@@ -34,7 +35,7 @@ def weights_of(problem: ContourProblem, coefficients: Float[np.ndarray, " m"]) -
 
 
 def weight_slope(weights: Float[np.ndarray, " e"]) -> Float[np.ndarray, " e"]:
-    """Returns ``TAIL / (t + w)`` for each expression weight w, where t is ``EXPRESSION_MEDIAN``. It is half the
+    """Returns ``TAIL / (t + w)`` for each expression weight w, where t is ``EXPRESSION_MEDIAN``. The slope is half the
     derivative of ``2 TAIL log(1 + w / t)``, the heavy-tailed factor of the weights' prior."""
     return TAIL / (EXPRESSION_MEDIAN + weights)
 

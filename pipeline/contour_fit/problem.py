@@ -212,8 +212,8 @@ def make_problem(
 
 @lru_cache(maxsize=4)  # models are few, jobs are many
 def level_basis(model: HeadModel, name: str) -> LevelBasis:
-    """Returns the mean and modes (head frame, mm) of a mesh level. They are stored at the level's vertices or at those
-    of the coarse cage mesh, whichever are fewer."""
+    """Returns the mean and modes (head frame, mm) of a mesh level. Mean and modes are stored at the level's vertices or
+    at those of the coarse cage mesh, whichever are fewer."""
     level = model.levels[name]
     if level.count < len(model.mean):
         coarse_basis = model.basis(name, len(model.modes)).transpose(1, 2, 0)
@@ -233,8 +233,8 @@ def level_topology(model: HeadModel, name: str) -> Topology:
 
 
 def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Float[np.ndarray, "6 6"]:
-    """Returns the inverse prior covariance of a camera's correction (rad, mm). It follows from the camera's calibrated
-    covariance or, if there is none, from an error of ``error_px`` in the image.
+    """Returns the inverse prior covariance of a camera's correction (rad, mm). The covariance follows from the camera's
+    calibrated covariance or, if there is none, from an error of ``error_px`` in the image.
 
     The default prior moves the image of a head of 100 mm radius at ``depth_mm`` by ``error_px`` RMS. Half of the
     variance is due to rotation and half to translation, because both shift the image of a head alike.

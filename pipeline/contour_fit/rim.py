@@ -1,10 +1,11 @@
 """Finds the rim of a head in every camera without drawing an image.
 
-For a surface point X with normal N and a camera centre C_k, the rim is where ``N . (X - C_k) = 0``. This product is
-interpolated along mesh edges to find its zero crossing. A rim point is on the *outer* outline if a step outwards leaves
-the model's mask. The test of this needs no drawn mask: it projects the edges where front-facing faces meet back-facing
-ones (counted twice) or where the mesh ends (counted once). The winding number of these edges around a pixel is the
-number of faces over the pixel. The edges are sorted by image rows, so a test visits the edges of one row only.
+For a surface point X with normal N and a camera centre C_k, the rim is where ``N . (X - C_k) = 0``. The product ``N .
+(X - C_k)`` is interpolated along mesh edges to find the zero crossing. A rim point is on the *outer* outline if a step
+outwards leaves the model's mask. The test of this needs no drawn mask: it projects the edges where front-facing faces
+meet back-facing ones (counted twice) or where the mesh ends (counted once). The winding number of these edges around a
+pixel is the number of faces over the pixel. The edges are sorted by image rows, so a test visits the edges of one row
+only.
 
 The tangent plane at the rim contains the viewing ray. With P = d(pixel)/dX the outline's normal in the image is
 therefore ``n = l / |l|, l = N^T P^+``, and ``n^T P = N^T / |l|``. A shift of the rim along the surface has no effect to

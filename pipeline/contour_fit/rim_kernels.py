@@ -1,4 +1,4 @@
-"""Contains the compiled loops of ``rim``. The first loops pass over the mesh for all views at once; the later ones
+"""Contains the compiled loops of ``rim``. The first loops pass over the mesh for all views at once; the later loops
 treat one view each, in parallel."""
 
 from typing import NamedTuple

@@ -6,8 +6,8 @@ The residual of a rim sample at the pixel u is the silhouette's signed distance 
     dr/dpose   = n^T P [-[X - c]x, I, X - c]        rotation and log scale about the head's place c, translation
     dr/dcamera = n^T P_c [-[X_c]x, I]               left perturbation of camera_from_world
 
-Each sample represents ``length`` px of outline. Its weight is ``length / (l sigma^2)``, the Fisher information of an
-outline with noise sigma and correlation length l.
+Each sample represents ``length`` px of outline. The weight of a sample is ``length / (l sigma^2)``, the Fisher
+information of an outline with noise sigma and correlation length l.
 
 Clutter (hair, shoulders, clothes) only adds area, so the silhouette's outline may lie outside the model but hardly ever
 inside. The scale of the robust loss (Geman-McClure) is therefore small where the model lies inside the silhouette, and
@@ -105,8 +105,8 @@ class LinearisedRimTerm:
 
 
 def _loss(residual_px: Float[np.ndarray, " s"], scale_px: float) -> GemanMcClure:
-    """Returns the robust loss of residuals. Its scale is ``OUTSIDE_SCALE`` times larger where the model sticks out of
-    the silhouette."""
+    """Returns the robust loss of residuals. The scale of the loss is ``OUTSIDE_SCALE`` times larger where the model
+    sticks out of the silhouette."""
     return GemanMcClure(np.where(residual_px < 0, scale_px, OUTSIDE_SCALE * scale_px))
 
 

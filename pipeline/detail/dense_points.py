@@ -73,8 +73,8 @@ def thinned(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:
 
 @traced
 def dense_points(depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_world: Mesh) -> SurfacePoints:
-    """Returns the surface points on which enough views agree. They are thinned to one for each cell of a grid, part of
-    the head, and side of a thin sheet.
+    """Returns the surface points on which enough views agree. The points are thinned to one for each cell of a grid,
+    part of the head, and side of a thin sheet.
 
     Args:
         depth_maps: one for each view.
@@ -102,8 +102,8 @@ def dense_points(depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_w
 
 
 def count_views_needed(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"]) -> int:
-    """Returns how many views must agree on a point near the head. It is half of the largest number of cameras within
-    ``TOGETHER_DEG`` of each other, but at least two and at most ``MAX_VIEWS_NEEDED``.
+    """Returns how many views must agree on a point near the head. The number is half of the largest number of cameras
+    within ``TOGETHER_DEG`` of each other, but at least two and at most ``MAX_VIEWS_NEEDED``.
 
     Args:
         cameras: of the depth maps.

@@ -137,8 +137,8 @@ def _bending(topology: Topology) -> sparse.csr_array:
 def _solved(
     bending: sparse.csr_array, stiffness: float, weights: Float[np.ndarray, " v"], wanted: Float[np.ndarray, "v k"]
 ) -> Float[np.ndarray, "v k"]:
-    """Returns the smooth field that is nearest to the wanted values in weighted least squares. It uses conjugate
-    gradients, since a factorisation for 53,000 vertices takes six seconds."""
+    """Returns the smooth field that is nearest to the wanted values in weighted least squares. The solver uses
+    conjugate gradients, since a factorisation for 53,000 vertices takes six seconds."""
     system = sparse.csr_array(sparse.diags_array(weights + MIN_WEIGHT) + stiffness * bending)
     inverse = sparse.diags_array(1.0 / np.asarray(system.diagonal(), dtype=np.float64))
     right = weights[:, None] * wanted

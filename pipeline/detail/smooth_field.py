@@ -3,7 +3,7 @@ matrix.
 
 The field follows Lindgren, Rue and Lindstroem (2011), *An explicit link between Gaussian fields and Gaussian Markov
 random fields* (https://doi.org/10.1111/j.1467-9868.2011.00777.x). The solution of ``(kappa^2 - Laplace) tau x = white
-noise`` on a surface is a Matern field with nu = 1 and standard deviation ``1 / (sqrt(4 pi) kappa tau)``. Its
+noise`` on a surface is a Matern field with nu = 1 and standard deviation ``1 / (sqrt(4 pi) kappa tau)``. The field's
 correlation falls to 0.14 at ``sqrt(8) / kappa``. With linear finite elements, lumped masses M and stiffness S,
 
     precision = tau^2 K M^-1 K,    K = kappa^2 M + S.

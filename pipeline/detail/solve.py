@@ -32,8 +32,8 @@ NEIGHBOURS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeMesh:
-    """Holds a mesh of control points, the nodes. Their displacement defines that of the full mesh: ``full = operator @
-    nodes``."""
+    """Holds a mesh of control points, the nodes. The nodes' displacement defines that of the full mesh: ``full =
+    operator @ nodes``."""
 
     faces: Int[np.ndarray, "f 3"]
     operator: sparse.csr_array  # (v, n)

@@ -50,8 +50,8 @@ class CameraFigures:
 def camera_figures(
     model: HeadModel, fit: Fit, silhouettes: Mapping[str, Silhouette], rig: Rig, fitted: Masks, started: Masks
 ) -> dict[str, CameraFigures]:
-    """Computes the figures of every camera, in the order of the rig. It uses the calibrated cameras without the
-    corrections of the fit."""
+    """Computes the figures of every camera, in the order of the rig. The function uses the calibrated cameras without
+    the corrections of the fit."""
     level = model.levels["full"]
     vertices = fit.world_from_head.apply(model.vertices(fit.coefficients))
     views = pack_views(rig, {camera.name: silhouettes[camera.name].distance for camera in rig})

@@ -1,7 +1,7 @@
 """Checks the head's pose against the face in the photographs, and against the cost of other poses.
 
-The module warns if the head misses the face in most views that show one. It also warns if no face was found, since the
-pose then depends on outlines only. The module also computes gaze and pupil distance from the irises.
+The module warns if the head misses the face in most views that show one. The module also warns if no face was found,
+since the pose then depends on outlines only. The module also computes gaze and pupil distance from the irises.
 """
 
 from collections.abc import Mapping
@@ -142,8 +142,8 @@ def pupils(eyes: Mapping[str, Iris | UnseenEye]) -> dict[str, Measurement]:
 def pupil_distance(eyes: Mapping[str, Iris | UnseenEye]) -> Measurement | None:
     """Returns the far pupil distance (mm); None unless both irises were found.
 
-    The far pupil distance is measured while both eyes look at a point infinitely far ahead (ISO 13666). It equals the
-    distance between the centres of the eyeballs, whatever the eyes looked at in the photographs."""
+    The far pupil distance is measured while both eyes look at a point infinitely far ahead (ISO 13666). The far pupil
+    distance equals the distance between the centres of the eyeballs, whatever the eyes looked at in the photographs."""
     right, left = eyes.get("right"), eyes.get("left")
     if not isinstance(right, Iris) or not isinstance(left, Iris):
         return None

@@ -3,7 +3,7 @@
 The picture may have any orientation. The detector proposes faces in the picture rotated by 0, 90, 180 and 270 degrees,
 since it tolerates 45 degrees either way. A proposal is accepted if the landmark network confirms it in a crop around
 the landmarks. The network runs on the crop and on its mirror image, and the two results are averaged. Crops are
-squares, rotated so that the face is upright in them. They are sampled from an image pyramid at the level near their
+squares, rotated so that the face is upright in them. Crops are sampled from an image pyramid at the level near their
 resolution, to avoid aliasing."""
 
 from collections.abc import Iterator, Sequence

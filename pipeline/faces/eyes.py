@@ -1,7 +1,7 @@
 """Finds the irises and the lids' edges of a detected face in one picture.
 
-The network for eyes has a higher resolution than the network for the face's 468 landmarks. It follows the visible edges
-of the lids, whereas the landmarks are biased towards the opening of an average eye.
+The network for eyes has a higher resolution than the network for the face's 468 landmarks. The network for eyes follows
+the visible edges of the lids, whereas the landmarks are biased towards the opening of an average eye.
 """
 
 from collections.abc import Collection, Mapping

@@ -12,10 +12,10 @@ and the lines of sight meet half a metre away or farther. If the eyes clearly co
 each keeps its own result.
 
 The fit iterates: it searches limbus edges and pupils near the circle, fits the circle to them, and narrows the search.
-The pupil lies on the circle's axis. Its distance in front of the limbus is fitted too, since the cornea's refraction
-shifts its image. The pupil is the darkest disc in the iris, of the same size in all views. Pixels with the reflection
-of a lamp are left out. The square root of the brightness is used, because its noise is the same in bright and dark
-pixels.
+The pupil lies on the circle's axis. The pupil's distance in front of the limbus is fitted too, since the cornea's
+refraction shifts the pupil's image. The pupil is the darkest disc in the iris, of the same size in all views. Pixels
+with the reflection of a lamp are left out. The square root of the brightness is used, because its noise is the same in
+bright and dark pixels.
 """
 
 from collections.abc import Mapping, Sequence

@@ -6,8 +6,8 @@ tracking from monocular video for digital puppetry* (2020), places the lids and 
 ``packs`` (Apache-2.0), and their sha256 is checked. OpenCV's classic engine is used, since the new engine of version
 5.0 returns only one output of a network.
 
-Pixel (0, 0) of a network's input is the centre of its top-left pixel. This was measured: the x of a point and of its
-mirror image add up to 190.8 px, and 191 px are expected.
+Pixel (0, 0) of a network's input is the centre of its top-left pixel. A measurement confirmed this: the x of a point
+and of its mirror image add up to 190.8 px, and 191 px are expected.
 """
 
 import hashlib

@@ -77,8 +77,8 @@ def has_front(rig: Rig) -> bool:
 
 
 def _fan(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """Returns the mean of the unit vectors from the subject to the cameras. Its length is 1 for cameras at the same
-    place, 0 for a full ring."""
+    """Returns the mean of the unit vectors from the subject to the cameras. The mean's length is 1 for cameras at the
+    same place, 0 for a full ring."""
     directions = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return directions.mean(axis=0)

@@ -4,8 +4,8 @@ A search of a whole picture takes 0.06 s, a test at a known position 0.01 s. Vie
 until two or more agree on a face; the face is then projected into all other views.
 
 A face in only one view gets its pose from the mean adult's face points. On rendered captures this pose differs from the
-result of all views by 5 degrees (median; 17 degrees for profiles). Its distance follows from the face's size, with an
-RMS error of 9 % (24 % for profiles) plus the difference between the subject's size and the mean adult's.
+result of all views by 5 degrees (median; 17 degrees for profiles). The distance of such a face follows from the face's
+size, with an RMS error of 9 % (24 % for profiles) plus the difference between the subject's size and the mean adult's.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -87,8 +87,8 @@ def point_noise_px(
     camera: Camera,
     which: slice = ALL_POINTS,
 ) -> Float[np.ndarray, " n"]:
-    """Returns the standard deviation (px, along each axis) of the independent error of each point in a view. It grows
-    as the skin at the point turns away from the camera."""
+    """Returns the standard deviation (px, along each axis) of the independent error of each point in a view. The error
+    grows as the skin at the point turns away from the camera."""
     straight, growth = point_table().point_noise
     normals = point_table().normals[which] @ world_from_face.rotation.T
     towards = camera.centre_world - points_world

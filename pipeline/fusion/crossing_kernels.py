@@ -104,8 +104,8 @@ def crossing_triangles(
     first: int,
     last: int,
 ) -> None:
-    """Marks triangles that cross another triangle in ``crossing`` (f), in place. It tests pairs with an ``active``
-    triangle at the positions ``first`` to ``last`` of ``order``. Threads may run at the same time.
+    """Marks triangles that cross another triangle in ``crossing`` (f), in place. The function tests pairs with an
+    ``active`` triangle at the positions ``first`` to ``last`` of ``order``. Threads may run at the same time.
 
     ``order``, sorted ``keys`` and ``spans`` (the number of cells) are as in ``cells.Cells``; ``boxes`` (f, 6) is in the
     sorted order.

@@ -5,9 +5,9 @@ The membrane is solved by successive over-relaxation in a chequerboard order. No
 the result does not depend on the order of threads.
 
 A surface net (``pipeline.geometry.surface_nets``) is a manifold exactly if the set of inside nodes is well composed
-(Latecki, *3D well-composed pictures*, 1997). This means that no square of four nodes has inside nodes on one diagonal
-and outside nodes on the other, and no cell has two opposite corners that differ from its six others. The signs of
-single nodes are changed until both conditions hold.
+(Latecki, *3D well-composed pictures*, 1997). In a well-composed set no square of four nodes has inside nodes on one
+diagonal and outside nodes on the other, and no cell has two opposite corners that differ from its six others. The signs
+of single nodes are changed until both conditions hold.
 """
 
 from typing import NamedTuple

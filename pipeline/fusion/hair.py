@@ -6,8 +6,8 @@ fused surface would be rough, with pockets and handles. So depth of hair gets a 
 the scalp. So at the silhouettes' rims hair is moved outwards until it is as far inside all silhouettes as visible
 strands. Hair with a smooth surface has depth nearly everywhere, and is not changed.
 
-Long hair often has hardly any measured depth. It is modelled as a smooth shell inside the visual hull, whose distance
-from the hull is estimated from the few measured points.
+Long hair often has hardly any measured depth. Such hair is modelled as a smooth shell inside the visual hull, whose
+distance from the hull is estimated from the few measured points.
 """
 
 from collections.abc import Mapping, Sequence
@@ -126,8 +126,8 @@ def only_where(kept: Bool[np.ndarray, "h w"], depth_map: DepthMap) -> DepthMap:
 
 
 def without_specks(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> DepthMap:
-    """Removes isolated depths of skin and clothes from a depth map in which plain clothes have hardly any depth. Such
-    depths are chance matches and lie centimetres in front of the subject."""
+    """Removes isolated depths of skin and clothes from a depth map in which plain clothes have hardly any depth.
+    Isolated depths are chance matches and lie centimetres in front of the subject."""
     _, hair, clothes = np.moveaxis(shown_parts(depth_map, parts, rig) > LIKELY, 2, 0)
     known, (height, width) = depth_map.known[::PIXEL_EVERY, ::PIXEL_EVERY], depth_map.depth_mm.shape
     if not clothes.any() or known[clothes].mean() > PLAIN_SHARE:

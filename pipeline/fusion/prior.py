@@ -63,8 +63,8 @@ def _offsets(
     tree: PointTree, normals: Float[np.ndarray, "v 3"], seen: SeenSurface
 ) -> tuple[Float[np.ndarray, "2 v"], Float[np.ndarray, "2 v"]]:
     """Returns the offsets (mm) of the seen surface from the head and from the hull around each vertex of the head, and
-    their mean squares (mm^2). They are extrapolated from vertices near seen points by inverse squared distances. With
-    too few points only the head is used, with offset 0."""
+    their mean squares (mm^2). The offsets are extrapolated from vertices near seen points by inverse squared distances.
+    With too few points only the head is used, with offset 0."""
     vertices = tree.points
     far, near = nearest(tree, seen.points, within=THICKEST_MM)
     within = np.isfinite(far)

@@ -7,7 +7,7 @@ At every node each view contributes the distance to the surface that it sees, an
 the requested spacing; each finer level has nodes only near the surface of the coarser level.
 
 The method follows Curless and Levoy, *A volumetric method for building complex models from range images*, SIGGRAPH
-1996. Here the views are combined robustly, and silhouettes are inequality constraints.
+1996. In this module the views are combined robustly, and silhouettes are inequality constraints.
 """
 
 from collections.abc import Sequence
@@ -142,8 +142,9 @@ class Level:
 
 
 def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: float) -> Level:
-    """Computes the signed distance on one grid. It follows the views' votes, is positive outside the silhouettes, and
-    tends to ``start`` where hardly any view sees a node. ``sweeps`` and ``factor`` are parameters of the relaxation."""
+    """Computes the signed distance on one grid. The signed distance follows the views' votes, is positive outside the
+    silhouettes, and tends to ``start`` where hardly any view sees a node. ``sweeps`` and ``factor`` are parameters of
+    the relaxation."""
     reach = np.float32(REACH * grid.step_mm)
     start = np.clip(start, -reach, reach)
     blend = np.where(votes.weight < 0, UNDECIDED_BLEND_MM, BLEND_MM)
@@ -301,8 +302,8 @@ def _box(
 
 
 def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface, cut: Cut) -> Field:
-    """Returns the start value of the signed distance. It is the measured distance where views certainly see the
-    surface, and elsewhere the distance to the surface predicted from visual hull and head."""
+    """Returns the start value of the signed distance. The start value is the measured distance where views certainly
+    see the surface, and elsewhere the distance to the surface predicted from visual hull and head."""
     prior = np.maximum(votes.value, votes.bound).astype(float)
     if head_world is not None:
         weak = (votes.weight > 0) & (votes.weight < WEAK) & (votes.bound < 0)

@@ -10,9 +10,9 @@ regions without depth continue the heights at their border smoothly. A head with
 measured surface. Hair (p = 0) is not changed, and p gives a smooth transition to skin.
 
 The robust weight w falls where a measured height differs from the estimate by several combined standard deviations
-(Geman and McClure's weights, from wide to narrow). This rejects single craters and specks, but keeps whole regions of
-different height, such as an open mouth. Where depth and head differ over a whole region, the head's standard deviation
-is enlarged, since the model cannot represent the subject there.
+(Geman and McClure's weights, from wide to narrow). The weight rejects single craters and specks, but keeps whole
+regions of different height, such as an open mouth. Where depth and head differ over a whole region, the head's standard
+deviation is enlarged, since the model cannot represent the subject there.
 """
 
 from dataclasses import dataclass

@@ -2,9 +2,9 @@
 
 Expressions and other displacements can make closed lips intersect, fold closing lids behind the brow, or push an ear
 into the head. Each bad region, if necessary with rings of triangles around it, first gets the shape of the model's mean
-head, which has no bad triangles. Its displacement from the mean head is interpolated from the region's border, so that
-an ear remains an ear. Regions that are still bad become smooth surfaces through their border (membranes). All other
-vertices stay unchanged."""
+head, which has no bad triangles. The region's displacement from the mean head is interpolated from the region's border,
+so that an ear remains an ear. Regions that are still bad become smooth surfaces through their border (membranes). All
+other vertices stay unchanged."""
 
 from dataclasses import dataclass
 from functools import lru_cache

@@ -59,8 +59,8 @@ def vote(
     A view's vote is the distance to the tangent plane of the pixel at the node's projection. Votes are limited to
     ``reach`` in front of the plane, and left out if the node lies more than ``behind`` behind it. The value is the mean
     of the votes that agree with their weighted median; the weight falls with the square of their fraction. A node
-    without a vote has weight 0 (or ``UNDECIDED``). Its value is the distance to the visual hull, or to the back of a
-    body of limited thickness behind a seen surface.
+    without a vote has weight 0 (or ``UNDECIDED``). The value of such a node is the distance to the visual hull, or to
+    the back of a body of limited thickness behind a seen surface.
 
     ``index`` (n, 3) and ``corner`` (3, world frame, mm) give the positions of nodes, ``step_mm`` apart. ``limits`` are
     reach, behind, largest difference of agreeing votes, the deviation (mm) of unit weight and the lower limit of
@@ -209,8 +209,8 @@ def mark_contradicted(target: int, views: Pixels, blocks: np.ndarray, width: int
 
 @njit(cache=True, nogil=True)
 def write_outline(crop: np.ndarray, lens: np.ndarray, width: int, distance: np.ndarray, shown: np.ndarray) -> None:
-    """Fills two columns of ``shown``, in units of ``PIXEL_STEP``, at the pixels of an undistorted crop. They are the
-    signed distances (px of the crop, negative inside) to the silhouette's contour and to the photograph's border.
+    """Fills two columns of ``shown``, in units of ``PIXEL_STEP``, at the pixels of an undistorted crop. The columns are
+    the signed distances (px of the crop, negative inside) to the silhouette's contour and to the photograph's border.
 
     Outside the photograph the contour distance is copied from the nearest border pixel, so that a shoulder continues
     beyond the border. ``crop`` is fx, fy, cx, cy of the crop, ``width`` its width; ``lens`` is the photograph's
@@ -290,9 +290,9 @@ def measure(
 def depth_between(
     depths: np.ndarray, shown: np.ndarray, start: int, size: np.ndarray, column: float, row: float, near: int
 ) -> float:
-    """Returns the depth (mm) at a point between four pixels. It is interpolated if all four show the same surface, else
-    it is that of the nearest pixel, with index ``near`` in ``shown``. ``start`` is the index of the view's first
-    pixel."""
+    """Returns the depth (mm) at a point between four pixels. The depth is interpolated if all four show the same
+    surface, else it is that of the nearest pixel, with index ``near`` in ``shown``. ``start`` is the index of the
+    view's first pixel."""
     c, r = min(int(column), size[1] - 2), min(int(row), size[0] - 2)
     a = start + r * size[1] + c
     b, d, e = a + 1, a + size[1], a + size[1] + 1

@@ -1,7 +1,7 @@
 """Defines the value ``Reconstruction``: the products of all stages, which ``pipeline.results.write`` writes.
 
-The value contains everything for the result folder. It is reproducible, except for the seconds of the stages, which
-only report.json contains.
+The value contains everything for the result folder. The value ``Reconstruction`` is reproducible, except for the
+seconds of the stages, which only report.json contains.
 """
 
 from collections.abc import Mapping

@@ -251,7 +251,8 @@ def smooth_odds(odds: Plane, image: Picture, background: Background) -> Float[np
 
 def find_shadows(image: Picture, plate: Picture, chi2: Plane, variance: Picture, odds: Plane) -> tuple[Plane, Mask]:
     """Returns the chi-squared of each pixel against the plate scaled to the best brightness, and a mask of soft shadows
-    and reflected light. Such pixels differ from the plate only in brightness, and the difference begins gradually."""
+    and reflected light. Shadows and reflected light differ from the plate only in brightness, and the difference begins
+    gradually."""
     ratio = ((image * plate / variance) @ CHANNEL_SUM) / np.maximum((plate**2 / variance) @ CHANNEL_SUM, 1e-6)
     strength = np.sqrt(chi2 / (2 * ANY_COLOUR_ODDS))
     best, soft = chi2, np.zeros(odds.shape, bool)

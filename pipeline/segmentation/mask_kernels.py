@@ -63,8 +63,8 @@ def mean_field_sweeps(odds: np.ndarray, residual: np.ndarray, strength: float, s
 
 @njit(cache=True, nogil=True)
 def undecided_pixels(odds: np.ndarray) -> np.ndarray:
-    """Returns the flat indices of the pixels that mean-field sweeps can change. Such a pixel has, within two pixels,
-    log odds that are not clipped or that differ from its own."""
+    """Returns the flat indices of the pixels that mean-field sweeps can change. A pixel can change if it has, within
+    two pixels, log odds that are not clipped or that differ from its own."""
     height, width = odds.shape
     out = np.empty(height * width, np.int64)
     count = 0

@@ -1,9 +1,9 @@
 """Finds a sub-pixel contour from a coarse mask: estimates the alpha of pixels in a band around the mask's outline.
 
 The background B of every pixel is known, and the subject's colour F is taken from pixels just inside the mask. In
-linear light a pixel is ``I = q F + (1 - alpha) B``. Here q is alpha times the local brightness of the subject, which
-darkens where its surface turns away from the camera. Least squares over the channels, with q close to alpha, gives
-alpha. The contour is where alpha is one half, which is the position of the edge under any symmetric blur.
+linear light a pixel is ``I = q F + (1 - alpha) B``. The factor q is alpha times the local brightness of the subject,
+which darkens where its surface turns away from the camera. Least squares over the channels, with q close to alpha,
+gives alpha. The contour is where alpha is one half, which is the position of the edge under any symmetric blur.
 
 Colours are mixed in linear light; with sRGB codes the contour of dark hair was 0.25 px too far inside. Without q, the
 contour of cheeks, which darken towards their edge, was 0.2 px too far inside. B is first matched to the pixels just
@@ -58,7 +58,7 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision) -> Matte:
     """Computes the subject's alpha from a coarse decision.
 
     Where the subject's colour differs clearly from the plate, alpha is solved in a band that is wide enough for thin
-    hair. Elsewhere alpha follows the coarse decision, and is solved only at its border.
+    hair. Where the colours are similar, alpha follows the coarse decision, and is solved only at its border.
     """
     background, mask, clear = decision.background, decision.mask, decision.clear
     probability = np.where(mask, np.maximum(decision.probability, 0.6), np.minimum(decision.probability, 0.4))

@@ -164,7 +164,7 @@ def _concerns(message: Message, code: str) -> bool:
 
 
 def _as_cut(share: Float32[np.ndarray, "h w"], counted: Bool[np.ndarray, "h w"] | None = None) -> Silhouette:
-    """Returns the silhouette of a view whose mask was cut along image edges. Its outline is weak where overlapping
+    """Returns the silhouette of a view whose mask was cut along image edges. The outline is weak where overlapping
     windows of the cut disagree. Only the outline of the pixels ``counted`` is judged; None means all pixels."""
     alpha, holes = _without_specks(share, np.zeros_like(share))
     mask = alpha > 0.5
@@ -233,7 +233,7 @@ def _without_specks(
     of remaining holes.
 
     A small hole is noise. A larger hole is noise if the ``coarse`` probability, in which the sensor's noise is
-    averaged, is high in all of it. This happens if skin has the colour of the backdrop.
+    averaged, is high in all of it. Such holes occur if skin has the colour of the backdrop.
     """
     mask = alpha > 0.5
     labels, areas = _labelled(mask, 4)
@@ -296,8 +296,8 @@ def _quality(
 
 
 def _crown_side(mask: Bool[np.ndarray, "h w"]) -> str:
-    """Returns the image border next to the crown. It is opposite the border through which the body leaves the picture,
-    of which the body fills nearly the whole length. Cameras may be mounted on their side."""
+    """Returns the image border next to the crown. The crown's border is opposite the border through which the body
+    leaves the picture and which the body nearly fills. Cameras may be mounted on their side."""
     across, down = mask.sum(axis=0), mask.sum(axis=1)
     widest = {"top": down.max(), "bottom": down.max(), "left": across.max(), "right": across.max()}
     touched = {"top": mask[0].sum(), "bottom": mask[-1].sum(), "left": mask[:, 0].sum(), "right": mask[:, -1].sum()}

@@ -40,8 +40,8 @@ class Alignment:
 
 
 def front_camera(rig: Rig, settings: Settings) -> str:
-    """Returns the name of the camera that the subject faces. It is the camera in the settings or, by default, the
-    middle camera of the rig. Raises EigenheadError if the settings name a camera that the rig does not have."""
+    """Returns the name of the camera that the subject faces. The result is the camera in the settings or, by default,
+    the middle camera of the rig. Raises EigenheadError if the settings name a camera that the rig does not have."""
     if settings.front is None:
         return rig.front_camera()
     if settings.front not in rig:

@@ -34,8 +34,8 @@ class Depth:
 
 
 def is_refined(head: HeadFit, settings: Settings) -> bool:
-    """Returns True if a later stage deforms the head to the measured surface. This requires a fit that used the
-    photographs, and the detail ``fine`` in the settings."""
+    """Returns True if a later stage deforms the head to the measured surface. The deformation requires a fit that used
+    the photographs, and the detail ``fine`` in the settings."""
     return head.detail.level == "photo" and settings.detail in FINE_LEVELS
 
 

@@ -105,8 +105,9 @@ def _crop(
 
 
 def crop_camera(camera: Camera, silhouette: Silhouette, scale: float) -> Camera:
-    """Returns a pinhole camera at the pose of ``camera`` whose image just contains the subject. Its pixels are 1 /
-    ``scale`` as wide as the camera's. Width and height are multiples of 2^(``LEVELS`` - 1), for the image pyramid.
+    """Returns a pinhole camera at the pose of ``camera`` whose image just contains the subject. The pinhole camera's
+    pixels are 1 / ``scale`` as wide as the camera's. Width and height are multiples of 2^(``LEVELS`` - 1), for the
+    image pyramid.
 
     Where the photograph cuts the subject off, the crop extends ``MARGIN_PX`` beyond the photograph; these pixels are
     marked as unseen.

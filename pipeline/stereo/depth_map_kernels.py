@@ -2,9 +2,9 @@
 bias, upsampling, plane fits and the removal of specks.
 
 A speck is a small separate piece of surface, which may be a wrong match. Where skin has no texture, all depths along a
-ray match equally well, and overlapping windows make the same error. Such errors form pieces of a few windows' size, in
-front of or behind the surface around them. The pixels of a speck agree with each other, so neither planes of neighbours
-nor an average removes it.
+ray match equally well, and overlapping windows make the same error. Matching errors form pieces of a few windows' size,
+in front of or behind the surface around them. The pixels of a speck agree with each other, so neither planes of
+neighbours nor an average removes it.
 """
 
 import numpy as np

@@ -2,8 +2,8 @@
 head or to the back of the hull.
 
 Hair lies between skull and hull, clothes inside the hull, and skin within a few mm of the fitted head, so the range is
-short. It is computed on the smallest crops. Its two bounds are smooth surfaces, between which the search interpolates
-slopes.
+short. The range is computed on the smallest crops. The range's two bounds are smooth surfaces, between which the search
+interpolates slopes.
 """
 
 from collections.abc import Sequence

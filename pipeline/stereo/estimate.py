@@ -14,7 +14,7 @@ them.
 
 From one image size to the next, planes are upsampled, pixels take over better planes of their neighbours, and each
 plane moves to the best match. A part of the information from the smaller size is kept, because its larger windows
-contain more shading. This part is smaller where the surface has relief, which large windows miss.
+contain more shading. The kept part is smaller where the surface has relief, which large windows miss.
 
 Each view is refined by itself, and all views are compared at the end, so the result does not depend on the order of
 threads.
@@ -116,7 +116,7 @@ MAX_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
 
 
 def doubled(fields: Sequence[Field], stack: Stack) -> list[Field]:
-    """Upsamples the fields to twice their width and height, the size of ``stack``. They keep a part of their
+    """Upsamples the fields to twice their width and height, the size of ``stack``. The fields keep a part of their
     information."""
 
     def work(view: int) -> Field:

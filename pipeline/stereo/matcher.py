@@ -191,8 +191,8 @@ class ShaderMatcher:
 
 def packed_ways(stack: Stack, view: int, others: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m 16"]:
     """Packs the maps from a view's pixels to other views, one row for each, in the memory layout of the struct Way in
-    shaders/matching.glsl. The last three numbers of a row are integers. There is at least one row, since no GPU buffer
-    may be empty."""
+    shaders/matching.glsl. The last three numbers of a row are integers. The result has at least one row, since no GPU
+    buffer may be empty."""
     ways = stack.homographies(view, others)
     packed = np.zeros((max(len(ways), 1), 16), np.float32)
     packed[: len(ways), :12], packed[: len(ways), 12] = ways[:, :12], ways[:, 15]

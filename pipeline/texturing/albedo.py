@@ -1,6 +1,6 @@
 """Estimates the albedo of a head: its texture without the shading and highlights of the photographs.
 
-The module takes the head, its texture and the linear colours of all views. It returns the light
+The module takes the head, its texture and the linear colours of all views. The module returns the light
 (``pipeline.texturing.light``) and an image of the skin's reflectance with the texture's UV layout. Highlights move with
 the camera, so the darker views of a vertex show its matt colour. The albedo is the texture, in linear light, multiplied
 by a smooth factor: matt colour over photographed colour, divided by the shading.
@@ -78,8 +78,8 @@ def estimate_albedo(
 def shine_left(
     shown: Float[np.ndarray, "v 3"], dim: Float[np.ndarray, "v 3"], seen: Bool[np.ndarray, " v"], around: Neighbourhood
 ) -> Float[np.ndarray, " v"]:
-    """Returns the fraction of each vertex's light that is not a highlight, from ``1 - MAX_SHINE`` to 1. This fraction
-    is the brightness of ``dim``, the colours in the darker views, divided by that of ``shown``. Hue is not used: a
+    """Returns the fraction of each vertex's light that is not a highlight, from ``1 - MAX_SHINE`` to 1. The fraction is
+    the brightness of ``dim``, the colours in the darker views, divided by that of ``shown``. Hue is not used: a
     highlight has the hue of its lamp, and the hue in a dark view is mostly noise."""
     ratio = dim.sum(axis=1) / np.maximum(shown.sum(axis=1), 1e-4)
     ratio = np.where(seen, ratio, 1.0)

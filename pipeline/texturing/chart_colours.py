@@ -1,9 +1,9 @@
 """Corrects the colours of photographs by means of a colour chart that is visible in the clean plates.
 
-The module takes the clean plates and the photographs. It returns photographs with true colours (linear sRGB, D65, white
-where the chart is white), which only the texture uses. It also returns the direction that the chart faced, from which
-the brightness of the studio's light follows. A camera that saw no chart gets the mean correction of the cameras that
-did.
+The module takes the clean plates and the photographs. The module returns photographs with true colours (linear sRGB,
+D65, white where the chart is white), which only the texture uses. The module also returns the direction that the chart
+faced, from which the brightness of the studio's light follows. A camera that saw no chart gets the mean correction of
+the cameras that did.
 """
 
 from collections.abc import Mapping

@@ -1,9 +1,9 @@
 """Estimates the light in which a head was photographed, from the shading of the head.
 
-The light is given by spherical harmonics up to second order, nine coefficients for each channel. They describe 98 % of
-the shading of a matt surface in any distant light (Ramamoorthi and Hanrahan, *An Efficient Representation for
-Irradiance Environment Maps*, SIGGRAPH 2001). The shading of a vertex leaves out light that the head itself blocks
-(Sloan, Kautz and Snyder, *Precomputed Radiance Transfer*, SIGGRAPH 2002).
+The light is given by spherical harmonics up to second order, nine coefficients for each channel. Spherical harmonics
+describe 98 % of the shading of a matt surface in any distant light (Ramamoorthi and Hanrahan, *An Efficient
+Representation for Irradiance Environment Maps*, SIGGRAPH 2001). The shading of a vertex leaves out light that the head
+itself blocks (Sloan, Kautz and Snyder, *Precomputed Radiance Transfer*, SIGGRAPH 2002).
 
 The skin of the face is assumed to have the same colour everywhere; brows, lips and beards are treated as outliers. A
 dark head in bright light and a bright head in dim light look the same, so the light's mean over the sphere is fixed at

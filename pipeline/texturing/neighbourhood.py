@@ -1,9 +1,9 @@
 """Stores mesh adjacency in compressed rows, interpolates unknown vertex values, and corrects photographs so that they
 meet without a visible seam.
 
-Waechter et al. (2014, section 4.3) add smooth corrections that make both sides of every seam agree. Here each view gets
-a smooth correction (sRGB codes) on the whole surface that it sees. The correction moves the view's colours to the
-robust mean of all views (a screened Poisson equation), so any two views can be blended.
+Waechter et al. (2014, section 4.3) add smooth corrections that make both sides of every seam agree. In this module each
+view gets a smooth correction (sRGB codes) on the whole surface that it sees. The correction moves the view's colours to
+the robust mean of all views (a screened Poisson equation), so any two views can be blended.
 """
 
 from dataclasses import dataclass

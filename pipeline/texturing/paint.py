@@ -1,9 +1,9 @@
 """Paints the texture image: reads each texel from the photographs chosen for the vertices of its triangle.
 
-A texel is a point on a triangle of the mesh. Its pixel in a photograph is interpolated from the projections of the
-triangle's corners. The photograph is read at that pixel with a sub-pixel window, and the corners' colour correction is
-added (``pipeline.texturing.neighbourhood``). If the corners have different photographs, these are blended. A texel that
-no camera sees gets the vertices' colours."""
+A texel is a point on a triangle of the mesh. A texel's pixel in a photograph is interpolated from the projections of
+the triangle's corners. The photograph is read at that pixel with a sub-pixel window, and the corners' colour correction
+is added (``pipeline.texturing.neighbourhood``). If the corners have different photographs, these are blended. A texel
+that no camera sees gets the vertices' colours."""
 
 import cv2
 import numpy as np
@@ -73,8 +73,8 @@ def paint_texture(
 def texture_size(
     layout: Layout, mesh_world: Mesh, views: Rig, region: Int[np.ndarray, " n"], *, wanted: int | None = None
 ) -> int:
-    """Returns the width of the texture in texels. It is ``wanted`` or, if None, the smallest of ``SIZES`` whose texels
-    on the face (the vertices ``region``) are as fine as the photographs' pixels."""
+    """Returns the width of the texture in texels. The width is ``wanted`` or, if None, the smallest of ``SIZES`` whose
+    texels on the face (the vertices ``region``) are as fine as the photographs' pixels."""
     if wanted is not None:
         return wanted
     inside = layout.faces[np.isin(layout.source[layout.faces], region).all(axis=1)]
@@ -109,8 +109,8 @@ def paint_charts(
     region: Int[np.ndarray, " n"],
     wanted: int | None = None,
 ) -> Atlas | None:
-    """Paints the texture of a closed mesh (mm) in UV charts along ``head_axes`` (columns, world frame). Its texels are
-    as fine as the photographs' pixels at the vertices ``region``. Returns None without a ``Decision``."""
+    """Paints the texture of a closed mesh (mm) in UV charts along ``head_axes`` (columns, world frame). The texture's
+    texels are as fine as the photographs' pixels at the vertices ``region``. Returns None without a ``Decision``."""
     if coloured.decision is None:
         return None
     towards = blurred_over_mesh(normals @ head_axes, *neighbours(mesh_world.faces, len(normals)), ROUNDS)

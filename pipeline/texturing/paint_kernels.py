@@ -124,8 +124,8 @@ def paint_rows(
     image: np.ndarray, row: int, rows: int, which: np.ndarray, texels: np.ndarray, faces: np.ndarray,
     source: np.ndarray, pictures: Pictures, choice: Choice,
 ) -> None:  # fmt: skip
-    """Paints the triangles ``which`` of a UV layout into ``image`` (h, w, 3; BGR), in place. It changes ``rows`` image
-    rows, the first of which is ``row``.
+    """Paints the triangles ``which`` of a UV layout into ``image`` (h, w, 3; BGR), in place. The function changes
+    ``rows`` image rows, the first of which is ``row``.
 
     ``texels`` (n, 2) are the corners' positions in the image, ``faces`` (f, 3) the layout's triangles, and ``source``
     (n) the head's vertex for each corner.

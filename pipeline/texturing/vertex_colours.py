@@ -1,13 +1,14 @@
 """Computes one colour for each vertex from the photographs (section 4.5).
 
-The module takes the fitted mesh, the photographs and the silhouettes. It returns a colour for each vertex, and the
-number of images used. ``blend = "reference"`` is the paper's weighted mean: an image counts if the vertex projects
+The module takes the fitted mesh, the photographs and the silhouettes. The module returns a colour for each vertex, and
+the number of images used. ``blend = "reference"`` is the paper's weighted mean: an image counts if the vertex projects
 inside its silhouette and is not occluded. The image's weight is the dot product of normal and viewing direction.
 
-The default blending also handles cameras that differ and edges that are blurred. It leaves margins at contours and
-occluding edges (``visibility``), sharpens photographs where they have detail, and corrects gain and offset of each
-camera (``colour_balance``). It averages in linear light. It gives little weight to a view that differs from the others
-in any channel (a highlight, a shadow), and less to cameras with a large correction. Unseen vertices are interpolated.
+The default blending also handles cameras that differ and edges that are blurred. The default blending leaves margins at
+contours and occluding edges (``visibility``), sharpens photographs where they have detail, and corrects gain and offset
+of each camera (``colour_balance``). The default blending averages in linear light. The default blending gives little
+weight to a view that differs from the others in any channel (a highlight, a shadow), and less to cameras with a large
+correction. Unseen vertices are interpolated.
 
 In head models whose eyes are openings, strips of triangles from lid to lid close the openings; the vertices of a strip
 lie on the lids' hidden edges. A strip takes its colours from the one photograph that sees most of it.
@@ -16,9 +17,9 @@ Each vertex is labelled with one photograph, which gives the texture's detail th
 There Be Color! Large-Scale Texturing of 3D Reconstructions*, ECCV 2014). The labels minimise a data term plus a Potts
 term. The data term combines projected area and angle, the visibility of all neighbours, the difference of a view's
 colour from the others, and the camera's correction. The Potts term is the cost of mesh edges between different labels.
-It is highest where the views disagree, so seams avoid eyes and lips. Waechter et al. label triangles; here vertices are
-labelled, and two photographs are blended in the triangles at a seam. Belief propagation minimises the sum (Felzenszwalb
-and Huttenlocher, *Efficient Belief Propagation for Early Vision*, IJCV 2006).
+The Potts term is highest where the views disagree, so seams avoid eyes and lips. Waechter et al. label triangles; here
+vertices are labelled, and two photographs are blended in the triangles at a seam. Belief propagation minimises the sum
+(Felzenszwalb and Huttenlocher, *Efficient Belief Propagation for Early Vision*, IJCV 2006).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -236,7 +237,7 @@ def texture(
 
 def wide_doubtful_surface(weights: Weights, mesh_world: Mesh) -> Bool[np.ndarray, " v"]:
     """Returns a mask of the vertices on large regions that no view sees well, such as the back of a head in front of
-    frontal cameras. Their colours are interpolated from other vertices."""
+    frontal cameras. The colours of these vertices are interpolated from other vertices."""
     total = weights.sum(axis=0)
     unsure = total < SURE_SHARE * np.median(total[total > 0])
     faces = mesh_world.faces[unsure[mesh_world.faces].all(axis=1)]

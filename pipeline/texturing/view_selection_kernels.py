@@ -17,8 +17,8 @@ RING_SHARE = 0.7  # of a view's quality that the neighbours decide: beside an oc
 
 @njit(cache=True, nogil=True)
 def ring_quality(weights: np.ndarray, starts: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Returns the quality (v, k) of each view at each vertex. It mixes the vertex's weight with the smallest weight of
-    its neighbours, which is small near occlusions. ``weights`` is (k, v)."""
+    """Returns the quality (v, k) of each view at each vertex. The quality mixes the vertex's weight with the smallest
+    weight of its neighbours, which is small near occlusions. ``weights`` is (k, v)."""
     cameras, count = weights.shape
     out = np.zeros((count, cameras), np.float32)
     for v in range(count):
@@ -281,9 +281,9 @@ def visibility_weights(
 ) -> np.ndarray:
     """Returns the weight (float32) with which one camera sees each point (v); 0 for a point that it does not see.
 
-    A point counts if it lies inside the silhouette by a margin, and no nearer surface of the depth map hides it. Its
-    weight is cosine^sharpness / depth^2, reduced towards the margin, and ``POOR`` times that at a flat angle or beside
-    an occluding edge.
+    A point counts if it lies inside the silhouette by a margin, and no nearer surface of the depth map hides it. A
+    point's weight is cosine^sharpness / depth^2, reduced towards the margin, and ``POOR`` times that at a flat angle or
+    beside an occluding edge.
 
     Args:
         pixels: of the points (v, 2).

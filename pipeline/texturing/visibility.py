@@ -5,7 +5,7 @@ not exact, so points near the contour or near an occluding edge are also exclude
 with the nearest depth in a small window, corrected for the surface's slope. A view near an occluding edge, or at a flat
 angle, counts only where no better view exists.
 
-This module also packs the photographs, and those chosen for each vertex, for compiled loops.
+This module also packs the photographs, and the choice of photographs for each vertex, for compiled loops.
 """
 
 from collections.abc import Mapping, Sequence

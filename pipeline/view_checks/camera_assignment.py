@@ -2,8 +2,8 @@
 
 Swapped cables or renamed files exchange the pictures of two cameras, or of more cameras in a cycle. A plane through two
 camera centres that touches the subject is tangent to both silhouettes (Wong and Cipolla, *Structure and motion from
-silhouettes*, ICCV 2001). Its error is tenths of a pixel for correct pictures, and tens of pixels for exchanged
-pictures.
+silhouettes*, ICCV 2001). The error of this tangency is tenths of a pixel for correct pictures, and tens of pixels for
+exchanged pictures.
 
 The module returns the picture that each camera should have, and whether this is certain. A camera that was moved, or
 whose mask is bad, contradicts the others with every picture, and keeps its own.
@@ -79,8 +79,8 @@ def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignme
 
 
 def own_misfit(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, float]:
-    """Returns, for each camera, the mean robust misfit of its tangent planes with the other cameras. It is about 0.2
-    for the right picture, 0.5 and more for another camera's picture."""
+    """Returns, for each camera, the mean robust misfit of its tangent planes with the other cameras. The misfit is
+    about 0.2 for the right picture, 0.5 and more for another camera's picture."""
     seen, hulls = outlined(silhouettes, rig)
     if len(seen) < MIN_CAMERAS:
         return dict.fromkeys(seen.names, CUT_OFF_MISFIT)

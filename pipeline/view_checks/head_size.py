@@ -2,8 +2,8 @@
 
 Cameras from another program have an arbitrary unit if no known length was supplied. If the outlines are three times too
 large, a fitted model lies inside the face, and every outline is treated as clutter. The head's diameter is measured
-without a model: going down from the crown, it is the width of the outline at the depth of half that width. It is 150 to
-290 mm for people, hair included.
+without a model: going down from the crown, it is the width of the outline at the depth of half that width. The head's
+diameter is 150 to 290 mm for people, hair included.
 
 The upward direction is the face's. Without a face it is that of the pictures or of the rig, whichever makes more
 outlines consistent with the same head. Nothing is refused if the photographs show a face of a human's size.

@@ -224,8 +224,8 @@ def _same(one: UInt8[np.ndarray, "_ _ 3"], two: UInt8[np.ndarray, "_ _ 3"]) -> b
 
 
 def _composed(plates: Mapping[str, str], pictures: Mapping[str, str]) -> dict[str, str]:
-    """Returns, for each camera, the name under which its plates are filed. It combines the exchange of plates among
-    pictures with the exchange of pictures among cameras."""
+    """Returns, for each camera, the name under which its plates are filed. The result combines the exchange of plates
+    among pictures with the exchange of pictures among cameras."""
     found = {}
     for name in plates.keys() | pictures.keys():
         picture = pictures.get(name, name)

@@ -1,6 +1,6 @@
 """Checks whether supplied masks follow the edges in the photographs. Only this check finds masks that are all too large
-by the same amount, because their outlines are consistent. It also finds masks that are exchanged while the pictures are
-not.
+by the same amount, because their outlines are consistent. The check also finds masks that are exchanged while the
+pictures are not.
 
 The change of brightness across an outline, averaged along the outline, has a peak at the photograph's edge. The peak is
 2 to 10 times the mean change if the mask belongs to the picture, and at most 2 times if not. If the peak lies beside

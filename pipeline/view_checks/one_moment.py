@@ -1,9 +1,10 @@
 """Finds views that show another moment or another person than the other views, by the positions of face and lips.
 
-The face landmarks of each view are compared with landmarks triangulated from the other views. The first test is the
-offset of the whole face or of its upper half, whichever is less: it shows that the head has moved, or is another
-person's. The second test is the change of the distance between the lips: it shows that the mouth has opened or closed.
-The noise of both offsets has two parts: the common error of a view's landmarks, and the uncertainty of the other views.
+The face landmarks of each view are compared with landmarks triangulated from the other views. The first test measures
+the offset of the whole face or of its upper half, whichever is less: it shows that the head has moved, or is another
+person's. The second test measures the change of the distance between the lips: it shows that the mouth has opened or
+closed. The noise of both offsets has two parts: the common error of a view's landmarks, and the uncertainty of the
+other views.
 
 Two changes are not found: a head that moved towards a camera or away from it, and an opening mouth seen from the side.
 """

@@ -179,8 +179,8 @@ def _with_lenses(rig: Rig, at: Float[np.ndarray, " 3"]) -> Rig:
 
 
 def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
-    """Returns the single camera that contradicts all others, if the others agree; else None. Such a camera was moved
-    farther than ``camera_drift`` can measure, or its pose or mask is wrong."""
+    """Returns the single camera that contradicts all others, if the others agree; else None. A camera that contradicts
+    all others was moved farther than ``camera_drift`` can measure, or its pose or mask is wrong."""
     seen, hulls = outlined({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
     if len(seen) < MISPLACED_AMONG:
         return None

@@ -1,10 +1,10 @@
 """Computes the UV layout of a head or of a bust for a texture.
 
-The head's mesh is cut from the nape over the back of the head to the crown. Its border is then mapped to a square with
-slightly bulging sides, the neck at the bottom. Every inner vertex is placed at the weighted mean of its neighbours with
-mean-value weights (Floater, *Mean value coordinates*, CAGD 2003), so no two triangles overlap (Tutte's theorem). Parts
-that become too small in the layout (nose, ears) are enlarged by changing the weights repeatedly (Yoshizawa, Belyaev and
-Seidel, *A fast and simple stretch-minimizing mesh parameterization*, SMI 2004).
+The head's mesh is cut from the nape over the back of the head to the crown. The mesh's border is then mapped to a
+square with slightly bulging sides, the neck at the bottom. Every inner vertex is placed at the weighted mean of its
+neighbours with mean-value weights (Floater, *Mean value coordinates*, CAGD 2003), so no two triangles overlap (Tutte's
+theorem). Parts that become too small in the layout (nose, ears) are enlarged by changing the weights repeatedly
+(Yoshizawa, Belyaev and Seidel, *A fast and simple stretch-minimizing mesh parameterization*, SMI 2004).
 
 The layout is computed from a head model's mean head, so that a texel shows the same place of every subject's head.
 

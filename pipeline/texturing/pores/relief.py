@@ -1,14 +1,14 @@
 """Estimates the skin's relief and its fine colours from two disjoint sets of full-size pictures.
 
-A relief h changes the logarithm of the diffuse shading by ``-g . grad h``. Here g is the tangential gradient of the
-shading by the normal, divided by the shading (Pentland, *Linear shape from shading*, IJCV 1990). In a patch of skin, a
-few millimetres wide, this multiplies each Fourier component by a constant factor, so the shading can be inverted to the
-relief. Waves at right angles to g do not change the shading, so their height is estimated near zero.
+A relief h changes the logarithm of the diffuse shading by ``-g . grad h``. The vector g is the tangential gradient of
+the shading by the normal, divided by the shading (Pentland, *Linear shape from shading*, IJCV 1990). In a patch of
+skin, a few millimetres wide, this multiplies each Fourier component by a constant factor, so the shading can be
+inverted to the relief. Waves at right angles to g do not change the shading, so their height is estimated near zero.
 
 Pictures have noise and highlights, and the geometry and the cameras are off by a pixel. So the views are split into two
 disjoint sets, and the image shift between the sets is removed. For each patch and octave of wavelength, a Wiener filter
-keeps the fraction of the power that both sets share. This filter does not separate colour from relief; ``COLOUR`` sets
-which fraction of the colour's variation is taken for shading.
+keeps the fraction of the power that both sets share. The Wiener filter does not separate colour from relief; ``COLOUR``
+sets which fraction of the colour's variation is taken for shading.
 
 The same filter extracts detail for the texture from the difference between pictures of full and of working size.
 """
@@ -323,8 +323,8 @@ class Patches:
         return cls(side, per_mm, shading, octave)
 
     def shift_between(self, first: Spectra, second: Spectra) -> Spectra:
-        """Returns the phase factor of each wave that shifts the first set half-way to the second. Its conjugate shifts
-        the second set half-way to the first. Only shifts up to ``MAX_SHIFT_MM`` are searched."""
+        """Returns the phase factor of each wave that shifts the first set half-way to the second. The factor's
+        conjugate shifts the second set half-way to the first. Only shifts up to ``MAX_SHIFT_MM`` are searched."""
         cross = np.where(self.octave >= 0, np.conj(first) * second, np.complex64(0.0))
         peaks = np.fft.fftshift(fields_of(cross, self.side), axes=(1, 2))
         fu, fv = waves_by_texel(self.side)
