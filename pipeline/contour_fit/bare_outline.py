@@ -2,8 +2,7 @@
 
 ``noise_model.is_hairless`` assumes that an outline shows hair if no head of the model's population fits it. A bald head
 of unusual shape breaks this assumption, so this module tests the pixels. Along a bald scalp skin reaches up to the
-outline, and the outline is smooth. Strands and tufts make the outline of hair rough, even if the hair has the colour of
-skin.
+outline, and the outline is smooth. Strands and tufts make the outline of hair rough.
 """
 
 from collections.abc import Mapping
@@ -57,8 +56,8 @@ def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Plane]) -> Con
 def with_counted_crown(solved: ContourSolution, cells: tuple[Bool[np.ndarray, "_ _"], ...]) -> ContourSolution:
     """Fits the head once more, with full weight for the crown's outline in the marked ``cells`` of each view.
 
-    Adds the marked cells without a new fit if the outline of the whole head already counts, or if the crown's residuals
-    are below ``MISSED_PX``.
+    Skips the fit and only adds the marked cells if the whole head's outline already has full weight, or if the crown's
+    residuals are below ``MISSED_PX``.
     """
     problem, scale = solved.problem, solved.problem.settings.robust_px
     evidence = replace(solved.evidence, noise=replace(solved.evidence.noise, bare=cells))

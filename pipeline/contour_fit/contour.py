@@ -77,10 +77,9 @@ def solve_contour(
     landmarks: LandmarkObservations | None = None,
     report: Progress = discard_progress,
 ) -> ContourSolution:
-    """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes. The solver fits
-    the first ``settings.modes`` modes and, once these have converged, all of them. ``features`` are clicked pixels by
-    camera and landmark; ``landmarks`` are triangulated landmarks of the face. The function ``finish`` computes the
-    covariance."""
+    """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes. The solver first
+    fits ``settings.modes`` modes, then all modes. ``features`` are clicked pixels by camera and landmark; ``landmarks``
+    are triangulated landmarks of the face. The function ``finish`` computes the covariance."""
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)
     few, span, whole, *rest = schedule(settings, len(model.modes))
     evidence, state = first_evidence(settings), start_state(problem, world_from_head)
@@ -108,11 +107,11 @@ def solve_contour(
 def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
     """Returns the stages of the fit, from coarse to fine, for a model of ``modes`` modes:
 
-    - the first stage fits pose and a few modes on a decimated mesh;
-    - the second stage fits all eigenheads to the face's rim;
-    - the third stage fits them to the whole head's rim, and its result is kept only if the head is bald;
-    - the next stage fits the model's further modes, if there are any;
-    - the last stage fits all modes on the full mesh.
+    - The first stage fits pose and a few modes on a decimated mesh.
+    - The second stage fits all eigenheads to the face's rim.
+    - The third stage fits all eigenheads to the whole head's rim, and its result is kept only if the head is bald.
+    - The next stage fits the model's further modes, if there are any.
+    - The last stage fits all modes on the full mesh.
     """
     few, span = min(FIRST_MODES, modes), min(settings.modes, modes)
     last = settings.robust_px
@@ -173,8 +172,8 @@ def normal_equations(solved: ContourSolution) -> NormalEquations:
 
 
 def hold_at_bounds(solved: ContourSolution, equations: NormalEquations) -> None:
-    """Adds terms to the normal equations, in place, that keep expression weights at their bound 0. At a bound the
-    posterior is exponential instead of Gaussian, and its standard deviation is 1 / (slope of the cost)."""
+    """Adds terms to the normal equations, in place, that keep expression weights at their bound 0. At a weight's bound
+    the posterior is exponential instead of Gaussian, and its standard deviation is 1 / (slope of the cost)."""
     posed = np.asarray(solved.problem.model.posed, int)
     if len(posed) and posed[-1] < solved.stage.modes:
         held = posed[(solved.state.coefficients[posed] <= 0.0) & (equations.gradient[posed] > 0.0)]

@@ -1,7 +1,7 @@
 """Separates facial expression from head shape after the fit has converged.
 
-Shape modes can imitate a smile. To limit this, the prior variance of each group of modes (eigenheads, kernel, fine
-kernel) is estimated from the fit itself (MacKay 1992, as in ``posterior``). If the head hardly deviates from its
+Shape modes can imitate a smile. To limit this imitation, the prior variance of each group of modes (eigenheads, kernel,
+fine kernel) is estimated from the fit itself (MacKay 1992, as in ``posterior``). If the head hardly deviates from its
 population, the variance is small, and the expression has to explain the smile. Expression weights keep their prior and
 their bounds. The surface hardly moves, so the normal equations of the last stage are reused.
 """
@@ -71,8 +71,8 @@ def makes_face(coefficients: Float[np.ndarray, " m"], posed: range) -> bool:
 
 def doubtful_weights(model: HeadModel, coefficients: Float[np.ndarray, " m"]) -> frozenset[int]:
     """Returns the indices of expressions that probably explain noise or an unusual shape. Such expressions are pairs of
-    strong opposite expressions, or have a weight at the upper bound. Lid expressions are never among them, because they
-    are measured elsewhere."""
+    strong opposite expressions, or have a weight at the upper bound. Expressions of the lids are never returned,
+    because the lids are measured elsewhere."""
     weights = coefficients[model.posed.start : model.posed.stop]
     found = [np.flatnonzero(weights > BOUND)]
     strong = np.flatnonzero(weights > STRONG)

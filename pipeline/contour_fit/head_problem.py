@@ -102,7 +102,7 @@ def weight_bounds(
     state: State, problem: ContourProblem, unknowns: int
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     """Returns the smallest and the largest step of every unknown that keep the expression weights between 0 and 1.
-    Expressions that the stage does not fit stay 0. All other unknowns are unbounded."""
+    Expressions that the current stage does not fit keep the weight 0. All other unknowns are unbounded."""
     posed = problem.model.posed
     least, most = np.full(unknowns, -np.inf), np.full(unknowns, np.inf)
     weights = state.coefficients[posed.start : posed.stop]

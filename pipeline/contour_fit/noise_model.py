@@ -25,8 +25,8 @@ def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, 
     """Updates the evidence from the residuals of a stage: the outlines' noise, the lower limit of the robust loss's
     scale and, the first time, the clutter (hair and clothes).
 
-    Clutter is searched while the shape has only eigenheads. With more modes the shape would bulge into the hair, and
-    the hair's outline would leave no large residuals.
+    Clutter (hair and clothes) is searched while the shape has only eigenheads. With more modes the shape would bulge
+    into the hair, and the hair's outline would leave no large residuals.
     """
     rim = observed_rim(problem, evidence, state, stage)
     near = rim.residual[(np.abs(rim.residual) < 10.0) & (rim.length > 0)]
@@ -61,7 +61,7 @@ def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float |
     None if the settings give both the noise sigma and the correlation length l.
 
     The mean residual over a block of B px of outline has the variance l sigma^2 / B if B is well above the correlation
-    length l. Therefore l need not be known. Residuals of ``most_px`` and more are left out.
+    length l. Therefore the correlation length l need not be known. Residuals of ``most_px`` and more are left out.
     """
     stated = problem.settings
     if stated.contour_noise_px is not None and stated.contour_correlation_px is not None:
@@ -86,8 +86,8 @@ def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, 
     """Returns True if the outline of cranium and ears shows the head itself and not hair.
 
     ``state`` is the fit to the whole head, ``from_face`` the fit to the face alone. The head is bald if ``state``
-    explains the whole outline and fits the face about as well as ``from_face``. A head model seldom fits hair, and then
-    it fits the face worse.
+    explains the whole outline and fits the face about as well as ``from_face``. A head model that fits hair fits the
+    face worse.
     """
     rim = observed_rim(problem, evidence, state, replace(stage, whole_head=True))
     region = problem.model.levels[stage.level].face_region

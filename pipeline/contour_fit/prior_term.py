@@ -70,7 +70,8 @@ class LinearisedPriorTerm:
         return shape + cameras + (np.log(state.world_from_head.scale) / SCALE_SPREAD) ** 2
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds the prior to the normal equations, in place. Cameras are included only if the stage solves for them."""
+        """Adds the prior to the normal equations, in place. The prior of cameras is included only if the stage solves
+        for camera corrections."""
         state, problem, m = self.state, self.term.problem, self.term.stage.modes
         equations.matrix[np.arange(m), np.arange(m)] += 1.0
         equations.gradient[:m] += state.coefficients

@@ -118,8 +118,8 @@ class ContourProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceObservations:
-    """Holds n point-to-plane observations. Each one states how far a vertex of the full mesh should move along a
-    normal. ``surface_term`` has the equation. The k cameras are in the order of the solver's views; c = 6 k."""
+    """Holds n point-to-plane observations. Each observation states how far a vertex of the full mesh should move along
+    a normal. ``surface_term`` has the equation. The k cameras are in the order of the solver's views; c = 6 k."""
 
     vertex: Int[np.ndarray, " n"]
     basis: Float32[np.ndarray, "m n 3"]  # the model's modes at those vertices, head frame
@@ -251,8 +251,8 @@ def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Floa
 def pack_features(
     model: HeadModel, names: tuple[str, ...], features: Mapping[str, Mapping[str, np.ndarray]]
 ) -> Observed | None:
-    """Packs the feature points (px) that belong to the model's landmarks into arrays. Returns None if there are
-    none."""
+    """Packs the feature points (px) that belong to the model's landmarks into arrays. Returns None without feature
+    points."""
     found = [
         (model.landmarks[landmark], names.index(camera), pixel)
         for landmark, views in sorted(features.items())

@@ -2,10 +2,10 @@
 
 For a surface point X with normal N and a camera centre C_k, the rim is where ``N . (X - C_k) = 0``. The product ``N .
 (X - C_k)`` is interpolated along mesh edges to find the zero crossing. A rim point is on the *outer* outline if a step
-outwards leaves the model's mask. The test of this needs no drawn mask: it projects the edges where front-facing faces
-meet back-facing ones (counted twice) or where the mesh ends (counted once). The winding number of these edges around a
-pixel is the number of faces over the pixel. The edges are sorted by image rows, so a test visits the edges of one row
-only.
+outwards leaves the model's mask. Instead of a drawn mask, the test uses the mesh's silhouette edges, between
+front-facing and back-facing faces (counted twice), and its border edges (counted once). The winding number of these
+edges around a pixel is the number of faces over the pixel. The projected edges are sorted by image rows, so a test
+visits the edges of one row only.
 
 The tangent plane at the rim contains the viewing ray. With P = d(pixel)/dX the outline's normal in the image is
 therefore ``n = l / |l|, l = N^T P^+``, and ``n^T P = N^T / |l|``. A shift of the rim along the surface has no effect to
@@ -171,7 +171,7 @@ def _outlines(
     """Returns, for each of at most ``VIEWS_A_WORD`` views, the rim samples and the end points of their mesh edges;
     ``rim_kernels`` names the samples' columns.
 
-    One pass over faces and vertices serves all views, with one bit for each view. After it each view only visits the
+    One pass over faces and vertices serves all views, with one bit for each view. Afterwards each view only visits the
     faces on its rim.
     """
     centres = -np.einsum("kji,kj->ki", views.rotation[some], views.translation[some])

@@ -19,8 +19,8 @@ LONGEST_PX = 16.0  # between neighbours on the rim; farther apart, or turned by 
 
 
 class Surface(NamedTuple):
-    """Holds a mesh (world frame, mm). Columns of an edge: from, to (as in its first face), first face, second face or
-    -1."""
+    """Holds a mesh (world frame, mm). Columns of an edge are from, to (as in its first face), first face, second face
+    or -1."""
 
     vertices: np.ndarray
     normals: np.ndarray
@@ -29,7 +29,7 @@ class Surface(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """Holds a 64-bit word for each face, edge and vertex; bit k tells how it faces view k."""
+    """Holds a 64-bit word for each face, edge and vertex; bit k is the orientation towards view k."""
 
     facing: np.ndarray  # of all faces: that look to the view
     outline: np.ndarray  # edges where the number of layers changes in some view,
@@ -105,7 +105,7 @@ def _facing(planes, centres):
 
 @njit(cache=True, fastmath=True)
 def _side(vertex, normal, centre):
-    """Returns the product N . (X - C), whose zero crossings are the rim."""
+    """Returns the product N . (X - C), which is zero on the rim."""
     x, y, z = vertex[0] - centre[0], vertex[1] - centre[1], vertex[2] - centre[2]
     return normal[0] * x + normal[1] * y + normal[2] * z
 

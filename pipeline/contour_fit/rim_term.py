@@ -49,8 +49,8 @@ def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State,
 @dataclass(frozen=True, slots=True, eq=False)
 class RimTerm:
     """Computes the cost of the silhouettes' outlines. ``scale_px`` is the scale of the robust loss. The cost is
-    normalised to an outline of ``reference_px``, so that hiding a part of the rim does not lower the cost; None means
-    no normalisation."""
+    normalised to an outline of ``reference_px`` (None: not), so that hiding a part of the rim does not lower the
+    cost."""
 
     problem: ContourProblem
     evidence: StageEvidence

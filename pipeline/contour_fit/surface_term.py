@@ -7,9 +7,9 @@ the observed point by ``by_camera . c_k``. Image shifts that no surface explains
 
     e = n . (X(theta) - X_seen) - displacement - by_camera . (c - c_seen)
 
-the term is ``sum information rho(e) + (c - c_seen)^T M (c - c_seen) - 2 g^T (c - c_seen)``. The function rho is the
-loss of Geman and McClure with a scale of ``FORGIVEN_SIGMAS``. Some observations, as from hair, are upper bounds: they
-count only where e is positive, that is, where the head sticks out.
+With the residual e, the term is ``sum information rho(e) + (c - c_seen)^T M (c - c_seen) - 2 g^T (c - c_seen)``. The
+function rho is the loss of Geman and McClure with a scale of ``FORGIVEN_SIGMAS``. Some observations, as from hair, are
+upper bounds: they count only where e is positive, that is, where the head sticks out.
 """
 
 from dataclasses import dataclass

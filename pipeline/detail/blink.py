@@ -2,7 +2,7 @@
 
 The photometric fit uses patches of a few millimetres, which cannot follow a lid, so it leaves lids open. The colours
 between the lids (``eyelids``) mislead for eyes whose white is hidden. So a few weights of the blink expression are
-tried for each eye, and the one with the smallest robust distance between lids and surface points is chosen.
+tested for each eye, and the weight with the smallest robust distance between lids and surface points is chosen.
 """
 
 from collections.abc import Mapping
@@ -107,8 +107,8 @@ def _nearest_closure(
     open_lids: Vertices, moved: Vertices, fitted: float, model: HeadModel, surface: SurfacePoints, slit: Fissure
 ) -> tuple[float, float]:
     """Returns the blink weight with the smallest distance between lids and points, or ``fitted`` if no weight is
-    better. Also returns the misfit of half-closed lids divided by the misfit of open lids. Too few points give
-    ``fitted`` and 1.
+    better. Also returns the misfit of half-closed lids divided by the misfit of open lids. Without enough points the
+    function returns ``fitted`` and 1.
 
     ``moved`` is the displacement (mm) of the lids by a full blink.
     """

@@ -110,7 +110,7 @@ def _pulled(
     bending: sparse.csr_array,
     raised: Bool[np.ndarray, " v"],
 ) -> Float[np.ndarray, "v 3"]:
-    """Moves the raised vertices smoothly to the nearest hair; all other vertices stay."""
+    """Moves the vertices ``raised`` smoothly to the nearest hair; all other vertices stay."""
     start, out = vertices, vertices
     for stiffness in PULLS:
         hits = surface.closest(out, CANDIDATES, facing=vertex_normals(out, head.faces))

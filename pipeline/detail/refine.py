@@ -332,8 +332,8 @@ def _pooled(values: PerVertex, faces: Faces) -> PerVertex:
 def _local_density(
     found: Associated, corner: Int[np.ndarray, "n 3"], vertices: Vertices, faces: Faces, correlation_mm: float
 ) -> Float[np.ndarray, " n"]:
-    """Returns, for each point, the number of points within ``correlation_mm``, which have the same error. The number
-    follows from the density of points."""
+    """Returns, for each point, the number of points within ``correlation_mm``, which have the same error. The number of
+    points follows from the density of points."""
     area = np.linalg.norm(np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]],
                                    vertices[faces[:, 2]] - vertices[faces[:, 0]]), axis=1) / 6.0  # fmt: skip
     mass = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
@@ -351,8 +351,8 @@ def field_deviation(
     *,
     common_mm: PerVertex,
 ) -> PerVertex:
-    """Returns the standard deviation (mm) of every vertex along its normal. Near measured points it comes from random
-    draws of the posterior and from ``common_mm``, the error common to all points; elsewhere it is at least
+    """Returns the standard deviation (mm) of every vertex along its normal. Near measured points the deviation comes
+    from random draws of the posterior and from ``common_mm``, the error common to all points; elsewhere it is at least
     ``deviation_mm``."""
     draws = posterior.draws(np.random.default_rng(SEED), DRAWS)
     square = common_mm**2

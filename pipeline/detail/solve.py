@@ -2,9 +2,9 @@
 uncertainty.
 
 The unknown is a field w of unit variance on control points (nodes), with ``d`` = 3 or 1 (along the normals) components
-for each. The head moves by ``operator @ (amplitude w direction)``. Each observation ``n . X = e`` has the information
-q. The cost tr(w^T Q w) + sum q (n . dX(w) - e)^2 is minimised exactly as a sparse linear problem. A random draw from
-the posterior needs one more solution (Papandreou and Yuille 2010, *Gaussian sampling by local perturbations*).
+for each. The head moves by ``operator @ (amplitude w direction)``. An observation ``dot(n, X) = e`` has the information
+q. The cost ``tr(w^T Q w) + sum q (dot(n, dX(w)) - e)^2`` is minimised exactly as a sparse linear problem. A random draw
+from the posterior needs one more solution (Papandreou and Yuille 2010, *Gaussian sampling by local perturbations*).
 
 The nodes are no denser than the photographs' resolution. A model with subdivision has two meshes of nodes: its cage,
 and the mesh one subdivision step before the full mesh (edges of 1.7 mm in the face; the windows of dense matching are
@@ -178,8 +178,8 @@ def solve_field(field: SmoothField, directions: Directions, observed: Observed) 
 
 
 def _planes(observed: Observed, coordinates: int) -> sparse.csr_array:
-    """Returns the matrix that maps the coordinates of all vertices to sqrt(information) normal . X for each observation
-    at the point X on the head."""
+    """Returns the matrix that maps the coordinates of all vertices to ``sqrt(information) dot(normal, X)`` for each
+    observation, with the point X on the head."""
     count = len(observed.corner)
     value = np.sqrt(observed.information)[:, None, None] * observed.blend[:, :, None] * observed.normal[:, None, :]
     column = 3 * observed.corner[:, :, None].astype(np.int64) + np.arange(3)

@@ -120,7 +120,7 @@ class FaceDetection:
 
 def find_faces(image: ImageRgb, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
     """Finds the faces in a picture, the best score first. Faces larger than an eighth of the picture's longer side are
-    searched first. If there are none, faces down to a sixteenth are searched."""
+    searched first. If no such face is found, faces down to a sixteenth of this side are searched."""
     pyramid = make_pyramid(image)
     return find_large_faces(pyramid, networks) or find_small_faces(pyramid, networks)
 

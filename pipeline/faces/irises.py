@@ -1,15 +1,16 @@
 """Finds irises and gaze directions: fits a circle in space, the border of the iris (limbus), to image edges.
 
-The module takes the subject's face with the eye network's points, the photographs and the cameras. For each eye it
-returns centre and radius of the iris and the gaze, with standard deviations, or why the eye was not measured. The gaze
-is the normal of the limbus, which is the eye's optical axis; the line of sight lies 5 degrees nearer to the nose.
+The module takes the subject's face with the eye network's points, the photographs and the cameras. For each eye the
+module returns centre and radius of the iris and the gaze, with standard deviations, or why the eye was not measured.
+The gaze is the normal of the limbus, which is the eye's optical axis; the line of sight lies 5 degrees nearer to the
+nose.
 
 Each eye is fitted alone. If the two gazes differ, each eye is fitted again from the other eye's gaze and from the mean
 gaze, and the fit with most supporting edges is retained. The prior of the radius is 5.85 mm (standard deviation 0.25;
 Ruefer et al. 2005). The eyeball lies 10.5 mm behind the iris and 5 mm behind the corners of the eye, with 4 mm standard
 deviation in each direction. The two eyes are assumed to look at the same point: their elevations are equal to 1 degree,
 and the lines of sight meet half a metre away or farther. If the eyes clearly contradict this assumption (a squint),
-each keeps its own result.
+each eye keeps its own result.
 
 The fit iterates: it searches limbus edges and pupils near the circle, fits the circle to them, and narrows the search.
 The pupil lies on the circle's axis. The pupil's distance in front of the limbus is fitted too, since the cornea's
@@ -197,7 +198,7 @@ def fitted(
 
 
 def _edges(circle: LimbusCircle, view: EyeView, reach: float) -> LimbusEdges | None:
-    """Finds the edges of a limbus in a view. Returns None if there are too few."""
+    """Finds the edges of a limbus in a view. Returns None if there are too few edges."""
     angles = np.arange(RAYS) * 2.0 * np.pi / RAYS
     axes = circle.axes()
     spokes = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ axes

@@ -87,8 +87,7 @@ def limbus_offsets(
     view: EyeView, points_px: Float[np.ndarray, "n 2"], outwards: Float[np.ndarray, "n 2"], reach_px: float
 ) -> Float[np.ndarray, " n"]:
     """Returns the distance (px) from each predicted limbus point to the image edge along the unit direction
-    ``outwards``; NaN if there is no edge within ``reach_px``, or if lids cover it. The points run once around the
-    iris."""
+    ``outwards``; NaN if there is no edge within ``reach_px``, or if lids cover it. The points surround the iris."""
     count = max(int(np.ceil(reach_px / STEP_PX)), 2)
     along = np.arange(-count - 1, count + 2) * STEP_PX
     at = points_px[:, None] + along[None, :, None] * outwards[:, None] - view.origin_px

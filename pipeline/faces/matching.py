@@ -122,7 +122,7 @@ def _consistent(
 def _may_be_one(
     pair: Sequence[tuple[str, FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
 ) -> bool:
-    """Returns True if the viewing rays of two detections meet in points of a face's size. The test takes 0.3 ms."""
+    """Returns True if the viewing rays of two detections meet in points of a face's size. A test takes 0.3 ms."""
     (centre, ray), (other, other_ray) = (
         (rig[name].centre_world, rig[name].rays_world(face.landmarks_px[FEW_POINTS])) for name, face in pair
     )

@@ -67,8 +67,8 @@ def view_bias(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "468 2"]:
 
 
 def place_face(points_world: Float[np.ndarray, "n 3"], which: slice = slice(None)) -> tuple[Similarity, float]:
-    """Fits the mean face to the points with the indices ``which``. Returns its pose and scale (world_from_face), and
-    the relief.
+    """Fits the mean face to the points with the indices ``which``. Returns the face's pose and scale (world_from_face),
+    and the relief.
 
     The scale is fitted to breadth and height only. The relief is the depth of the points divided by the mean face's
     depth; a flat picture has 0.

@@ -1,7 +1,7 @@
 """Searches the subject's face quickly after a shot, to report which pictures lack it and where it looks.
 
-The search uses small pictures (``reduce_picture``) and ends after a few views without a face. If a face was found, it
-is searched in the other cameras that must show it.
+The search uses small pictures (``reduce_picture``) and ends after a few views without a face. A face that was found is
+then searched in the other cameras that must show it.
 """
 
 from dataclasses import replace
@@ -55,8 +55,7 @@ def sight_face(subject: SubjectFaces, rig: Rig, *, front: str) -> FaceSighting:
 
 
 def turned_deg(world_from_face: Similarity, rig: Rig, front: str) -> tuple[float, float] | tuple[None, None]:
-    """Returns the angles (degrees, to the face's left and up) from a face to the front camera; None without a front
-    camera."""
+    """Returns the angles (degrees, to the face's left and up) from a face to the front camera, if there is one."""
     if not has_front(rig):
         return None, None
     left, up = gaze_from(world_from_face, rig[front].axis_world if front in rig.names else -_fan(rig))

@@ -231,7 +231,8 @@ def _subject(
     vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, head: Float[np.ndarray, "h 3"] | None
 ) -> Bool[np.ndarray, " f"]:
     """Returns a mask of the faces that belong to the subject. With a fitted head, the subject is the piece nearest to
-    most of the head's vertices, since a bystander may be larger. Without a head, it is the piece of greatest volume."""
+    most of the head's vertices, since a bystander may be larger. Without a head, the subject is the piece of greatest
+    volume."""
     piece = component_of(faces, len(vertices))
     towards = vertices[faces[:, 0]] - vertices.mean(axis=0)
     volume = np.bincount(piece[faces[:, 0]], (face_normals(vertices, faces) * towards).sum(axis=1))

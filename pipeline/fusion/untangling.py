@@ -194,8 +194,8 @@ def turned_faces(
 
 
 def mesh_faults(vertices: Vertices, topology: Topology, moved: Bool[np.ndarray, " v"] | None = None) -> MeshFaults:
-    """Counts the faults of a mesh, also those that the model's mean head has. If ``moved`` is not None, only triangles
-    at these vertices are tested for intersections; the others must have none."""
+    """Counts the faults of a mesh, also those that the model's mean head has. ``moved``: tests only triangles at these
+    vertices for intersections; None tests all."""
     active = None if moved is None else any_corner(moved, topology.faces)
     turned, folded = _turned_and_folded(vertices, topology, np.ones(len(topology.faces), bool))
     return MeshFaults(int(turned.sum()), len(folded), int(crossing_faces(vertices, topology.faces, active).sum()))

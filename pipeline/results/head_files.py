@@ -180,8 +180,8 @@ def printable(head: Mesh) -> Mesh:
 def close_borders(head: Mesh) -> Mesh:
     """Closes the openings of the head's mesh (head frame, mm).
 
-    Triangles around the middle of its border close the neck; strips of triangles from corner to corner close open lids
-    and lips. Raises NotAManifold if a border touches itself.
+    Triangles around the middle of the neck's border close the neck; strips of triangles from corner to corner close
+    open lids and lips. Raises NotAManifold if a border touches itself.
     """
     vertices, added = [head.vertices], [head.faces]
     count = len(head.vertices)
@@ -240,8 +240,7 @@ def landmarks_document(result: Reconstruction) -> dict[str, Any]:
 
 
 def uncertainty(std_mm: Float[np.ndarray, " 3"] | None) -> str:
-    """Formats a landmark's standard deviations as text: that of its distance, then those of the three world
-    coordinates."""
+    """Formats a landmark's standard deviations as text: the distance's, then those of x, y and z in the world frame."""
     if std_mm is None:
         return "standard deviation unknown"
     x, y, z = (float(value) for value in std_mm)

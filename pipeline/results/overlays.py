@@ -1,9 +1,9 @@
 """Draws the pictures of a result: the contours of silhouette and fitted head over each image, the contact sheet, and
-the turntable strip. Also renders a head as grey clay or in colours.
+the turntable strip. The module also renders a head as grey clay or in colours.
 
 A contour is painted from its signed distance d with opacity ``half width + 1/2 - |d|``, so it is antialiased. Vermilion
 and sky blue can be told apart with every kind of colour vision (Okabe and Ito, *Color Universal Design*,
-https://jfly.uni-koeln.de/color/); a dark border keeps them readable on any image.
+https://jfly.uni-koeln.de/color/); a dark border keeps the lines readable on any image.
 """
 
 from collections.abc import Sequence

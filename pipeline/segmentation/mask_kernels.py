@@ -135,8 +135,8 @@ def least_dissent(
 
 @njit(cache=True, nogil=True, inline="always")
 def corner_of(x: int, size: int, small: int) -> tuple[int, float]:
-    """Maps the centre of pixel ``x`` of an image with ``size`` columns or rows into an image with ``small``. Returns
-    the pixel before this position, and the fraction of the way to the next pixel."""
+    """Maps the centre of pixel ``x`` of an image with ``size`` columns (or rows) into an image with ``small`` columns
+    (or rows). Returns the pixel before this position, and the fraction of the way to the next pixel."""
     at = min(max((x + 0.5) * small / size - 0.5, 0.0), small - 1.0)
     low = min(int(at), max(small - 2, 0))
     return low, at - low

@@ -137,8 +137,8 @@ def _subject_inside(
 
 
 def _along_contour(contrast: Plane, alpha: Plane) -> Float32[np.ndarray, " c"]:
-    """Returns the contrast at every pixel of the contour. Pixels outside the solved band get that of their neighbours,
-    or 0 if these are not solved either."""
+    """Returns the contrast at every pixel of the contour. Pixels outside the solved band get their neighbours'
+    contrast, or 0 if the neighbours are not solved either."""
     mask = alpha > 0.5
     nearby = np.where(contrast < 0, cv2.dilate(contrast, np.ones((3, 3), np.uint8)), contrast)
     return np.maximum(nearby, np.float32(0))[mask & ~eroded(mask, 1)]

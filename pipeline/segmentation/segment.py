@@ -112,7 +112,7 @@ def segment(capture: Capture, rig: Rig, *, report: Progress) -> dict[str, Silhou
 
 def _without_plates(capture: Capture, rig: Rig, report: Progress) -> dict[str, Silhouette]:
     """Finds the silhouettes without plates or masks. With few views the search starts at the subject's face. With more
-    views it starts at the face only if a search without it finds too few usable silhouettes."""
+    views the search starts at the face only if a search without a face finds too few usable silhouettes."""
     few = len(rig) < SEEDED_VIEWS
     found = _searched(capture, rig, find_head_seed(capture.images, rig) if few else None, report)
     if not few and _usable_count(found) < ENOUGH_USABLE * len(rig):

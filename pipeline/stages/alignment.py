@@ -50,8 +50,8 @@ def front_camera(rig: Rig, settings: Settings) -> str:
 
 
 def align_head(context: ReconstructionContext, views: Views, faces: Faces) -> Staged[Alignment]:
-    """Aligns the mean head to the capture's feature points. Without feature points it uses the subject's face in the
-    photographs, and without a face the silhouettes. Refuses with TooFewFeatures, WrongFeatures, NoSubject."""
+    """Aligns the mean head to the capture's feature points. Without feature points the function uses the subject's face
+    in the photographs, and without a face the silhouettes. Refuses with TooFewFeatures, WrongFeatures, NoSubject."""
     model, rig, settings = model_basis(context.model, context.settings), context.rig, context.settings
     face = None if faces.subject is None else faces.subject.matched
     if views.capture.features and face is not None:

@@ -119,8 +119,8 @@ def shape_bust(
     refined: RefinedHead,
     fused: DepthSurface | None,
 ) -> Staged[ShapedBust | None]:
-    """Combines the fused surface with the delivered head, extends hair to its outlines, and repairs bad triangles.
-    Returns None if ``fused`` is None. Warns ``bust-guessed`` if neither depth nor head measured most of the face."""
+    """Combines the fused surface with the final head, extends hair to its outlines, and repairs bad triangles. Returns
+    None if ``fused`` is None. Warns ``bust-guessed`` if neither depth nor head measured most of the face."""
     if fused is None:
         return Staged(None)
     head = HeadSkin(refined.mesh_world, refined.deviation_mm)
@@ -192,7 +192,7 @@ class HairyHead:
 def push_out_hair(
     context: ReconstructionContext, views: Views, refined: RefinedHead, bust: Bust | None, coloured: Capture
 ) -> Staged[HairyHead | None]:
-    """Moves the delivered head's vertices outwards to the bust's hair, and colours them from the photographs of
+    """Moves the final head's vertices outwards to the bust's hair, and colours them from the photographs of
     ``coloured``. Returns None without a bust, or if the settings do not request this. Warns ``hair-beyond-head`` if the
     head's vertices do not reach the hair."""
     settings, rig = context.settings, context.rig

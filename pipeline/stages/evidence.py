@@ -1,4 +1,4 @@
-"""Judges the delivered head: how well it explains every camera, its measurements, and its expression."""
+"""Evaluates the final head: agreement with every camera, measurements, and expression."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -44,7 +44,7 @@ Masks = Mapping[str, Bool[np.ndarray, "h w"]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Holds the figures of the delivered head. Mappings by camera have an entry for every camera of the rig."""
+    """Holds the measured properties of the final head. Mappings by camera have an entry for every camera of the rig."""
 
     start_masks: Masks  # of the head that the fit started from
     fitted_masks: Masks
@@ -66,7 +66,7 @@ def judge_head(
     texturing: Texturing,
     pose: PoseEvidence,
 ) -> Staged[Evidence]:
-    """Measures the delivered head, and warns if it is not plausible.
+    """Measures the final head, and warns if it is not plausible.
 
     Refuses with UnexplainedOutlines if the head explains hardly any outline and no face in the photographs confirms its
     pose. The settings can allow such a head, for subjects with long hair all around, whose outlines are all hair.
@@ -111,8 +111,8 @@ def fit_with_read_face(
     """Returns the fit with the expression from the deformed head. Also returns how many standard deviations a weight
     must have to be reported, and the indices of doubtful expressions, which are left out.
 
-    The expression is estimated again only if the fit has one. The lids always follow the measured points around the
-    eye, if these determine the lids (``told_lids``).
+    The expression is estimated again only if the fit has an expression. The lids always follow the measured points
+    around the eye, if these determine the lids (``told_lids``).
     """
     fit, model = head.fit, head.model
     rows = blinks_of(model)
@@ -152,8 +152,8 @@ def confirmed_closed(closed: frozenset[str], openings: Mapping[str, float]) -> f
 def check_pose(
     context: ReconstructionContext, faces: Faces, alignment: Alignment, head: HeadFit, refined: RefinedHead
 ) -> Staged[PoseEvidence]:
-    """Compares the head's landmarks with the faces in the photographs, and the pose's cost with that of the second best
-    pose."""
+    """Compares the head's landmarks with the faces in the photographs, and the pose's cost with the cost of the second
+    best pose."""
     evidence, warnings = judge_pose(
         refined.mesh_world,
         head.fit.world_from_head,

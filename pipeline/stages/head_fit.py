@@ -78,9 +78,9 @@ def fitted_mesh(model: HeadModel, fit: Fit) -> Mesh:
 def fit_outlines(
     context: ReconstructionContext, views: Views, alignment: Alignment, cap: Cap | None
 ) -> Staged[OutlineFit]:
-    """Fits shape and pose to the silhouettes with the contour solver. If the settings choose the simplex method, it
-    then fits the shape again at this pose. Outlines along the ``cap`` are moved inwards by its thickness and then show
-    the skull."""
+    """Fits shape and pose to the silhouettes with the contour solver. If the settings choose the simplex method, the
+    function then fits the shape again at this pose. Outlines along the ``cap`` are moved inwards by its thickness and
+    then show the skull."""
     settings, rig = context.settings, context.rig
     bare = CapOutline(views.silhouettes, {})
     if cap is not None:

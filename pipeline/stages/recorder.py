@@ -49,8 +49,8 @@ class Recorder:
     """Runs stages in sequence, or one in parallel with others, and records their seconds and warnings.
 
     The context's ``progress`` is called when a stage begins, and by the stage as it advances; if it raises Cancelled,
-    the stage ends. A parallel stage reports no progress. Only the time spent waiting for it counts, so that all seconds
-    add up to the job's duration. The seconds of stages with the same name are added.
+    the stage ends. A parallel stage reports no progress. Only the time spent waiting for a parallel stage counts, so
+    that all seconds add up to the job's duration. The seconds of stages with the same name are added.
     """
 
     def __init__(self, context: ReconstructionContext) -> None:

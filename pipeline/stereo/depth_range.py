@@ -130,7 +130,7 @@ def _enlarged(near: Plane, far: Plane, stack: Stack, view: int) -> DepthRange:
 
 
 def _extended(values: Plane, room: Bool[np.ndarray, "h w"]) -> Plane:
-    """Blurs the values at pixels with a depth range; all other pixels take the value of the nearest of these."""
+    """Blurs the values at pixels with a depth range; others take the value of the nearest such pixel."""
     weight = cv2.GaussianBlur(room.astype(np.float32), (0, 0), BOUND_BLUR_PX)
     smooth = cv2.GaussianBlur(np.where(room, values, np.float32(0.0)), (0, 0), BOUND_BLUR_PX) / np.maximum(weight, 1e-3)
     _, nearest = cv2.distanceTransformWithLabels(

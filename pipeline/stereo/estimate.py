@@ -92,8 +92,8 @@ def take_specks_off(
     pixels around them. Returns a mask of the replaced pixels.
 
     A piece stays if no pixels around it have a known depth, as at an outline. A piece also stays if it is adjacent to
-    other pieces that together exceed ``most_px``. In one capture the replacement of these would have lost 6 % of the
-    clothes.
+    other pieces that together exceed ``most_px``. In one capture the replacement of all small pieces would have lost 6
+    % of the clothes.
     """
     specks = np.zeros(depth.shape, bool)
     mark_specks(depth, slopes, GAP_PX * pixel_mm, most_px, specks)

@@ -1,5 +1,4 @@
-"""Packs all crops of one size for compiled loops: all images in one array, and the maps from every view to every other
-view.
+"""Packs all crops of one size for compiled loops: all images in one array, and the maps between all views.
 
 Each pixel is stored with its right neighbour in one 32-bit word. Bilinear interpolation then reads two words instead of
 four, which takes 1.4 ns instead of 2.3 ns for each sample.

@@ -79,8 +79,8 @@ def shine_left(
     shown: Float[np.ndarray, "v 3"], dim: Float[np.ndarray, "v 3"], seen: Bool[np.ndarray, " v"], around: Neighbourhood
 ) -> Float[np.ndarray, " v"]:
     """Returns the fraction of each vertex's light that is not a highlight, from ``1 - MAX_SHINE`` to 1. The fraction is
-    the brightness of ``dim``, the colours in the darker views, divided by that of ``shown``. Hue is not used: a
-    highlight has the hue of its lamp, and the hue in a dark view is mostly noise."""
+    the brightness of ``dim``, the colours in the darker views, divided by the brightness of ``shown``. Hue is not used:
+    a highlight has the hue of its lamp, and the hue in a dark view is mostly noise."""
     ratio = dim.sum(axis=1) / np.maximum(shown.sum(axis=1), 1e-4)
     ratio = np.where(seen, ratio, 1.0)
     ratio = around.calmed(ratio[:, None], CALM)[:, 0]

@@ -3,7 +3,7 @@
 The module takes the clean plates and the photographs. The module returns photographs with true colours (linear sRGB,
 D65, white where the chart is white), which only the texture uses. The module also returns the direction that the chart
 faced, from which the brightness of the studio's light follows. A camera that saw no chart gets the mean correction of
-the cameras that did.
+the other cameras.
 """
 
 from collections.abc import Mapping

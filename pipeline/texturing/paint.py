@@ -1,9 +1,9 @@
 """Paints the texture image: reads each texel from the photographs chosen for the vertices of its triangle.
 
 A texel is a point on a triangle of the mesh. A texel's pixel in a photograph is interpolated from the projections of
-the triangle's corners. The photograph is read at that pixel with a sub-pixel window, and the corners' colour correction
-is added (``pipeline.texturing.neighbourhood``). If the corners have different photographs, these are blended. A texel
-that no camera sees gets the vertices' colours."""
+the triangle's corners. The photograph is read at a texel's pixel with a sub-pixel window, and the corners' colour
+correction is added (``pipeline.texturing.neighbourhood``). If different photographs were chosen for the corners, the
+photographs are blended. A texel that no camera sees gets the vertices' colours."""
 
 import cv2
 import numpy as np

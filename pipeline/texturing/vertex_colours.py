@@ -6,9 +6,9 @@ inside its silhouette and is not occluded. The image's weight is the dot product
 
 The default blending also handles cameras that differ and edges that are blurred. The default blending leaves margins at
 contours and occluding edges (``visibility``), sharpens photographs where they have detail, and corrects gain and offset
-of each camera (``colour_balance``). The default blending averages in linear light. The default blending gives little
-weight to a view that differs from the others in any channel (a highlight, a shadow), and less to cameras with a large
-correction. Unseen vertices are interpolated.
+of each camera (``colour_balance``). The default blending averages in linear light, and gives little weight to a view
+that differs from the others in any channel (a highlight, a shadow), and less to cameras with a large correction. Unseen
+vertices are interpolated.
 
 In head models whose eyes are openings, strips of triangles from lid to lid close the openings; the vertices of a strip
 lie on the lids' hidden edges. A strip takes its colours from the one photograph that sees most of it.
@@ -190,7 +190,7 @@ def texture(
     in these views (mm).
 
     With ``around``, the edges of the mesh, the result also has a ``decision``: the views chosen for each vertex. With
-    ``dim_share``, it also has each vertex's colour at that quantile of the views' brightness, which is free of
+    ``dim_share``, the result also has each vertex's colour at that quantile of the views' brightness, which is free of
     highlights. A view counts half if it differs from the views' median by ``outlier``, relative to the median. With
     ``shown``, a view colours no vertex that something in front of the mesh hides.
     """
@@ -268,7 +268,7 @@ def decide(
     around: Neighbourhood | None,
 ) -> Decision:
     """Chooses a view for each vertex, and computes the colour corrections that hide the seams between views. Without
-    ``around`` (mesh edges), it chooses the view with the highest weight, corrected to the mean colour of all views."""
+    ``around`` (mesh edges), the view with the highest weight is chosen, and corrected to the views' mean colour."""
     if around is None:
         return take_best_views(views, weights, balanced, agreed, pictures)
     codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
@@ -301,7 +301,7 @@ def _by_name(rig: Rig, values: Float[np.ndarray, "k 3"]) -> dict[str, Rgb]:
 
 
 def _gain_warnings(gains: Mapping[str, Rgb]) -> tuple[ReportWarning, ...]:
-    """Returns a warning for one camera that is brighter or darker than the others, and one for several together."""
+    """Returns one warning about all cameras whose pictures are brighter or darker than those of the others."""
     strong = {
         name: 1 / min(gain) for name, gain in gains.items() if max(gain) > STRONG_GAIN or min(gain) < 1 / STRONG_GAIN
     }
@@ -384,7 +384,7 @@ def _parts(mesh: Mesh, rows: Int[np.ndarray, " f"]) -> tuple[Faces, Float[np.nda
 
 
 def _wide(faces: Faces, area: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles belong to patches that are large enough."""
+    """Returns a mask of the triangles that belong to large patches."""
     patch = _patches(faces)
     return np.bincount(patch, area)[patch] >= MIN_MM2 if len(faces) else np.zeros(0, bool)
 
@@ -502,7 +502,7 @@ def find_unlike(
     weights: Plane, colours: Float32[np.ndarray, "k n 3"], regions: Sequence[Bool[np.ndarray, " n"]]
 ) -> dict[int, float]:
     """Returns the views (row indices) in which the face differs from the other views, each with its correlation to
-    them. A view that is found is left out before the next search. With only two views none is reported. Views of the
+    them. A view that is found is left out before the next search. With only two views no view is reported. Views of the
     same moment differ only by gloss and shading (correlation 0.9 to 1.0). A mouth that is open in one view gives 0.2 to
     0.6, another person -0.5 to 0.3.
 

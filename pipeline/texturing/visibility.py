@@ -1,9 +1,9 @@
 """Computes which camera sees which point of a surface, with which weight and colour (section 4.5).
 
 The paper requires that a point projects inside the silhouette and is not occluded. Real edges are blurred and fits are
-not exact, so points near the contour or near an occluding edge are also excluded. For this test a point is compared
-with the nearest depth in a small window, corrected for the surface's slope. A view near an occluding edge, or at a flat
-angle, counts only where no better view exists.
+not exact, so points near the contour or near an occluding edge are also excluded. To find occluding edges, a point is
+compared with the nearest depth in a small window, corrected for the surface's slope. A view near an occluding edge, or
+at a flat angle, counts only where no better view exists.
 
 This module also packs the photographs, and the choice of photographs for each vertex, for compiled loops.
 """

@@ -2,11 +2,11 @@
 
 Cameras from another program have an arbitrary unit if no known length was supplied. If the outlines are three times too
 large, a fitted model lies inside the face, and every outline is treated as clutter. The head's diameter is measured
-without a model: going down from the crown, it is the width of the outline at the depth of half that width. The head's
+without a model: at the distance d below the crown at which the outline is 2 d wide, the diameter is 2 d. The head's
 diameter is 150 to 290 mm for people, hair included.
 
-The upward direction is the face's. Without a face it is that of the pictures or of the rig, whichever makes more
-outlines consistent with the same head. Nothing is refused if the photographs show a face of a human's size.
+The face gives the upward direction. Without a face the pictures or the rig give it, whichever makes more outlines
+consistent with the same head. Nothing is refused if the photographs show a face of a human's size.
 
 A crown is nearly round, so planes through each camera that touch it from above have nearly the same distance from the
 skull's middle. If a mask ends below the crown, its plane passes nearer.

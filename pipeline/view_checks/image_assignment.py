@@ -89,9 +89,10 @@ def assign_images(
     of a capture; called again after every change. ``exchanged``: whether a certain exchange is repaired or refused.
     ``guards``: decides about refusals.
 
-    Refuses with ExchangedPictures if the settings forbid to repair an exchange, or if it is uncertain and the face
-    confirms no picture as filed. Refuses with SamePictures if fewer than three pictures are different. Refuses with
-    WrongRig if most cameras contradict the others, no exchange explains this, and the face does not confirm the rig.
+    Refuses with ExchangedPictures if the settings forbid the repair of an exchange, or if the exchange is uncertain and
+    the face confirms no picture as filed. Refuses with SamePictures if fewer than three pictures are different. Refuses
+    with WrongRig if most cameras contradict the others, no exchange explains the contradiction, and the face does not
+    confirm the rig.
     """
     overruled: list[ReportWarning] = []
     plates = misplaced_plates(capture, rig)
@@ -138,8 +139,7 @@ def assign_images(
 
 
 def _check_rig(capture: Capture, rig: Rig, distinct: Mapping[str, Silhouette], guards: Guards) -> list[ReportWarning]:
-    """Refuses the calibration of another rig, unless the face confirms the rig. Returns warnings if it does not
-    refuse."""
+    """Refuses the calibration of another rig, unless the face confirms the rig. Else returns warnings."""
     wrong = wrong_rig(distinct, rig)
     if not wrong:
         return []

@@ -1,11 +1,11 @@
 """Checks whether the pictures have the rig's lens distortion: they may be undistorted while the rig has coefficients,
-or the reverse. Also checks whether the principal points count pixels from 1. Outlines hardly show these faults, since
-all heads' crowns are equally far from the middle of their pictures.
+or the reverse. The module also checks whether the principal points count pixels from 1. Outlines hardly show these
+faults, since all heads' crowns are equally far from the middle of their pictures.
 
 The faults appear in the reprojection errors of subject points in three or more views. The first estimated number, with
 its standard deviation, is a factor on all distortion coefficients: 1 if they fit the pictures, 0 if the pictures are
-undistorted. Without coefficients it is one radial coefficient for all cameras. The second estimated number is a common
-shift of all principal points, equally to the right and down.
+undistorted. For a rig without coefficients the first number is a radial coefficient of all cameras. The second
+estimated number is a common shift of all principal points, equally to the right and down.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -135,10 +135,11 @@ def masks_alone_exchanged(
 def turned_masks(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], ready: Collection[str]
 ) -> dict[str, Message]:
-    """Finds the supplied masks (cameras ``ready``) that follow their photograph only after a flip or a rotation. Some
-    programs count rows from the bottom. Returns, by camera, the change to undo (a key of ``TURNS``).
+    """Finds the supplied masks (cameras ``ready``) that follow their photograph only after a flip or a rotation, as
+    from programs that count rows from the bottom. Returns, by camera, the change to undo (a key of ``TURNS``).
 
-    In a test it reported none of 103 correct masks, and at least 101 of the same masks after each flip or rotation."""
+    In a test the function reported none of 103 correct masks, and at least 101 of the same masks after each flip or
+    rotation."""
     turns = {}
     for name in (name for name in ready if name in images and name in silhouettes):
         as_given = _height_at_outline(images[name], silhouettes[name])

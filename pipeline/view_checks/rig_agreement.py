@@ -3,10 +3,10 @@
 If most cameras contradict the others, other interpretations of the calibration are tried. The pictures may be mirrored,
 flipped, or rotated by 180 degrees, or by 90 if square. Poses may follow another convention (``rig.plausibility``).
 Intrinsics may belong to pictures that were cropped, reduced or taken at another zoom (``LensReading``). The message
-names the interpretation under which epipolar tangent planes touch both outlines of each pair of cameras. If there is
-none, the calibration belongs to another rig, or the rig was changed. If many planes nevertheless agree closely, the
-masks are loose: they include a shadow on the wall, or some lack hair. If a single camera contradicts the others, the
-message names it.
+names the interpretation under which epipolar tangent planes touch both outlines of each pair of cameras. If no
+interpretation fits, the calibration belongs to another rig, or the rig was changed. If many planes nevertheless agree
+closely, the masks are loose: they include a shadow on the wall, or some lack hair. If a single camera contradicts the
+others, the message names it.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -2,8 +2,9 @@
 
 A relief h changes the logarithm of the diffuse shading by ``-g . grad h``. The vector g is the tangential gradient of
 the shading by the normal, divided by the shading (Pentland, *Linear shape from shading*, IJCV 1990). In a patch of
-skin, a few millimetres wide, this multiplies each Fourier component by a constant factor, so the shading can be
-inverted to the relief. Waves at right angles to g do not change the shading, so their height is estimated near zero.
+skin, a few millimetres wide, shading multiplies each Fourier component of the relief by a constant factor, so the
+shading can be inverted to the relief. Waves at right angles to g do not change the shading, so their height is
+estimated near zero.
 
 Pictures have noise and highlights, and the geometry and the cameras are off by a pixel. So the views are split into two
 disjoint sets, and the image shift between the sets is removed. For each patch and octave of wavelength, a Wiener filter
@@ -238,7 +239,7 @@ def without_slow(light: Float32[np.ndarray, "r s"], side: int) -> Float32[np.nda
     """Subtracts structures wider than a third of a patch, which would leak into all Fourier components.
 
     The wide Gaussian is computed on a downsampled strip, which takes a fiftieth of the time for a texture of 8192
-    texels. On pure noise this changes the result by at most 0.3 % of the noise's spread."""
+    texels. On pure noise the downsampling changes the result by at most 0.3 % of the noise's spread."""
     height, width = light.shape
     step = max(side // BLURRED_SIDE, 1)
     coarse = cv2.resize(light, (width // step, height // step), interpolation=cv2.INTER_AREA)
@@ -295,8 +296,8 @@ def _row_of_patches(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Holds the Fourier components of square patches of one size. Each has a frequency (cycles per mm), the shading
-    that 1 mm of height causes, and an octave (-1: discarded)."""
+    """Holds the Fourier components of square patches of one size. Each component has a frequency (cycles per mm), the
+    shading that 1 mm of height causes, and an octave (-1: discarded)."""
 
     side: int
     per_mm: Float32[np.ndarray, "n p q"]
