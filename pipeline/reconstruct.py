@@ -1,4 +1,4 @@
-"""Reconstructs a textured head from a capture (section 4) by calling the stages in their order."""
+"""Reconstructs a textured head from a capture (the paper's section 4) by calling the stages in their order."""
 
 from collections.abc import Generator
 from dataclasses import replace
@@ -38,7 +38,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     """Reconstructs a textured head from one capture (paper, section 4). Reads and writes no files.
 
     Raises EigenheadError if no head can be computed, as with too few usable views, or if ``settings.fail_on`` names the
-    code of a warning. Raises Cancelled if ``context.progress`` does.
+    code of a warning. Raises Cancelled if ``context.progress`` raises it.
     """
     steps = start_reconstruction(context)
     return steps.send(replace(next(steps), solution=None))  # which no later stage needs, and which is large

@@ -48,7 +48,7 @@ class FaceSettings:
 
 @dataclass(frozen=True, slots=True)
 class FittingSettings:
-    """Sets the fit to the outlines (sections 4.3 and 4.4)."""
+    """Sets the fit to the outlines (the paper's sections 4.3 and 4.4)."""
 
     modes: int = 60  # of the eigenheads (section 3.1); lower it where few cameras see the head
     robust_px: float = 1.5  # residual at which an outline counts a quarter; raise it to six times the noise of outlines
@@ -70,7 +70,7 @@ class CapSettings:
 
 @dataclass(frozen=True, slots=True)
 class TextureSettings:
-    """Sets how the head is coloured (section 4.5). The defaults minimise the colour error on rendered faces."""
+    """Sets how the head is coloured (the paper's section 4.5). Defaults minimise the error on rendered faces."""
 
     blend: Literal["default", "reference"] = "default"  # reference is the paper's weighted mean, for comparison
     balance: bool = True  # gain and offset of each camera; false where the cameras' colours are calibrated already

@@ -1,11 +1,10 @@
-"""Finds the rim of a head in every camera without drawing an image.
+"""Finds the rim of a head, the curve that projects to its outline, in every camera without drawing an image.
 
 For a surface point X with normal N and a camera centre C_k, the rim is where ``N . (X - C_k) = 0``. The product ``N .
 (X - C_k)`` is interpolated along mesh edges to find the zero crossing. A rim point is on the *outer* outline if a step
 outwards leaves the model's mask. Instead of a drawn mask, the test uses the mesh's silhouette edges, between
 front-facing and back-facing faces (counted twice), and its border edges (counted once). The winding number of these
-edges around a pixel is the number of faces over the pixel. The projected edges are sorted by image rows, so a test
-visits the edges of one row only.
+edges around a pixel is the number of faces over the pixel. A test visits only the edges that cross one image row.
 
 The tangent plane at the rim contains the viewing ray. With P = d(pixel)/dX the outline's normal in the image is
 therefore ``n = l / |l|, l = N^T P^+``, and ``n^T P = N^T / |l|``. A shift of the rim along the surface has no effect to

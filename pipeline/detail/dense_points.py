@@ -73,8 +73,8 @@ def thinned(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:
 
 @traced
 def dense_points(depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_world: Mesh) -> SurfacePoints:
-    """Returns the surface points on which enough views agree. The points are thinned to one for each cell of a grid,
-    part of the head, and side of a thin sheet.
+    """Returns the surface points on which enough views agree. The points are thinned to one for each grid cell, part
+    label and main direction of the normal.
 
     Args:
         depth_maps: one for each view.

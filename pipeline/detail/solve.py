@@ -6,9 +6,10 @@ for each. The head moves by ``operator @ (amplitude w direction)``. An observati
 q. The cost ``tr(w^T Q w) + sum q (dot(n, dX(w)) - e)^2`` is minimised exactly as a sparse linear problem. A random draw
 from the posterior needs one more solution (Papandreou and Yuille 2010, *Gaussian sampling by local perturbations*).
 
-The nodes are no denser than the photographs' resolution. A model with subdivision has two meshes of nodes: its cage,
-and the mesh one subdivision step before the full mesh (edges of 1.7 mm in the face; the windows of dense matching are
-2.6 mm wide). A model without subdivision is solved first on a decimated mesh, then on its own vertices.
+The nodes are no denser than the photographs' resolution. A model with subdivision has two meshes of nodes: its coarsest
+mesh (the cage), and the mesh one subdivision step before the full mesh (edges of 1.7 mm in the face; the windows of
+dense matching are 2.6 mm wide). A model without subdivision is solved first on a decimated mesh, then on its own
+vertices.
 """
 
 from dataclasses import dataclass

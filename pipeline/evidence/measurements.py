@@ -1,9 +1,9 @@
 """Measures anthropometric landmarks and distances of a fitted head, with standard deviations by linear propagation.
 
-A landmark is a vertex of the model's full mesh, with the position ``x = s R (h0 + sum_m z_m h_m) + t`` (eq. 1 and the
-paper's T). The landmark's derivatives are ``s R h_m`` by a coefficient, ``-[x - t]x`` by a rotation about the head's
-origin, the identity by the translation, and ``x - t`` by log scale. A distance has ``var = g C g^T``, where g is its
-gradient and C the fit's covariance. Rotation and translation do not change a distance.
+A landmark is a vertex of the model's full mesh, with the position ``x = s R (h0 + sum_m z_m h_m) + t`` (the paper's eq.
+1). The landmark's derivatives are ``s R h_m`` by a coefficient, ``-[x - t]x`` by a rotation about the head's origin,
+the identity by the translation, and ``x - t`` by log scale. A distance has ``var = g C g^T``, where g is its gradient
+and C the fit's covariance. Rotation and translation do not change a distance.
 
 Outlines and photographs of skin hardly determine a landmark's position along the surface. The eigenheads determine this
 position, but most heads are not exact combinations of eigenheads. So a landmark has the standard deviation

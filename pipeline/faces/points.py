@@ -1,5 +1,5 @@
 """Provides measured properties of the landmark network's 468 face points: symmetric pairs, mean shape, bias and noise.
-``right`` and ``left`` are the subject's.
+``right`` and ``left`` are the subject's sides.
 
 Each point was paired with the nearest point in the mirror image of a face (``python -m
 tests.laboratory.model_packs.landmark_map``).

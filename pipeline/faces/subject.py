@@ -237,7 +237,7 @@ def place_from_one_view(face: FaceDetection, camera: Camera) -> Similarity | Non
 
 def match_alone(name: str, face: FaceDetection, camera: Camera) -> MatchedFaces | None:
     """Returns a ``MatchedFaces`` from a single view, with a mean adult's points. Returns None if
-    ``place_from_one_view`` does.
+    ``place_from_one_view`` returns None.
 
     The pixels determine the points perpendicular to the viewing rays. Motions of the whole face along the rays, and
     rotations about its middle, get a large uncertainty.

@@ -1,7 +1,7 @@
 """Finds the curve at which a bust ends if masks cut the subject off inside the pictures.
 
-Masks of other programs often end at the chest. Near this end depth is unreliable, and the surface would have a ragged
-edge. The bust therefore ends at a distance from the head that is a smooth function of direction.
+Masks of other programs often end at the chest. Near a mask's end depth is unreliable, and the surface would have a
+ragged edge. The bust therefore ends at a distance from the head that is a smooth function of direction.
 """
 
 from dataclasses import dataclass

@@ -139,7 +139,7 @@ def nearest_pixel(column: float, row: float, size: np.ndarray) -> tuple[int, flo
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def cosine(camera: np.ndarray, place: np.ndarray, depth: float, shown: np.ndarray) -> float:
     """Returns the cosine between a pixel's normal and the direction to the camera, times the ray's length for each mm
-    of depth. Multiplied by a difference in depth, it gives the distance to the pixel's tangent plane."""
+    of depth. The product with a difference in depth is the distance to the pixel's tangent plane."""
     x, y, z = place[0] - camera[CENTRE], place[1] - camera[CENTRE + 1], place[2] - camera[CENTRE + 2]
     return -NORMAL_STEP * (x * shown[NORMAL] + y * shown[NORMAL + 1] + z * shown[NORMAL + 2]) / depth
 

@@ -74,8 +74,8 @@ def tinted(image: ImageRgb, parts: Float32[np.ndarray, "h w 3"]) -> ImageRgb:
 
 
 def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> Resized:
-    """Draws the difference of two masks (eq. 4) over a pale copy of the image, in a panel's size. Pixels only in the
-    input mask are sky blue, pixels only in the model's mask vermilion."""
+    """Draws the difference of two masks (the paper's eq. 4) over a pale copy of the image, in a panel's size. Pixels
+    only in the input mask are sky blue, pixels only in the model's mask vermilion."""
     size = _fitted_size(image)
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     observed, model = (

@@ -3,9 +3,9 @@
 The module computes each pixel's log odds of foreground against the corrected background
 (``pipeline.segmentation.background``), and smooths them by mean-field sweeps. Neighbours are coupled weakly where their
 *differences* to the plate differ (Sun et al., *Background Cut*, ECCV 2006), so edges of the backdrop have no effect. A
-pixel like the plate is certainly background only if the subject has another colour (``Decision.clear``). Other pixels
-are doubtful, as are pixels where a shadow might be a coat. For doubtful pixels, ``pipeline.segmentation.segment`` uses
-the other cameras, and ``reconsider`` decides again.
+pixel similar to the plate is certainly background only if the subject has another colour (``Decision.clear``). Other
+pixels are doubtful, as are pixels where a shadow might be a coat. For doubtful pixels,
+``pipeline.segmentation.segment`` uses the other cameras, and ``reconsider`` decides again.
 
 Soft shadows on the backdrop, and light that the subject reflects onto the backdrop, count as background.
 """

@@ -1,15 +1,15 @@
-"""Computes one silhouette for each camera of a capture by background subtraction (section 5.4).
+"""Computes one silhouette for each camera of a capture by background subtraction (the paper's section 5.4).
 
 First ``pipeline.segmentation.foreground`` decides which pixels show the subject; other cameras decide about doubtful
 pixels. Then ``pipeline.segmentation.matting`` finds the sub-pixel contour. Last the silhouettes of all cameras are
 compared. ``quality.usable`` is False if a mask would harm a fit, and ``quality.warnings`` give the reason. Masks that
 the operator supplies replace the computed masks.
 
-A coarse visual hull (figure 1) shows whether the silhouettes agree. A voxel is empty according to a camera that sees it
-clearly outside its silhouette. A view can be wrong in two ways. *Strange* area is mask where, according to at least two
-other cameras, every voxel on the ray is empty: a moved chair, a passer-by. *Missing* area is background in this view,
-although no other camera excludes the voxels on the ray: hair or a coat in the colour of the backdrop. Two cameras must
-agree that a voxel is empty, so that one bad view does not affect the others.
+A coarse visual hull (the paper's figure 1) shows whether the silhouettes agree. A voxel is empty according to a camera
+that sees it clearly outside its silhouette. A view can be wrong in two ways. *Strange* area is mask where, according to
+at least two other cameras, every voxel on the ray is empty: a moved chair, a passer-by. *Missing* area is background in
+this view, although no other camera excludes the voxels on the ray: hair or a coat in the colour of the backdrop. Two
+cameras must agree that a voxel is empty, so that one bad view does not affect the others.
 
 A visual hull is larger than the subject, most of all with few cameras: the hull of three cameras covers up to 11 % more
 than a correct fourth mask. Missing area therefore counts only if the view also *contradicts* another camera: this view

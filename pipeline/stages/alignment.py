@@ -1,4 +1,4 @@
-"""Determines the pose and scale of the mean head before the shape is fitted (section 4.2)."""
+"""Determines the pose and scale of the mean head before the shape is fitted (the paper's section 4.2)."""
 
 from dataclasses import dataclass, replace
 from typing import Literal

@@ -68,8 +68,8 @@ def judge_head(
 ) -> Staged[Evidence]:
     """Measures the final head, and warns if it is not plausible.
 
-    Refuses with UnexplainedOutlines if the head explains hardly any outline and no face in the photographs confirms its
-    pose. The settings can allow such a head, for subjects with long hair all around, whose outlines are all hair.
+    Refuses with UnexplainedOutlines if the head fits hardly any outline and no face in the photographs confirms its
+    pose. The settings can allow a misfitting head, for subjects with long hair all around.
     """
     fit, model, rig, outputs = head.fit, head.model, context.rig, context.settings.outputs
     before = start_masks(model, alignment.world_from_head, rig)

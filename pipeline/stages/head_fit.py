@@ -1,4 +1,4 @@
-"""Fits the head to the outlines (section 4.4) by the solver in the settings, and then to the photographs.
+"""Fits the head to the outlines (the paper's section 4.4) by the solver in the settings, and then to the photographs.
 
 The fit has two stages, ``fit_outlines`` and ``fit_head``, because the pixels are labelled between them.
 """

@@ -1,4 +1,4 @@
-"""Computes the head's colours and texture (section 4.5)."""
+"""Computes the head's colours and texture (the paper's section 4.5)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Finds the silhouettes (section 5.4), and decides which views are used."""
+"""Finds the silhouettes (the paper's section 5.4), and decides which views are used."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -73,7 +73,7 @@ def fill_unknown(
     parts: UInt8[np.ndarray, " v"] | None = None,
 ) -> Float[np.ndarray, "v c"]:
     """Fills in the values (at most four channels) of unknown vertices smoothly from their neighbours. A piece of the
-    mesh without any known vertex gets the mean of all known ones. With ``parts`` (labels such as skin or hair), a
+    mesh without any known vertex gets the mean of all known values. With ``parts`` (labels such as skin or hair), a
     vertex is filled only from its own part, if possible. Where two filled parts meet, their values are blended over
     ``SEAM_RINGS`` rings."""
     if parts is None:

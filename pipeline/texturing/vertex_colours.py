@@ -1,4 +1,4 @@
-"""Computes one colour for each vertex from the photographs (section 4.5).
+"""Computes one colour for each vertex from the photographs (the paper's section 4.5).
 
 The module takes the fitted mesh, the photographs and the silhouettes. The module returns a colour for each vertex, and
 the number of images used. ``blend = "reference"`` is the paper's weighted mean: an image counts if the vertex projects

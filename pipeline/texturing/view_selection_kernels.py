@@ -35,8 +35,8 @@ def ring_quality(weights: np.ndarray, starts: np.ndarray, indices: np.ndarray) -
 
 @njit(cache=True, nogil=True)
 def best_candidates(costs: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ``most`` views of lowest cost (v, most) for each vertex, the lowest first, and their costs. The value
-    is -1 where there are fewer views. ``costs`` is (v, k)."""
+    """Returns the ``most`` views of lowest cost (v, most) for each vertex, the lowest first, and their costs. Missing
+    views are -1. ``costs`` is (v, k)."""
     count, cameras = costs.shape
     views = np.full((count, most), -1, np.int32)
     found = np.full((count, most), NEVER, np.float32)

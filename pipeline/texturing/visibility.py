@@ -1,4 +1,4 @@
-"""Computes which camera sees which point of a surface, with which weight and colour (section 4.5).
+"""Computes which camera sees which point of a surface, with which weight and colour (the paper's section 4.5).
 
 The paper requires that a point projects inside the silhouette and is not occluded. Real edges are blurred and fits are
 not exact, so points near the contour or near an occluding edge are also excluded. To find occluding edges, a point is
@@ -67,7 +67,8 @@ def see_points(
 
 
 def unclipped(colours: Float32[np.ndarray, "v 3"]) -> Float32[np.ndarray, " v"]:
-    """Returns a factor for the weight of each colour: 1 well below the end of the scale, falling to almost 0 at it.
+    """Returns a factor for the weight of each colour: it falls from 1 well below the largest code to almost 0 at this
+    code.
 
     A clipped value does not show how bright a point is, so a view with a longer exposure would make it too dark. Where
     all views are clipped the result is still white.

@@ -149,8 +149,8 @@ def mean_misfit(errors_px: Float[np.ndarray, "n n 2"], cut_off: float | None = N
 
 
 def _judged(held: Int[np.ndarray, " n"], misfit: Float32[np.ndarray, "n n n n"], rig: Rig) -> Assignment:
-    """Converts the permutation ``held`` to an assignment. Returns an empty assignment if the misfit hardly falls, or if
-    an exchanged picture still contradicts the others."""
+    """Converts the permutation ``held`` to an assignment. Returns an empty assignment if the permutation hardly reduces
+    the misfit, or if an exchanged picture still contradicts the others."""
     identity = np.arange(len(rig))
     displaced = np.flatnonzero(held != identity)
     if not len(displaced):
@@ -237,8 +237,8 @@ def _size(camera: Camera) -> tuple[int, int]:
 
 def _least_misfit(misfit: Float32[np.ndarray, "n n n n"], rig: Rig) -> Int[np.ndarray, " n"]:
     """Finds the permutation of least misfit by exchanging two pictures at a time, starting with the pictures as filed.
-    If all names are shifted by the same number, no single exchange helps, so the search also starts with such
-    shifts."""
+    If all file names are shifted by the same number, no single exchange helps, so the search also starts with shifted
+    names."""
     count = len(rig)
     sizes = [_size(camera) for camera in rig]
     allowed = np.array([[one == two for two in sizes] for one in sizes])

@@ -1,8 +1,8 @@
 """Divides the space around the subject into voxels, and combines the log odds of other views along each pixel's ray.
 
-As in the visual hull (figure 1), a voxel belongs to the subject only if no view that sees it excludes it. Views are
-combined by log odds instead of masks (Franco & Boyer, *Fusion of multi-view silhouette cues using a space occupancy
-grid*, ICCV 2005), so that an uncertain view has no effect.
+As in the visual hull (the paper's figure 1), a voxel belongs to the subject only if no view that sees it excludes it.
+Views are combined by log odds instead of masks (Franco & Boyer, *Fusion of multi-view silhouette cues using a space
+occupancy grid*, ICCV 2005), so that an uncertain view has no effect.
 """
 
 from collections.abc import Mapping

@@ -8,9 +8,9 @@ theorem). Parts that become too small in the layout (nose, ears) are enlarged by
 
 The layout is computed from a head model's mean head, so that a texel shows the same place of every subject's head.
 
-The bust's mesh is divided into several UV charts instead. Each triangle is projected along one of six directions (the
-head's axes), the one that the surface around it faces. If one part of the surface hides another (an ear the head), the
-hidden part gets a chart of its own. Charts are packed in rows of equal height.
+The bust's mesh, in contrast, is divided into several UV charts. Each triangle is projected along one of six directions
+(the head's axes), the one that the surface around it faces. If one part of the surface hides another (an ear the head),
+the hidden part gets a chart of its own. Charts are packed in rows of equal height.
 """
 
 from dataclasses import dataclass
@@ -129,7 +129,8 @@ def _path(vertices: Float[np.ndarray, "v 3"], faces: Faces, start: int, end: int
 
 
 def _cut_open(faces: Faces, count: int, path: Int[np.ndarray, " p"]) -> tuple[Faces, Int[np.ndarray, " n"]]:
-    """Cuts the mesh along a path, whose vertices are duplicated. Returns faces, and each vertex's original."""
+    """Cuts the mesh along a path, whose vertices are duplicated. Returns faces, and original indices of the
+    vertices."""
     edges = _edges(faces)
     beside = np.flatnonzero(np.isin(edges, path).any(axis=1))
     face_of = dict(zip(map(tuple, edges[beside].tolist()), (beside % len(faces)).tolist(), strict=True))

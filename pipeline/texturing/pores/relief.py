@@ -9,7 +9,7 @@ estimated near zero.
 Pictures have noise and highlights, and the geometry and the cameras are off by a pixel. So the views are split into two
 disjoint sets, and the image shift between the sets is removed. For each patch and octave of wavelength, a Wiener filter
 keeps the fraction of the power that both sets share. The Wiener filter does not separate colour from relief; ``COLOUR``
-sets which fraction of the colour's variation is taken for shading.
+is the fraction of the colour's variation that counts as shading.
 
 The same filter extracts detail for the texture from the difference between pictures of full and of working size.
 """

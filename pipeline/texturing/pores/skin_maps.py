@@ -91,8 +91,7 @@ def read_close_views(
 
 
 def _head_of(camera: Camera, image: ImageRgb, mesh: Mesh) -> tuple[Camera, UInt8[np.ndarray, "_ _ 3"]]:
-    """Crops a picture to the head. Returns the crop's camera, and a copy of its pixels, so that the picture can be
-    freed."""
+    """Crops a picture to the head. Returns the crop's camera, and a copy of its pixels, which frees the picture."""
     k = camera.intrinsics.at_size(image.shape[1], image.shape[0])
     pixels = project_points(replace(camera, intrinsics=k), mesh.vertices)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
