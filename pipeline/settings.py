@@ -70,7 +70,7 @@ class CapSettings:
 
 @dataclass(frozen=True, slots=True)
 class TextureSettings:
-    """Sets how the head is coloured (the paper's section 4.5). Defaults minimise the error on rendered faces."""
+    """Sets how the head is coloured (the paper's section 4.5)."""
 
     blend: Literal["default", "reference"] = "default"  # reference is the paper's weighted mean, for comparison
     balance: bool = True  # gain and offset of each camera; false where the cameras' colours are calibrated already

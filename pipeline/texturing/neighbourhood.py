@@ -74,8 +74,8 @@ def fill_unknown(
 ) -> Float[np.ndarray, "v c"]:
     """Fills in the values (at most four channels) of unknown vertices smoothly from their neighbours. A piece of the
     mesh without any known vertex gets the mean of all known values. With ``parts`` (labels such as skin or hair), a
-    vertex is filled only from its own part, if possible. Where two filled parts meet, their values are blended over
-    ``SEAM_RINGS`` rings."""
+    vertex is filled only from its own part, if possible. Filled parts that meet are blended over ``SEAM_RINGS``
+    rings."""
     if parts is None:
         return _fill(values, known, faces)
     out, sure = values.astype(float), known.copy()

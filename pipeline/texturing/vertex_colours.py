@@ -7,8 +7,7 @@ inside its silhouette and is not occluded. The image's weight is the dot product
 The default blending also handles cameras that differ and edges that are blurred. The default blending leaves margins at
 contours and occluding edges (``visibility``), sharpens photographs where they have detail, and corrects gain and offset
 of each camera (``colour_balance``). The default blending averages in linear light, and gives little weight to a view
-that differs from the others in any channel (a highlight, a shadow), and less to cameras with a large correction. Unseen
-vertices are interpolated.
+that differs from the others in any channel (a highlight, a shadow), and less to cameras with a large correction.
 
 In head models whose eyes are openings, strips of triangles from lid to lid close the openings; the vertices of a strip
 lie on the lids' hidden edges. A strip takes its colours from the one photograph that sees most of it.

@@ -89,10 +89,9 @@ def assign_images(
     of a capture; called again after every change. ``exchanged``: whether a certain exchange is repaired or refused.
     ``guards``: decides about refusals.
 
-    Refuses with ExchangedPictures if the settings forbid the repair of an exchange, or if the exchange is uncertain and
-    the face confirms no picture as filed. Refuses with SamePictures if fewer than three pictures are different. Refuses
-    with WrongRig if most cameras contradict the others, no exchange explains the contradiction, and the face does not
-    confirm the rig.
+    Refuses with ExchangedPictures if the settings forbid a repair, or if the exchange is uncertain and the face
+    confirms no picture. Refuses with SamePictures if fewer than three pictures differ. Refuses with WrongRig if most
+    cameras contradict the others, no exchange is found, and the face does not confirm the rig.
     """
     overruled: list[ReportWarning] = []
     plates = misplaced_plates(capture, rig)
