@@ -1,1 +1,1 @@
-"""From a capture to a head: values in, values out; no stage reads or writes files, the clock or a global."""
+"""Reconstructs a head from a capture. The method works on values in memory and writes no files."""

@@ -1,4 +1,4 @@
-"""Reconstructs a textured head from a capture (section 4): the order of the stages, for every caller."""
+"""Reconstructs a textured head from a capture (the paper's section 4) by calling the stages in their order."""
 
 from collections.abc import Generator
 from dataclasses import replace
@@ -37,16 +37,16 @@ def fit_shape(run: Recorder, views: Views, alignment: Alignment) -> tuple[PartLa
 def reconstruct(context: ReconstructionContext) -> Reconstruction:
     """Reconstructs a textured head from one capture (paper, section 4). Reads and writes no files.
 
-    Raises EigenheadError where there is no answer (too few usable views, feature points that determine nothing) or a
-    warning has a code that ``settings.fail_on`` names, and Cancelled when ``context.progress`` does.
+    Raises EigenheadError if no head can be computed, as with too few usable views, or if ``settings.fail_on`` names the
+    code of a warning. Raises Cancelled if ``context.progress`` raises it.
     """
     steps = start_reconstruction(context)
     return steps.send(replace(next(steps), solution=None))  # which no later stage needs, and which is large
 
 
 def start_reconstruction(context: ReconstructionContext, run: Recorder | None = None) -> Generator[Any, HeadFit, None]:
-    """Runs a reconstruction up to the fitted head, which it yields; with the head that is sent back it goes on, and
-    yields the result. Several captures of one person meet in between. ``run`` shows the warnings until then."""
+    """Runs a reconstruction, and yields the fitted head. The caller sends back a head, perhaps fitted to several
+    captures; the generator continues with this head, and yields the result. ``run`` collects the warnings."""
     if "usdz" in context.settings.outputs.formats:
         check_usd()
     run = run or Recorder(context)

@@ -1,5 +1,5 @@
-"""Defines what a user can set: each setting with when to change it. Values are frozen; unknown keys of a document are
-refused, and those of the version before are read with a warning."""
+"""Defines all settings that a user can change, with their defaults. Unknown keys of a settings document are refused;
+keys of the previous version are read with a warning."""
 
 import dataclasses
 import re
@@ -48,7 +48,7 @@ class FaceSettings:
 
 @dataclass(frozen=True, slots=True)
 class FittingSettings:
-    """Sets the fit to the outlines (sections 4.3 and 4.4)."""
+    """Sets the fit to the outlines (the paper's sections 4.3 and 4.4)."""
 
     modes: int = 60  # of the eigenheads (section 3.1); lower it where few cameras see the head
     robust_px: float = 1.5  # residual at which an outline counts a quarter; raise it to six times the noise of outlines
@@ -62,7 +62,7 @@ class FittingSettings:
 
 @dataclass(frozen=True, slots=True)
 class CapSettings:
-    """Sets the swim or wig cap that the subject wears, under which the skull lies its thickness deep."""
+    """Sets colour and thickness of the swim or wig cap that the subject wears."""
 
     colour: str | None = None  # about its colour, #rrggbb or a name (blue, black, white ...), where one is worn
     thickness_mm: float = 1.0  # 0 to 10: latex and silicone 0.4 to 1, cloth 1 to 1.5; add that of flattened hair
@@ -70,7 +70,7 @@ class CapSettings:
 
 @dataclass(frozen=True, slots=True)
 class TextureSettings:
-    """Sets how the head is coloured (section 4.5). Chosen by the colour error over the face of rendered captures."""
+    """Sets how the head is coloured (the paper's section 4.5)."""
 
     blend: Literal["default", "reference"] = "default"  # reference is the paper's weighted mean, for comparison
     balance: bool = True  # gain and offset of each camera; false where the cameras' colours are calibrated already
@@ -90,7 +90,7 @@ class BustSettings:
 
 @dataclass(frozen=True, slots=True)
 class OutputSettings:
-    """Sets which surfaces are made, and which files beside those that every result has."""
+    """Sets which surfaces are made, and which optional files are written."""
 
     surface: Literal["head", "bust", "both", "hair"] = "both"  # one alone saves seconds; hair: head_hair.ply, too
     formats: tuple[str, ...] = ("glb", "ply")  # of the head: name those that you open; head.ply is always written
@@ -107,7 +107,7 @@ class OutputSettings:
 
     @property
     def textured(self) -> bool:
-        """Tells whether any file has a texture."""
+        """Returns True if any requested file has a texture."""
         requested = self.ply_texture or self.albedo != "none" or bool({"glb", "obj", "usdz"} & set(self.formats))
         return self.surface != "bust" and requested
 
@@ -138,7 +138,7 @@ class Settings:
 
 
 def settings_from_document(document: Mapping[str, Any], subject: str = "settings") -> Settings:
-    """Returns the settings in decoded JSON or TOML. Raises InputError that names every unknown key and wrong value."""
+    """Converts decoded JSON or TOML to settings. Raises InputError, which names every unknown key and wrong value."""
     faults: list[Message] = []
     document, warnings = _with_present_keys(document)
     settings = replace(read_fields(Settings, document, "", faults), warnings=warnings)
@@ -166,12 +166,12 @@ def settings_from_document(document: Mapping[str, Any], subject: str = "settings
 
 
 def document_from_settings(settings: Settings) -> dict[str, object]:
-    """Returns settings as nested dictionaries, the form that ``settings_from_document`` reads."""
+    """Converts settings to nested dictionaries, which ``settings_from_document`` can read."""
     return {name: value for name, value in dataclasses.asdict(settings).items() if name != "warnings"}
 
 
 def _with_present_keys(document: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[Message, ...]]:
-    """Returns a document without the keys of earlier versions, and warnings about those that it has."""
+    """Removes or renames the keys of earlier versions in a document. Returns it with warnings about these keys."""
     present, fixed, warnings = dict(document), [], []
     for table, names in FIXED.items():
         if table in present and not names:

@@ -1,5 +1,4 @@
-"""Defines what stages report besides their products: warnings for the operator, and the level of detail that a fit
-reached."""
+"""Defines the codes of warnings for the operator, and the value that states the level of detail of a fit."""
 
 from dataclasses import dataclass
 from typing import Literal

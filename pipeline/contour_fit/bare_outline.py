@@ -1,8 +1,8 @@
-"""Finds the stretches of a silhouette's outline that show the bare skull instead of hair.
+"""Finds the parts of a silhouette's outline where the scalp is bald.
 
-``noise_model.is_hairless`` takes an outline for hair if no head of the model's population fits it. That is wrong for a
-bald head outside the population. This module looks at the pixels: along a hairless head skin reaches up to the outline,
-and the outline is smooth. Hair as light as skin fails the second test: strands and tufts make its outline rough.
+``noise_model.is_hairless`` assumes that an outline shows hair if no head of the model's population fits it. A bald head
+of unusual shape breaks this assumption, so this module tests the pixels. Along a bald scalp skin reaches up to the
+outline, and the outline is smooth. Strands and tufts make the outline of hair rough.
 """
 
 from collections.abc import Mapping
@@ -37,15 +37,14 @@ MISSED_PX = 1.0  # a crown whose outline is farther off is fitted once more
 
 
 def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Plane]) -> ContourSolution:
-    """Marks the outline of the crown where it is hairless, and fits the head once more with that outline at full
-    weight.
+    """Finds the outline of a bald crown, and fits the head once more with this outline at full weight.
 
     Args:
         solved: the solution of the contour solver.
         skin: for each camera, the probability that a pixel shows skin.
 
     Returns:
-        The new solution; ``solved`` if the crown is not bare.
+        The new solution, or ``solved`` if the crown has hair.
     """
     if not skin:
         return solved
@@ -55,10 +54,10 @@ def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Plane]) -> Con
 
 
 def with_counted_crown(solved: ContourSolution, cells: tuple[Bool[np.ndarray, "_ _"], ...]) -> ContourSolution:
-    """Fits the head once more; the crown's outline has full weight in the marked cells of each view.
+    """Fits the head once more, with full weight for the crown's outline in the marked ``cells`` of each view.
 
-    Skips the fit and only adds the marks if the whole head's outline already counts, or if the crown lies within
-    ``MISSED_PX`` of its outline.
+    Skips the fit and only adds the marked cells if the whole head's outline already has full weight, or if the crown's
+    residuals are below ``MISSED_PX``.
     """
     problem, scale = solved.problem, solved.problem.settings.robust_px
     evidence = replace(solved.evidence, noise=replace(solved.evidence.noise, bare=cells))
@@ -77,14 +76,14 @@ def with_counted_crown(solved: ContourSolution, cells: tuple[Bool[np.ndarray, "_
 def _shown_crown(
     solved: ContourSolution, cells: tuple[Bool[np.ndarray, "_ _"], ...]
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
-    """Returns two masks over the rim samples: those on the crown, and those on the crown in a marked cell."""
+    """Returns two masks over the rim samples: samples on the crown, and samples on the crown in marked cells."""
     rim = observed_rim(solved.problem, solved.evidence, solved.state, solved.stage)
     crown = is_crown(solved.problem, rim, solved.stage.level)
     return crown, crown & within(cells, rim)
 
 
 def find_bare(problem: ContourProblem, state: State, skin: Mapping[str, Plane]) -> tuple[Bool[np.ndarray, "_ _"], ...]:
-    """Marks, in every view, the square cells (``CELL_PX`` pixels wide) near the outline of a hairless head."""
+    """Marks, in every view, the square cells (``CELL_PX`` pixels wide) near the outline of a bald scalp."""
     views, maps = problem.views, []
     for k, camera in enumerate(problem.rig):
         distance = views.distance_map(k)
@@ -97,8 +96,8 @@ def find_bare(problem: ContourProblem, state: State, skin: Mapping[str, Plane]) 
 
 
 def bare_cells(distance: Plane, skin: Plane, px_per_mm: float) -> Bool[np.ndarray, "_ _"]:
-    """Marks the square cells (``CELL_PX`` pixels wide) of one view within ``REACH_MM`` of an outline that is smooth and
-    has skin up to it.
+    """Marks the square cells (``CELL_PX`` pixels wide) of one view that lie within ``REACH_MM`` of a bald scalp's
+    outline, which is smooth and borders on skin.
 
     Args:
         distance: signed distance to the outline (px), negative inside.
@@ -117,7 +116,7 @@ def bare_cells(distance: Plane, skin: Plane, px_per_mm: float) -> Bool[np.ndarra
 
 
 def largest_outline(distance: Plane) -> Float[np.ndarray, "n 2"] | None:
-    """Returns the pixels (column, row) along the longest outline of a signed distance; None without a subject."""
+    """Returns the pixels (column, row) along the longest zero contour of a signed distance map; None without any."""
     outlines = cv2.findContours((distance < 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
     return max(outlines, key=len)[:, 0].astype(float) if outlines else None
 
@@ -126,7 +125,7 @@ def cells_along(
     outline: Float[np.ndarray, "n 2"], chosen: Bool[np.ndarray, " n"], shape: tuple[int, int], reach_px: float
 ) -> Bool[np.ndarray, "_ _"]:
     """Marks the square cells (``CELL_PX`` pixels wide) of a picture of ``shape`` (rows, columns) that lie within
-    ``reach_px`` of an outline and whose nearest outline point is ``chosen``."""
+    ``reach_px`` of an outline and whose nearest outline point has the mask ``chosen`` set."""
     height, width = shape
     cells = np.zeros((height // CELL_PX + 1, width // CELL_PX + 1), bool)
     if not chosen.any():
@@ -140,11 +139,11 @@ def cells_along(
 
 
 def roughness(distance: Plane, smooth: Float[np.ndarray, "n 2"], px_per_mm: float) -> Float[np.ndarray, " n"]:
-    """Returns the roughness (px, RMS) of an outline at each point of the ``smooth`` curve along it: the scatter, within
-    some millimetres, of the outline's distance from the curve.
+    """Returns the roughness (px, RMS) of an outline at each point of ``smooth``, a smoothed curve along it. Roughness
+    is the scatter of the distance between outline and curve within some millimetres.
 
-    ``distance`` is the signed distance (px) to the outline. It is read at the curve's points, because the pixels of the
-    outline would add steps of a whole pixel.
+    ``distance`` is the signed distance (px) to the outline. The distance is interpolated at the curve's points, because
+    the outline's pixels would add steps of a whole pixel.
     """
     column, row = np.split(smooth.T.astype(np.float32), 2)
     off = cv2.remap(distance, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].astype(float)
@@ -172,8 +171,8 @@ def share_inside(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CapOutline:
-    """Holds, by camera, the silhouettes after the cap is taken off, and the square cells (``CELL_PX`` pixels wide) near
-    the cap's outline."""
+    """Holds, by camera, the silhouettes without the wig cap's thickness, and the square cells (``CELL_PX`` pixels wide)
+    near the cap's outline."""
 
     silhouettes: Mapping[str, Silhouette]
     cells: Mapping[str, Bool[np.ndarray, "_ _"]]
@@ -182,7 +181,7 @@ class CapOutline:
 def without_cap(
     silhouettes: Mapping[str, Silhouette], cap: Cap, rig: Rig, at_world: Float[np.ndarray, " 3"]
 ) -> CapOutline:
-    """Moves the outlines inwards by the cap's thickness wherever the cap forms the outline.
+    """Moves the outlines inwards by the wig cap's thickness wherever the cap forms the outline.
 
     Args:
         silhouettes: by camera.

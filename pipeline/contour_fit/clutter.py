@@ -1,5 +1,5 @@
-"""Finds the stretches of a rim that hair, shoulders or clothes may hide, and gives them no weight. Such clutter can
-only add area to a silhouette."""
+"""Gives zero weight to rim samples where hair, shoulders or clothes, here called clutter, may form the silhouette's
+outline. Clutter can only add area to a silhouette."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,23 +17,23 @@ CELL_PX, CLUTTER_CELLS = 4, 3  # clutter reaches 12 px beyond where it was found
 
 
 def downweight_outside_contour(problem: ContourProblem, evidence: StageEvidence, rim: Rim, level: str) -> Rim:
-    """Reduces the weight of the rim outside the face. A sample on cranium, ears or neck counts only where the model
-    lies outside the silhouette, with ``OUTSIDE_SHARE`` of its weight."""
+    """Reduces the weight of rim samples on cranium, ears and neck. A sample on these parts counts only if the model
+    sticks out of the silhouette, and then with ``OUTSIDE_SHARE`` of its weight."""
     face = face_of(problem, evidence, level)[rim.corner].all(axis=1)
     share = np.where(rim.residual > 0, OUTSIDE_SHARE, 0.0)
     return replace(rim, length=np.where(face, rim.length, share * rim.length))
 
 
 def face_of(problem: ContourProblem, evidence: StageEvidence, level: str) -> Bool[np.ndarray, " v"]:
-    """Tells which vertices of a mesh level lie in the face region and not under hair."""
+    """Returns a mask of the vertices of a mesh level that lie in the face region and not under hair."""
     region = problem.model.levels[level].face_region
     hair = {} if evidence.photographs is None else evidence.photographs.hair
     return region & ~hair[level] if level in hair else region
 
 
 def find_clutter(problem: ContourProblem, rim: Rim, threshold_px: float) -> tuple[Bool[np.ndarray, "_ _"], ...]:
-    """Marks clutter in every view, as square cells (``CELL_PX`` pixels wide): where the silhouette extends more than
-    ``threshold_px`` beyond the model, and ``CLUTTER_CELLS`` cells around."""
+    """Marks the square cells (``CELL_PX`` pixels wide) of every view where the silhouette extends more than
+    ``threshold_px`` beyond the model, and ``CLUTTER_CELLS`` cells around them."""
     maps = []
     for k, (width, height) in enumerate(problem.views.size):
         cells = np.zeros((height // CELL_PX + 1, width // CELL_PX + 1), np.uint8)
@@ -45,7 +45,7 @@ def find_clutter(problem: ContourProblem, rim: Rim, threshold_px: float) -> tupl
 
 
 def without_clutter(evidence: StageEvidence, rim: Rim) -> Rim:
-    """Returns the rim with zero weight for the samples in cells that ``evidence`` marks as clutter."""
+    """Returns the rim with zero length for the samples in cells that ``evidence`` marks as clutter."""
     if evidence.noise.clutter is None:
         return rim
     return replace(rim, length=np.where(within(evidence.noise.clutter, rim), 0.0, rim.length))
@@ -54,8 +54,8 @@ def without_clutter(evidence: StageEvidence, rim: Rim) -> Rim:
 def with_bare_crown(
     problem: ContourProblem, evidence: StageEvidence, rim: Rim, length: Float[np.ndarray, " s"], level: str
 ) -> Rim:
-    """Restores the weight of a hairless crown: samples above the brows in cells marked as hairless get their full
-    ``length``. All other samples stay as they are."""
+    """Restores the weight of a bald crown: rim samples above the brows, in cells marked as bald, get their full
+    ``length``. All other samples stay unchanged."""
     if evidence.noise.bare is None:
         return rim
     bare = is_crown(problem, rim, level) & within(evidence.noise.bare, rim)
@@ -63,14 +63,14 @@ def with_bare_crown(
 
 
 def is_crown(problem: ContourProblem, rim: Rim, level: str) -> Bool[np.ndarray, " s"]:
-    """Tells which rim samples lie on the crown, here all of the head above the brows."""
+    """Returns a mask of the rim samples on the crown, that is, on the head above the brows."""
     mean = problem.model.vertices(np.zeros(0), level)
     brows = problem.model.vertices(np.zeros(0))[problem.model.landmarks["glabella"], 1]
     return (mean[:, 1] > brows)[rim.corner].all(axis=1)
 
 
 def within(cells: Sequence[Bool[np.ndarray, "_ _"]], rim: Rim) -> Bool[np.ndarray, " s"]:
-    """Tells which rim samples lie in the marked cells of their view. ``cells`` has one map for each view."""
+    """Returns a mask of the rim samples in marked cells of their view. ``cells`` has one map for each view."""
     row, column = (rim.pixel / CELL_PX).astype(int).T[::-1]
     found = np.zeros(len(rim.view), bool)
     for k, marked in enumerate(cells):

@@ -1,8 +1,9 @@
-"""Fits a head to outlines by Levenberg-Marquardt on the rim (section 4.4's problem, another cost and minimiser).
+"""Fits a head model to outlines by Levenberg-Marquardt. The paper's section 4.4 uses another cost and a simplex.
 
-In: the silhouettes' signed distances, a start pose, and feature points if there are any. Out: coefficients, pose,
-camera corrections, and their covariance (each ``*_term`` has its equation). The robust scale shrinks step by step: a
-large scale lets the fit pass over clutter from a start that is 20 px off. The prior holds the shape until it is small.
+The solver needs the silhouettes' signed distances, a start pose and, if there are any, feature points. The solver
+returns coefficients, pose, camera corrections and their covariance. The modules ``*_term`` give the equations. The
+scale of the robust loss shrinks step by step, since a start that is 20 px off needs a large scale. While the scale is
+large, the prior keeps the shape from following clutter.
 """
 
 from collections.abc import Callable, Mapping
@@ -50,9 +51,9 @@ NON_MONOTONE = 4  # costs that a step may climb back to
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContourSolution:
-    """Holds the contour solver's problem and solution, from which later stages continue.
+    """Holds the problem and the solution of the contour solver for later stages.
 
-    ``evaluations`` counts evaluations of the cost. ``misfit_mm`` is handed on to ``Fit``.
+    ``evaluations`` counts evaluations of the cost. ``misfit_mm`` is copied into ``Fit``.
     """
 
     problem: ContourProblem
@@ -76,9 +77,9 @@ def solve_contour(
     landmarks: LandmarkObservations | None = None,
     report: Progress = discard_progress,
 ) -> ContourSolution:
-    """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes. It fits the
-    first ``settings.modes`` modes and, once these have converged, all of them. ``features`` are clicked pixels by
-    camera and landmark; ``landmarks`` are the face's. ``finish`` adds the covariance, which takes longer."""
+    """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes. The solver first
+    fits ``settings.modes`` modes, then all modes. ``features`` are clicked pixels by camera and landmark; ``landmarks``
+    are triangulated landmarks of the face. The function ``finish`` computes the covariance."""
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)
     few, span, whole, *rest = schedule(settings, len(model.modes))
     evidence, state = first_evidence(settings), start_state(problem, world_from_head)
@@ -106,11 +107,11 @@ def solve_contour(
 def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
     """Returns the stages of the fit, from coarse to fine, for a model of ``modes`` modes:
 
-    - pose and a few modes on a decimated mesh;
-    - all eigenheads, with the face's rim;
-    - the same with the whole head's rim, whose result is kept only if the head is hairless;
-    - the further modes, if the model has any;
-    - all modes on the full mesh.
+    - The first stage fits pose and a few modes on a decimated mesh.
+    - The second stage fits all eigenheads to the face's rim.
+    - The third stage fits all eigenheads to the whole head's rim, and its result is kept only if the head is bald.
+    - The next stage fits the model's further modes, if there are any.
+    - The last stage fits all modes on the full mesh.
     """
     few, span = min(FIRST_MODES, modes), min(settings.modes, modes)
     last = settings.robust_px
@@ -127,11 +128,11 @@ def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
 def run_stage(
     problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, report: Callable[[float], None]
 ) -> tuple[State, int, str]:
-    """Runs Levenberg-Marquardt at each robust scale of one stage in turn. Returns the state, the number of evaluations
-    and the reason why the last search stopped.
+    """Runs Levenberg-Marquardt once for each scale of the robust loss in a stage. Returns the state, the number of
+    evaluations and the reason why the last search stopped.
 
     The set of rim samples changes with the state, so the cost is not quite continuous. A step may therefore raise the
-    cost a little. When every step had to lower it, the search stopped 0.3 mm from the minimum.
+    cost a little; a search without this allowance stopped 0.3 mm from the minimum.
     """
     few = state.coefficients[: stage.modes]
     state = replace(state, coefficients=np.concatenate([few, np.zeros(stage.modes - len(few))]))
@@ -148,18 +149,18 @@ def run_stage(
 
 
 def coarsened(evidence: StageEvidence, scale_px: float) -> StageEvidence:
-    """Returns the evidence for steps with a coarse robust scale. Its noise unit l sigma^2 (px^3) is at least that of a
-    fixed correlation length l and a sigma of half the scale.
+    """Returns the evidence for steps with a large scale of the robust loss. The outline's noise l sigma^2 (px^3) is
+    raised to match a sigma of half the scale, at a fixed correlation length l.
 
-    With so much noise the prior outweighs the outlines and holds the shape. Without it, hair over both ears moved the
-    head by 5 mm and the first 15 modes to 8 standard deviations.
+    With so much noise the prior outweighs the outlines. With less noise, hair over both ears moved the head by 5 mm and
+    its coefficients to 8 standard deviations.
     """
     unit = max(evidence.noise.unit, FIRST_CORRELATION_PX * (0.5 * scale_px) ** 2)
     return replace(evidence, noise=replace(evidence.noise, unit=unit))
 
 
 def last_problem(solved: ContourSolution) -> tuple[Problem[State], Linearised]:
-    """Returns the problem of the last stage, and its linearisation at the solution."""
+    """Returns the least-squares problem of the last stage, and its linearisation at the solution."""
     scale = max(solved.stage.scales_px[-1], solved.evidence.noise.floor_px)
     return started_problem(solved.problem, solved.evidence, solved.stage, scale, solved.state)
 
@@ -171,8 +172,8 @@ def normal_equations(solved: ContourSolution) -> NormalEquations:
 
 
 def hold_at_bounds(solved: ContourSolution, equations: NormalEquations) -> None:
-    """Adds to the equations, in place, the terms that hold expression weights at their bound 0. At a bound the
-    posterior is exponential instead of Gaussian; its standard deviation is 1 / slope of the cost there."""
+    """Adds terms to the normal equations, in place, that keep expression weights at their bound 0. At a weight's bound
+    the posterior is exponential instead of Gaussian, and its standard deviation is 1 / (slope of the cost)."""
     posed = np.asarray(solved.problem.model.posed, int)
     if len(posed) and posed[-1] < solved.stage.modes:
         held = posed[(solved.state.coefficients[posed] <= 0.0) & (equations.gradient[posed] > 0.0)]
@@ -180,8 +181,8 @@ def hold_at_bounds(solved: ContourSolution, equations: NormalEquations) -> None:
 
 
 def finish(solved: ContourSolution) -> Fit:
-    """Returns the fit with its Laplace covariance: the rows and columns of shape and pose in the inverse of the last
-    normal matrix. The covariance thus includes the uncertainty of the cameras."""
+    """Returns the fit with its Laplace covariance of shape and pose. The covariance is a block of the inverse of the
+    last normal matrix, so it includes the uncertainty of the cameras."""
     problem, state, stage = solved.problem, solved.state, solved.stage
     kept, equations = stage.modes + POSE, normal_equations(solved)
     hold_at_bounds(solved, equations)
@@ -202,17 +203,17 @@ def finish(solved: ContourSolution) -> Fit:
 
 
 def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_mm: float) -> Fit:
-    """Returns the fit of a solution with its misfit set to the error that eigenheads cannot represent.
+    """Returns a fit with an estimate of the shape error that the eigenheads cannot represent.
 
-    Most heads lie outside the span of the eigenheads, and the fit's covariance does not include that error. The fit
-    agrees with the head at the outlines; between them its error is several times larger. The same outlines are
-    therefore fitted once more in a wider basis that can leave the span (``gaussian_process``). The misfit of the narrow
-    fit is the distance between both heads, combined with the uncertainty of the wider fit.
+    Few heads are exact combinations of the eigenheads, and the fit's covariance does not include this error. The error
+    is small at the outlines and several times larger between them. The same outlines are therefore fitted once more
+    with additional modes (``gaussian_process``). The misfit combines the distance between the two fitted heads with the
+    uncertainty of the second one.
 
     Args:
         solved: solution with the eigenheads alone.
         wider_model: the same mesh and eigenheads, followed by the kernel's modes.
-        relief_mm: as of ``with_estimated_prior``.
+        relief_mm: as in ``with_estimated_prior``.
     """
     fit, eigenheads = finish(solved), len(solved.state.coefficients)
     problem = widened(solved.problem, wider_model, (LEVEL,))
@@ -225,9 +226,9 @@ def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_
 
 
 def judged_by(wider_model: HeadModel, wider: Fit, model: HeadModel, fit: Fit) -> Fit:
-    """Returns ``fit`` with its misfit (mm, along the normals) set by comparison with ``wider``, a fit of more modes to
-    the same outlines. The squared misfit is the squared distance between both fits plus the variance that only the
-    wider fit has. Both fits must have a covariance."""
+    """Returns ``fit`` with a misfit (mm, along the normals) from its comparison with ``wider``, a fit of more modes to
+    the same outlines. The squared misfit is the squared distance between the two fits plus the excess of the wider
+    fit's variance. The fits ``fit`` and ``wider`` must have a covariance."""
     cage = fit.world_from_head.apply(model.cage(fit.coefficients))
     normals = vertex_normals(cage, model.levels["cage"].faces)
     apart = ((wider.world_from_head.apply(wider_model.cage(wider.coefficients)) - cage) * normals).sum(axis=1)

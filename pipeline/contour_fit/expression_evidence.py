@@ -1,10 +1,9 @@
-"""Separates expression from shape once everything else has been fitted.
+"""Separates facial expression from head shape after the fit has converged.
 
-The shape modes can imitate a smile. How far they may depends on the size that this head's other deviations give them.
-The prior variance of each group of modes (eigenheads, kernel, fine kernel) is therefore estimated from the fit itself
-(MacKay 1992, as in ``posterior``). If the head hardly deviates from its population, the variance is small, and the
-expression has to explain the smile. Expression weights keep their prior and their bounds. The images are not read
-again: the surface hardly moves, so the quadratic problem of the last stage is reused.
+Shape modes can imitate a smile. To limit this imitation, the prior variance of each group of modes (eigenheads, kernel,
+fine kernel) is estimated from the fit itself (MacKay 1992, as in ``posterior``). If the head hardly deviates from its
+population, the variance is small, and the expression has to explain the smile. Expression weights keep their prior and
+their bounds. The surface hardly moves, so the normal equations of the last stage are reused.
 """
 
 import re
@@ -30,8 +29,8 @@ LIDS = re.compile("eye(?!brow)")  # names of expressions that move lids or gaze
 
 
 def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> ContourSolution:
-    """Solves once more for shape and expression, with a prior variance for each group of modes that is estimated from
-    the fit. A neutral face is returned unchanged.
+    """Solves once more for shape and expression, with the prior variance of each group of modes estimated from the fit.
+    A neutral face is returned unchanged.
 
     Args:
         solved: a solution for all modes; ``posed`` of its model says which modes are expressions.
@@ -65,15 +64,15 @@ def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> Contou
 
 
 def makes_face(coefficients: Float[np.ndarray, " m"], posed: range) -> bool:
-    """Tells whether the face has an expression: whether the expression weights, ``coefficients[posed]``, sum to at
+    """Returns True if the face has an expression, that is, if the expression weights ``coefficients[posed]`` sum to at
     least ``NEUTRAL``."""
     return len(posed) > 0 and bool(coefficients[posed.start : posed.stop].sum() >= NEUTRAL)
 
 
 def doubtful_weights(model: HeadModel, coefficients: Float[np.ndarray, " m"]) -> frozenset[int]:
-    """Returns the indices of expressions that probably explain noise or an unusual shape: opposite expressions that are
-    both strong, and weights at their upper bound. Expressions of the lids are never returned, because other evidence
-    decides them."""
+    """Returns the indices of expressions that probably explain noise or an unusual shape. Such expressions are pairs of
+    strong opposite expressions, or have a weight at the upper bound. Expressions of the lids are never returned,
+    because the lids are measured elsewhere."""
     weights = coefficients[model.posed.start : model.posed.stop]
     found = [np.flatnonzero(weights > BOUND)]
     strong = np.flatnonzero(weights > STRONG)

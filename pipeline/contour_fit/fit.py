@@ -1,4 +1,4 @@
-"""The result of a solver, the same for the contour solver and the simplex."""
+"""Defines the result of a solver, common to the contour solver and the simplex."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

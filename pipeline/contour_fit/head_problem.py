@@ -1,7 +1,7 @@
-"""Builds the least-squares problem of one stage at one robust scale; rim, points, photographs and priors are its terms.
+"""Builds the least-squares problem of one stage from its terms: rim, feature points, photographs and priors.
 
-A feature point's residual is ``(pi(X) - picked) / sigma`` in both image axes; sigma combines the noise of a click with
-the projected variation of the landmark between heads. The loss of the residual's norm is Geman and McClure's.
+A feature point's residual is ``(pi(X) - picked) / sigma`` in both image axes. The feature point's sigma combines the
+noise of a click with the projected variation of the landmark between heads. The robust loss is Geman and McClure's.
 """
 
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ FEATURE_SCALE = 4.0  # Geman-McClure scale of a feature point, in its standard d
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureTerm:
-    """Computes the cost of the feature points as a function of shape, pose and, in stages that solve for them, camera
+    """Computes the cost of the feature points as a function of shape, pose and, if the stage solves for them, camera
     corrections."""
 
     problem: ContourProblem
@@ -61,7 +61,7 @@ class FeatureTerm:
     def _rows(
         self, state: State, points: Float[np.ndarray, "n 3"], slopes: Float[np.ndarray, "n 2 3"]
     ) -> Float[np.ndarray, "n 2 p"]:
-        """Returns d(pixel) / d(unknowns) of each feature point; the change of its deviation is ignored."""
+        """Returns d(pixel) / d(unknowns) of each feature point; the change of its standard deviation is ignored."""
         observed, stage, views = self.observed, self.stage, moved_views(self.problem, state)
         pose, count = state.world_from_head, len(points)
         cameras = PER_CAMERA * len(views.names) if stage.cameras else 0
@@ -82,9 +82,9 @@ class FeatureTerm:
 def head_problem(
     problem: ContourProblem, evidence: StageEvidence, stage: Stage, scale_px: float, reference_px: float | None = None
 ) -> Problem[State]:
-    """Builds the least-squares problem of one stage: all its terms as functions of shape, pose and, in stages that
-    solve for them, cameras. ``scale_px`` is the contours' robust scale; ``reference_px`` is the outline length to which
-    ``RimTerm`` scales its cost."""
+    """Builds the least-squares problem of one stage as a list of terms that depend on shape, pose and perhaps cameras.
+    ``scale_px`` is the scale of the outlines' robust loss; ``reference_px`` is the outline length to which ``RimTerm``
+    scales its cost."""
     cameras = PER_CAMERA * len(problem.views.names) if stage.cameras else 0
     rim = RimTerm(problem, evidence, stage, scale_px, reference_px)
     terms: tuple[Term[State], ...] = (rim, *_other_terms(problem, evidence, stage))
@@ -101,8 +101,8 @@ def head_problem(
 def weight_bounds(
     state: State, problem: ContourProblem, unknowns: int
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Returns the smallest and the largest step of every unknown that keep the expression weights between 0 and 1;
-    weights outside the stage stay 0. All other unknowns are unbounded."""
+    """Returns the smallest and the largest step of every unknown that keep the expression weights between 0 and 1.
+    Expressions that the current stage does not fit keep the weight 0. All other unknowns are unbounded."""
     posed = problem.model.posed
     least, most = np.full(unknowns, -np.inf), np.full(unknowns, np.inf)
     weights = state.coefficients[posed.start : posed.stop]
@@ -116,8 +116,8 @@ def weight_bounds(
 def started_problem(
     problem: ContourProblem, evidence: StageEvidence, stage: Stage, scale_px: float, start: State
 ) -> tuple[Problem[State], Linearised]:
-    """Returns the problem with its cost scaled to the outline length at ``start``, and its linearisation there. The rim
-    at ``start`` is searched only once for both."""
+    """Returns the least-squares problem, with its cost scaled to the outline length at ``start``, and its linearisation
+    at ``start``."""
     seen = RimTerm(problem, evidence, stage, scale_px).at(start)
     whole = head_problem(problem, evidence, stage, scale_px, float(seen.rim.length.sum()))
     rim, *others = whole.terms
@@ -137,8 +137,7 @@ def _other_terms(problem: ContourProblem, evidence: StageEvidence, stage: Stage)
 
 
 def apply_step(state: State, step: Float[np.ndarray, " p"], stage: Stage) -> State:
-    """Returns the state after a step. The step holds the stage's unknowns in this order: coefficients, pose,
-    cameras."""
+    """Returns the state after a solver step. The step holds coefficients, pose and cameras in this order."""
     m = stage.modes
     pose = state.world_from_head
     turned = rotation_from_vector(step[m : m + 3]) @ pose.rotation

@@ -1,13 +1,14 @@
-"""Computes the landmark term: the difference between the triangulated landmarks of the face and those on the head.
+"""Computes the landmark term: the differences between triangulated face landmarks and the head model's landmarks.
 
-With the places ``X(theta)`` of the head, stacked, their found positions ``x`` and the covariance ``S`` of the
-difference (of the triangulation, and of a network's idea of a face, in which all places err together),
+``X(theta)`` are the head model's landmarks, stacked, and ``x`` the triangulated ones. The covariance ``S`` of their
+difference has two parts: the error of triangulation, and the network's error, which is common to all landmarks. The
+residual is
 
     r = W (X(theta) - x),    W^T W = S^-1
     dr / d(coefficients) = W s R B,    dr / d(rotation, translation, log s) = W [-[X - t]x, I, X - t]
 
-all landmarks make one residual under Geman and McClure's loss, so the face of another person loses its weight as a
-whole. A landmark that contradicts the others has a larger variance in ``S`` (``alignment.face_alignment``).
+All landmarks form one residual under Geman and McClure's loss, so a wrong face loses its weight as a whole. A landmark
+that contradicts the others has a larger variance in ``S`` (``alignment.face_alignment``).
 """
 
 from dataclasses import dataclass
@@ -35,7 +36,7 @@ def observe_landmarks(
 
     Args:
         model: the head model with all modes of the fit.
-        corner: the three vertices of the full level around each landmark.
+        corner: the three vertices of the full mesh around each landmark.
         blend: their weights, which sum to 1.
         position_world: each landmark's triangulated position, mm.
         covariance_world: covariance (mm^2) of the difference between head and observation, over all coordinates: x, y,
@@ -49,15 +50,15 @@ def observe_landmarks(
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkTerm:
     """Computes the cost of the face's triangulated landmarks as a function of shape and pose. The cost does not depend
-    on ``cameras``; their number only tells how many columns of zeros to leave."""
+    on cameras; ``cameras`` is the number of columns of zeros in its Jacobian."""
 
     observed: LandmarkObservations
     stage: Stage
     cameras: int  # in the problem
 
     def at(self, state: State) -> Residuals:
-        """Returns the differences between the head's landmarks and the triangulated ones as a single residual of many
-        components, in standard deviations, with Geman and McClure's loss. One loss for all lets them lose their weight
+        """Returns the differences between the head's landmarks and the triangulated landmarks, in standard deviations.
+        The differences form one residual under Geman and McClure's loss, so that all landmarks lose their weight
         together."""
         observed = self.observed
         moved = np.einsum("m,mnc->nc", state.coefficients, observed.basis[: len(state.coefficients)])

@@ -1,5 +1,5 @@
-"""Estimates from a stage's residuals how well the model fits: the noise of an outline, where it is clutter, and whether
-the head is hairless."""
+"""Estimates three things from the residuals of a stage: the noise of the outlines, where hair or clothes form them, and
+whether the head is bald."""
 
 from dataclasses import replace
 
@@ -22,11 +22,11 @@ MIN_UNIT = 1.0  # px^3: noise of 0.5 px over 4 px. No upper limit: 40 let long h
 
 
 def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> StageEvidence:
-    """Returns the evidence updated from the residuals of a stage: the noise unit, the lower limit of the robust scale
-    and, the first time, the clutter.
+    """Updates the evidence from the residuals of a stage: the outlines' noise, the lower limit of the robust loss's
+    scale and, the first time, the clutter (hair and clothes).
 
-    Clutter is searched while only the eigenheads describe the shape. A wider basis would bulge into the hair and leave
-    no outliers.
+    Clutter (hair and clothes) is searched while the shape has only eigenheads. With more modes the shape would bulge
+    into the hair, and the hair's outline would leave no large residuals.
     """
     rim = observed_rim(problem, evidence, state, stage)
     near = rim.residual[(np.abs(rim.residual) < 10.0) & (rim.length > 0)]
@@ -43,11 +43,11 @@ def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, 
 def with_clutter_of_start(
     problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage
 ) -> StageEvidence:
-    """Returns the evidence with clutter marked before the first fit: wherever the silhouette reaches more than
-    ``START_CLUTTER_MM`` beyond the mean head at the start pose.
+    """Marks clutter before the first fit: wherever the silhouette reaches more than ``START_CLUTTER_MM`` beyond the
+    mean head at the start pose.
 
-    Long hair in front of a face is wider than any face. The first modes would follow it before residuals could show
-    that it is hair.
+    Long hair beside a face is wider than any face. The fit would follow the hair before its residuals could show that
+    it is hair.
     """
     rim = observed_rim(problem, evidence, state, stage)
     depths = [camera.camera_from_world.apply(state.world_from_head.translation)[2] for camera in problem.rig]
@@ -57,11 +57,11 @@ def with_clutter_of_start(
 
 
 def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float | None:
-    """Estimates the noise unit l sigma^2 (px^3) of contours from their residuals, which include the model's misfit.
-    Returns None if the settings state both noise and correlation length.
+    """Estimates the outlines' noise l sigma^2 (px^3) from their residuals, which include the model's misfit. Returns
+    None if the settings give both the noise sigma and the correlation length l.
 
     The mean residual over a block of B px of outline has the variance l sigma^2 / B if B is well above the correlation
-    length l. So l need not be known. Residuals of ``most_px`` and more are left out.
+    length l. Therefore the correlation length l need not be known. Residuals of ``most_px`` and more are left out.
     """
     stated = problem.settings
     if stated.contour_noise_px is not None and stated.contour_correlation_px is not None:
@@ -83,10 +83,11 @@ def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float |
 
 
 def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, from_face: State) -> bool:
-    """Tells whether the outline of cranium and ears belongs to the head itself instead of hair.
+    """Returns True if the outline of cranium and ears shows the head itself and not hair.
 
-    ``state`` is the fit to the whole head, ``from_face`` the fit to the face alone. The head is hairless if ``state``
-    explains the whole outline and fits the face about as well. A head seldom fits hair; if so, it fits the face worse.
+    ``state`` is the fit to the whole head, ``from_face`` the fit to the face alone. The head is bald if ``state``
+    explains the whole outline and fits the face about as well as ``from_face``. A head model that fits hair fits the
+    face worse.
     """
     rim = observed_rim(problem, evidence, state, replace(stage, whole_head=True))
     region = problem.model.levels[stage.level].face_region
@@ -101,6 +102,6 @@ def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, 
 
 
 def _robust_deviation_px(rim: Rim, chosen: Int[np.ndarray, " s"]) -> float:
-    """Returns the robust standard deviation (px) of the chosen residuals from their median, since hair on the forehead
-    hardly changes a median."""
+    """Returns the robust standard deviation (px) of the ``chosen`` residuals, from medians, which hair on the forehead
+    hardly changes."""
     return 1.4826 * float(np.median(np.abs(rim.residual[chosen]))) if len(chosen) else 0.0

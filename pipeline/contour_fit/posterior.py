@@ -1,15 +1,15 @@
-"""Computes the uncertainty of a fitted head: the Laplace posterior, and from it the standard deviation of every vertex.
+"""Computes the uncertainty of a fitted head: its Laplace posterior and the standard deviation of every vertex.
 
-Where no photograph constrains the surface, above all under hair, the posterior equals the prior, so its variance must
-be right. Where nothing is observed, a head of the model's population deviates by half of the kernel's standard
-deviation, a head of another population by twice as much. ``with_estimated_prior`` therefore estimates the prior's
-variance from the coefficients that the photographs determine (the evidence framework; MacKay 1992, *Bayesian
-interpolation*, https://doi.org/10.1162/neco.1992.4.3.415).
+Where no photograph constrains the surface, mostly under hair, the posterior equals the prior, so the prior's variance
+must be right. Under hair a head of the model's population deviates by half of the kernel's standard deviation, a head
+of another population by its double. ``with_estimated_prior`` therefore estimates the prior's variance from the
+coefficients that the photographs determine (the evidence framework; MacKay 1992, *Bayesian interpolation*,
+https://doi.org/10.1162/neco.1992.4.3.415).
 
-Two more errors are added, which no coefficient describes. The kernel moves the surface along its normals only, but real
-heads also deviate along the surface; a landmark's position along it gets the standard deviation that the kernel has
-along the normal (``Fit.sliding_mm``). The second error is relief finer than the modes, which exists even where no
-photograph shows it. A fit to the eigenheads alone contains neither error (see ``with_span_misfit``).
+Two errors that no coefficient describes are added to the standard deviation. The kernel moves the surface along its
+normals only, but landmarks of real heads also shift along the surface. The shift along the surface gets the standard
+deviation that the kernel has along the normal (``Fit.sliding_mm``). The second additional error is relief finer than
+the modes. A fit of eigenheads alone contains neither error (see ``with_span_misfit``).
 """
 
 import math
@@ -38,17 +38,17 @@ EAR_MISFIT_MM = 5.0  # where the face says that an ear sits, by the variance rat
 def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_mm: float) -> Fit:
     """Returns the fit with a covariance whose prior variance is estimated from the fit itself.
 
-    Coefficients that the photographs determine keep their variance. With ``C`` the covariance under unit priors, the
-    prior variance of a group of modes is ``s^2 = sum z^2 / sum (1 - C_ii)``, and the new covariance is ``(C^-1 + 1 /
-    s^2 - 1)^-1`` (MacKay 1992).
+    If ``C`` is the covariance under unit priors, a group of modes gets the prior variance ``s^2 = sum z^2 / sum (1 -
+    C_ii)``. The new covariance is ``(C^-1 + 1 / s^2 - 1)^-1`` (MacKay 1992). Coefficients that the photographs
+    determine keep their variance.
 
     Args:
         model: the head model with all modes of the fit.
-        fit: with its covariance under unit priors; one without a covariance, or without kernel modes, is returned as it
-            is.
+        fit: with its covariance under unit priors; a fit without a covariance, or without kernel modes, is returned
+            unchanged.
         eigenheads: how many of the modes, the first ones, are eigenheads; the rest are the kernel's.
-        relief_mm: standard deviation of relief that only photographs show, for a head that deviates as far as the
-            kernel assumes.
+        relief_mm: standard deviation of relief finer than the modes, for a head that deviates as far as the kernel
+            assumes.
     """
     if fit.covariance is None or len(fit.coefficients) <= eigenheads:
         return fit
@@ -79,11 +79,11 @@ def _variance_ratio(fit: Fit, modes: Int[np.ndarray, " k"]) -> float:
 
 @traced
 def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
-    """Returns the standard deviation (mm) of every vertex of the full level along its normal; zero if the fit has no
+    """Returns the standard deviation (mm) of every vertex of the full mesh along its normal; zero if the fit has no
     covariance.
 
-    It is computed at the cage's vertices, a twentieth as many, and interpolated. Movement along the surface is left
-    out, since it does not change the shape. Relief too fine for the modes (``Fit.misfit_mm``) is included.
+    The deviation is computed at the vertices of the coarse mesh (the cage) and interpolated. Movement along the surface
+    is left out, since it does not change the shape. Relief too fine for the modes (``Fit.misfit_mm``) is included.
     """
     operator = model.levels["full"].operator
     if fit.covariance is None:
@@ -92,8 +92,8 @@ def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
 
 
 def cage_variance(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v0"]:
-    """Returns the variance (mm^2) of the cage's vertices along their normals, including relief finer than the modes.
-    The fit must have a covariance."""
+    """Returns the variance (mm^2) along the normals at the vertices of the coarse mesh (the cage), including relief
+    finer than the modes. The fit must have a covariance."""
     assert fit.covariance is not None
     rows = normal_rows(model, fit)
     # One triangular factor instead of rows @ covariance twice; the jitter keeps rounding from making it indefinite.
@@ -106,8 +106,8 @@ def cage_variance(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v0"]:
 
 
 def normal_rows(model: HeadModel, fit: Fit) -> Float[np.ndarray, "v0 p"]:
-    """Returns the derivative of every cage vertex's position along its normal (mm) by the parameters of the fit's
-    covariance: coefficients, rotation, translation, log scale."""
+    """Returns the Jacobian of the coarse mesh's (the cage's) vertices along their normals (mm), by coefficients,
+    rotation, translation and log scale."""
     pose, count = fit.world_from_head, len(fit.coefficients)
     cage = model.cage(fit.coefficients)
     normals_head = vertex_normals(cage, model.levels["cage"].faces)

@@ -1,16 +1,17 @@
-"""Computes the prior: what is known of any head before this one is observed. Coefficients are z ~ N(0, I); expressions
-are few; the scale is metric; cameras stand where their calibration says, within its covariance.
+"""Computes the prior on shape, expression, scale and cameras. Shape coefficients are z ~ N(0, I), expressions are
+sparse, the scale is near 1, and cameras follow their calibration within its covariance.
 
-Most faces are neutral, and the others combine few expressions. The prior of an expression's weight has a heavy tail,
+Most faces are neutral or combine few expressions. The prior of an expression's weight therefore has a heavy tail:
 
     p(w) ~ (1 + w / t)^-2 N(w; 0, 1),    0 <= w <= 1
 
-Its first factor is Lomax's distribution (1954) of shape 1, whose median is t. A small weight survives only if it
-explains much; a large one is penalised little, unlike under a Gaussian or an exponential prior. The equations replace
-the logarithm by its tangent, which lies above it: a step that lowers the tangent also lowers the logarithm (Candes,
-Wakin and Boyd 2008, *Enhancing sparsity by reweighted l1 minimization*). ``head_problem`` bounds the weights.
+The first factor of the prior is Lomax's distribution (1954) of shape 1, whose median is t. Lomax's distribution
+suppresses small weights that explain little, and hardly penalises large weights, unlike a Gaussian or an exponential
+prior. The normal equations replace the cost's logarithm by its tangent, which lies above it, so a step that lowers the
+tangent also lowers the logarithm (Candes, Wakin and Boyd 2008, *Enhancing sparsity by reweighted l1 minimization*).
+``head_problem`` bounds the weights.
 
-The other priors are Gaussian: of the coefficients, of log scale and of each camera's correction.
+The priors of the coefficients, of log scale and of each camera's correction are Gaussian.
 """
 
 from dataclasses import dataclass
@@ -28,13 +29,13 @@ TAIL = 2.0  # exponent of the weights' prior
 
 
 def weights_of(problem: ContourProblem, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, " e"]:
-    """Returns the expression weights among the coefficients; negative weights become 0. The array is empty in stages
-    that do not solve for expressions."""
+    """Returns the expression weights among the coefficients; negative weights become 0. The array is empty if the stage
+    does not solve for expressions."""
     return np.maximum(coefficients[problem.model.posed.start : problem.model.posed.stop], 0.0)
 
 
 def weight_slope(weights: Float[np.ndarray, " e"]) -> Float[np.ndarray, " e"]:
-    """Returns ``TAIL / (t + w)`` for each expression weight w, where t is ``EXPRESSION_MEDIAN``. It is half the
+    """Returns ``TAIL / (t + w)`` for each expression weight w, where t is ``EXPRESSION_MEDIAN``. The slope is half the
     derivative of ``2 TAIL log(1 + w / t)``, the heavy-tailed factor of the weights' prior."""
     return TAIL / (EXPRESSION_MEDIAN + weights)
 
@@ -47,7 +48,7 @@ class PriorTerm:
     stage: Stage
 
     def at(self, state: State) -> "LinearisedPriorTerm":
-        """Returns the prior's cost and equations at ``state``."""
+        """Returns the prior, linearised at ``state``."""
         return LinearisedPriorTerm(self, state)
 
 
@@ -69,8 +70,8 @@ class LinearisedPriorTerm:
         return shape + cameras + (np.log(state.world_from_head.scale) / SCALE_SPREAD) ** 2
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds the prior of coefficients, expression weights, log scale and, if the stage solves for them, cameras, in
-        place."""
+        """Adds the prior to the normal equations, in place. The prior of cameras is included only if the stage solves
+        for camera corrections."""
         state, problem, m = self.state, self.term.problem, self.term.stage.modes
         equations.matrix[np.arange(m), np.arange(m)] += 1.0
         equations.gradient[:m] += state.coefficients

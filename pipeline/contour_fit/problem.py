@@ -1,4 +1,4 @@
-"""Defines the contour solver's values: its state, the stages of its schedule, and everything fixed during a fit."""
+"""Defines the contour solver's data types: its state, its stages, and everything that stays fixed during a fit."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Holds one stage of the coarse-to-fine schedule: which unknowns it solves for, on which mesh level, and which part
+    """Holds one stage of the coarse-to-fine fit: which unknowns it solves for, at which mesh resolution, and which part
     of the outline counts."""
 
     level: str
@@ -47,8 +47,8 @@ class Stage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Holds feature points as arrays, one row each: the landmark's vertex on the full level, the view, the observed
-    pixel, and the model's mean and modes at the vertex (head frame, mm)."""
+    """Holds feature points as arrays with one row for each: the landmark's vertex on the full mesh, the view, the
+    observed pixel, and the model's mean and modes at the vertex (head frame, mm)."""
 
     vertex: Int[np.ndarray, " n"]
     view: Int[np.ndarray, " n"]
@@ -59,15 +59,15 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkObservations:
-    """Holds triangulated landmarks of the face, one row each.
+    """Holds triangulated landmarks of the face in arrays with one row for each.
 
     Attributes:
-        corner: three vertices of the full level around each landmark.
+        corner: three vertices of the full mesh around each landmark.
         blend: their weights, which sum to 1.
         position_world: triangulated positions, mm.
         whiten: turns the differences of all coordinates (mm), stacked, into uncorrelated standard deviations.
         mean: the mean head at the landmarks, head frame, mm.
-        basis: the model's modes there, head frame, mm per standard deviation.
+        basis: the model's modes at the landmarks, head frame, mm per standard deviation.
     """
 
     corner: Int[np.ndarray, "n 3"]
@@ -83,8 +83,8 @@ class LevelBasis:
     """Holds the mean and modes (head frame, mm) of a mesh level, and the sparse operator that turns them into the
     level's vertices.
 
-    A decimated level stores them at its own vertices (2 MB) and its operator is the identity. The full level stores
-    them at the cage's vertices instead, since its own would take 40 to 170 MB.
+    A decimated mesh stores its modes at its own vertices (2 MB), and its operator is the identity. The full mesh stores
+    its modes at the vertices of a coarse mesh (the cage), since its own would take 40 to 170 MB.
     """
 
     operator: sparse.csr_array
@@ -92,8 +92,8 @@ class LevelBasis:
     modes: Float32[np.ndarray, "v 3 m"]
 
     def vertices(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "V 3"]:
-        """Returns the level's vertices (head frame, mm); coefficients beyond the last one handed over count as 0. The
-        sum over modes is in single precision (exact to 1e-5 mm), which needs a third of the memory traffic."""
+        """Returns the level's vertices (head frame, mm); missing coefficients at the end of the vector count as 0. The
+        sum over modes is in single precision, exact to 1e-5 mm, for speed."""
         flat = self.modes.reshape(self.mean.size, -1)
         moved = flat[:, : len(coefficients)] @ coefficients.astype(np.float32)
         return self.operator @ (self.mean + moved.reshape(-1, 3))
@@ -118,8 +118,8 @@ class ContourProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceObservations:
-    """Holds n point-to-plane observations: each states how far a vertex of the full level should move along a normal.
-    The equation is in ``surface_term``. The k cameras are in the order of the solver's views; c = 6 k."""
+    """Holds n point-to-plane observations. Each observation states how far a vertex of the full mesh should move along
+    a normal. ``surface_term`` has the equation. The k cameras are in the order of the solver's views; c = 6 k."""
 
     vertex: Int[np.ndarray, " n"]
     basis: Float32[np.ndarray, "m n 3"]  # the model's modes at those vertices, head frame
@@ -137,15 +137,15 @@ class SurfaceObservations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RimNoise:
-    """Holds the noise of the outlines, from which the weights of the rim follow.
+    """Holds the noise of the outlines, which determines the weights of the rim samples.
 
     Attributes:
         unit: l sigma^2 (px^3) of an outline with noise sigma and correlation length l. The cost is squared residual
             (px^2) times outline length (px), divided by it.
-        floor_px: the smallest robust scale to use: three standard deviations of the model's misfit.
-        clutter: for each view, the cells with hair or clothes; None before they were searched.
+        floor_px: the smallest scale of the robust loss: three standard deviations of the model's misfit.
+        clutter: for each view, the cells with hair or clothes; None before the search for them.
         is_settled: whether ``clutter`` comes from a fit rather than from the start pose.
-        bare: for each view, the cells near the outline of a hairless head; None before they were searched.
+        bare: for each view, the cells near the outline of a bald head; None before the search for them.
     """
 
     unit: float
@@ -157,7 +157,7 @@ class RimNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotoEvidence:
-    """Holds the surface observations from photographs, and for each level which vertices lie under hair."""
+    """Holds the surface observations from photographs, and for each mesh level which vertices lie under hair."""
 
     surface: SurfaceObservations
     hair: Mapping[str, Bool[np.ndarray, " v"]]
@@ -165,7 +165,7 @@ class PhotoEvidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StageEvidence:
-    """Holds the results of earlier stages: the noise of the outlines and, once measured, the surface in the
+    """Holds the results of earlier stages: the noise of the outlines and, if measured, surface observations from
     photographs."""
 
     noise: RimNoise
@@ -173,8 +173,7 @@ class StageEvidence:
 
 
 def first_evidence(settings: FittingSettings) -> StageEvidence:
-    """Returns the evidence for the first stage: the contour noise from the settings or, if they state none, a
-    default."""
+    """Returns the evidence for the first stage: the outlines' noise from the settings, or a default."""
     noise, length = settings.contour_noise_px or FIRST_NOISE_PX, settings.contour_correlation_px
     return StageEvidence(RimNoise(noise**2 * (length or FIRST_CORRELATION_PX), 0.0, None))
 
@@ -213,8 +212,8 @@ def make_problem(
 
 @lru_cache(maxsize=4)  # models are few, jobs are many
 def level_basis(model: HeadModel, name: str) -> LevelBasis:
-    """Returns the mean and modes (head frame, mm) of a mesh level. They are stored at the level's vertices or at the
-    cage's, whichever are fewer."""
+    """Returns the mean and modes (head frame, mm) of a mesh level. Mean and modes are stored at the level's vertices or
+    at those of the coarse cage mesh, whichever are fewer."""
     level = model.levels[name]
     if level.count < len(model.mean):
         coarse_basis = model.basis(name, len(model.modes)).transpose(1, 2, 0)
@@ -225,8 +224,8 @@ def level_basis(model: HeadModel, name: str) -> LevelBasis:
 
 @lru_cache(maxsize=4)
 def level_topology(model: HeadModel, name: str) -> Topology:
-    """Returns a mesh level's edges and regions. Faces of the neck below the chin belong to no region: the head turns on
-    the neck, collars hide it, and its lower border is an edge of the model alone."""
+    """Returns a mesh level's edges and regions. Faces of the neck below the chin belong to no region, because the head
+    turns on the neck, collars hide it, and no real neck ends at the model's lower border."""
     level = model.levels[name]
     mean = model.vertices(np.zeros(0), name)
     chin = model.vertices(np.zeros(0))[model.landmarks["gnathion"], 1]
@@ -234,10 +233,10 @@ def level_topology(model: HeadModel, name: str) -> Topology:
 
 
 def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Float[np.ndarray, "6 6"]:
-    """Returns the inverse prior covariance of a camera's correction (rad, mm): from the camera's own covariance if it
-    has one, else from an error of ``error_px`` in the image.
+    """Returns the inverse prior covariance of a camera's correction (rad, mm). The covariance follows from the camera's
+    calibrated covariance or, if there is none, from an error of ``error_px`` in the image.
 
-    The default prior moves the image of a head of 100 mm radius at ``depth_mm`` by ``error_px`` RMS. Half of that
+    The default prior moves the image of a head of 100 mm radius at ``depth_mm`` by ``error_px`` RMS. Half of the
     variance is due to rotation and half to translation, because both shift the image of a head alike.
     """
     if camera.covariance is not None:
@@ -252,8 +251,8 @@ def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Floa
 def pack_features(
     model: HeadModel, names: tuple[str, ...], features: Mapping[str, Mapping[str, np.ndarray]]
 ) -> Observed | None:
-    """Packs the feature points (px) that belong to the model's landmarks into arrays. Returns None if there are
-    none."""
+    """Packs the feature points (px) that belong to the model's landmarks into arrays. Returns None without feature
+    points."""
     found = [
         (model.landmarks[landmark], names.index(camera), pixel)
         for landmark, views in sorted(features.items())
@@ -270,7 +269,7 @@ def pack_features(
 def landmark_basis(
     model: HeadModel, vertex: Int[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float32[np.ndarray, "m n 3"]]:
-    """Returns the mean (n 3) and all modes (m n 3) of the model at vertices of the full level, head frame, mm."""
+    """Returns the mean (n 3) and all modes (m n 3) of the model at vertices of the full mesh, head frame, mm."""
     mean = np.asarray(model.levels["full"].operator[vertex] @ model.mean, float)
     return mean, model.basis("full", len(model.modes), vertex)
 
@@ -278,8 +277,8 @@ def landmark_basis(
 def blended_basis(
     model: HeadModel, corner: Int[np.ndarray, "n 3"], blend: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float32[np.ndarray, "m n 3"]]:
-    """Returns the model's mean and all its modes (head frame, mm) at points inside triangles of the full level. A point
-    is the mean of three vertices (``corner``) with weights (``blend``)."""
+    """Returns the model's mean and all its modes (head frame, mm) at points inside triangles of the full mesh. A point
+    is the mean of the three vertices ``corner`` with weights ``blend``."""
     rows, inverse = np.unique(corner, return_inverse=True)
     mean, basis = landmark_basis(model, rows)
     at = inverse.reshape(corner.shape)
@@ -288,8 +287,8 @@ def blended_basis(
 
 
 def widened(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) -> ContourProblem:
-    """Returns the problem for another ``model`` with the same mesh and more modes. Keeps only the mesh levels named in
-    ``levels``."""
+    """Returns the problem for another head ``model`` with the same mesh and more modes. Keeps only the mesh resolutions
+    named in ``levels``."""
     features = problem.features
     if features is not None:
         mean, basis = landmark_basis(model, features.vertex)

@@ -1,14 +1,14 @@
-"""Finds the rim of a head in every camera without drawing an image.
+"""Finds the rim of a head, the curve that projects to its outline, in every camera without drawing an image.
 
-For X on the surface with normal N seen from C_k the rim is ``N . (X - C_k) = 0``: the zero crossing of vertex normals,
-linearly interpolated along mesh edges. A rim point is on the *outer* outline if a step outwards leaves the model's
-mask. An exact test decides it. Project the edges where front-facing faces meet back-facing ones (counted twice) or
-where the mesh ends (counted once). Their winding number around a pixel is the number of faces over that pixel. This
-chain has about a thousand edges a view, sorted into image rows, so a test is one walk along a row. No mask is drawn.
-(The looser test |D_model| < 0.6 px accepts inner facets, and the fit stalls.)
+For a surface point X with normal N and a camera centre C_k, the rim is where ``N . (X - C_k) = 0``. The product ``N .
+(X - C_k)`` is interpolated along mesh edges to find the zero crossing. A rim point is on the *outer* outline if a step
+outwards leaves the model's mask. Instead of a drawn mask, the test uses the mesh's silhouette edges, between
+front-facing and back-facing faces (counted twice), and its border edges (counted once). The winding number of these
+edges around a pixel is the number of faces over the pixel. A test visits only the edges that cross one image row.
 
-With P = d(pixel)/dX the image normal of the outline is ``n = l / |l|, l = N^T P^+``, since the tangent plane at the rim
-holds the viewing ray; so ``n^T P = N^T / |l|``. Sliding of the rim along the surface has no effect to first order.
+The tangent plane at the rim contains the viewing ray. With P = d(pixel)/dX the outline's normal in the image is
+therefore ``n = l / |l|, l = N^T P^+``, and ``n^T P = N^T / |l|``. A shift of the rim along the surface has no effect to
+first order.
 """
 
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ STEPS_OUT_PX = (0.3, 2.5)  # both must leave the mask: the second drops samples 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Topology:
-    """Holds the faces, edges and regions of a mesh level, in the form that the search for its rim needs."""
+    """Holds the faces, edges and regions of a mesh level, for the search for its rim."""
 
     faces: Int32[np.ndarray, "f 3"]
     edges: Int32[np.ndarray, "e 4"]  # from, to (as in face one), face one, face two or -1
@@ -69,15 +69,15 @@ class Views:
         return self.distance[self.offset[k] : self.offset[k] + width * height].reshape(height, width)
 
     def packed(self) -> Float[np.ndarray, "k 22"]:
-        """Returns one row for each camera: rotation (9) and translation (3, mm) of ``camera_from_world``, then lens
-        (10)."""
+        """Returns one row for each camera: rotation (9) and translation (3, mm) of ``camera_from_world``, then
+        intrinsics (10)."""
         return np.concatenate([self.rotation.reshape(-1, 9), self.translation, self.lens], axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rim:
-    """Holds samples of a head's rim: the points on the outer outline where the rim crosses edges of the mesh. The
-    samples of all views stand one after another."""
+    """Holds samples of a head's rim: the points on the outer outline where the rim crosses mesh edges. The arrays hold
+    the samples of all views, one view after another."""
 
     view: Int32[np.ndarray, " s"]
     corner: Int32[np.ndarray, "s 2"]  # the edge's two vertices
@@ -141,9 +141,9 @@ def find_rim(
 ) -> Rim:
     """Finds samples of a mesh's outer outline in every view, and reads the silhouette's signed distance (px) at each.
 
-    ``whole_head`` also searches cranium and ears; otherwise only the face region is searched. If ``averaged``, each
-    distance is a mean along the outline, half way to both neighbouring samples; this is meant for meshes whose edges
-    are only 2 to 6 px long in the image.
+    With ``whole_head`` cranium and ears are searched too; otherwise only the face region. If ``averaged``, each
+    distance is a mean along the outline, half way to the two neighbouring samples. The mean is meant for meshes with
+    edges of 2 to 6 px in the image.
     """
     faces = topology.head if whole_head else topology.face
     vertices = np.ascontiguousarray(vertices_world)
@@ -167,11 +167,11 @@ def _outlines(
     some: slice,
     averaged: bool,
 ) -> list[tuple[Int32[np.ndarray, "_ 2"], Float[np.ndarray, "_ 14"]]]:
-    """Returns, for each of at most ``VIEWS_A_WORD`` views, the corners of the crossed edges and the samples;
+    """Returns, for each of at most ``VIEWS_A_WORD`` views, the rim samples and the end points of their mesh edges;
     ``rim_kernels`` names the samples' columns.
 
-    One sweep over faces and vertices serves all views, with a bit for each view; after it a view only visits the faces
-    on its rim.
+    One pass over faces and vertices serves all views, with one bit for each view. Afterwards each view only visits the
+    faces on its rim.
     """
     centres = -np.einsum("kji,kj->ki", views.rotation[some], views.translation[some])
     pictures = Pictures(views.packed()[some], centres, views.size[some], views.distance, views.offset[some])

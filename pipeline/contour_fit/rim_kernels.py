@@ -1,5 +1,5 @@
-"""Compiled loops of ``rim``: first sweeps over the mesh for all views at once, then a loop for each view, shared among
-threads."""
+"""Contains the compiled loops of ``rim``. The first loops pass over the mesh for all views at once; the later loops
+treat one view each, in parallel."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,8 @@ LONGEST_PX = 16.0  # between neighbours on the rim; farther apart, or turned by 
 
 
 class Surface(NamedTuple):
-    """Holds a mesh level (world, mm). An edge: from, to (in its first face's order), first face, second face or -1."""
+    """Holds a mesh (world frame, mm). Columns of an edge are from, to (as in its first face), first face, second face
+    or -1."""
 
     vertices: np.ndarray
     normals: np.ndarray
@@ -28,7 +29,7 @@ class Surface(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """Holds which way faces, edges and vertices face in at most 64 views: a 64-bit word each; bit k is view k's."""
+    """Holds a 64-bit word for each face, edge and vertex; bit k is the orientation towards view k."""
 
     facing: np.ndarray  # of all faces: that look to the view
     outline: np.ndarray  # edges where the number of layers changes in some view,
@@ -39,8 +40,8 @@ class Sweep(NamedTuple):
 
 
 class Pictures(NamedTuple):
-    """Holds the views: camera rows (``packed_camera``), centres (world, mm), and the signed distances (px) of all views
-    in sequence."""
+    """Holds the views: rows of cameras (``packed_camera``), their centres (world frame, mm), and the signed distance
+    maps (px) of all views in one array."""
 
     cameras: np.ndarray
     centres: np.ndarray
@@ -66,8 +67,7 @@ def projected_with_slopes(points, view, cameras):
 
 @njit(cache=True, fastmath=True)
 def normals_and_planes(vertices, faces):
-    """Returns unit vertex normals (v, 3), and each face's normal n and n . a (4, f): C is in front where n . C > n .
-    a."""
+    """Returns unit vertex normals (v, 3), and each face's plane: normal n and offset n . a (4, f)."""
     normals = np.zeros_like(vertices)
     planes = np.empty((4, len(faces)))
     for f in range(len(faces)):
@@ -105,7 +105,7 @@ def _facing(planes, centres):
 
 @njit(cache=True, fastmath=True)
 def _side(vertex, normal, centre):
-    """Returns N . (X - C), whose zero crossings are the rim."""
+    """Returns the product N . (X - C), which is zero on the rim."""
     x, y, z = vertex[0] - centre[0], vertex[1] - centre[1], vertex[2] - centre[2]
     return normal[0] * x + normal[1] * y + normal[2] * z
 
@@ -125,7 +125,7 @@ def _back_facing(vertices, normals, centres):
 
 @njit(cache=True, fastmath=True)
 def _silhouette_edges(edges, facing):
-    """Returns the edges where some view's number of layers changes, and all borders, with the word of these views."""
+    """Returns the silhouette edges and border edges of the mesh, each with a bit mask of its views."""
     count = 0
     for e in range(len(edges)):
         if edges[e, 3] < 0 or facing[edges[e, 2]] != facing[edges[e, 3]]:
@@ -145,7 +145,7 @@ def _silhouette_edges(edges, facing):
 
 @njit(cache=True, fastmath=True)
 def _crossed(faces, active, behind):
-    """Returns the active faces that the rim crosses in some view, each with the word of those views."""
+    """Returns the active faces that the rim crosses in any view, each with a bit mask of these views."""
     which, words = np.empty(len(active), np.int32), np.empty(len(active), np.uint64)
     count = 0
     for s in range(len(active)):
@@ -160,8 +160,8 @@ def _crossed(faces, active, behind):
 
 @njit(cache=True, fastmath=True)
 def _chain(surface, sweep, bit, camera):
-    """Returns the image of one view's outline, an edge a row: x0 y0 x1 y1 and a number of layers. An edge runs as in
-    its face towards the camera, or against its face away from the camera."""
+    """Projects the silhouette edges of one view: x0 y0 x1 y1 and a number of layers in each row. An edge has the
+    direction of its front-facing face, or the reverse of its back-facing face."""
     vertices, total = surface.vertices, 0
     for word in sweep.outline_words:
         total += 1 if word & bit else 0
@@ -183,8 +183,8 @@ def _chain(surface, sweep, bit, camera):
 
 @njit(cache=True, fastmath=True)
 def _rows(chain, height):
-    """Sorts the chain's edges into the image rows that they cross. Returns where each row starts, and for every entry
-    the edge's y0, y1, x0, dx/dy and signed layers. They are copies, so that a test reads one stretch of memory."""
+    """Sorts the projected silhouette edges into the image rows that they cross. Returns where each row starts, and for
+    every entry the edge's y0, y1, x0, dx/dy and signed number of layers."""
     start = np.zeros(height + 1, np.int64)
     for i in range(len(chain)):
         low, high = min(chain[i, 1], chain[i, 3]), max(chain[i, 1], chain[i, 3])
@@ -211,7 +211,7 @@ def _rows(chain, height):
 
 @njit(cache=True, fastmath=True)
 def _layers(x, y, start, entries):
-    """Returns the chain's winding number around a pixel: the number of faces over it."""
+    """Returns the winding number of the silhouette edges around a pixel, which is the number of faces over it."""
     row = int(np.floor(y))
     if row < 0 or row >= len(start) - 1:
         return 1.0  # outside the image nothing is known; such samples are dropped
@@ -225,7 +225,7 @@ def _layers(x, y, start, entries):
 
 @njit(cache=True, fastmath=True)
 def _read(pictures, k, x, y):
-    """Returns the signed distance of a view at a pixel."""
+    """Interpolates the signed distance map of view k at a pixel."""
     width, height = pictures.size[k, 0], pictures.size[k, 1]
     column, right = cell(x, width)
     row, down = cell(y, height)
@@ -234,8 +234,8 @@ def _read(pictures, k, x, y):
 
 @njit(cache=True, fastmath=True)
 def _crossings(surface, sweep, bit, centre, corners, samples):
-    """Finds the zero crossings of N . (X - C) along the edges of the crossed faces, each edge once. Fills in each
-    sample's edge, blend, point and normal (in the slope's column); returns their number, and the joining segments."""
+    """Finds the zero crossings of N . (X - C) along the edges of the crossed faces. Fills in each sample's edge, blend,
+    point and normal (in the slope's columns). Returns the number of samples, and the segments between them."""
     vertices, normals, faces, behind = surface.vertices, surface.normals, surface.faces, sweep.behind
     kept_index = np.full(len(vertices), -1, np.int32)
     segments = np.empty((corners.shape[0], 2), np.int32)
@@ -290,7 +290,7 @@ def _crossings(surface, sweep, bit, centre, corners, samples):
 
 @njit(cache=True, fastmath=True)
 def _view(k, surface, sweep, bit, pictures, steps, averaged, corners, samples):
-    """Fills ``corners`` and ``samples`` with one view's samples on the outer outline; returns their number."""
+    """Fills ``corners`` and ``samples`` with the rim samples of one view on the outer outline; returns their number."""
     camera = pictures.cameras[k]
     width, height = pictures.size[k, 0], pictures.size[k, 1]
     start, entries = _rows(_chain(surface, sweep, bit, camera), height)
@@ -344,10 +344,10 @@ def _view(k, surface, sweep, bit, pictures, steps, averaged, corners, samples):
 
 @njit(cache=True, fastmath=True)
 def _average(segments, place, kept, pictures, k, samples):
-    """Replaces each residual by its mean over the outline that the sample represents, half way to its neighbours.
+    """Replaces each sample's signed distance by its mean along the outline, half way to the neighbouring samples.
 
-    Samples are 2 to 6 px apart, and a contour's noise is independent after 2 px: reading at the samples alone would
-    lose half of the contour's information.
+    Samples are 2 to 6 px apart, and the outline's noise is independent after 2 px, so reading at the samples alone
+    would lose half of the information.
     """
     total, read = np.zeros(kept), np.zeros(kept)
     for j in range(len(segments)):
@@ -379,8 +379,8 @@ def _average(segments, place, kept, pictures, k, samples):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def sweep_views(surface, planes, active, centres):
-    """Computes the ``Sweep`` of at most 64 views with these ``centres`` (k, 3; world, mm). ``active`` are the faces
-    whose rim is searched."""
+    """Computes the ``Sweep`` of at most 64 views with camera ``centres`` (k, 3; world frame, mm). ``active`` are the
+    faces whose rim is searched."""
     facing = _facing(planes, centres)
     outline, outline_words = _silhouette_edges(surface.edges, facing)
     behind = _back_facing(surface.vertices, surface.normals, centres)
@@ -390,10 +390,10 @@ def sweep_views(surface, planes, active, centres):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def find_rim_samples(first, last, surface, sweep, pictures, steps, averaged, counts, corners, samples):
-    """Finds the rim samples of views ``first`` to ``last`` and fills, for each view k, ``counts[k]``, ``corners[k]``
-    (the two vertices of each sample's edge) and ``samples[k]`` (columns as named above).
+    """Finds the rim samples of views ``first`` to ``last``. Fills in, for each view k, ``counts[k]``, ``corners[k]``
+    (the two vertices of each sample's edge) and ``samples[k]``.
 
-    ``steps`` are distances (px) outside the outline at which no part of the model may lie; ``averaged`` is that of
+    ``steps`` are distances (px) outside the outline at which no part of the model may lie. ``averaged`` is explained at
     ``find_rim``.
     """
     for k in range(first, last):
@@ -402,8 +402,8 @@ def find_rim_samples(first, last, surface, sweep, pictures, steps, averaged, cou
 
 
 class Level(NamedTuple):
-    """Holds a mesh level's operator from the cage (compressed sparse rows: ``indptr``, ``indices``, ``data``), and the
-    modes of the cage (v0, 3, m; head frame, mm)."""
+    """Holds the modes of a coarse mesh, the cage (v0, 3, m; head frame, mm), and the sparse matrix (``indptr``,
+    ``indices``, ``data``) that interpolates them to a mesh level."""
 
     indptr: np.ndarray
     indices: np.ndarray
@@ -412,7 +412,7 @@ class Level(NamedTuple):
 
 
 class RimSamples(NamedTuple):
-    """Holds the columns of ``rim.Rim`` that its Jacobian needs, one row each for a sample."""
+    """Holds the columns of ``rim.Rim`` that the Jacobian needs, with one row for each rim sample."""
 
     view: np.ndarray
     corner: np.ndarray
@@ -428,8 +428,8 @@ def fill_rows(first, last, level, count, turn, place, cameras, rim, out):
     (rotation, translation). The equations are in ``rim_term``.
 
     ``turn`` is scale times rotation (3, 3) and ``place`` the translation (3, mm) of world_from_head; ``cameras`` has
-    the rows of ``Views.packed``. The derivative by a coefficient is gradient . mode, summed over the cage's vertices
-    with the weights of the level's operator and of the sample on its edge.
+    the rows of ``Views.packed``. The derivative by a coefficient is the gradient times the mode at the sample, which is
+    interpolated from the cage's vertices.
     """
     indptr, indices, data, modes = level
     view, corner, blend, point, gradient = rim

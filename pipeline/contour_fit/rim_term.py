@@ -1,17 +1,17 @@
-"""Computes the contour term: the distances of the input's outline from the model's rim, over all samples of all views.
+"""Computes the contour term: the signed distances of the model's rim samples from the silhouettes' outlines.
 
-Residual of a rim sample: the input's signed distance ``r = D_obs(u)`` (px), with
+The residual of a rim sample at the pixel u is the silhouette's signed distance ``r = D_obs(u)`` (px), with
 
     dr/dz      = n^T P s R B            n^T P from rim.py, B the modes at the sample
     dr/dpose   = n^T P [-[X - c]x, I, X - c]        rotation and log scale about the head's place c, translation
     dr/dcamera = n^T P_c [-[X_c]x, I]               left perturbation of camera_from_world
 
-Each sample stands for ``length`` px of outline and weighs ``length / (l sigma^2)``: the Fisher information of a contour
-with noise sigma and correlation length l.
+Each sample represents ``length`` px of outline. The weight of a sample is ``length / (l sigma^2)``, the Fisher
+information of an outline with noise sigma and correlation length l.
 
-Clutter (hair, shoulders, clothes) only adds area: the input's outline may lie outside the model but hardly ever inside.
-So the robust loss (Geman-McClure) is one-sided: its scale is small where the model lies inside the input, and large
-where the model sticks out.
+Clutter (hair, shoulders, clothes) only adds area, so the silhouette's outline may lie outside the model but hardly ever
+inside. The scale of the robust loss (Geman-McClure) is therefore small where the model lies inside the silhouette, and
+large where the model sticks out.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ OUTSIDE_SCALE = 2.0  # robust scale where the model sticks out of the input, by 
 
 
 def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> Rim:
-    """Returns the rim of the head at ``state``, with each sample's weight from ``stage`` and ``evidence``; samples in
+    """Returns the rim of the head at ``state``, with weights of its samples from ``stage`` and ``evidence``. Samples in
     clutter have length 0."""
     vertices = state.world_from_head.apply(problem.bases[stage.level].vertices(state.coefficients))
     # On a decimated mesh a sample's share of the outline is long enough to be half clutter: it would hide what is not.
@@ -48,8 +48,9 @@ def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RimTerm:
-    """Computes the cost of the silhouettes' outlines. ``scale_px`` is the robust scale. The cost is normalised to an
-    outline of ``reference_px``, so that hiding a part of the rim does not lower it; None means no normalisation."""
+    """Computes the cost of the silhouettes' outlines. ``scale_px`` is the scale of the robust loss. The cost is
+    normalised to an outline of ``reference_px`` (None: not), so that hiding a part of the rim does not lower the
+    cost."""
 
     problem: ContourProblem
     evidence: StageEvidence
@@ -72,16 +73,15 @@ class LinearisedRimTerm:
 
     @property
     def cost(self) -> float:
-        """Returns the robust cost of all samples in squared standard deviations, each weighted by its length of
-        outline."""
+        """Returns the robust cost of all samples in squared standard deviations, weighted by their outline length."""
         rho = _loss(self.rim.residual, self.term.scale_px).cost(self.rim.residual**2)
         total = float(self.rim.length.sum())
         share = (self.term.reference_px or total) / max(total, 1.0)
         return float((self.rim.length * rho).sum()) / self.term.evidence.noise.unit * share
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds the rim's part to the normal equations in place, camera by camera: a sample depends on shape, pose and
-        the camera that sees it."""
+        """Adds the rim samples to the normal equations in place, camera by camera, since a sample depends on only one
+        camera's correction."""
         stage, rim = self.term.stage, active_samples(self.rim)
         rows = rim_rows(self.term.problem, self.state, rim, stage)
         weight = _loss(rim.residual, self.term.scale_px).weight(rim.residual**2)
@@ -105,20 +105,20 @@ class LinearisedRimTerm:
 
 
 def _loss(residual_px: Float[np.ndarray, " s"], scale_px: float) -> GemanMcClure:
-    """Returns the robust loss, whose scale is ``OUTSIDE_SCALE`` times larger where the model sticks out of the
-    silhouette."""
+    """Returns the robust loss of residuals. The scale of the loss is ``OUTSIDE_SCALE`` times larger where the model
+    sticks out of the silhouette."""
     return GemanMcClure(np.where(residual_px < 0, scale_px, OUTSIDE_SCALE * scale_px))
 
 
 def active_samples(rim: Rim) -> Rim:
-    """Returns the samples that count: those whose length is above 0."""
+    """Returns the indices of the samples with a length above 0."""
     kept = rim.length > 0
     return rim if kept.all() else Rim(*(getattr(rim, name)[kept] for name in Rim.__dataclass_fields__))
 
 
 def rim_rows(problem: ContourProblem, state: State, rim: Rim, stage: Stage) -> Float32[np.ndarray, "s q"]:
-    """Returns the derivative of each sample's residual (px) by the coefficients, the pose and the correction of the
-    camera that sees it, in columns of this order."""
+    """Returns the derivative of each sample's residual (px) by coefficients, pose and camera correction, in columns of
+    this order."""
     pose, views = state.world_from_head, moved_views(problem, state)
     basis = problem.bases[stage.level]
     operator = basis.operator

@@ -1,15 +1,15 @@
-"""Computes the surface term: point-to-plane observations of the surface inside the outline, for the same equations.
+"""Computes the surface term: point-to-plane residuals of surface observations from photographs.
 
-An observation states that a vertex of the full level lies ``displacement`` mm along a normal from its position at that
-time, with an information (mm^-2). Sliding along the surface is free, as for the rim. An observation from images depends
-on the cameras: moving camera k by c_k moves the observed point by ``by_camera . c_k``. What the images tell of the
-cameras alone (shifts that no surface explains) is in ``camera_matrix``. With
+An observation states that a vertex of the full mesh lies ``displacement`` mm along a normal from its position X_seen
+during the observation, with an information (mm^-2). A shift along the surface has no cost. Moving camera k by c_k moves
+the observed point by ``by_camera . c_k``. Image shifts that no surface explains constrain the cameras alone, through M
+(``camera_matrix``). With
 
     e = n . (X(theta) - X_seen) - displacement - by_camera . (c - c_seen)
 
-the term is ``sum information rho(e) + (c - c_seen)^T M (c - c_seen) - 2 g^T (c - c_seen)``, rho of Geman and McClure
-with a scale of ``FORGIVEN_SIGMAS``. A bound counts only where e is positive, that is where the head sticks out of it.
-(A dozen bounds treated as positions held a chin at its beard, 9 mm too far out.)
+With the residual e, the term is ``sum information rho(e) + (c - c_seen)^T M (c - c_seen) - 2 g^T (c - c_seen)``. The
+function rho is the loss of Geman and McClure with a scale of ``FORGIVEN_SIGMAS``. Some observations, as from hair, are
+upper bounds: they count only where e is positive, that is, where the head sticks out.
 """
 
 from dataclasses import dataclass
@@ -34,8 +34,8 @@ def surface_residual(
     world_from_head: Similarity,
     camera_shift: Float[np.ndarray, "k 6"],
 ) -> tuple[Float[np.ndarray, " n"], Points]:
-    """Returns the residual e (mm) of each observation, as the module defines it, and the current positions of the
-    vertices (world, mm). A bound (from hair) has the residual 0 while the head stays inside it."""
+    """Returns the residual e (mm) of each observation and the current positions of the vertices (world frame, mm). An
+    upper bound, as from hair, has the residual 0 while the head stays inside."""
     count = len(coefficients)
     moved = (coefficients.astype(np.float32) @ seen.basis[:count].reshape(count, -1)).reshape(-1, 3)
     points = world_from_head.apply(seen.mean + moved)
@@ -46,14 +46,14 @@ def surface_residual(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceTerm:
-    """Computes the cost of the surface observations as a function of shape, pose and, in stages that solve for them,
+    """Computes the cost of the surface observations as a function of shape, pose and, if the stage solves for them,
     camera corrections."""
 
     seen: SurfaceObservations
     stage: Stage
 
     def at(self, state: State) -> "LinearisedSurfaceTerm":
-        """Returns the term linearised at ``state``."""
+        """Returns the surface term, linearised at ``state``."""
         residual, points = surface_residual(self.seen, state.coefficients, state.world_from_head, state.camera_shift)
         return LinearisedSurfaceTerm(self, state, residual, points)
 
@@ -75,8 +75,8 @@ class LinearisedSurfaceTerm:
 
     @property
     def cameras(self) -> LinearisedQuadratic:
-        """Returns the cost of the cameras' corrections alone: a quadratic form that was measured when the surface was
-        observed."""
+        """Returns the quadratic cost of the cameras' corrections, whose matrix was measured together with the
+        surface."""
         seen = self.term.seen
         form = Quadratic(seen.camera_matrix, seen.camera_shift.ravel(), seen.camera_gradient)
         return form.at(self.state.camera_shift.ravel())
@@ -88,7 +88,7 @@ class LinearisedSurfaceTerm:
         return float(LOSS.cost(self.squares).sum()) + self.cameras.cost
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds the term's part to the normal equations in place. Bounds that the head satisfies add nothing."""
+        """Adds the surface term to the normal equations in place. Upper bounds that the head satisfies add nothing."""
         seen, stage, state = self.term.seen, self.term.stage, self.state
         rows = surface_rows(seen, stage.modes, state.world_from_head, self.points, cameras=stage.cameras)
         counts = ~seen.bound | (self.residual > 0.0)

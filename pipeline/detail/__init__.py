@@ -1,5 +1,5 @@
-"""Deforms the fitted head to the surface that dense matching measured (level ``fine``), lids and ears included.
+"""Deforms the fitted head to the surface from dense stereo (detail level ``fine``), lids and ears included.
 
-In: the fit, the depth of every view, and the appearance of the eyes in the photographs. Out: vertices of the model's
-full level (world, mm) and their standard deviation.
+The modules take the fit, the depth map of every view, and the photographs of the eyes. The modules return the vertices
+of the model's full mesh (world frame, mm) and their standard deviation.
 """

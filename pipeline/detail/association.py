@@ -1,7 +1,7 @@
-"""Assigns each measured surface point to the closest point of the head that faces the same way.
+"""Assigns each measured surface point to the closest point of the head with a similar normal.
 
-The search goes from the points to the head, not from the head to the points. So a part of the head without points gets
-no observation, neither at the rim of a hole nor in its middle.
+The search goes from the measured points to the head. Thus parts of the head without measured points, and the borders of
+such holes, get no observation.
 """
 
 from dataclasses import dataclass
@@ -21,8 +21,7 @@ CANDIDATES = 4  # vertices whose triangles are tried
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Associated:
-    """Holds the n surface points near a head, by their indices, and the corresponding point of the head's mesh for
-    each."""
+    """Holds the indices of the n surface points near a head, and the closest point on the head's mesh for each."""
 
     row: Int[np.ndarray, " n"]  # of the points asked for
     triangle: Int[np.ndarray, " n"]
@@ -32,7 +31,7 @@ class Associated:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """Holds a head's mesh with a search tree for the closest point on it."""
+    """Holds a head's mesh with a search tree for closest points."""
 
     head: FannedMesh
     tree: PointTree
@@ -63,7 +62,7 @@ class Target:
             least_agreement: smallest cosine between a point's normal and the head's.
 
         Returns:
-            The points that have a counterpart, in their order.
+            The points that have a closest point within reach, in their order.
         """
         count = min(CANDIDATES, len(self.head.vertices))
         within = reach_mm + self.corner_mm
@@ -81,6 +80,6 @@ class Target:
 
 
 def interpolated(corners: Float[np.ndarray, "n 3 3"], blend: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Returns the values at n points inside triangles: the sum of the values at the three corners, weighted with the
-    barycentric coordinates ``blend``."""
+    """Interpolates values at n points inside triangles from the three corners, with barycentric coordinates
+    ``blend``."""
     return np.einsum("nk,nkc->nc", blend, corners)

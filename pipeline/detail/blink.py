@@ -1,8 +1,8 @@
 """Estimates from the measured surface how far the eyelids are closed.
 
-Other evidence is weak. Patches of a few millimetres do not follow a lid, so the photometric fit leaves lids open; the
-appearance between the lids (``eyelids``) misleads for eyes whose white is hidden. So a few blink weights are tried for
-each eye. The result is the weight with the smallest robust distance between lids and surface points.
+The photometric fit uses patches of a few millimetres, which cannot follow a lid, so it leaves lids open. The colours
+between the lids (``eyelids``) mislead for eyes whose white is hidden. So a few weights of the blink expression are
+tested for each eye, and the weight with the smallest robust distance between lids and surface points is chosen.
 """
 
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ OPEN = 1.25  # ... and so are others, unless half closed ones fit that much wors
 
 
 def blinks_of(model: HeadModel) -> dict[str, int]:
-    """Returns, for each eye (``right``, ``left``), the index of the fit's coefficient of its blink. Eyes for which the
+    """Returns, for each eye (``right``, ``left``), the index of its blink coefficient in the fit. Eyes for which the
     model has no blink expression are left out."""
     found: dict[str, int] = {}
     for name, place in zip(model.expressions.names, model.posed, strict=False):
@@ -46,16 +46,16 @@ def blinks_of(model: HeadModel) -> dict[str, int]:
 def estimate_eyelid_closure(
     fit: Fit, model: HeadModel, base: Vertices, surface: SurfacePoints, eyes: Mapping[str, EyeEvidence]
 ) -> tuple[dict[str, float], frozenset[str]]:
-    """Estimates how far each eye that the model can close is closed (0 open, 1 closed). Also returns the eyes whose
-    lids must be bridged instead: they look closed, but no blink of the model brings its lids nearer to the points.
+    """Estimates how far each eye is closed (0 open, 1 closed), if the model has a blink for it. Also returns eyes that
+    look closed although no blink brings the lids nearer to the points; their lids must be bridged.
 
     Args:
-        fit: to the photographs.
+        fit: the head fitted to the photographs.
         model: with the modes that the fit has.
-        base: the fit's head with plain lids (``with_plain_lids``), full level, world, mm.
+        base: the fitted head with smooth lids (``with_plain_lids``), full mesh, world frame, mm.
         surface: the measured surface points, world frame.
-        eyes: what the photographs show between the lids. An eye that shows neither white nor iris counts as closed
-            unless the points say otherwise.
+        eyes: appearance of the eyes in the photographs. An eye that shows neither white nor iris counts as closed
+            unless the points contradict it.
     """
     found, unexplained = {}, set[str]()
     for side, place in blinks_of(model).items():
@@ -72,7 +72,7 @@ def estimate_eyelid_closure(
 
 
 def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Vertices:
-    """Returns the displacement (full level, world frame, mm) that changes each eye from the fit's blink weight to the
+    """Returns the displacement (full mesh, world frame, mm) that changes each eye from the fit's blink weight to the
     weight in ``lids``."""
     shift, places = np.zeros((model.levels["full"].count, 3)), blinks_of(model)
     for side, share in lids.items():
@@ -82,7 +82,7 @@ def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Vertic
 
 
 def _moved(fit: Fit, model: HeadModel, place: int) -> Vertices:
-    """Returns the displacement of every vertex (full level, world frame, mm) by the mode ``place`` at weight 1."""
+    """Returns the displacement of every vertex (full mesh, world frame, mm) by the mode ``place`` at weight 1."""
     moved = model.levels["full"].operator @ model.modes[place].astype(float)
     return fit.world_from_head.scale * moved @ fit.world_from_head.rotation.T
 
@@ -96,7 +96,7 @@ def with_lids(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Fit:
 
 
 def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Vertices:
-    """Returns the fitted head (full level, world frame, mm) with eigenheads and expressions only: the coefficients of
+    """Returns the fitted head (full mesh, world frame, mm) with eigenheads and expressions only: the coefficients of
     all other modes are set to 0."""
     plain = fit.coefficients.copy()
     plain[np.setdiff1d(np.arange(eigenheads, len(plain)), model.posed)] = 0.0
@@ -106,11 +106,11 @@ def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Vertices:
 def _nearest_closure(
     open_lids: Vertices, moved: Vertices, fitted: float, model: HeadModel, surface: SurfacePoints, slit: Fissure
 ) -> tuple[float, float]:
-    """Returns the blink weight with the smallest distance between lids and points; ``fitted`` if too few points lie
-    there or no weight is better. Also returns the misfit of half closed lids divided by that of open ones; 1 if too few
-    points lie there.
+    """Returns the blink weight with the smallest distance between lids and points, or ``fitted`` if no weight is
+    better. Also returns the misfit of half-closed lids divided by the misfit of open lids. Without enough points the
+    function returns ``fitted`` and 1.
 
-    ``moved`` is the displacement of a full blink (mm).
+    ``moved`` is the displacement (mm) of the lids by a full blink.
     """
     middle = open_lids[slit.ellipse(0.5 * slit.length_mm, 0.4 * slit.length_mm)].mean(axis=0)
     off = np.linalg.norm(surface.points - middle, axis=1)
@@ -141,8 +141,8 @@ def _patch(
 
 
 def _misfit(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], points: SurfacePoints) -> float:
-    """Returns the mean of Geman and McClure's loss over the points' distances to the mesh, 0 to 1. A point without a
-    mesh point within reach counts as 1."""
+    """Returns the mean of Geman and McClure's loss (0 to 1) over the points' distances to the mesh. A point too far
+    from the mesh counts as 1."""
     target = Target.of(vertices, vertex_normals(vertices, faces), faces)
     found = target.closest(points.points, points.normals, reach_mm=REACH_MM, least_agreement=AGREEMENT)
     loss = np.ones(len(points.points))

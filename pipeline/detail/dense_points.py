@@ -43,23 +43,23 @@ class SurfacePoints:
     part: UInt8[np.ndarray, " n"]  # codes of ``Part``
 
     def chosen(self, rows: Bool[np.ndarray, " n"] | Int[np.ndarray, " m"]) -> "SurfacePoints":
-        """Returns the points of the chosen rows."""
+        """Returns the surface points with the indices ``rows``."""
         return SurfacePoints(self.points[rows], self.normals[rows], self.deviation_mm[rows], self.part[rows])
 
 
 def thinned(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:
-    """Thins out points to one for each cell of a grid, part and main direction of the normal: the mean, weighted by
-    information.
+    """Replaces the points in each cell of a grid that have the same part and main direction of the normal by their
+    mean, weighted by information.
 
-    The deviation remains that of a single point: neighbouring points have nearly the same error, since their windows
-    overlap.
+    The standard deviation remains that of a single point, because neighbouring points come from overlapping windows and
+    have nearly the same error.
 
     Args:
         surface: points, mm.
         cell_mm: edge of a cell.
 
     Returns:
-        The means, in the order of the cells.
+        The mean points, in the order of the cells.
     """
     if not len(surface.points):
         return surface
@@ -73,8 +73,8 @@ def thinned(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:
 
 @traced
 def dense_points(depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_world: Mesh) -> SurfacePoints:
-    """Returns the surface points on which enough views agree. They are thinned to at most one for each cell of a grid,
-    part of the head, and side of a thin sheet.
+    """Returns the surface points on which enough views agree. The points are thinned to one for each grid cell, part
+    label and main direction of the normal.
 
     Args:
         depth_maps: one for each view.
@@ -82,7 +82,7 @@ def dense_points(depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_w
         head_world: the fitted head.
 
     Returns:
-        The points, in the order of their cells; none without depth maps or votes.
+        The points, in the order of their cells; no points without depth maps or votes.
     """
     views_needed = count_views_needed([each.camera for each in depth_maps], head_world.vertices.mean(axis=0))
     clouds = map_in_threads(lambda k: _cloud(depth_maps[k], views_needed), len(depth_maps))
@@ -102,8 +102,8 @@ def dense_points(depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_w
 
 
 def count_views_needed(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"]) -> int:
-    """Returns how many views must agree on a point near the head: half of the cameras within ``TOGETHER_DEG`` of each
-    other where they are densest, but at least two and at most ``MAX_VIEWS_NEEDED``.
+    """Returns how many views must agree on a point near the head. The number is half of the largest number of cameras
+    within ``TOGETHER_DEG`` of each other, but at least two and at most ``MAX_VIEWS_NEEDED``.
 
     Args:
         cameras: of the depth maps.
@@ -137,7 +137,7 @@ def _cloud(
 
 
 def skin_under_cap(points: SurfacePoints, depth_maps: Sequence[DepthMap], cap: Cap, rig: Rig) -> SurfacePoints:
-    """Moves the points on the cap inwards by its thickness, and labels them as skin.
+    """Moves the points on a swim or wig cap inwards by the cap's thickness, and labels them as skin.
 
     ``points``: points of the visible surface (world, mm) with outward normals. ``depth_maps``: the maps from which the
     points come. ``cap``: thickness of the cap, and its pixels. ``rig``: the cameras as calibrated.

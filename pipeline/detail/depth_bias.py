@@ -1,9 +1,8 @@
-"""Measures the bias that matching windows cause in depth (``pipeline.stereo.depth_map``), on the fitted face of each
-capture. The face is a good reference: its shape and the cameras were solved together, from patches that follow the
-surface.
+"""Measures the depth bias that matching windows cause (``pipeline.stereo.depth_map``) on the fitted face of each
+capture. The fitted face is a good reference, since it was fitted with patches that follow the surface.
 
-On captures from two renderers the surface was 0.0 to 0.15 mm too deep, and the ``share`` was 0.7 to 1.5. The fitted
-face and the true face gave the same share to 0.1.
+On captures from two renderers the surface was 0.0 to 0.15 mm too deep, and the slope ``share`` was 0.7 to 1.5. The
+fitted face and the true face gave the same slope to 0.1.
 """
 
 from dataclasses import dataclass, replace
@@ -28,8 +27,8 @@ MAX_MM, MAX_SHARE = 0.3, 2.0  # of the common offset, and of the share: beyond, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnFace:
-    """Holds points of skin with their closest points on the fitted face, their offsets from the face (mm, along the
-    ``normal`` there), and the face's ``windowed_height`` there."""
+    """Holds points of skin with their closest points on the fitted face, their offsets from the face (mm, along
+    ``normal``), and the face's ``windowed_height`` at the closest points."""
 
     row: Int[np.ndarray, " n"]  # of the points
     normal: Float[np.ndarray, "n 3"]
@@ -39,8 +38,7 @@ class OnFace:
 
 @traced
 def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarray, " v"]) -> OnFace:
-    """Returns the points of skin whose closest triangle on the fitted head (world frame, mm) has all corners in
-    ``face``."""
+    """Returns the points of skin whose closest triangle on the head (world frame, mm) has all corners in ``face``."""
     vertices, faces, normals = head_world.vertices, head_world.faces, head_world.normals()
     skin = np.flatnonzero(surface.part == Part.SKIN)
     if not len(skin):
@@ -56,9 +54,9 @@ def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarr
 
 
 def measure_bias(seen: OnFace) -> WindowBias:
-    """Measures the bias of the matching windows: fits a robust straight line to the points' offsets from the fitted
-    face as a function of its windowed height. The intercept is the common bias (mm), the slope is the share. Returns no
-    bias for fewer than ``MIN_POINTS`` points."""
+    """Measures the bias of the matching windows by a robust straight line through the points' offsets from the fitted
+    face over its windowed height. The intercept is the common bias (mm), the slope is ``share``. Returns zero bias for
+    fewer than ``MIN_POINTS`` points."""
     if len(seen.row) < MIN_POINTS:
         return WindowBias()
     columns = np.stack([np.ones(len(seen.row)), seen.windowed_mm], axis=1)
@@ -70,7 +68,7 @@ def measure_bias(seen: OnFace) -> WindowBias:
 
 def without_window_bias(surface: SurfacePoints, seen: OnFace, bias: WindowBias) -> SurfacePoints:
     """Returns the points with the bias of the matching windows removed. Every point moves along its normal by the
-    common bias. Points on the face also move by ``share`` times the windowed height, which is known only there."""
+    common bias. Points on the face also move by ``share`` times the windowed height."""
     points = surface.points - bias.common_mm * surface.normals
     points[seen.row] = (
         surface.points[seen.row] - (bias.common_mm + bias.share * seen.windowed_mm)[:, None] * seen.normal

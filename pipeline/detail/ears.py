@@ -1,8 +1,9 @@
-"""Moves each ear into position as a whole, before the head is deformed.
+"""Moves each ear of the head by a similarity transform, before the head is deformed.
 
-An ear may be a centimetre away from its predicted position, and has many folds: the closest point may lie on the wrong
-fold. So each ear first moves by a similarity. From several starts, that with the best agreement to the surface points
-around it wins (iterated closest points along the normals; Chen and Medioni 1992). Its surroundings follow smoothly.
+An ear may be a centimetre away from its predicted position, and has many folds, so closest points may lie on the wrong
+fold. So each ear first moves by a similarity, found by iterated closest points along the normals (Chen and Medioni
+1992). The search has several starts, and the result with the best fit to the surface points is kept. The skin around
+the ear follows smoothly.
 """
 
 from dataclasses import dataclass
@@ -38,7 +39,7 @@ AGREEMENT = 0.4
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
     """Holds a similarity about the middle of an ear, its robust cost per point, and the number of points (``shown``)
-    whose closest point then lies on the ear."""
+    whose closest point lies on the moved ear."""
 
     cost: float
     scale: float
@@ -48,11 +49,10 @@ class Motion:
 
 
 def with_ears_in_place(vertices: Vertices, model: HeadModel, surface: SurfacePoints) -> Vertices:
-    """Returns the head with each ear moved to the points of skin that show it. An ear with too few points around it
-    stays.
+    """Returns the head with each ear moved to the skin points near it. An ear with too few points does not move.
 
     Args:
-        vertices: full level, world frame, mm.
+        vertices: full mesh, world frame, mm.
         model: the head model.
         surface: the surface points, thinned to a spacing of 1.5 to 3 mm.
     """
@@ -82,9 +82,9 @@ def _registered(
     points: SurfacePoints,
     model: HeadModel,
 ) -> Vertices:
-    """Returns all vertices under the similarity that best fits the ear to the points around it. Returns them unchanged
-    if fewer than ``MIN_SHOWN`` points show the ear itself: if hair covers the ear, the cheek in front would pull it
-    along."""
+    """Returns all vertices after the similarity that best fits the ear to the points around it. The vertices are
+    unchanged if fewer than ``MIN_SHOWN`` points lie on the ear itself, as under hair, where the cheek would pull the
+    ear."""
     centre = vertices[ear].mean(axis=0)
     local = np.flatnonzero(np.linalg.norm(vertices - centre, axis=1) < np.linalg.norm(
         vertices[ear] - centre, axis=1).max() + BLEND_MM)  # fmt: skip
@@ -107,7 +107,7 @@ def _registered(
 
 
 def _axes(vertices: Vertices, model: HeadModel) -> tuple[Vector, Vector]:
-    """Returns the unit vectors up and forward of the head, world frame."""
+    """Returns the head's upward and forward unit vectors in the world frame."""
     at = {name: vertices[row] for name, row in model.landmarks.items()}
     up = at["nasion"] - at["gnathion"]
     ahead = at["nasion"] - 0.5 * (at["tragion_left"] + at["tragion_right"])
@@ -120,7 +120,7 @@ def _descend(
     target: Target, ear: Bool[np.ndarray, " v"], points: SurfacePoints, centre: Vector, shift: Vector
 ) -> Motion:
     """Computes the similarity about ``centre`` to which iterated closest points converge from one starting ``shift``
-    (mm). ``target`` is the ear with its surroundings, relative to ``centre``.
+    (mm). ``target`` is the ear with the skin around it, relative to ``centre``.
 
     The points are mapped back to the original ear, so that the search tree is built only once.
     """

@@ -1,17 +1,17 @@
 """Estimates the expression of a face from the deformed head.
 
-In: the deformed head (``refine``). Out: the weights of its expressions with their standard deviations. The fit
-estimates these weights with few eigenheads, when the surface is known to half a millimetre only. Shape that the few
-eigenheads lack then looks like an expression, above all at the brows and the wings of the nose. So the weights are
-estimated once more, from the final surface and with all eigenheads of the population. With X a point of the head, Y the
-same point on the deformed head and n the normal there,
+The fit estimates expression weights with few eigenheads, from a surface that is exact to half a millimetre only. Shape
+that few eigenheads cannot represent then looks like an expression, mostly at the brows and the wings of the nose. So
+this module estimates the weights and their standard deviations again, from the deformed head (``refine``) and with all
+eigenheads of the population. With X a point of the head, Y the same point on the deformed head and n its normal,
 
     n . (mean + sum_m z_m modes_m + sum_e w_e shapes_e + pose - Y) = noise,    z ~ N(0, 1),
 
-robustly. The variance of the kernel's modes is estimated here, since all eigenheads leave little for them; the
-expression weights have the prior and bounds of the fit (``prior_term``). Sliding along the surface is free: the closest
-points are searched anew on the deformed head. Only the weights change, not the head. If a head is outside the
-population, expressions would replace missing eigenheads, so the weights of the fit stay.
+is solved for z, w and the pose with a robust loss. The variance of the kernel's modes is estimated too, since with all
+eigenheads little deviation is left for them. The expression weights have the same prior and bounds as in the fit
+(``prior_term``). The point Y is the closest point on the deformed head, so a shift along the surface has no cost. The
+module does not change the head's vertices. For a head outside the population expressions would replace missing
+eigenheads, so the fit's weights are kept.
 """
 
 from dataclasses import dataclass, replace
@@ -47,8 +47,8 @@ FIRST = 0.1  # weight at which the prior's tangent is taken first
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingBasis:
-    """Holds sample points of the mean head's face (head frame, mm) and the modes that move them; the last modes are the
-    expressions."""
+    """Holds sample points on the mean head's face (head frame, mm) and their displacements by each mode; the last modes
+    are the expressions."""
 
     vertex: Int[np.ndarray, " n"]  # of the full level
     mean: Points
@@ -59,8 +59,8 @@ class ReadingBasis:
 
 @lru_cache(maxsize=1)  # 10 MB; studios work with one model
 def reading_basis(population: HeadModel, model: HeadModel, eigenheads: int) -> ReadingBasis:
-    """Returns points on the mean face of ``population`` and their displacement by each mode: first all its eigenheads,
-    then the kernel modes and expressions of ``model``, which the fit used."""
+    """Returns points on the mean face of ``population`` and their displacement by each mode. The modes are all
+    eigenheads of ``population``, then the kernel modes and expressions of ``model``, which the fit used."""
     full = population.levels["full"]
     inputs = (population.sha256, population.modes, model.modes, model.posed, eigenheads, SPACING_MM)
 
@@ -86,12 +86,12 @@ def with_read_expression(
     *,
     eigenheads: int,
 ) -> Fit:
-    """Returns the fit with expression weights, and their standard deviations, estimated anew from the deformed head.
-    Returns the fit unchanged if the model has no expressions, or if the population does not explain the head.
+    """Returns the fit with expression weights, and their standard deviations, estimated from the deformed head. Returns
+    the fit unchanged if the model has no expressions, or if the population does not explain the head.
 
     ``fit``: the fit to the photographs. ``model``: the model with the fit's modes. ``population``: the model with all
-    its eigenheads. ``vertices_world``: the deformed head, full level, mm. ``observed``: which of its vertices have a
-    point of skin. ``eigenheads``: how many of the fit's modes are eigenheads.
+    its eigenheads. ``vertices_world``: the deformed head, full mesh, mm. ``observed``: mask of vertices near a measured
+    point of skin. ``eigenheads``: number of the fit's modes that are eigenheads.
     """
     if not len(model.posed):
         return fit
@@ -122,8 +122,8 @@ def with_read_expression(
 def _solved(
     basis: ReadingBasis, place: Points, normal: Points, information: Float[np.ndarray, " n"], expressions: int
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"], Points, float]:
-    """Estimates the expression weights. Returns the weights, their standard deviations, the modelled points under them
-    (head frame, mm) and the variance of the kernel's modes (MacKay 1992, as in ``posterior``)."""
+    """Estimates the expression weights. Returns the weights, their standard deviations, the modelled points (head
+    frame, mm) and the variance of the kernel's modes (MacKay 1992, as in ``posterior``)."""
     count = len(basis.modes)
     arm = place - place.mean(axis=0)
     by_mode = np.einsum("mnc,nc->nm", basis.modes, normal.astype(np.float32), optimize=True)
@@ -166,7 +166,7 @@ def _solved(
 def _with_weights(
     fit: Fit, model: HeadModel, weights: Float[np.ndarray, " e"], deviation: Float[np.ndarray, " e"]
 ) -> Fit:
-    """Returns the fit with other expression weights, and its covariance scaled to their new standard deviations."""
+    """Replaces the expression weights of a fit, and scales its covariance to their standard deviations."""
     coefficients, posed = fit.coefficients.copy(), np.asarray(model.posed)
     coefficients[posed] = weights
     if fit.covariance is None:

@@ -1,10 +1,10 @@
-"""Closes eyes that the photographs show closed but the model has open.
+"""Closes the eyes of the head model where the photographs show closed eyes.
 
-The pixels between the lids decide: the white of an eye has no colour, and iris and pupil are darker than skin; a closed
-lid is skin with a thin line of lashes. A blink expression of the model then closes the lids. In a model without one,
-the lids bridge the opening: the smoothest surface that continues the skin replaces the lids' margins and the surface
-between (biharmonic; Botsch and Kobbelt 2004, *An intuitive framework for real-time freeform modeling*). The measured
-surface later deforms it to the lids. The model's eyeball lies behind it and stays hidden.
+The pixels between the lids show whether an eye is open: the white of an eye is grey, and iris and pupil are darker than
+skin. A closed lid is skin with a thin line of lashes. A blink expression of the model closes the lids. In a model
+without such an expression, a smooth surface bridges the opening and replaces the lids' margins (biharmonic; Botsch and
+Kobbelt 2004, *An intuitive framework for real-time freeform modeling*). Later steps deform this bridge to the measured
+lids. The model's eyeball stays hidden behind the bridge.
 """
 
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ MIN_VERTICES = 12
 @dataclass(frozen=True, slots=True)
 class EyeEvidence:
     """Holds an eye's appearance in the photographs: the fractions (0 to 1) of the opening that are white and dark, and
-    the distance between the lids if a face was found (``faces.eyes.eye_openings``)."""
+    the relative distance between the lids if a face was found (``faces.eyes.eye_openings``)."""
 
     white: float
     dark: float
@@ -50,26 +50,26 @@ class EyeEvidence:
 
     @property
     def is_surely_closed(self) -> bool:
-        """Tells whether the measured opening is smaller than that of any half closed eye."""
+        """Returns True if the measured opening is smaller than that of any half-closed eye."""
         return self.opening is not None and self.opening < MIN_HALF_OPENING
 
     @property
     def is_surely_open(self) -> bool:
-        """Tells whether the measured opening is larger than that of any closed eye."""
+        """Returns True if the measured opening is larger than that of any closed eye."""
         return self.opening is not None and self.opening > MAX_CLOSED_OPENING
 
     @property
     def closed(self) -> bool:
-        """Tells whether the eye is closed: its lids surely touch, or some view shows neither white nor dark pixels
-        between them and the lids are not surely apart."""
+        """Returns True if the lids certainly touch, or if a view shows neither white nor dark pixels between them and
+        the eye is not certainly open."""
         nothing = self.views > 0 and self.white < WHITE_SHARE and self.dark < DARK_SHARE
         return self.is_surely_closed or (nothing and not self.is_surely_open)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fissure:
-    """Holds the slit between the lids of one eye on the mean head: its length, and the position of every vertex
-    relative to its middle, along the slit and above it (mm)."""
+    """Holds the slit between the lids of one eye on the mean head: its length, and the position of every vertex along
+    the slit and above it (mm), relative to the slit's middle."""
 
     length_mm: float
     along: Float[np.ndarray, " v"]  # mm from the middle, towards the corners
@@ -77,14 +77,14 @@ class Fissure:
     front: Bool[np.ndarray, " v"]
 
     def ellipse(self, half_length: float, half_height: float, below: float = 0.0) -> Bool[np.ndarray, " v"]:
-        """Returns which vertices lie inside an ellipse (half axes in mm); its centre lies ``below`` mm under the middle
-        of the fissure."""
+        """Returns a mask of the vertices inside an ellipse (half axes in mm), whose centre lies ``below`` mm under the
+        middle of the slit."""
         inside = (self.along / half_length) ** 2 + ((self.above + below) / half_height) ** 2 < 1.0
         return self.front & inside
 
 
 def eye_fissure(model: HeadModel, side: str) -> Fissure:
-    """Returns the fissure of the eye on one ``side``, ``right`` or ``left``."""
+    """Returns the slit between the lids of the eye on one ``side``, ``right`` or ``left``."""
     mean = model.vertices(np.zeros(0))
     outer, inner = (mean[model.landmarks[f"{corner}canthion_{side}"]] for corner in ("exo", "endo"))
     chord = inner - outer
@@ -101,9 +101,8 @@ def measure_eye_appearance(
 ) -> dict[str, EyeEvidence]:
     """Measures the appearance between the lids of each eye (``right``, ``left``) in the photographs.
 
-    ``model``: the head model. ``vertices``: the fitted head, full level, world frame, mm. ``images``: photographs by
-    camera, sRGB. ``rig``: the cameras. ``openings``: distance between the lids of the detected face, by side; empty
-    without a face.
+    ``model``: the head model. ``vertices``: the fitted head, full mesh, world frame, mm. ``images``: photographs by
+    camera, sRGB. ``rig``: the cameras. ``openings``: relative distance between the lids of the detected face, by side.
     """
     normals = vertex_normals(vertices, model.levels["full"].faces)
     found = {}
@@ -140,8 +139,8 @@ def _facing(
 def _shares(
     image: Photograph, opening: Float[np.ndarray, "n 2"], skin: Float[np.ndarray, "m 2"]
 ) -> tuple[float, float] | None:
-    """Returns the fractions of the opening that are white and that are dark, compared with the skin around it; None if
-    too little of opening or skin lies inside the photograph."""
+    """Returns the white and the dark fraction of the opening, compared with the skin around it. Returns None if too
+    little of opening or skin lies inside the photograph."""
     eye, about = _colours(image, opening), _colours(image, skin)
     if len(eye) < MIN_VERTICES or len(about) < MIN_VERTICES:
         return None
@@ -159,24 +158,24 @@ def _colours(image: Photograph, pixels: Float[np.ndarray, "n 2"]) -> Float[np.nd
 
 
 def _light_and_chroma(colours: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Returns the linear light of each colour, and (red - blue) / light: about 0 for white in any shade."""
+    """Returns the linear light of each colour, and (red - blue) / light, which is about 0 for grey and white."""
     light = colours.mean(axis=1)
     return light, (colours[:, 0] - colours[:, 2]) / np.maximum(light, 1e-3)
 
 
 def _lids(slit: Fissure) -> Int[np.ndarray, " r"]:
-    """Returns the vertices of both lids and of the surface between them."""
+    """Returns a mask of the vertices of the two lids and of the surface between them."""
     half_length, half_height = 0.5 * slit.length_mm + MARGIN_MM, BRIDGE_HEIGHT * slit.length_mm
     return np.flatnonzero(slit.ellipse(half_length, half_height, -BRIDGE_RAISED * slit.length_mm))
 
 
 def with_plain_lids(vertices: Vertices, shape: Vertices, model: HeadModel) -> Vertices:
-    """Returns the head with the lids of ``shape``, moved by a displacement that continues the surrounding skin's.
+    """Replaces the lids by those of ``shape``, displaced smoothly to meet the skin around them.
 
     Displacements along the normals would tear lids, because the normals at the lids' margins point at each other.
 
     Args:
-        vertices: full level, mm.
+        vertices: the head's full mesh, mm.
         shape: the same head with eigenheads and expressions only.
         model: the topology.
     """
@@ -188,8 +187,8 @@ def with_plain_lids(vertices: Vertices, shape: Vertices, model: HeadModel) -> Ve
 
 
 def bridge_eyelids(vertices: Vertices, model: HeadModel, closed: frozenset[str]) -> Vertices:
-    """Returns the head with the lids of the eyes ``closed`` (``right``, ``left``) bridged. ``vertices`` are the full
-    level, in any frame, mm."""
+    """Bridges the openings of the eyes ``closed`` (``right``, ``left``) by smooth surfaces. ``vertices`` are the full
+    mesh, in any frame, mm."""
     out, faces = vertices.copy(), model.levels["full"].faces
     for side in sorted(closed):
         rows = _lids(eye_fissure(model, side))
@@ -200,8 +199,8 @@ def bridge_eyelids(vertices: Vertices, model: HeadModel, closed: frozenset[str])
 def _smoothest(
     values: Vertices, vertices: Vertices, faces: Int[np.ndarray, "f 3"], rows: Int[np.ndarray, " r"]
 ) -> Float[np.ndarray, "r 3"]:
-    """Returns the values at the vertices ``rows`` that minimise the squared Laplacian while all other vertices keep
-    theirs."""
+    """Returns the values at the vertices ``rows`` that minimise the squared Laplacian, with all other vertices
+    fixed."""
     inside = np.zeros(len(vertices), bool)
     inside[rows] = True
     for _ in range(2):  # the Laplacian's own reach, squared

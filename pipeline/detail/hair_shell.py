@@ -1,9 +1,8 @@
-"""Pushes the head out to its hair: moves the head's own vertices to the bust's surface where the bust is hair.
+"""Moves vertices of the head outwards to the bust's surface where the bust is hair.
 
-In: the delivered head and the bust (world frame, mm). Leaves: ``HairShell``. Every vertex moves along a direction that
-is smooth over the head, up to the bust's hair in that direction; no vertex ends inside the skin. The mesh retains the
-head's vertex order, so a template's binding applies to it. It shows hair only as far as its topology reaches: hair that
-hangs beside the head has no vertices.
+Every vertex moves along a direction that is smooth over the head, up to the bust's hair in this direction. No vertex
+ends inside the skin. The mesh retains the head's vertex order, so templates can be bound to it. Hair that hangs beside
+the head is not covered, since the head has no vertices for it.
 """
 
 from dataclasses import dataclass
@@ -35,7 +34,7 @@ MIN_COVERED = 0.9  # of the visible hair: less is told
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HairShell:
-    """Holds the head with its hair."""
+    """Holds the head with its vertices moved outwards to the hair."""
 
     vertices_world: Float[np.ndarray, "v 3"]  # of the head's full level, mm
     height_mm: Float[np.ndarray, " v"]  # of each above the skin
@@ -43,7 +42,7 @@ class HairShell:
 
 
 def hair_shell(head: Mesh, bust: Mesh, part: UInt8[np.ndarray, " b"]) -> HairShell:
-    """Pushes a head out to the hair of a bust whose vertices have the labels ``part`` (codes of ``Part``)."""
+    """Moves a head outwards to the hair of a bust whose vertices have the labels ``part`` (codes of ``Part``)."""
     if not (part == Part.HAIR).any():
         return HairShell(head.vertices, np.zeros(len(head.vertices)), 1.0)
     topology = topology_of(head.faces, len(head.vertices))
@@ -75,7 +74,7 @@ def covered_share(shell: Mesh, bust: Mesh, part: UInt8[np.ndarray, " b"]) -> flo
 
 
 def smooth_directions(head: Mesh, topology: Topology) -> Float[np.ndarray, "v 3"]:
-    """Returns unit directions out of the head: its normals averaged over their neighbours."""
+    """Returns unit vectors out of the head: its vertex normals, smoothed over the mesh."""
     directions, beside = head.normals(), topology.beside
     degree = np.maximum(np.asarray(beside.sum(axis=1)).ravel(), 1.0)[:, None]
     for _ in range(DIRECTION_STEPS):
@@ -86,8 +85,8 @@ def smooth_directions(head: Mesh, topology: Topology) -> Float[np.ndarray, "v 3"
 def _traced(
     head: Mesh, directions: Float[np.ndarray, "v 3"], surface: SurfaceIndex
 ) -> tuple[Float[np.ndarray, " v"], Int[np.ndarray, " v"]]:
-    """Returns the distance of each vertex to the bust along its direction (mm; ``REACH_MM`` if there is none), and the
-    bust's triangle there. A step is as long as the distance to the bust, so no step passes it."""
+    """Traces a ray from each vertex along its direction to the bust. Returns the distance (mm; ``REACH_MM`` without a
+    hit) and the bust's triangle. Each step is as long as the distance to the nearest surface."""
     hits = surface.closest(head.vertices, CANDIDATES, facing=directions)
     depth = np.einsum("nx,nx->n", hits.points - head.vertices, hits.normals)
     heights, hit = np.zeros(len(head.vertices)), hits.triangles.copy()
@@ -111,7 +110,7 @@ def _pulled(
     bending: sparse.csr_array,
     raised: Bool[np.ndarray, " v"],
 ) -> Float[np.ndarray, "v 3"]:
-    """Moves the raised vertices smoothly to the nearest hair; the others stay."""
+    """Moves the vertices ``raised`` smoothly to the nearest hair; all other vertices stay."""
     start, out = vertices, vertices
     for stiffness in PULLS:
         hits = surface.closest(out, CANDIDATES, facing=vertex_normals(out, head.faces))
@@ -123,7 +122,7 @@ def _pulled(
 
 
 def _outside(vertices: Float[np.ndarray, "v 3"], head: Mesh) -> Float[np.ndarray, "v 3"]:
-    """Returns the vertices with those inside the head, or behind their own skin, moved back onto it."""
+    """Moves vertices that lie inside the head, or behind their own skin, back onto the skin."""
     hits = SurfaceIndex(head.vertices, head.faces).closest(vertices, CANDIDATES)
     inside = np.einsum("nx,nx->n", vertices - hits.points, hits.normals) < 0.0
     return np.where(inside[:, None], head.vertices, vertices)
@@ -138,8 +137,8 @@ def _bending(topology: Topology) -> sparse.csr_array:
 def _solved(
     bending: sparse.csr_array, stiffness: float, weights: Float[np.ndarray, " v"], wanted: Float[np.ndarray, "v k"]
 ) -> Float[np.ndarray, "v k"]:
-    """Returns the smooth field nearest to the wanted values by their weights. It uses conjugate gradients, since
-    factorising for the default model's 53,000 vertices takes six seconds."""
+    """Returns the smooth field that is nearest to the wanted values in weighted least squares. The solver uses
+    conjugate gradients, since a factorisation for 53,000 vertices takes six seconds."""
     system = sparse.csr_array(sparse.diags_array(weights + MIN_WEIGHT) + stiffness * bending)
     inverse = sparse.diags_array(1.0 / np.asarray(system.diagonal(), dtype=np.float64))
     right = weights[:, None] * wanted

@@ -1,9 +1,9 @@
-"""Adds the silhouettes' outlines as observations of the deformed head.
+"""Computes observations of the deformed head from the silhouettes' outlines.
 
-Where skin is smooth and shiny, windows match highlights, which lie behind a convex surface: all views agree on a tip of
-the nose that is 2 to 3 mm too deep. In profile the silhouettes show the same tip to half a pixel. At the rim the
-surface's normal lies in the image, so the signed distance to the silhouette is an offset along that normal. Only the
-face's rim counts; pixels of hair reduce its weight, since the outline of hair is not the skin's.
+On smooth and shiny skin dense matching follows highlights, which lie behind a convex surface, so the tip of the nose
+comes out 2 to 3 mm too deep. In profile the silhouettes show this tip to half a pixel. At the rim the surface's normal
+is parallel to the image, so the signed distance to the silhouette is an offset along the normal. Only the face's rim is
+used. Pixels of hair reduce the rim's weight, since the outline of hair is not that of skin.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,16 +31,16 @@ Outlines = Callable[[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"], float],
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutlineSearch:
-    """Holds the inputs of the comparison with outlines: the full level's topology, the silhouettes' distances with the
-    cameras corrected by the fit, and the probability of hair by camera."""
+    """Holds the inputs of the comparison with outlines: the topology of the full mesh, the silhouettes' signed
+    distances, the cameras corrected by the fit, and the probability of hair by camera."""
 
     topology: Topology
     views: Views
     hair: HairProbability
 
     def observed(self, base: Float[np.ndarray, "v 3"], now: Float[np.ndarray, "v 3"], robust_mm: float) -> Observed:
-        """Returns the offsets (mm) of the silhouettes from the vertices ``base``, along the normals at the rim of the
-        head at ``now``; both in the world frame."""
+        """Returns the offsets (mm) of the silhouettes from the vertices ``base`` along the normals at the rim. The rim
+        is found on the head ``now``; all positions are in the world frame."""
         rim = find_rim(self.topology, now, self.views, averaged=True)
         px_per_mm = np.linalg.norm(rim.gradient, axis=1)
         normal, off = rim.gradient / px_per_mm[:, None], -rim.residual / px_per_mm
@@ -67,9 +67,9 @@ class OutlineSearch:
 
 
 def outline_search(model: HeadModel, views: Views, cameras: Sequence[Camera], hair: HairProbability) -> OutlineSearch:
-    """Prepares the search.
+    """Prepares the comparison of a deformed head with the silhouettes' outlines.
 
-    ``model``: the model whose full level is deformed. ``views``: the silhouettes. ``cameras``: cameras of the views,
+    ``model``: the model whose full mesh is deformed. ``views``: the silhouettes. ``cameras``: cameras of the views,
     with the fit's corrections. ``hair``: for each camera, the probability that a pixel shows hair.
     """
     level, poses = model.levels["full"], [camera.camera_from_world for camera in cameras]

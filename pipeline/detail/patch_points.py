@@ -1,9 +1,9 @@
-"""Measures the deformed head again with patches of its own surface, where the windows of dense matching flatten it.
+"""Measures the deformed head again with image patches that follow its surface, to correct the bias of dense matching.
 
-Dense windows are planes, so curved skin comes out too flat and too deep (``pipeline.stereo.depth_map``). A patch of the
-deformed head (``pipeline.photometric_fit.patches``) already has the surface's shape, so it warps correctly into all its
-views. The cameras have the fit's corrections. These patches are narrower than the fit's; where they match, they
-determine the last tenths of a millimetre. Elsewhere the dense points are used.
+Dense matching uses planar windows, so curved skin comes out too flat and too deep (``pipeline.stereo.depth_map``). A
+patch of the deformed head (``pipeline.photometric_fit.patches``) has the surface's shape, so it warps correctly into
+all its views. The patches are narrower than in the fit, and correct the surface by tenths of a millimetre. Where no
+patch matches, the dense points are used.
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ SEARCH = Round(window_mm=1.2, blur_mm=0.3, reach_mm=0.8, steps=9)  # 1.6 and 2 m
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchPlaces:
-    """Holds n vertices of the full level, and the measured distance of the surface along their normals."""
+    """Holds n vertices of the full mesh, and the measured distance of the surface along their normals."""
 
     vertex: Int[np.ndarray, " n"]
     place_mm: Float[np.ndarray, " n"]
@@ -76,9 +76,9 @@ def patch_search(
     hair: HairProbability,
     rig: Rig,
 ) -> PatchSearch:
-    """Prepares the search: chooses patches on ``model``, and loads the photographs of the views that have a silhouette.
+    """Prepares the patch search: chooses patches on ``model``, and loads the photographs of views with a silhouette.
 
-    ``model``: the model on whose full level the patches lie. ``fit``: holds the cameras' corrections. ``images``: sRGB
+    ``model``: the model on whose full mesh the patches lie. ``fit``: holds the cameras' corrections. ``images``: sRGB
     photographs by camera. ``distances``: signed distances to the silhouettes (px), by camera. ``hair``: for each
     camera, the probability that a pixel shows hair. ``rig``: the cameras as calibrated.
     """

@@ -1,13 +1,13 @@
 """Deforms the fitted head to the measured surface.
 
-In: a fit with its covariance, and the surface points of the depth maps with normals. Out: every vertex of the model's
-full level displaced (same vertices, same order), and its standard deviation. The displacement is a smooth random field
-(``smooth_field``); its prior standard deviation is the uncertainty of the fit. Each point of skin pulls the nearest
-point of the head along their normals (``association``), robustly; without points the head retains the fit's shape.
+The displacement of the full mesh's vertices is a smooth random field (``smooth_field``), whose prior standard deviation
+is the uncertainty of the fit. Each measured point of skin pulls the closest point of the head along the normals
+(``association``), with a robust loss. Where there are no points, the head retains the fit's shape. The result also has
+a standard deviation for each vertex.
 
-The rounds go from coarse to fine. In the first rounds every node moves in three dimensions, over a long range, which
+The deformation runs in rounds from coarse to fine. In the first rounds the control points move freely and far, which
 brings ears and jaw into position. Then the vertices move only along their normals, so that a vertex remains the same
-anatomical point on every subject. Points of hair and clothes do not pull; they only bound the skin from outside.
+anatomical point on every subject. Points of hair and clothes only bound the skin from outside.
 """
 
 from collections.abc import Callable, Mapping
@@ -69,8 +69,8 @@ SEED = 16
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Holds the limits of one round, which first assigns the points to the head and then solves for the displacement.
-    ``agreement`` is the smallest cosine between a point's normal and the head's."""
+    """Holds the limits of one round of the deformation, which assigns the points to the head and solves for the
+    displacement. ``agreement`` is the smallest cosine between a point's normal and the head's."""
 
     reach_mm: float
     loose_reach_mm: float
@@ -86,8 +86,8 @@ PATCH_REACH_MM = 4.0  # no dense point counts so near to a patch, whose window r
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointObservations:
-    """Holds the observations of the head from surface points. For the n points of skin it also holds their triangles on
-    the head (corners and barycentric coordinates) and their standard deviations."""
+    """Holds the observations of the head from surface points. Also holds, for the n points of skin, the triangle on the
+    head (corners and barycentric coordinates) and the standard deviation."""
 
     observed: Observed
     corner: Int[np.ndarray, "n 3"]
@@ -97,8 +97,8 @@ class PointObservations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeformedSurface:
-    """Holds the deformed head (world frame, mm), the standard deviation of each vertex, whether a point of skin
-    observes it, and how far the eyes are closed."""
+    """Holds the deformed head (world frame, mm), the standard deviation of each vertex, a mask of vertices with a
+    measured point of skin, and how far the eyes are closed."""
 
     vertices: Vertices
     deviation_mm: PerVertex  # along the normal
@@ -126,13 +126,12 @@ def refine_to_surface(
         fit: with its covariance.
         model: with the modes that the fit has.
         surface: the measured surface points, world frame.
-        eigenheads: how many of the modes are eigenheads; the rest, expressions apart, are smooth deformations along the
-            normals.
+        eigenheads: how many of the modes are eigenheads; the others are smooth deformations along the normals, or
+            expressions.
         deviation_mm: standard deviation of every vertex in the fit (``vertex_deviation_mm``).
-        eyes: what photographs show between the lids (``measure_eye_appearance``); None keeps the lids as the model has
-            them.
-        patches: measures the deformed head once more with the photographs; None leaves that out.
-        outlines: compares the deformed head with the silhouettes; None leaves that out.
+        eyes: appearance of the eyes (``measure_eye_appearance``); None keeps the lids as the model has them.
+        patches: measures the deformed head once more with the photographs; None skips this step.
+        outlines: compares the deformed head with the silhouettes; None skips this step.
         report: called with the share that is done.
 
     Returns:
@@ -179,22 +178,22 @@ def deform_to_points(
     shared_error: float = SHARED_ERROR,
     report: Progress = discard_progress,
 ) -> DeformedSurface:
-    """Deforms a surface to the measured points near it.
+    """Deforms a mesh to the measured points near it.
 
     Args:
-        vertices: of the surface, mm.
-        deviation_mm: how far they may be off, along their normals.
-        faces: its triangles.
+        vertices: of the mesh, mm.
+        deviation_mm: prior standard deviation of the vertices along their normals.
+        faces: the mesh's triangles.
         nodes: the meshes on which the displacement is solved.
         surface: the points, in the same frame.
-        loose: vertices that may be farther off than the others.
-        look: measures the surface once more with the photographs; None leaves that out.
-        outlines: compares the surface with silhouettes; None leaves that out.
-        shared_error: the share of their deviation by which all points err alike.
+        loose: vertices that may move farther than the others.
+        look: measures the surface once more with the photographs; None skips this step.
+        outlines: compares the surface with silhouettes; None skips this step.
+        shared_error: the fraction of the points' standard deviation that is an error common to all of them.
         report: called with the share that is done.
 
     Returns:
-        The same vertices displaced; far from all points they are unchanged.
+        The displaced vertices; vertices far from all points are unchanged.
     """
     amplitude = np.maximum(deviation_mm, MIN_AMPLITUDE_MM)
     informative = (surface.part != Part.UNSEEN) & np.isfinite(surface.deviation_mm)
@@ -235,7 +234,7 @@ def _coarsely_deformed(
     outlines: Outlines | None,
     report: Progress,
 ) -> Vertices:
-    """Returns the vertices after the coarse rounds, which move them freely in space."""
+    """Returns the vertices after the coarse rounds, which move control points freely in three dimensions."""
     current = vertices
     field = smooth_field(nodes.shape @ vertices, nodes.faces, COARSE_LENGTH_MM)
     directions = free_directions(nodes, nodes.shape @ amplitude)
@@ -250,7 +249,7 @@ def _coarsely_deformed(
 def with_outlines(
     observed: Observed, outlines: Outlines | None, base: Vertices, current: Vertices, robust_mm: float
 ) -> Observed:
-    """Returns the observations together with those of the outlines, if there are any."""
+    """Adds the observations from the outlines, if there are any, to the observations from points."""
     return observed if outlines is None else observed.joined(outlines(base, current, robust_mm))
 
 
@@ -264,11 +263,11 @@ def observe(
     limits: Round,
     floor_mm: float,
 ) -> PointObservations:
-    """Returns the observations of the head at ``current`` by points, as offsets (mm) from ``base``. A point of hair
-    counts only where the head reaches beyond it.
+    """Returns the observations from points near the head ``current``, as offsets (mm) from ``base``. A point of hair
+    counts only where the head extends beyond the point.
 
-    The normal of an observation is half the point's and half the head's (Rusinkiewicz 2019, *A symmetric objective
-    function for ICP*), which is exact to second order where both are curved.
+    The normal of an observation is the mean of the point's and the head's normal (Rusinkiewicz 2019, *A symmetric
+    objective function for ICP*), which is exact to second order for curved surfaces.
     """
     normals = vertex_normals(current, faces)
     found = Target.of(current, normals, faces).closest(
@@ -299,8 +298,8 @@ def observe(
 def with_patches(
     observed: Observed, found: PatchPlaces, base: Vertices, current: Vertices, faces: Faces, robust_mm: float
 ) -> Observed:
-    """Replaces observations by those of patches near them: adds the patches' measurements on the head at ``current``,
-    and drops the dense observations within ``PATCH_REACH_MM`` of a patch."""
+    """Adds the patches' measurements on the head ``current``, and drops the observations from dense matching within
+    ``PATCH_REACH_MM`` of a patch."""
     vertex, normals = found.vertex, vertex_normals(current, faces)[found.vertex]
     if not len(vertex):
         return observed
@@ -314,8 +313,8 @@ def with_patches(
 
 
 def typical_deviation(dense: PointObservations, faces: Faces, count: int) -> PerVertex:
-    """Returns the mean standard deviation (mm) of the points of skin around each of ``count`` vertices; 0 where there
-    are none."""
+    """Returns the mean standard deviation (mm) of the points of skin around each of ``count`` vertices; 0 without
+    points."""
     if not len(dense.corner):
         return np.zeros(count)
     known = np.bincount(dense.corner.ravel(), dense.blend.ravel(), count)
@@ -333,8 +332,8 @@ def _pooled(values: PerVertex, faces: Faces) -> PerVertex:
 def _local_density(
     found: Associated, corner: Int[np.ndarray, "n 3"], vertices: Vertices, faces: Faces, correlation_mm: float
 ) -> Float[np.ndarray, " n"]:
-    """Returns, for each point, the number of points with the same error, itself included: those within
-    ``correlation_mm``, computed from the density of points there."""
+    """Returns, for each point, the number of points within ``correlation_mm``, which have the same error. The number of
+    points follows from the density of points."""
     area = np.linalg.norm(np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]],
                                    vertices[faces[:, 2]] - vertices[faces[:, 0]]), axis=1) / 6.0  # fmt: skip
     mass = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
@@ -352,8 +351,8 @@ def field_deviation(
     *,
     common_mm: PerVertex,
 ) -> PerVertex:
-    """Returns the standard deviation (mm) of every vertex along its normal. Near observed vertices it comes from random
-    draws of the posterior and from ``common_mm``, the error common to all points; far from them it is at least
+    """Returns the standard deviation (mm) of every vertex along its normal. Near measured points the deviation comes
+    from random draws of the posterior and from ``common_mm``, the error common to all points; elsewhere it is at least
     ``deviation_mm``."""
     draws = posterior.draws(np.random.default_rng(SEED), DRAWS)
     square = common_mm**2
@@ -367,16 +366,15 @@ def field_deviation(
 
 
 def folded(before: Vertices, after: Vertices, faces: Faces) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles a displacement turns over or squeezes to almost no area."""
+    """Returns a mask of the triangles that a displacement flips or makes almost degenerate."""
     old, new = face_normals(before, faces), face_normals(after, faces)
     size, length = np.linalg.norm(old, axis=1), np.linalg.norm(new, axis=1)
     return ((old * new).sum(axis=1) <= MAX_TURN * size * length) | (length < MIN_AREA * size)
 
 
 def unfolded(before: Vertices, after: Vertices, faces: Faces) -> Vertices:
-    """Returns the displaced vertices ``after`` without folds. Around each fold the displacement from ``before`` is
-    smoothed until no triangle is turned over. In the second half of the sweeps it also shrinks there, so that the
-    vertices return towards ``before``."""
+    """Removes folds from the displaced vertices ``after``. Around each fold the displacement from ``before`` is
+    smoothed until no triangle is flipped. In the second half of the sweeps the displacement is also reduced."""
     bad = faces[folded(before, after, faces)]
     if not len(bad):
         return after
@@ -398,7 +396,7 @@ def unfolded(before: Vertices, after: Vertices, faces: Faces) -> Vertices:
 
 
 def _around(chosen: Int[np.ndarray, "b 3"], faces: Faces, count: int, rings: int) -> Int[np.ndarray, "g 3"]:
-    """Returns the faces within this number of rings around the chosen faces."""
+    """Returns a mask of the faces within ``rings`` rings around the chosen faces."""
     about = np.zeros(count, bool)
     about[chosen] = True
     for _ in range(rings - 1):
@@ -407,8 +405,7 @@ def _around(chosen: Int[np.ndarray, "b 3"], faces: Faces, count: int, rings: int
 
 
 def _neighbour_mean(faces: Faces, count: int) -> sparse.csr_array:
-    """Returns the matrix that computes, for each vertex, the mean over the corners of the faces at it, including the
-    vertex itself."""
+    """Returns the matrix that averages vertex values over the corners of the faces around each vertex."""
     rows, columns = np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, 3).ravel()
     share = 1.0 / np.maximum(np.bincount(rows, minlength=count), 1)
     return sparse.csr_array((share[rows], (rows, columns)), shape=(count, count))

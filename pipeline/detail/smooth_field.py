@@ -1,15 +1,15 @@
 """Defines a displacement that varies smoothly along a head's surface: a Gaussian random field with a sparse precision
 matrix.
 
-Lindgren, Rue and Lindstroem (2011), *An explicit link between Gaussian fields and Gaussian Markov random fields*
-(https://doi.org/10.1111/j.1467-9868.2011.00777.x): the solution of ``(kappa^2 - Laplace) tau x = white noise`` on a
-surface is a Matern field with nu = 1, standard deviation ``1 / (sqrt(4 pi) kappa tau)``, and a correlation that falls
-to 0.14 at ``sqrt(8) / kappa``. With linear finite elements, lumped masses M and stiffness S,
+The field follows Lindgren, Rue and Lindstroem (2011), *An explicit link between Gaussian fields and Gaussian Markov
+random fields* (https://doi.org/10.1111/j.1467-9868.2011.00777.x). The solution of ``(kappa^2 - Laplace) tau x = white
+noise`` on a surface is a Matern field with nu = 1 and standard deviation ``1 / (sqrt(4 pi) kappa tau)``. The field's
+correlation falls to 0.14 at ``sqrt(8) / kappa``. With linear finite elements, lumped masses M and stiffness S,
 
     precision = tau^2 K M^-1 K,    K = kappa^2 M + S.
 
-The field here has unit variance; the displacement is the field times an amplitude at each vertex. Where nothing is
-observed, the field continues the observed displacement and fades to zero over ``length_mm = 1 / kappa``.
+The field here has unit variance; the displacement is the field times an amplitude at each vertex. Beside observed
+regions the field continues the observed displacement and fades to zero over ``length_mm = 1 / kappa``.
 """
 
 from dataclasses import dataclass
@@ -48,8 +48,8 @@ class SmoothField:
 
 
 def smooth_field(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], length_mm: float) -> SmoothField:
-    """Returns the field on a mesh of the given shape (mm). The cotangents of its angles are limited, so that the
-    precision matrix stays positive definite."""
+    """Returns the random field on a mesh (mm). The cotangents of the mesh's angles are limited, so that the precision
+    matrix stays positive definite."""
     count = len(vertices)
     mass = np.zeros(count)
     corners = vertices[faces]

@@ -1,15 +1,15 @@
 """Solves for the displacement that best agrees with the field's prior and point-to-plane observations, and computes its
 uncertainty.
 
-The unknown is a unit field w on the nodes, in ``d`` directions each (three, or one along the normals); the head moves
-by ``operator @ (amplitude w direction)``. With K observations ``n . X = e`` of information q, each at a point inside a
-triangle, tr(w^T Q w) + sum q (n . dX(w) - e)^2 is a sparse linear problem, solved exactly. Each random draw of its
-posterior takes one more solution (Papandreou and Yuille 2010, *Gaussian sampling by local perturbations*).
+The unknown is a field w of unit variance on control points (nodes), with ``d`` = 3 or 1 (along the normals) components
+for each. The head moves by ``operator @ (amplitude w direction)``. An observation ``dot(n, X) = e`` has the information
+q. The cost ``tr(w^T Q w) + sum q (dot(n, dX(w)) - e)^2`` is minimised exactly as a sparse linear problem. A random draw
+from the posterior needs one more solution (Papandreou and Yuille 2010, *Gaussian sampling by local perturbations*).
 
-The nodes are as dense as the photographs' resolution, not denser. A model with subdivision has two such meshes: its
-cage, and the mesh one step before its full level (edges of 1.7 mm in the face, where the windows of dense matching are
-2.6 mm wide). The full level follows both smoothly. A model without subdivision is solved first on a decimated level,
-then on its own vertices.
+The nodes are no denser than the photographs' resolution. A model with subdivision has two meshes of nodes: its coarsest
+mesh (the cage), and the mesh one subdivision step before the full mesh (edges of 1.7 mm in the face; the windows of
+dense matching are 2.6 mm wide). A model without subdivision is solved first on a decimated mesh, then on its own
+vertices.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ NEIGHBOURS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeMesh:
-    """Holds a mesh of control points, the nodes. A displacement of the nodes defines that of the full level: ``full =
+    """Holds a mesh of control points, the nodes. The nodes' displacement defines that of the full mesh: ``full =
     operator @ nodes``."""
 
     faces: Int[np.ndarray, "f 3"]
@@ -85,8 +85,8 @@ def _decimated(model: HeadModel) -> NodeMesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Holds n observations of the surface: offsets (mm) along normals at points inside triangles of the full level,
-    with their information (mm^-2)."""
+    """Holds n observations of the surface: offsets (mm) along normals at points inside triangles of the full mesh, with
+    their information (mm^-2)."""
 
     corner: Int[np.ndarray, "n 3"]
     blend: Float[np.ndarray, "n 3"]
@@ -95,13 +95,13 @@ class Observed:
     information: Float[np.ndarray, " n"]  # mm^-2, robust weight included
 
     def chosen(self, rows: Bool[np.ndarray, " n"]) -> "Observed":
-        """Returns the observations of the chosen rows."""
+        """Returns the observations with the indices ``rows``."""
         return Observed(
             self.corner[rows], self.blend[rows], self.normal[rows], self.offset_mm[rows], self.information[rows]
         )
 
     def joined(self, other: "Observed") -> "Observed":
-        """Returns both observations."""
+        """Concatenates two sets of observations."""
         return Observed(
             np.concatenate([self.corner, other.corner]),
             np.concatenate([self.blend, other.blend]),
@@ -113,19 +113,19 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Directions:
-    """Holds the matrix (3 v, d n) that converts the solver's unknowns, d at each of n nodes, to displacements (mm) of
-    the head's v vertices: x, y and z of each vertex are three rows."""
+    """Holds the matrix (3 v, d n) that converts the solver's unknowns, d at each of n nodes, to the x, y and z
+    displacements (mm) of the head's v vertices."""
 
     matrix: sparse.csr_array
     count: int  # d
 
     def moved(self, field: Float[np.ndarray, " u"]) -> Float[np.ndarray, "v 3"]:
-        """Returns the displacement (mm) of every vertex under the given values of the field."""
+        """Returns the displacement (mm) of every vertex for given values of the field."""
         return (self.matrix @ field).reshape(-1, 3)
 
 
 def free_directions(mesh: NodeMesh, amplitude_mm: Float[np.ndarray, " n"]) -> Directions:
-    """Returns directions in which every node may move along x, y and z, scaled by its amplitude (mm)."""
+    """Returns ``Directions`` for nodes that move along x, y and z, scaled by their amplitudes (mm)."""
     scaled = mesh.operator @ sparse.diags_array(amplitude_mm)
     return Directions(sparse.csr_array(sparse.kron(scaled, sparse.identity(3), format="csr")), 3)
 
@@ -133,7 +133,7 @@ def free_directions(mesh: NodeMesh, amplitude_mm: Float[np.ndarray, " n"]) -> Di
 def normal_directions(
     mesh: NodeMesh, amplitude_mm: Float[np.ndarray, " n"], normals: Float[np.ndarray, "v 3"]
 ) -> Directions:
-    """Returns directions in which every vertex moves along its own normal only, by the interpolated amounts of its
+    """Returns ``Directions`` for vertices that move only along their normals, by amounts interpolated from the
     nodes."""
     scaled = sparse.csr_array(mesh.operator @ sparse.diags_array(amplitude_mm))
     vertices = len(normals)
@@ -179,8 +179,8 @@ def solve_field(field: SmoothField, directions: Directions, observed: Observed) 
 
 
 def _planes(observed: Observed, coordinates: int) -> sparse.csr_array:
-    """Returns the matrix that maps the coordinates of all vertices to sqrt(information) normal . X of each observation,
-    with X the place on the head."""
+    """Returns the matrix that maps the coordinates of all vertices to ``sqrt(information) dot(normal, X)`` for each
+    observation, with the point X on the head."""
     count = len(observed.corner)
     value = np.sqrt(observed.information)[:, None, None] * observed.blend[:, :, None] * observed.normal[:, None, :]
     column = 3 * observed.corner[:, :, None].astype(np.int64) + np.arange(3)

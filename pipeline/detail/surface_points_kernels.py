@@ -1,4 +1,4 @@
-"""Compiled loops of ``pipeline.detail.dense_points``."""
+"""Contains the compiled loops of ``pipeline.detail.dense_points``."""
 
 import numpy as np
 
@@ -9,8 +9,8 @@ SIDES, PARTS = 6, 4  # main directions of a normal; codes of ``Part``, at most
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cell_numbers(points: np.ndarray, normals: np.ndarray, part: np.ndarray, cell_mm: float) -> np.ndarray:
-    """Numbers the cells of a grid, by ``part`` and main direction of the normal. Returns the cell's number of each of
-    the points (n, 3)."""
+    """Assigns each of the points (n, 3) to a group by grid cell, ``part`` and main direction of the normal. Returns the
+    group numbers."""
     low, cells = np.full(3, np.inf), np.zeros(3, np.int64)
     for axis in range(3):
         high = -np.inf
@@ -34,8 +34,8 @@ def cell_numbers(points: np.ndarray, normals: np.ndarray, part: np.ndarray, cell
 def mean_points(
     group: np.ndarray, count: int, points: np.ndarray, normals: np.ndarray, deviation: np.ndarray, part: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the mean point, unit mean normal, deviation and part of ``count`` groups of points (n, 3), weighted by
-    information. The standard deviation is that of a single point of a group."""
+    """Returns the mean point, unit mean normal, standard deviation and part of ``count`` groups of points (n, 3),
+    weighted by information. The standard deviation is that of a single point."""
     place, towards, single = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count)
     total, of = np.zeros(count), np.zeros(count, np.uint8)
     for n in range(len(group)):

@@ -1,1 +1,1 @@
-"""Measures a finished head and judges it by camera, by length and by plausibility."""
+"""Measures a finished head: errors in each camera, anthropometric distances, expression and plausibility."""

@@ -1,4 +1,4 @@
-"""Measures how well a fitted head explains every camera: the figures of the report."""
+"""Measures, for the report, how well a fitted head agrees with the silhouette in every camera."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,13 +29,12 @@ Masks = Mapping[str, Bool[np.ndarray, "h w"]]
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """Holds how well the fitted head explains one camera's silhouette.
+    """Holds measures of how well the fitted head agrees with one camera's silhouette.
 
     ``iou`` and ``contour_rms_px`` are over all rim samples of the face region, outliers included; ``excluded_share`` is
     the fraction of them (0 to 1) whose residual is too large for the fit. ``xor_cost`` is eq. (5) for the fitted head,
-    ``xor_cost_start`` for the head at the start of the fit. ``outside_rms_px`` counts only rim samples outside the
-    mask: hair, hands or shoulders may hide those inside. A figure is None if it cannot be computed for the view (no rim
-    sample).
+    ``xor_cost_start`` for the head at the start of the fit. ``outside_rms_px`` is over rim samples outside the mask
+    only, because hair, hands or shoulders may hide samples inside. A value is None if the view has no rim sample.
     """
 
     used: bool
@@ -51,7 +50,7 @@ class CameraFigures:
 def camera_figures(
     model: HeadModel, fit: Fit, silhouettes: Mapping[str, Silhouette], rig: Rig, fitted: Masks, started: Masks
 ) -> dict[str, CameraFigures]:
-    """Computes the figures of every camera, in the order of the rig. The cameras are those of the calibration, without
+    """Computes the figures of every camera, in the order of the rig. The function uses the calibrated cameras without
     the corrections of the fit."""
     level = model.levels["full"]
     vertices = fit.world_from_head.apply(model.vertices(fit.coefficients))
@@ -84,8 +83,7 @@ def _rms(values: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> fl
 
 
 def _costs(observed: Bool[np.ndarray, "h w"], *models: Bool[np.ndarray, "h w"]) -> list[float]:
-    """Returns the cost of eq. (5) for each model's mask. Only the box around all masks is compared, because the masks
-    do not differ outside."""
+    """Returns the XOR cost of the paper's eq. (5) for each mask, computed in the bounding box of all masks."""
     everything = observed.copy()
     for model in models:
         everything |= model
@@ -95,7 +93,7 @@ def _costs(observed: Bool[np.ndarray, "h w"], *models: Bool[np.ndarray, "h w"]) 
 
 
 def _zone(camera: Camera, face_world: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, "h w"]:
-    """Marks the convex hull of the face in the image and a margin, where hair and shoulders do not matter."""
+    """Returns a mask of the face's convex hull in the image, with a margin."""
     zone = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
     pixels = camera.project(face_world)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
@@ -108,13 +106,13 @@ def _zone(camera: Camera, face_world: Float[np.ndarray, "v 3"]) -> Bool[np.ndarr
 def _overlap(
     observed: Bool[np.ndarray, "h w"], fitted: Bool[np.ndarray, "h w"], zone: Bool[np.ndarray, "h w"]
 ) -> float | None:
-    """Returns the intersection over union of two masks inside the zone; None if both are empty there."""
+    """Returns the intersection over union of two masks inside ``zone``; None if both masks are empty there."""
     union = np.count_nonzero((observed | fitted) & zone)
     return float(np.count_nonzero(observed & fitted & zone) / union) if union else None
 
 
 def start_masks(model: HeadModel, world_from_head: Similarity, rig: Rig) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Returns the mask of the mean head in each camera, at the pose of the alignment."""
+    """Returns the mask of the aligned mean head in each camera."""
     vertices = world_from_head.apply(model.vertices(np.zeros(0), START_LEVEL))
     depths = depth_maps(rig, Mesh(vertices, model.levels[START_LEVEL].faces))
     return {name: np.isfinite(depth) for name, depth in depths.items()}

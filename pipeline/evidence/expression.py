@@ -1,4 +1,4 @@
-"""Describes the expression of a fitted head, removes it, and provides morph targets under Apple's names for
+"""Describes and removes the expression of a fitted head, and provides morph targets with Apple's names for
 animation."""
 
 from collections.abc import Collection, Mapping
@@ -22,7 +22,7 @@ CLOSED = 0.8  # lids that are so far closed show no eye
 @dataclass(frozen=True, slots=True)
 class Found:
     """Holds one expression of a head: its name in the model, its weight from 0 to 1, and the weight's standard
-    deviation (None if the fit has none)."""
+    deviation (None if the fit has no covariance)."""
 
     name: str
     weight: float
@@ -36,8 +36,8 @@ class Found:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlendshapeRig:
-    """Holds a neutral head, the morph targets that animate it, and their weights on the photographed head. ``missing``
-    are Apple's names without counterpart in the model; their morph targets move nothing."""
+    """Holds a neutral head, its morph targets, and their weights on the photographed head. ``missing`` are Apple's
+    names without counterpart in the model; their morph targets are zero."""
 
     neutral_world: Mesh
     morphs: Mapping[str, Float[np.ndarray, "v 3"]]  # mm, head frame, at weight 1
@@ -46,19 +46,19 @@ class BlendshapeRig:
 
     @property
     def moving(self) -> dict[str, Float[np.ndarray, "v 3"]]:
-        """Returns the morph targets that move something."""
+        """Returns the morph targets with a displacement other than zero."""
         return {name: morph for name, morph in self.morphs.items() if name not in self.missing}
 
 
 def fitted_weights(model: HeadModel, fit: Fit) -> dict[str, float]:
-    """Returns the fitted weight of every expression of the model, by name; empty if the model has none."""
+    """Returns the fitted weight of every expression of the model, by name."""
     fitted = fit.coefficients[model.posed.start : model.posed.stop] if len(model.posed) else ()
     return dict(zip(model.expressions.names, (float(w) for w in fitted), strict=False))
 
 
 def found_expressions(model: HeadModel, fit: Fit, least_sigma: float = MIN_SIGMA) -> tuple[Found, ...]:
-    """Returns the expressions of the head, the strongest first: those whose weight is at least ``TOLD`` and exceeds
-    ``least_sigma`` standard deviations."""
+    """Returns the head's expressions whose weight is at least ``TOLD`` and exceeds ``least_sigma`` standard deviations,
+    the strongest first."""
     weights = fitted_weights(model, fit)
     spread = None if fit.covariance is None else np.sqrt(np.diag(fit.covariance))[np.asarray(model.posed, int)]
     found = []
@@ -75,7 +75,7 @@ def shut_eyes(model: HeadModel, fit: Fit) -> frozenset[str]:
 
 
 def neutral_mesh(model: HeadModel, place: Similarity, mesh_world: Mesh, found: Collection[Found]) -> Mesh:
-    """Returns the head without the displacement of its expressions; all other detail stays."""
+    """Returns the head without the displacement of its expressions; all other detail is unchanged."""
     moved = model.levels["full"].operator @ model.expressions.moved({each.name: each.weight for each in found})
     back = place.scale * moved @ place.rotation.T
     return Mesh(mesh_world.vertices - back, mesh_world.faces, mesh_world.colours)
@@ -84,8 +84,8 @@ def neutral_mesh(model: HeadModel, place: Similarity, mesh_world: Mesh, found: C
 def build_blendshape_rig(
     model: HeadModel, place: Similarity, mesh_world: Mesh, found: Collection[Found]
 ) -> BlendshapeRig:
-    """Builds the neutral head with Apple's 52 morphs. Adds a morph for every measured expression that they do not fully
-    reproduce, so that the weights give the head as photographed."""
+    """Builds the neutral head with Apple's 52 morph targets. Adds a target for every measured expression that these do
+    not fully reproduce, so that the weights give the head as photographed."""
     operator, names = model.levels["full"].operator, model.expressions.names
     expression_weights = {each.name: each.weight for each in found}
     morphs, weights, left = {}, {}, dict(expression_weights)

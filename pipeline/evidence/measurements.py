@@ -1,20 +1,20 @@
 """Measures anthropometric landmarks and distances of a fitted head, with standard deviations by linear propagation.
 
-In: a model, a fit and its covariance. Out: landmarks and lengths in the world frame, mm. A landmark is a vertex of the
-model's full level. With ``x = s R (h0 + sum_m z_m h_m) + t`` (eq. 1 and the paper's T) its derivatives are exact: ``s R
-h_m`` by a coefficient, ``-[x - t]x`` by a rotation about the head's origin, the identity by the translation, and ``x -
-t`` by log scale. A distance has ``var = g C g^T``; its rotation and translation parts cancel.
+A landmark is a vertex of the model's full mesh, with the position ``x = s R (h0 + sum_m z_m h_m) + t`` (the paper's eq.
+1). The landmark's derivatives are ``s R h_m`` by a coefficient, ``-[x - t]x`` by a rotation about the head's origin,
+the identity by the translation, and ``x - t`` by log scale. A distance has ``var = g C g^T``, where g is its gradient
+and C the fit's covariance. Rotation and translation do not change a distance.
 
-Outlines and photographs of skin hardly determine a landmark's position along the surface. The eigenheads determine it,
-but a head outside their span also deviates along the surface. So a landmark has the standard deviation
+Outlines and photographs of skin hardly determine a landmark's position along the surface. The eigenheads determine this
+position, but most heads are not exact combinations of eigenheads. So a landmark has the standard deviation
 ``Fit.sliding_mm`` in every direction of its tangent plane. The kernel of ``gaussian_process`` gives the correlation of
 two landmarks, which decreases with their distance.
 
-Definitions follow Farkas, *Anthropometry of the Head and Face* (1994). Head length and breadth need three more points:
-the point of the back of the head farthest from the glabella in the midsagittal plane (opisthocranion), and the most
-lateral points of the skull above the ears (euryon). They are searched on the fitted head. Each distance is extremal at
-these points, so to first order its variance does not depend on their choice. Heads without a cranium (face-only models)
-have no such measurement.
+Definitions follow Farkas, *Anthropometry of the Head and Face* (1994). Head length and breadth need three more points
+on the fitted head. The opisthocranion is the point of the back of the head farthest from the glabella in the
+midsagittal plane; the euryons are the most lateral points of the skull above the ears. Length and breadth are extremal
+at these points, so to first order their variance does not depend on the exact points. Face-only models have no head
+length and breadth.
 """
 
 from collections.abc import Mapping
@@ -58,33 +58,34 @@ MIDSAGITTAL_MM = 5.0  # half width of the band that stands for the midsagittal p
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmark:
-    """Holds a point in the world frame and the standard deviation of each coordinate (mm; None if the fit has none)."""
+    """Holds a point in the world frame and the standard deviation of each coordinate (mm; None if unknown)."""
 
     position_mm: Float[np.ndarray, " 3"]
     std_mm: Float[np.ndarray, " 3"] | None
 
     def widen_by_scale(self, sigma: float, centre: Float[np.ndarray, " 3"]) -> "Landmark":
-        """Returns the landmark for a relative standard deviation ``sigma`` of the head's size about ``centre`` (mm)."""
+        """Adds the relative standard deviation ``sigma`` of the head's scale about ``centre`` (mm) to the landmark."""
         off = sigma * (self.position_mm - centre)
         return Landmark(self.position_mm, None if self.std_mm is None else np.hypot(self.std_mm, off))
 
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """Holds a length and its standard deviation (mm; None if the fit has none)."""
+    """Holds a length and its standard deviation (mm; None if the fit has no covariance)."""
 
     value_mm: float
     std_mm: float | None
 
     def widen_by_scale(self, sigma: float) -> "Measurement":
-        """Returns the length for a head whose size has the relative standard deviation ``sigma``."""
+        """Adds the relative standard deviation ``sigma`` of the head's scale to the length's."""
         std = None if self.std_mm is None else float(np.hypot(self.std_mm, sigma * self.value_mm))
         return Measurement(self.value_mm, std)
 
 
 def landmarks(model: HeadModel, fit: Fit, vertices: Vertices | None = None) -> dict[str, Landmark]:
-    """Returns the model's landmarks on the fitted head, world frame, mm. If the head was refined beyond the fit,
-    ``vertices`` is the delivered head (full level, world, mm); the standard deviations remain those of the fit."""
+    """Returns the model's landmarks on the fitted head, world frame, mm. If the head was deformed after the fit,
+    ``vertices`` is the final head (full mesh, world frame, mm). The standard deviations are always computed from the
+    fit."""
     names = list(model.landmarks)
     index = np.array([model.landmarks[name] for name in names])
     points, jacobian = _points(model, fit, index)
@@ -100,7 +101,7 @@ def landmarks(model: HeadModel, fit: Fit, vertices: Vertices | None = None) -> d
 
 def measurements(model: HeadModel, fit: Fit, vertices: Vertices | None = None) -> dict[str, Measurement]:
     """Returns every distance of ``DISTANCES`` (mm) whose end points the model has, with its standard deviation. If the
-    head was refined beyond the fit, ``vertices`` is the delivered head (full level, world, mm)."""
+    head was deformed after the fit, ``vertices`` is the final head (full mesh, world frame, mm)."""
     rows = dict(model.landmarks) | _cranial_points(model, fit)
     found = {name: ends for name, ends in DISTANCES.items() if ends[0] in rows and ends[1] in rows}
     index = np.array([[rows[a], rows[b]] for a, b in found.values()], int).reshape(-1)
@@ -120,7 +121,7 @@ def measurements(model: HeadModel, fit: Fit, vertices: Vertices | None = None) -
 
 
 def _normals(model: HeadModel, fit: Fit, vertices: Vertices | None) -> Vertices:
-    """Returns the vertex normals (world frame) of the delivered head; ``vertices`` None means the fitted head."""
+    """Returns the vertex normals (world frame) of the mesh ``vertices``; None means the fitted head."""
     head = fit.world_from_head.apply(model.vertices(fit.coefficients)) if vertices is None else vertices
     return vertex_normals(head, model.levels["full"].faces)
 
@@ -128,8 +129,8 @@ def _normals(model: HeadModel, fit: Fit, vertices: Vertices | None) -> Vertices:
 def _sliding_apart(
     units: Points, lengths_mm: Float[np.ndarray, " n"], first_normals: Points, second_normals: Points
 ) -> Float[np.ndarray, " n"]:
-    """Returns the variance of distances along ``units`` between points that slide in their tangent planes with unit
-    variance. Points near each other slide together."""
+    """Returns the variance of distances, along the directions ``units``, between points that shift in their tangent
+    planes with unit variance. Shifts of points near each other are correlated."""
     first, second = (
         units - normals * (units * normals).sum(axis=1, keepdims=True) for normals in (first_normals, second_normals)
     )
@@ -139,8 +140,8 @@ def _sliding_apart(
 
 
 def _points(model: HeadModel, fit: Fit, vertices: np.ndarray) -> tuple[Points, Float[np.ndarray, "n 3 p"]]:
-    """Returns the world positions of full-level vertices, and their derivatives by the parameters in the order of
-    ``Fit``."""
+    """Returns the world positions of vertices of the full mesh, and their derivatives by the parameters of ``Fit`` in
+    its order."""
     place = fit.world_from_head
     count = len(fit.coefficients)
     basis = model.basis("full", count, vertices).astype(float)
@@ -154,8 +155,7 @@ def _points(model: HeadModel, fit: Fit, vertices: np.ndarray) -> tuple[Points, F
 
 
 def _cranial_points(model: HeadModel, fit: Fit) -> dict[str, int]:
-    """Finds the full-level vertices of the right and left euryon and the opisthocranion; empty for models without a
-    cranium."""
+    """Finds the vertices of the right and left euryon and the opisthocranion; empty for models without a cranium."""
     if not {"glabella", "tragion_right", "tragion_left"} <= set(model.landmarks):
         return {}
     head = model.vertices(fit.coefficients)

@@ -1,8 +1,8 @@
-"""Checks whether a finished fit is plausible for heads, rigs and masks. Each check has its own code.
+"""Checks whether a finished fit is plausible. Each check has its own warning code.
 
-In: a fit and the figures of its cameras. Leaves: warnings. These checks change no result; ``settings.fail_on`` turns
-codes into failures. Thresholds are documented with the values of good captures at the deepest level of detail: a real
-scan with closed eyes and hair (scale 1.024), and a random head of another population (1.053).
+The checks only add warnings to a result; ``settings.fail_on`` names the codes that become failures. The comments on the
+thresholds give the values of two good captures: a real scan with closed eyes and hair (scale 1.024), and a random head
+of another population (1.053).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,11 +30,11 @@ UNEXPLAINED_MM = 5.0  # and median over the views of the rim's RMS distance from
 
 
 class UnexplainedOutlines(EigenheadError):
-    """Reports a fitted head that explains hardly any outline and thus cannot be the subject's."""
+    """Reports a fitted head that agrees with hardly any outline and is therefore wrong."""
 
 
 class ImplausibleResult(EigenheadError):
-    """Reports a result with warnings that the settings treat as failures."""
+    """Reports a result with warnings that are failures according to the settings."""
 
     def __init__(self, warnings: Sequence[ReportWarning]) -> None:
         reasons = [compose("warning-of-code", warning=warning.code, text=warning) for warning in warnings]
@@ -48,7 +48,7 @@ def plausibility_warnings(
 
     Args:
         fit: coefficients in standard deviations; scale relative to the model's own size.
-        model: with the modes that the fit has.
+        model: with the modes of the fit.
         cameras: contour residuals of every camera.
         widths_px: of the pictures, by camera.
     """
@@ -56,7 +56,7 @@ def plausibility_warnings(
 
 
 def unexplained_outlines(cameras: Mapping[str, CameraFigures], pixels_mm: Mapping[str, float]) -> ReportWarning | None:
-    """Returns a warning if the head explains hardly any outline in most views; otherwise None.
+    """Returns a warning if the head's rim misses the outlines in most views; otherwise None.
 
     Args:
         cameras: contour residuals of every camera.
@@ -75,7 +75,7 @@ def unexplained_outlines(cameras: Mapping[str, CameraFigures], pixels_mm: Mappin
 
 
 def unseen_face(views: UInt8[np.ndarray, " v"], face_region: Bool[np.ndarray, " v"]) -> ReportWarning | None:
-    """Returns a warning if no camera sees a considerable part of the face, which then comes from the model's prior.
+    """Returns a warning if no camera sees a large part of the face, whose shape then follows the model's prior.
 
     Args:
         views: number of photographs that coloured each vertex.
@@ -100,8 +100,8 @@ def _scale(scale: float) -> list[ReportWarning]:
 
 
 def size_of(fit: Fit, model: HeadModel) -> tuple[float, float]:
-    """Returns the size of the face relative to the mean face (RMS distance from its middle, shape and scale together),
-    and its difference from the mean in standard deviations of the population."""
+    """Returns the size of the face relative to the mean face, and its deviation in standard deviations of the
+    population. Size is the RMS distance of the face's vertices from their middle."""
     by_mode = size_by_mode(model)
     z = fit.coefficients[: len(by_mode)]
     size = float(np.log(fit.world_from_head.scale) + z @ by_mode[: len(z)])
@@ -129,7 +129,7 @@ def _size(size: float, sigmas: float) -> list[ReportWarning]:
 def _contours(cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]) -> list[ReportWarning]:
     """Returns a warning for each camera in which the head extends much farther beyond the outline than in most cameras.
 
-    A rim inside the outline is no fault: seen from above, a chin lies in front of the shirt, a hundred pixels inside.
+    A rim inside the outline is not a fault: seen from above, a chin lies in front of the shirt, far inside the outline.
     """
     rms = {name: of.outside_rms_px for name, of in cameras.items() if of.used and of.outside_rms_px is not None}
     if not rms:

@@ -1,8 +1,7 @@
-"""Judges the pose: whether the head lies on the face in the photographs, and how much worse other poses are.
+"""Checks the head's pose against the face in the photographs, and against the cost of other poses.
 
-In: the delivered head, the faces found in the photographs, and the pose's method. Out: ``PoseEvidence`` and warnings.
-If the face lies elsewhere in most views that show one, there is always a warning. If no face was found, the pose
-depends on outlines alone, and a warning says so. The module also computes gaze and pupil distance from the irises.
+The module warns if the head misses the face in most views that show one. The module also warns if no face was found,
+since the pose then depends on outlines only. The module also computes gaze and pupil distance from the irises.
 """
 
 from collections.abc import Mapping
@@ -36,9 +35,9 @@ RIVAL_MARGIN = 0.03  # of the cost of the outlines: a rival so near to the best 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEvidence:
-    """Holds the evidence for the pose. ``off``: for each camera, the RMS distance of the head's landmarks from those of
-    the face in the photograph, relative to the face's size. ``rival``: extra cost of the best other pose, relative to
-    the cost; None if none was tried."""
+    """Holds the evidence for the pose. ``off``: for each camera, the RMS distance between the head's landmarks and the
+    face's landmarks in the photograph, relative to the face's size. ``rival``: relative extra cost of the second best
+    pose; None if no other pose was tried."""
 
     method: str
     off: Mapping[str, float]
@@ -47,7 +46,7 @@ class PoseEvidence:
 
     @property
     def is_on_face(self) -> bool:
-        """Tells whether a face was found and agrees with the head's face in every view that shows one."""
+        """Returns True if a face was found and agrees with the head in every view that shows one."""
         return bool(self.off) and max(self.off.values()) <= ELSEWHERE
 
 
@@ -61,13 +60,12 @@ def judge_pose(
     method: str,
     rival: float | None,
 ) -> tuple[PoseEvidence, list[ReportWarning]]:
-    """Compares the delivered head with the faces in the photographs. Returns the evidence and the warnings about the
-    pose.
+    """Compares the final head with the faces in the photographs. Returns the evidence and the warnings about the pose.
 
-    ``head_world``: the head's full level (mm). ``world_from_head``: its pose. ``rig``: the cameras as calibrated.
-    ``subject``: the faces; None if they were not searched for. ``places``: positions of the landmarks on the head; None
-    if there is no face. ``method``: method of the pose: features, landmarks or silhouettes. ``rival``: extra cost of
-    the best other pose (``FoundPose.rival``).
+    ``head_world``: the head's full mesh (mm). ``world_from_head``: pose of the head. ``rig``: the cameras as
+    calibrated. ``subject``: the faces; None if they were not searched. ``places``: positions of the landmarks on the
+    head; None if there is no face. ``method``: method of the pose: features, landmarks or silhouettes. ``rival``: extra
+    cost of the second best pose (``FoundPose.rival``).
     """
     warnings: list[ReportWarning] = []
     off: dict[str, float] = {}
@@ -98,10 +96,10 @@ def judge_pose(
 def landmark_offsets(
     subject: SubjectFaces, places: LandmarkMap, head_world: Mesh, world_from_head: Similarity, rig: Rig
 ) -> dict[str, float]:
-    """Returns, for each camera, the RMS distance of the head's landmarks from those found in the photograph, relative
-    to the face's size.
+    """Returns, for each camera, the RMS distance between the head's landmarks and the face's landmarks in the
+    photograph, relative to the face's size.
 
-    In a view with several faces the nearest one counts; the others may be posters or bystanders.
+    In a view with several faces the nearest face is used; other faces may be posters or bystanders.
     """
     turned = world_from_head.scale * places.offset_mm @ world_from_head.rotation.T
     expected_world = (places.points(head_world.vertices) + turned)[~places.slides]
@@ -113,15 +111,15 @@ def landmark_offsets(
 
 
 def cameras_in_front(world_from_head: Similarity, rig: Rig, least: float = MIN_FACING) -> tuple[str, ...]:
-    """Returns the names of the cameras that see the head from the front: ``least`` is the cosine of the angle."""
+    """Returns the names of the cameras that see the head from the front; ``least`` is the cosine of the angle."""
     facing, middle = world_from_head.rotation[:, 2], world_from_head.translation
     towards = {camera.name: camera.centre_world - middle for camera in rig}
     return tuple(name for name, way in towards.items() if way @ facing > least * np.linalg.norm(way))
 
 
 def _seen(subject: SubjectFaces) -> dict[str, tuple[FaceDetection, ...]]:
-    """Returns the subject's face in each camera. If the views agree on no face, it returns all faces of each view; none
-    if there are only uncertain ones in too few views."""
+    """Returns the subject's face in each camera. If the views agree on no face, it returns all faces of each view, or
+    none if too few views have a certain face."""
     if subject.matched is None:
         seen = {name: faces for name, faces in subject.found.items() if faces}
         doubtful = len(seen) < MIN_VIEWS and all(f.score < CERTAIN_SCORE for faces in seen.values() for f in faces)
@@ -136,7 +134,7 @@ def _offset(pixels: Float[np.ndarray, "n 2"], found: Float[np.ndarray, "n 2"], s
 
 
 def pupils(eyes: Mapping[str, Iris | UnseenEye]) -> dict[str, Measurement]:
-    """Returns the far pupil distance under its name; empty if it was not measured."""
+    """Returns the far pupil distance in a dictionary, which is empty if it was not measured."""
     found = pupil_distance(eyes)
     return {} if found is None else {PUPIL_DISTANCE: found}
 
@@ -144,9 +142,8 @@ def pupils(eyes: Mapping[str, Iris | UnseenEye]) -> dict[str, Measurement]:
 def pupil_distance(eyes: Mapping[str, Iris | UnseenEye]) -> Measurement | None:
     """Returns the far pupil distance (mm); None unless both irises were found.
 
-    It is the pupil distance while both eyes look at a point infinitely far ahead (ISO 13666). It equals the distance
-    between the centres of the eyeballs, whatever the eyes looked at in the photographs: with parallel gazes both pupils
-    are equally displaced from the centres."""
+    The far pupil distance is measured while both eyes look at a point infinitely far ahead (ISO 13666). The far pupil
+    distance equals the distance between the centres of the eyeballs, whatever the eyes looked at in the photographs."""
     right, left = eyes.get("right"), eyes.get("left")
     if not isinstance(right, Iris) or not isinstance(left, Iris):
         return None
@@ -160,6 +157,6 @@ def pupil_distance(eyes: Mapping[str, Iris | UnseenEye]) -> Measurement | None:
 
 def angles_deg(direction: Float[np.ndarray, " 3"]) -> tuple[float, float]:
     """Returns the azimuth (from z towards x) and elevation (towards y) of a unit vector, degrees. In the head frame
-    these are to the subject's left, and up."""
+    azimuth is to the subject's left."""
     x, y, z = direction
     return float(np.degrees(np.arctan2(x, z))), float(np.degrees(np.arcsin(np.clip(y, -1.0, 1.0))))

@@ -1,10 +1,10 @@
 """Finds faces in one picture, with 468 points on each.
 
-In: a picture as it was taken, in any orientation. Leaves: ``FaceDetection``. The detector proposes faces in the picture
-rotated by 0, 90, 180 and 270 degrees (it tolerates 45 degrees either way). A proposal is a face if the landmark network
-confirms it, in a crop that follows the points. The network sees the face and its mirror image; the points are the means
-of both results. Crops are squares, rotated so that the face is upright in them. They are sampled from an image
-pyramid, at the level near their resolution, so that a large face is averaged and not skipped over."""
+The picture may have any orientation. The detector proposes faces in the picture rotated by 0, 90, 180 and 270 degrees,
+since it tolerates 45 degrees either way. A proposal is accepted if the landmark network confirms it in a crop around
+the landmarks. The network runs on the crop and on its mirror image, and the two results are averaged. Crops are
+squares, rotated so that the face is upright in them. Crops are sampled from an image pyramid at the level near their
+resolution, to avoid aliasing."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -34,8 +34,8 @@ RIGHT_EYE, LEFT_EYE = 2, 3  # rows of the finder's faces
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crop:
-    """Holds a square part of a picture: its centre and side (px of the picture), and the angle (degrees, clockwise) by
-    which the square is turned in the picture. A ``mirrored`` crop is read from right to left."""
+    """Holds a square part of a picture: its centre and side (px of the picture), and the clockwise angle (degrees) of
+    the square in the picture. A ``mirrored`` crop is read from right to left."""
 
     centre_px: Float[np.ndarray, " 2"]
     side_px: float
@@ -56,7 +56,7 @@ class Crop:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pyramid:
-    """Holds a picture at full size, half, quarter and so on, the full size first."""
+    """Holds an image pyramid: a picture at full size, half size, quarter size and so on, the full size first."""
 
     levels: tuple[ImageRgb, ...]
 
@@ -66,7 +66,7 @@ class Pyramid:
         return np.array(self.levels[0].shape[1::-1], float)
 
     def sample(self, crop: Crop, size: int) -> UInt8[np.ndarray, "size size 3"]:
-        """Returns the pixels of a crop, resampled to ``size`` x ``size``; black where the crop leaves the picture."""
+        """Returns the pixels of a crop, resampled to ``size`` x ``size``; pixels outside the picture are black."""
         picture_from_crop = crop.picture_from_crop(size)
         halvings = int(np.ceil(np.log2(max(crop.side_px / size / AREA_FROM, 1.0))))
         level = self.levels[min(halvings, len(self.levels) - 1)]
@@ -78,7 +78,7 @@ class Pyramid:
 
 
 def make_pyramid(image: ImageRgb) -> Pyramid:
-    """Halves a picture again and again, until its longer side is below twice ``SMALLEST_PX``, and returns all sizes."""
+    """Builds an image pyramid by halving a picture until its longer side is below twice ``SMALLEST_PX``."""
     levels = [np.ascontiguousarray(image)]
     while max(levels[-1].shape[:2]) >= 2 * SMALLEST_PX:
         height, width = levels[-1].shape[:2]
@@ -120,27 +120,27 @@ class FaceDetection:
 
 def find_faces(image: ImageRgb, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
     """Finds the faces in a picture, the best score first. Faces larger than an eighth of the picture's longer side are
-    searched first. Only if there are none are smaller ones searched, down to half of that."""
+    searched first. If no such face is found, faces down to a sixteenth of this side are searched."""
     pyramid = make_pyramid(image)
     return find_large_faces(pyramid, networks) or find_small_faces(pyramid, networks)
 
 
 def find_large_faces(pyramid: Pyramid, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """Finds the faces that are large enough to be detected in the whole picture. Takes 0.03 s for an upright face, else
-    0.06 s."""
+    """Finds the faces that are large enough to be detected in the whole picture. The search takes 0.03 s for an upright
+    face, else 0.06 s."""
     return _find(pyramid, _whole(pyramid), networks)
 
 
 def find_small_faces(pyramid: Pyramid, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """Finds smaller faces, in nine overlapping parts of the picture, each searched at twice the size. Takes 0.35 s."""
+    """Finds smaller faces in nine overlapping parts of the picture at twice the size. The search takes 0.35 s."""
     return _find(pyramid, _parts(pyramid), networks)
 
 
 def find_face_at(
     pyramid: Pyramid, crop: Crop, networks: FaceNetworks, *, min_rounds: int = MIN_ROUNDS
 ) -> FaceDetection:
-    """Places the 468 points on the face in a crop. The crop follows the points until they no longer change; the
-    result's score tells whether it shows a face."""
+    """Places the 468 points on the face in a crop. The crop is centred on the points again until they no longer change.
+    The result's score is high only for a face."""
     for count in range(MAX_ROUNDS):
         points, _ = _place(pyramid, crop, networks)
         before, crop = crop, crop_around(points)
@@ -166,7 +166,7 @@ def crop_around(points_px: Float[np.ndarray, "468 2"]) -> Crop:
 
 
 def _place(pyramid: Pyramid, crop: Crop, networks: FaceNetworks) -> tuple[Float[np.ndarray, "468 2"], float]:
-    """Returns pixels and score of the points in a crop."""
+    """Runs the landmark network on a crop. Returns the points' pixels and the network's score."""
     points, score = networks.place_landmarks(pyramid.sample(crop, LANDMARK_SIZE))
     if crop.mirrored:
         points = points[point_table().mirror_images]
@@ -174,12 +174,12 @@ def _place(pyramid: Pyramid, crop: Crop, networks: FaceNetworks) -> tuple[Float[
 
 
 def _whole(pyramid: Pyramid) -> list[Crop]:
-    """Returns the picture as one square."""
+    """Returns the square crop that contains the whole picture."""
     return [Crop((pyramid.size_px - 1) / 2, float(pyramid.size_px.max()), 0.0)]
 
 
 def _parts(pyramid: Pyramid) -> list[Crop]:
-    """Returns squares of half the picture's longer side that overlap by half; none if the picture is too small."""
+    """Returns square crops of half the picture's longer side that overlap by half; none if the picture is too small."""
     side = float(pyramid.size_px.max()) / 2
     if side < FINDER_SIZE:
         return []
@@ -189,8 +189,8 @@ def _parts(pyramid: Pyramid) -> list[Crop]:
 
 
 def _find(pyramid: Pyramid, frames: Sequence[Crop], networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """Returns the faces in parts of a picture, best first. If an upright face is beyond doubt, only upright ones are
-    returned."""
+    """Returns the faces in parts of a picture, best first. If an upright face has a very high score, rotated faces are
+    not searched."""
     seen: list[tuple[float, Crop]] = []
     found: tuple[FaceDetection, ...] = ()
     for turns in ((0.0,), (90.0, 180.0, 270.0)):
@@ -207,7 +207,7 @@ def _find(pyramid: Pyramid, frames: Sequence[Crop], networks: FaceNetworks) -> t
 
 
 def _proposals(seen: Sequence[tuple[float, Crop]]) -> list[Crop]:
-    """Returns crops of the detector's faces, best first, one crop for each orientation of a face."""
+    """Returns crops of the detector's proposals, best first, one crop for each orientation of a face."""
     chosen: list[Crop] = []
     for _, crop in sorted(seen, key=lambda proposal: -proposal[0]):
         if not any(_is_same(crop, other) and _angle_deg(crop, other) < SAME_WAY_UP_DEG for other in chosen):
@@ -216,7 +216,7 @@ def _proposals(seen: Sequence[tuple[float, Crop]]) -> list[Crop]:
 
 
 def _seen(pyramid: Pyramid, frame: Crop, networks: FaceNetworks) -> Iterator[tuple[float, Crop]]:
-    """Returns score and crop of each face that the detector finds in one square; each comes from its best cell."""
+    """Returns score and crop of each face that the detector finds in one square of the picture."""
     faces, scores = networks.find(pyramid.sample(frame, FINDER_SIZE))
     picture_from_crop = frame.picture_from_crop(FINDER_SIZE)
     centres: list[Float[np.ndarray, " 2"]] = []
@@ -234,7 +234,7 @@ def _seen(pyramid: Pyramid, frame: Crop, networks: FaceNetworks) -> Iterator[tup
 
 
 def _verified(pyramid: Pyramid, proposals: Sequence[Crop], networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """Returns the proposals that are faces, best first and without duplicates; it tests the most likely first."""
+    """Returns the proposals that the landmark network confirms as faces, best first and without duplicates."""
     candidates = [_place(pyramid, crop, networks) for crop in proposals]
     chosen: list[FaceDetection] = []
     for points, _ in sorted(candidates, key=lambda candidate: -candidate[1]):
@@ -250,12 +250,12 @@ def _verified(pyramid: Pyramid, proposals: Sequence[Crop], networks: FaceNetwork
 
 
 def _is_same(a: Crop, b: Crop) -> bool:
-    """Tells whether two crops show one face, whatever their rotation."""
+    """Returns True if two crops show the same face, whatever their rotation."""
     return bool(np.linalg.norm(a.centre_px - b.centre_px) < SAME_FACE / CROP_OF_FACE * max(a.side_px, b.side_px))
 
 
 def _is_settled(before: Crop, after: Crop) -> bool:
-    """Tells whether a crop no longer moves."""
+    """Returns True if two successive crops are almost the same."""
     step = max(float(np.linalg.norm(after.centre_px - before.centre_px)), abs(after.side_px - before.side_px))
     return step < SETTLED * after.side_px and _angle_deg(before, after) < SETTLED_DEG
 

@@ -1,20 +1,22 @@
-"""Finds irises and gaze directions: fits a circle in space, the limbus, to its edges in all views.
+"""Finds irises and gaze directions: fits a circle in space, the border of the iris (limbus), to image edges.
 
-In: the subject's face in the views with the eye network's points, the photographs and the cameras. Out, for each eye:
-centre and radius of the iris and the direction of the gaze, with standard deviations; or why the eye was not measured.
-The gaze is the normal of the limbus, the eye's optical axis; the line of sight lies 5 degrees nearer to the nose.
+The module takes the subject's face with the eye network's points, the photographs and the cameras. For each eye the
+module returns centre and radius of the iris and the gaze, with standard deviations, or why the eye was not measured.
+The gaze is the normal of the limbus, which is the eye's optical axis; the line of sight lies 5 degrees nearer to the
+nose.
 
-Each eye is fitted alone. If both gazes differ, each is fitted again from the other's gaze and from the common gaze, and
-the fit that most edges support is retained. Priors: the radius is 5.85 mm (standard deviation 0.25; a visible iris of
-11.7 mm, Ruefer et al. 2005). The eyeball lies 10.5 mm behind the iris and 5 mm behind the corners of the eye, with 4 mm
-standard deviation in each direction. Both eyes look at one point: elevations are equal to 1 degree, and the lines of
-sight meet half a metre away or farther. If the two eyes clearly contradict that (a squint), each keeps its own result.
+Each eye is fitted alone. If the two gazes differ, each eye is fitted again from the other eye's gaze and from the mean
+gaze, and the fit with most supporting edges is retained. The prior of the radius is 5.85 mm (standard deviation 0.25;
+Ruefer et al. 2005). The eyeball lies 10.5 mm behind the iris and 5 mm behind the corners of the eye, with 4 mm standard
+deviation in each direction. The two eyes are assumed to look at the same point: their elevations are equal to 1 degree,
+and the lines of sight meet half a metre away or farther. If the eyes clearly contradict this assumption (a squint),
+each eye keeps its own result.
 
-The fit repeats: it searches edges of limbus and pupils near the circle, fits the circle to them, and narrows the
-search. The pupil lies on the circle's axis, at a distance in front that is fitted too: the cornea lifts the image of an
-iris, and a model's iris may be painted on the cornea. The pupil is the darkest disc in the iris, of the same size in
-all views. Pixels with the reflection of a lamp are left out. The square root of the brightness is used, because its
-noise is the same in bright and dark pixels.
+The fit iterates: it searches limbus edges and pupils near the circle, fits the circle to them, and narrows the search.
+The pupil lies on the circle's axis. The pupil's distance in front of the limbus is fitted too, since the cornea's
+refraction shifts the pupil's image. The pupil is the darkest disc in the iris, of the same size in all views. Pixels
+with the reflection of a lamp are left out. The square root of the brightness is used, because its noise is the same in
+bright and dark pixels.
 """
 
 from collections.abc import Mapping, Sequence
@@ -95,8 +97,8 @@ class EyeSight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LimbusCircle:
-    """Holds a limbus (world, mm), and the pupil's distance in front of it. ``up`` is the face's upward direction, so
-    that the result does not depend on the world's axes."""
+    """Holds a limbus (world frame, mm), and the pupil's distance in front of it. ``up`` is the face's upward
+    direction."""
 
     centre: Float[np.ndarray, " 3"]
     gaze: Float[np.ndarray, " 3"]
@@ -111,39 +113,39 @@ class LimbusCircle:
         return np.stack([across, np.cross(self.gaze, across)])
 
     def after(self, step: Float[np.ndarray, " 7"]) -> "LimbusCircle":
-        """Returns the circle after a step. A step changes the centre, the gaze about ``axes``, the radius, and the
-        pupil's distance."""
+        """Returns the circle after a solver step, which changes the centre, the gaze about ``axes``, the radius, and
+        the pupil's distance."""
         turn = rotation_from_vector(step[3:5] @ self.axes())
         radius, ahead = self.radius + float(step[5]), self.ahead + float(step[6])
         return LimbusCircle(self.centre + step[:3], turn @ self.gaze, self.up, radius, ahead)
 
     def on_axis(self, ahead: float) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 7"]]:
-        """Returns a point on the axis ``ahead`` of the centre, and its derivative by a step with ``ahead`` fixed."""
+        """Returns the point on the circle's axis ``ahead`` mm in front of the centre, and its derivative by a step."""
         slopes = np.zeros((3, 7))
         slopes[:, :3] = np.eye(3)
         slopes[:, 3:5] = ahead * np.stack([np.cross(axis, self.gaze) for axis in self.axes()], axis=1)
         return self.centre + ahead * self.gaze, slopes
 
     def radius_px(self, view: EyeView) -> float:
-        """Returns the radius (px) of an iris in a view."""
+        """Returns the radius (px) of the limbus in a view's picture."""
         _, slopes = view.camera.project_with_jacobian(self.centre[None])
         return RADIUS_MM * float(np.linalg.svd(slopes[0], compute_uv=False)[0])
 
     def faces(self, seen: EyeSight) -> bool:
-        """Tells whether an eye is turned towards a view."""
+        """Returns True if the eye is turned towards a view's camera."""
         towards = seen.view.camera.centre_world - self.centre
         return bool(towards @ self.gaze > MIN_FACING * np.linalg.norm(towards))
 
     def agrees(self, seen: EyeSight) -> bool:
-        """Tells whether the network's iris agrees with the circle."""
+        """Returns True if the iris that the network found in a view agrees with the circle."""
         pixel = seen.view.camera.project(self.centre[None])[0]
         return bool(np.linalg.norm(pixel - seen.network_px) < MAX_NETWORK_OFF * self.radius_px(seen.view))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LimbusEdges:
-    """Holds the edges of a circle in one view: their distances beyond the circle (px), the derivatives of the circle's
-    image along these rays by a step, weights, and standard deviation (px)."""
+    """Holds the image edges near a circle in one view, one on each ray: distances beyond the projected circle (px),
+    derivatives of the projected circle by a step, weights, and standard deviation (px)."""
 
     offsets: Float[np.ndarray, " n"]
     slopes: Float[np.ndarray, "n 7"]
@@ -153,7 +155,7 @@ class LimbusEdges:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LimbusFit:
-    """Holds a circle, its information matrix (of a step), and the edges it was fitted to, by view."""
+    """Holds a fitted circle, the information matrix of a solver step, and the image edges used, by view."""
 
     circle: LimbusCircle
     information: Float[np.ndarray, "7 7"]
@@ -161,25 +163,25 @@ class LimbusFit:
 
     @property
     def offsets(self) -> Float[np.ndarray, " n"]:
-        """Returns the distances of all edges beyond the circle (px)."""
+        """Returns the distances (px) of all image edges beyond the projected circle."""
         return np.concatenate([edges.offsets for edges in self.edges.values()])
 
     @property
     def agreement(self) -> float:
-        """Returns the number of edges that support the circle."""
+        """Returns the number of image edges that support the circle."""
         return float((1.0 / (1.0 + (self.offsets / AGREED_PX) ** 2) ** 2).sum())
 
 
 def fitted(
     seen: Sequence[EyeSight], circle: LimbusCircle, eyeball: Float[np.ndarray, " 3"], reaches: Sequence[float]
 ) -> LimbusFit | None:
-    """Returns the circle on which the views agree; None if too few do.
+    """Fits a limbus to the edges in all views. Returns None if too few views agree.
 
     Args:
         seen: the views.
         circle: the one to begin with.
-        eyeball: where the centre of the eyeball may lie, to ``CENTRE_STD_MM``.
-        reaches: of the search about the circle, by its radius, one after the other.
+        eyeball: expected centre of the eyeball, with standard deviation ``CENTRE_STD_MM``.
+        reaches: widths of the successive edge searches, relative to the radius.
     """
     out, pupils = None, None
     for reach in reaches:
@@ -196,7 +198,7 @@ def fitted(
 
 
 def _edges(circle: LimbusCircle, view: EyeView, reach: float) -> LimbusEdges | None:
-    """Returns the edges of a limbus in a view; None if there are too few."""
+    """Finds the edges of a limbus in a view. Returns None if there are too few edges."""
     angles = np.arange(RAYS) * 2.0 * np.pi / RAYS
     axes = circle.axes()
     spokes = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ axes
@@ -222,14 +224,14 @@ def _edges(circle: LimbusCircle, view: EyeView, reach: float) -> LimbusEdges | N
 
 
 def _end_weights(there: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns smaller weights for the last two rays at each end of an arc of the circle."""
+    """Returns weights for rays around the circle, reduced at the two rays at each end of a visible arc."""
     inner = there & np.roll(there, 1) & np.roll(there, -1)
     innermost = inner & np.roll(inner, 1) & np.roll(inner, -1)
     return np.where(innermost, 1.0, np.where(inner, ENDS[1], ENDS[0]))
 
 
 def _pupils(circle: LimbusCircle, seen: Sequence[EyeSight]) -> list[tuple[EyeView, Float[np.ndarray, " 2"]]]:
-    """Returns the views that show the pupil, each with its position."""
+    """Returns the views that show the pupil, each with the pupil's position."""
     centre, _ = circle.on_axis(AHEAD_MM)
     found = pupils_px([sight.view for sight in seen], centre, circle.axes())
     return [(sight.view, pixel) for sight, pixel in zip(seen, found, strict=True) if pixel is not None]
@@ -241,7 +243,7 @@ def _normal_equations(
     pupils: Sequence[tuple[EyeView, Float[np.ndarray, " 2"]]],
     eyeball: Float[np.ndarray, " 3"],
 ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, " 7"]]:
-    """Returns the matrix and right side of the normal equations from edges, pupils and priors."""
+    """Returns the matrix and the right side of the normal equations of limbus edges, pupils and priors."""
     matrix, right = np.zeros((7, 7)), np.zeros(7)
     for view in edges.values():
         scale = max(ROBUST_PX, 2.0 * view.noise)
@@ -273,8 +275,8 @@ def pupils_px(
 
     Args:
         views: of one eye.
-        centre: where the pupil is looked for, world, to ``REACH_MM``.
-        axes: two unit vectors in its plane.
+        centre: centre of the search region (world frame, mm), whose half width is ``REACH_MM``.
+        axes: two unit vectors in the pupil's plane.
     """
     contrasts = [_contrasts(view, centre, axes) for view in views]
     if not contrasts:
@@ -288,7 +290,8 @@ def pupils_px(
 
 
 def _contrasts(view: EyeView, centre: Float[np.ndarray, " 3"], axes: Float[np.ndarray, "2 3"]) -> Contrasts:
-    """Returns, by disc radius and position, how much darker a disc is than the ring around it, by the iris' level."""
+    """Returns, for each disc radius and position, how much darker the disc is than the ring around it, relative to the
+    brightness of the iris."""
     across, up = np.meshgrid(ALONG_MM, ALONG_MM)
     places = centre + across.reshape(-1, 1) * axes[0] + up.reshape(-1, 1) * axes[1]
     x, y = (view.camera.project(places) - view.origin_px).T.astype(np.float32).reshape(2, *across.shape)
@@ -312,7 +315,7 @@ def _contrasts(view: EyeView, centre: Float[np.ndarray, " 3"], axes: Float[np.nd
 
 @lru_cache(maxsize=1)
 def _kernels() -> list[tuple[Float32[np.ndarray, "k k"], Float32[np.ndarray, "k k"]]]:
-    """Returns a disc of each radius and the ring around it."""
+    """Returns the filter masks of a disc of each radius and of the ring around the disc."""
     out = []
     for radius in RADII_MM:
         count = int((radius + RING_MM) / STEP_MM) + 1
@@ -323,8 +326,8 @@ def _kernels() -> list[tuple[Float32[np.ndarray, "k k"], Float32[np.ndarray, "k 
 
 
 def _peak(contrast: Float32[np.ndarray, "n n"]) -> Float[np.ndarray, " 2"] | None:
-    """Returns the sub-cell position (mm along both axes) of the highest contrast; None if it is low or at the border of
-    the measured area."""
+    """Returns the position (mm along the two axes) of the highest contrast, interpolated between cells; None if the
+    contrast is low or highest at the border."""
     row, column = np.unravel_index(contrast.argmax(), contrast.shape)
     about = contrast[row - 1 : row + 2, column - 1 : column + 2]
     if contrast[row, column] < MIN_CONTRAST or about.shape != (3, 3):
@@ -340,7 +343,7 @@ def _peak(contrast: Float32[np.ndarray, "n n"]) -> Float[np.ndarray, " 2"] | Non
 @dataclass(frozen=True, slots=True, eq=False)
 class Iris:
     """Holds an iris (world frame, mm). ``gaze`` is the unit vector of the eye's optical axis. ``covariance`` is over
-    the centre (mm), a rotation of the gaze (rad, world axes; none about the gaze itself), and the radius (mm)."""
+    the centre (mm), a rotation of the gaze (rad, world axes), and the radius (mm)."""
 
     centre: Float[np.ndarray, " 3"]
     gaze: Float[np.ndarray, " 3"]
@@ -355,7 +358,7 @@ class Iris:
 
     @property
     def gaze_std_deg(self) -> float:
-        """Returns the standard deviation of the gaze (degrees), the mean of the two directions across it."""
+        """Returns the standard deviation of the gaze (degrees), the mean of two directions perpendicular to it."""
         return float(np.degrees(np.sqrt(np.trace(self.covariance[3:6, 3:6]) / 2.0)))
 
     @property
@@ -364,20 +367,20 @@ class Iris:
         return self.centre - BEHIND_MM * self.gaze
 
     def widen_by_scale(self, sigma: float, origin: Float[np.ndarray, " 3"]) -> "Iris":
-        """Returns the iris if the head's size about ``origin`` (mm) has the relative standard deviation ``sigma``."""
+        """Adds to the covariance the relative standard deviation ``sigma`` of the scale about ``origin`` (mm)."""
         moved = sigma * np.concatenate([self.centre - origin, np.zeros(3), [self.radius_mm]])
         return replace(self, covariance=self.covariance + np.outer(moved, moved))
 
     @property
     def eyeball_jacobian(self) -> Float[np.ndarray, "3 7"]:
-        """Returns the derivative of ``eyeball`` by the seven parameters of ``covariance``."""
+        """Returns the derivative of the eyeball's centre by the seven parameters of ``covariance``."""
         return np.concatenate([np.eye(3), BEHIND_MM * cross_matrix(self.gaze), np.zeros((3, 1))], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
 class UnseenEye:
-    """Holds why an eye was not measured: its lids are closed, fewer than two views show it, no two views show it large
-    enough, or its limbus is not clear."""
+    """Holds the reason why an eye was not measured: its lids are closed, too few views show it large enough, or its
+    limbus is not clear."""
 
     cause: Cause
 
@@ -385,10 +388,10 @@ class UnseenEye:
 def find_irises(
     face: MatchedFaces, images: Mapping[str, ImageRgb], rig: Rig, closed: frozenset[str]
 ) -> dict[str, Iris | UnseenEye]:
-    """Finds both irises.
+    """Finds the irises of the right and the left eye.
 
     Args:
-        face: the subject's, with the eyes' points.
+        face: the subject's face, with the points of the eyes.
         images: sRGB, by camera.
         rig: the cameras.
         closed: the sides whose lids meet.
@@ -406,8 +409,8 @@ def find_irises(
 
 
 def believed(eyes: Mapping[str, Iris | UnseenEye], ahead: Float[np.ndarray, " 3"]) -> dict[str, Iris | UnseenEye]:
-    """Rejects impossible gazes: two that differ by more than ``MAX_BETWEEN_DEG``, or a single one that is more than
-    ``MAX_ALONE_DEG`` from ``ahead``, the direction of the face (a unit vector)."""
+    """Rejects impossible gazes: two gazes that differ by more than ``MAX_BETWEEN_DEG``, or a single gaze more than
+    ``MAX_ALONE_DEG`` from the direction of the face, ``ahead`` (a unit vector)."""
     gazes = [eye.gaze for eye in eyes.values() if isinstance(eye, Iris)]
     beside, limit_deg = (gazes[1], MAX_BETWEEN_DEG) if len(gazes) == len(eyes) else (ahead, MAX_ALONE_DEG)
     if not gazes or gazes[0] @ beside >= np.cos(np.radians(limit_deg)):
@@ -416,8 +419,8 @@ def believed(eyes: Mapping[str, Iris | UnseenEye], ahead: Float[np.ndarray, " 3"
 
 
 def looking_together(right: Iris, left: Iris, face_axes: Float[np.ndarray, "3 3"]) -> tuple[Iris, Iris]:
-    """Returns both irises rotated towards one point, as far as their standard deviations allow. ``face_axes`` has the
-    face's axes as columns: to the subject's left, up, ahead."""
+    """Combines the measured irises with the prior that both eyes look at the same point. ``face_axes`` has the face's
+    axes as columns: to the subject's left, up, ahead."""
     across, up = face_axes[:, 0], face_axes[:, 1]
     covariance = np.zeros((14, 14))
     covariance[:7, :7], covariance[7:, 7:] = right.covariance, left.covariance
@@ -442,7 +445,7 @@ def _moved(iris: Iris, step: Float[np.ndarray, " 7"], covariance: Float[np.ndarr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Eye:
-    """Holds the views of an eye, the prior position of its eyeball, and the face's upward direction."""
+    """Holds the views of one eye, the prior position of the eyeball, and the face's upward direction."""
 
     seen: Sequence[EyeSight]
     eyeball: Float[np.ndarray, " 3"]
@@ -463,7 +466,7 @@ def _eye(face: MatchedFaces, images: Mapping[str, ImageRgb], rig: Rig, side: str
 
 
 def _first_fit(eye: _Eye, ahead: Float[np.ndarray, " 3"]) -> LimbusFit | UnseenEye:
-    """Returns the limbus on which an eye's views agree, or the reason why there is none."""
+    """Returns the limbus fitted to the views of one eye, or the reason why there is none."""
     if len(eye.seen) < MIN_VIEWS:
         return UnseenEye("few-views")
     centre = _nearest_to_rays(eye.seen, eye.eyeball + BEHIND_MM * ahead)
@@ -484,7 +487,7 @@ def _large(circle: LimbusCircle, seen: Sequence[EyeSight]) -> list[EyeSight]:
 
 
 def _together(fits: Mapping[str, LimbusFit | UnseenEye], eyes: Mapping[str, _Eye]) -> dict[str, LimbusFit | UnseenEye]:
-    """Returns the fits, each repeated from the other eye's gaze and from the common gaze if both gazes differ."""
+    """Repeats the fits from the other eye's gaze and from the mean gaze if the two gazes differ, and keeps the best."""
     out = dict(fits)
     for side, fit in fits.items():
         beside = next(
@@ -504,7 +507,7 @@ def _together(fits: Mapping[str, LimbusFit | UnseenEye], eyes: Mapping[str, _Eye
 
 
 def _iris(fit: LimbusFit, seen: Sequence[EyeSight]) -> Iris | UnseenEye:
-    """Returns the iris of a fit, or the reason why it is none."""
+    """Returns the iris of a limbus fit, or the reason why the fit is rejected."""
     circle = fit.circle
     rms = float(1.4826 * np.median(np.abs(fit.offsets)))
     scale = float(np.mean([circle.radius_px(sight.view) for sight in seen if sight.name in fit.edges]))
@@ -518,8 +521,8 @@ def _iris(fit: LimbusFit, seen: Sequence[EyeSight]) -> Iris | UnseenEye:
 
 
 def _nearest_to_rays(seen: Sequence[EyeSight], start: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-    """Returns the point nearest to the rays through the network's irises, without outliers; its prior is ``start`` with
-    ``CENTRE_STD_MM``."""
+    """Returns the point nearest to the viewing rays through the network's irises, without outliers. The prior is the
+    point ``start`` with ``CENTRE_STD_MM``."""
     rays = np.concatenate([each.view.camera.rays_world(each.network_px[None]) for each in seen])
     centres = np.array([each.view.camera.centre_world for each in seen])
     point = start

@@ -1,13 +1,12 @@
 """Maps each of the face detector's 468 points to a point on a head model's surface, with the detector's error.
 
-Both were measured on renders of heads of the model's own population (``python -m
-tests.laboratory.model_packs.landmark_map``), for the two models whose triangles are known: MakeHuman's and ICT-FaceKit.
-For any other model the points are transferred from the first model's mean head, by the landmarks that both have, and
-the error of the transfer is added.
+Points and errors were measured on renders of heads (``python -m tests.laboratory.model_packs.landmark_map``) for two
+head models: MakeHuman's and ICT-FaceKit. For any other model the points are transferred from MakeHuman's mean head by
+means of common landmarks, and the error of the transfer is added.
 
-The detector places a point (triangulated, without its bias) at ``map.points(vertices) + e``. The error e has the mean
-``offset_mm``, a part that is independent for each point (``deviation_mm``), and a part common to all points
-(``shared_mm``), because the detector tends towards the average face of its training.
+The triangulated points of the detector lie at ``map.points(vertices) + e``. The error e has the mean ``offset_mm``, a
+part that is independent for each point (``deviation_mm``), and a part common to all points (``shared_mm``), because the
+detector is biased towards the average face of its training.
 """
 
 import hashlib
@@ -32,7 +31,7 @@ MIN_LANDMARKS = 6  # that models share, for one to be carried to the other
 
 
 class NoLandmarkMap(EigenheadError):
-    """Reports a head model that names too few landmarks to place the 468 points of a face on it."""
+    """Reports a head model that has too few named landmarks for the transfer of the 468 face points."""
 
     def __init__(self, name: str, shared: int) -> None:
         super().__init__(
@@ -44,8 +43,8 @@ class NoLandmarkMap(EigenheadError):
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkMap:
     """Holds the points on a head model's surface that correspond to the detector's 468 points, and the detector's error
-    at each (mm, head frame). ``slides`` marks points that may slide along the skin (jaw line, forehead). Arrays are
-    read-only."""
+    at each point (mm, head frame). ``slides`` marks points that may slide along the skin (jaw line, forehead). Arrays
+    are read-only."""
 
     rows: Int[np.ndarray, "468 3"]  # vertices of the full level
     weights: Float[np.ndarray, "468 3"]  # of them; each row sums to 1
@@ -55,26 +54,24 @@ class LandmarkMap:
     slides: Bool[np.ndarray, " 468"]  # jaw line, forehead: better left out of what looks for single points
 
     def points(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "468 3"]:
-        """Returns the 468 surface points of a head, from its vertices at the full level, in the
-        frame of the vertices."""
+        """Returns the 468 surface points of a head whose full mesh has these vertices, in the frame of the vertices."""
         return (vertices[self.rows] * self.weights[..., None]).sum(axis=1)
 
     def expected(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "468 3"]:
-        """Returns the detector's mean positions of the 468 points: the surface points plus its mean error (mm, head
-        frame)."""
+        """Returns the surface points plus the detector's mean error at each of them (mm, head frame)."""
         return self.points(vertices) + self.offset_mm
 
     def covariance(self, which: Int[np.ndarray, " n"]) -> Float[np.ndarray, "p p"]:
-        """Returns the covariance of the detector's errors at the points ``which`` (mm^2, head frame), ordered x y z of
-        the first point, x y z of the second and so on."""
+        """Returns the covariance of the detector's errors at the points ``which`` (mm^2, head frame), in the order x y
+        z of the first point, x y z of the second point and so on."""
         modes = self.shared_mm[:, which].reshape(len(self.shared_mm), -1)
         return modes.T @ modes + np.diag(self.deviation_mm[which].ravel() ** 2)
 
 
 def landmark_map(model: HeadModel) -> LandmarkMap:
-    """Returns the landmark map of a head model. Models whose triangles are known have a measured one; for any other,
-    the points are transferred from the default model's mean head. Raises NoLandmarkMap if the model names too few
-    landmarks."""
+    """Returns the landmark map of a head model. Models with the triangles of a built-in model have a measured map; for
+    other models the points are transferred from the default model's mean head. Raises NoLandmarkMap if the model names
+    too few landmarks."""
     digest = faces_digest(model)
     for name in BUILT_IN:
         if str(_table()[f"{name}_faces"]) == digest:
@@ -91,7 +88,7 @@ def built_in_map(name: str) -> LandmarkMap:
 
 
 def faces_digest(model: HeadModel) -> str:
-    """Returns the SHA-256 of a head model's triangles at the full level. Models with the same triangles share one
+    """Returns the SHA-256 of the triangles of a head model's full mesh. Models with the same triangles share one
     landmark map."""
     faces = np.ascontiguousarray(model.levels["full"].faces, np.int32)
     return hashlib.sha256(faces.tobytes()).hexdigest()
@@ -113,7 +110,7 @@ def _map(rows: np.ndarray, weights: np.ndarray, offset_mm: np.ndarray, carried_m
 
 
 def _carried(model: HeadModel) -> Mapping[str, np.ndarray]:
-    """Returns the rows and weights that place the default model's points on another model's mean head."""
+    """Transfers the default model's points to another model. Returns each point's vertices and weights."""
     marks = model.levels["full"].landmarks
     default = load_model()
     names = sorted(set(marks) & set(default.levels["full"].landmarks))

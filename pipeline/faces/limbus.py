@@ -1,8 +1,8 @@
-"""Finds the limbus, the border of iris and white, in the picture of an eye: sub-pixel edges along rays.
+"""Finds the limbus, the border between iris and sclera, in the picture of an eye, as sub-pixel edges along rays.
 
-In: a picture, the lids' edges in it, and points of a predicted limbus with the directions away from the iris. Out: the
-distance from each point to the strongest step from dark to bright along its ray. Slopes of neighbouring rays are
-averaged, since the limbus is smooth and noise is not. Rays that the lids cut off get no distance.
+A ray starts at each point of a predicted limbus and points away from the iris. The edge is the strongest step from dark
+to bright along the ray. Slopes of neighbouring rays are averaged, since the limbus is smooth and noise is not. Rays
+that the lids interrupt get no edge.
 """
 
 from dataclasses import dataclass
@@ -33,9 +33,9 @@ CROP = 2.2  # half side of what is cut out, by the eye's length
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EyeView:
-    """Holds one camera's picture of an eye: its brightness (linear, 1 for the white of the eye), the similarity of each
-    pixel's colour to skin (0 for the white of the eye, 1 for skin), and the distance inside the lids' edges (px,
-    ``FINE`` cells a pixel). ``origin_px`` is the picture's pixel at the crop's first pixel."""
+    """Holds one camera's crop of an eye: linear brightness (1 for the white of the eye), the similarity of each pixel's
+    colour to skin (0 to 1), and the distance inside the lids' edges (px, ``FINE`` cells for each pixel). ``origin_px``
+    is the position of the crop's first pixel in the picture."""
 
     camera: Camera
     origin_px: Float[np.ndarray, " 2"]
@@ -72,7 +72,8 @@ def eye_view(camera: Camera, image: ImageRgb, lids_px: Float[np.ndarray, "16 2"]
 def _skin_share(
     crop: Float32[np.ndarray, "h w 3"], brightness: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"] | None:
-    """Returns how similar colours are to skin: 0 for the palest bright one between the lids, 1 for those around."""
+    """Returns the similarity of colours to skin: 0 for the palest colour between the lids, 1 for the colours around
+    them."""
     redness = (crop[:, :, 0] - crop[:, :, 2]) / (crop.sum(axis=2) + 1e-3)
     far = cv2.dilate(inside.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=int(SKIN_PX)) == 0
     if inside.sum() < MIN_PIXELS or far.sum() < MIN_PIXELS:
@@ -85,8 +86,8 @@ def _skin_share(
 def limbus_offsets(
     view: EyeView, points_px: Float[np.ndarray, "n 2"], outwards: Float[np.ndarray, "n 2"], reach_px: float
 ) -> Float[np.ndarray, " n"]:
-    """Returns the distance from each predicted point to the picture's edge, along its direction (unit, px); NaN where
-    there is none within ``reach_px``, or lids cover it. The points run once around the iris."""
+    """Returns the distance (px) from each predicted limbus point to the image edge along the unit direction
+    ``outwards``; NaN if there is no edge within ``reach_px``, or if lids cover it. The points surround the iris."""
     count = max(int(np.ceil(reach_px / STEP_PX)), 2)
     along = np.arange(-count - 1, count + 2) * STEP_PX
     at = points_px[:, None] + along[None, :, None] * outwards[:, None] - view.origin_px
@@ -107,7 +108,7 @@ def limbus_offsets(
 
 
 def _averaged_along(slope: Float[np.ndarray, "n k"], valid: Bool[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-    """Returns the mean slope of neighbouring valid rays; 0 where the ray itself is not valid."""
+    """Returns the brightness slope averaged over neighbouring valid rays; 0 where the ray itself is not valid."""
     apart = np.abs(np.arange(len(slope)) - np.arange(len(slope))[:, None])
     near = np.minimum(apart, len(slope) - apart)  # the rays go round
     share = np.where(near <= 3 * ALONG_RAYS, np.exp(-0.5 * (near / ALONG_RAYS) ** 2), 0.0)

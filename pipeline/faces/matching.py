@@ -1,9 +1,9 @@
-"""Finds the faces in several pictures that belong to one subject.
+"""Finds the faces in several pictures that belong to the subject.
 
-In: the faces found in each view. Out: ``MatchedFaces``, or None if no two views show one face. Every two detections
-that may show one face are triangulated. The result must have the size (mm) and the relief of a face (a poster is flat),
-and be turned towards its cameras. Further views are added if the points project onto their detections. If there are
-several faces, it takes the one that is large and central in the pictures: bystanders stand behind.
+Every two detections that may show the same face are triangulated. The triangulated face must have the size (mm) and the
+relief of a face (a poster is flat), and be turned towards its cameras. Further views are added if the points project
+onto their detections. If there are several faces, the subject's is the largest and most central one, since bystanders
+stand behind.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,11 +42,11 @@ DISSENTING_FACING = 0.5  # the same of a camera that must see it
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedFaces:
-    """Holds one person's face as found in several views, and its 468 points in the world frame (mm).
+    """Holds one person's face in several views, and its 468 points in the world frame (mm).
 
-    The error of a point is the sum of three: its own, independent of all others (``covariances``); the view's, common
-    to all its points (``shared_mm``: each row times a standard normal number); and the network's, which tends towards
-    an average face in all views (``landmark_map.LandmarkMap`` of the model).
+    The error of a point is the sum of three errors: one independent of other points (``covariances``); one common to
+    all points in a view (``shared_mm``: each row times a standard normal number); and the network's bias towards an
+    average face (``landmark_map.LandmarkMap`` of the model).
     """
 
     detections: Mapping[str, FaceDetection]  # by view
@@ -75,9 +75,9 @@ class MatchedFaces:
 def find_subject_face(
     candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
 ) -> TriangulatedFace | None:
-    """Finds the subject's face among all faces in the views (best first in each), and triangulates only every
-    thirteenth of its points. Returns None if no two views show one face. ``eye_distance_mm``: limits of a face's size;
-    None if the rig's scale is not known."""
+    """Finds the subject's face among all faces in the views (best first in each view), and triangulates every
+    thirteenth of its points. Returns None if no two views show the same face. ``eye_distance_mm``: limits of the
+    distance between the eyes; None if the rig's scale is not known."""
     faces = _consistent(candidates, rig, eye_distance_mm)
     return max(faces, key=lambda face: _prominence(face, rig), default=None)
 
@@ -93,7 +93,7 @@ def complete_match(
 def _consistent(
     candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
 ) -> Iterator[TriangulatedFace]:
-    """Returns the faces on which two or more views agree, each with all its views."""
+    """Returns the faces that two or more views show, each with all its views."""
     detections = [(name, face) for name, faces in candidates.items() for face in faces]
     pairs = [(a, b) for k, a in enumerate(detections) for b in detections[k + 1 :] if a[0] != b[0]]
     pairs.sort(key=lambda pair: -min(pair[0][1].score, pair[1][1].score))
@@ -122,7 +122,7 @@ def _consistent(
 def _may_be_one(
     pair: Sequence[tuple[str, FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
 ) -> bool:
-    """Tells whether the rays of two detections meet in points of a face's size: a quick test of 0.3 ms."""
+    """Returns True if the viewing rays of two detections meet in points of a face's size. A test takes 0.3 ms."""
     (centre, ray), (other, other_ray) = (
         (rig[name].centre_world, rig[name].rays_world(face.landmarks_px[FEW_POINTS])) for name, face in pair
     )
@@ -149,7 +149,7 @@ def _may_be_one(
 def _grown(
     face: TriangulatedFace | None, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
 ) -> TriangulatedFace | None:
-    """Returns a pair's face extended by all views in which its points project to a detection."""
+    """Adds to a face from two views all views in which its points project to a detection."""
     for _ in range(GROWING_ROUNDS):
         if face is None:
             return None
@@ -164,8 +164,8 @@ def _grown(
 def _nearest(
     face: TriangulatedFace, detections: Sequence[FaceDetection], camera: Camera
 ) -> tuple[FaceDetection, float]:
-    """Returns a view's detection nearest to the projected points of the face, and its misfit: the RMS of residuals over
-    their expected standard deviation (noise and uncertainty of points). Behind the camera it is infinite."""
+    """Returns a view's detection nearest to the projected points of the face, and its misfit: the RMS of the residuals
+    divided by their standard deviations. The misfit is infinite for a face behind the camera."""
     points, placed = face.points.positions_world, face.world_from_face
     pixels, slopes = camera.project_with_jacobian(points)
     if not np.isfinite(pixels).all():
@@ -184,7 +184,7 @@ def _nearest(
 
 
 def _is_face(face: TriangulatedFace, rig: Rig, eye_distance_mm: tuple[float, float] | None) -> bool:
-    """Tells whether the points form a face: with its size and relief, and turned towards its cameras."""
+    """Returns True if the points have the size and relief of a face, and face the cameras."""
     low, high = eye_distance_mm or (0.0, np.inf)
     scaled_mm = face.world_from_face.scale * mean_eye_distance_mm()
     middle, facing = face.world_from_face.translation, face.world_from_face.rotation[:, 2]
@@ -240,7 +240,7 @@ def _prominence(face: TriangulatedFace, rig: Rig) -> float:
 def _outliers(
     face: TriangulatedFace, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
 ) -> dict[str, FaceDetection]:
-    """Returns detections of excluded views that lie at the face but do not fit it."""
+    """Returns the detections in unmatched views that lie near the projected face but do not fit it."""
     found = {}
     for name, faces in candidates.items():
         if name not in face.detections and faces:
@@ -252,7 +252,7 @@ def _outliers(
 
 
 def _matched(face: TriangulatedFace, rig: Rig, outliers: Mapping[str, FaceDetection]) -> MatchedFaces:
-    """Builds the face that the stage returns."""
+    """Builds the ``MatchedFaces`` of a triangulated face."""
     names = list(face.detections)
     return MatchedFaces(
         detections=face.detections,

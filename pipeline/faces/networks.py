@@ -1,13 +1,13 @@
-"""Loads the networks that find a face and 468 points on it: MediaPipe's, run by OpenCV.
+"""Loads MediaPipe's networks for faces, 468 face points and eyes, and runs them by OpenCV.
 
-BlazeFace (Bazarevsky et al. 2019) finds faces. Kartynnik et al., *Real-time facial surface geometry from monocular
-video on mobile GPUs* (2019), place 468 points on one. Ablavatski et al., *Real-time pupil tracking from monocular video
-for digital puppetry* (2020), place the lids and the iris of an eye. The files lie in ``packs`` (Apache-2.0) and are
-checked by their sha256 when they are loaded. OpenCV's classic engine returns both outputs of a network at once; the new
-engine of 5.0 returns only the first.
+BlazeFace (Bazarevsky et al. 2019) finds faces. The network of Kartynnik et al., *Real-time facial surface geometry from
+monocular video on mobile GPUs* (2019), places 468 points on a face. The network of Ablavatski et al., *Real-time pupil
+tracking from monocular video for digital puppetry* (2020), places the lids and the iris of an eye. The files are in
+``packs`` (Apache-2.0), and their sha256 is checked. OpenCV's classic engine is used, since the new engine of version
+5.0 returns only one output of a network.
 
-Pixel (0, 0) of a network's input is the centre of its top-left pixel. This was measured: x of a point and of its mirror
-image add up to 190.8 of 192 px (191 in this convention, 192 for corners).
+Pixel (0, 0) of a network's input is the centre of its top-left pixel. A measurement confirmed this: the x of a point
+and of its mirror image add up to 190.8 px, and 191 px are expected.
 """
 
 import hashlib
@@ -39,7 +39,7 @@ LID_POINTS, IRIS_POINTS = 16, 5
 
 
 class DamagedNetwork(EigenheadError):
-    """Reports a network file that is missing or differs from the one of this version."""
+    """Reports a network file that is missing or has the wrong sha256."""
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(f"{path}: {why}; install the program again")
@@ -55,7 +55,7 @@ class FaceNetworks:
     _lock: Any = field(default_factory=threading.Lock, repr=False)
 
     def find(self, crop: UInt8[np.ndarray, "192 192 3"]) -> tuple[Float[np.ndarray, "n 8 2"], Float[np.ndarray, " n"]]:
-        """Proposes a face for every cell of the 192 x 192 crop. Most proposals are no faces and have a low score.
+        """Proposes a face for every cell of the 192 x 192 crop. Most proposals are wrong and have a low score.
 
         Returns:
             For each cell a face's centre, width and height, right eye, left eye, tip of the nose, mouth, right and left
@@ -79,7 +79,7 @@ class FaceNetworks:
         self, crop: UInt8[np.ndarray, "64 64 3"]
     ) -> tuple[Float[np.ndarray, "16 2"], Float[np.ndarray, "5 2"]]:
         """Returns the lids' edges and the iris (centre, left, top, right, bottom) of the eye in a crop (px of the
-        crop). The eye must be a right one, or a left one mirrored."""
+        crop). The crop must show a right eye, or the mirror image of a left eye."""
         eye, iris = self._run(self.eye, _blob(crop), ("output_eyes_contours_and_brows", "output_iris"))
         return eye.reshape(-1, 3)[:LID_POINTS, :2].astype(float), iris.reshape(IRIS_POINTS, 3)[:, :2].astype(float)
 
@@ -107,5 +107,5 @@ def _load(path: Path) -> cv2.dnn.Net:
 
 
 def _blob(crop: UInt8[np.ndarray, "s s 3"]) -> Float32[np.ndarray, "1 3 s s"]:
-    """Converts a crop to the networks' input: planes, 0 to 1."""
+    """Converts a crop to the networks' input: colour planes with values from 0 to 1."""
     return np.ascontiguousarray(crop.transpose(2, 0, 1)[None], np.float32) / np.float32(255.0)

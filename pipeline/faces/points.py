@@ -1,8 +1,8 @@
-"""Provides measured properties of the landmark network's 468 points: the pairs of mirror images, their mean shape, and
-their bias and noise. ``right`` and ``left`` are the subject's.
+"""Provides measured properties of the landmark network's 468 face points: symmetric pairs, mean shape, bias and noise.
+``right`` and ``left`` are the subject's sides.
 
-The network was run on faces and on their mirror images; each point was paired with the nearest mirrored point (``python
--m tests.laboratory.model_packs.landmark_map``).
+Each point was paired with the nearest point in the mirror image of a face (``python -m
+tests.laboratory.model_packs.landmark_map``).
 """
 
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ inner one, then along the upper lid."""
 class PointTable:
     """Holds the measured properties of the landmark network's 468 points. Arrays are read-only.
 
-    Face frame: x to the subject's left, y up, z out of the face. Noise is relative to the size of the face in the
-    picture. Its logarithm grows linearly with ``1 - cos`` of the angle between the point's normal and the direction to
-    the camera.
+    In the face frame x points to the subject's left, y up, and z out of the face. Noise is relative to the size of the
+    face in the picture. The logarithm of the noise grows linearly with ``1 - cos`` of the angle between the point's
+    normal and the direction to the camera.
     """
 
     mirror_images: Int[np.ndarray, " 468"]  # of each point; those of the midline are their own
@@ -41,8 +41,7 @@ class PointTable:
 
 @cache
 def point_table() -> PointTable:
-    """Returns the ``PointTable`` that is shipped with the networks: mirror images, mean shape, bias and noise of their
-    468 points. It is read once."""
+    """Reads the ``PointTable`` that belongs to the networks, and caches it."""
     with np.load(Path(__file__).parent / "packs" / "points.npz", allow_pickle=False) as table:
         arrays = {name: table[name].astype(int if name == "mirror_images" else float) for name in table.files}
     for array in arrays.values():
@@ -52,8 +51,8 @@ def point_table() -> PointTable:
 
 def view_terms(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 8"]:
     """Returns the eight polynomial terms, up to third order, of which the network's bias is a weighted sum.
-    ``direction`` is the unit vector from the face to the camera (face frame). Multiplied by ``VIEW_TERMS_MIRRORED``,
-    the terms are those of the mirror image."""
+    ``direction`` is the unit vector from the face to the camera (face frame). ``VIEW_TERMS_MIRRORED`` are the factors
+    that give the terms of the mirror image."""
     x, y, _ = direction
     return np.array([1.0, x, y, x * x, x * y, y * y, x**3, x * x * y])
 
@@ -62,17 +61,17 @@ VIEW_TERMS_MIRRORED = np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
 
 
 def view_bias(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "468 2"]:
-    """Returns the network's mean error at each point of a face seen from ``direction`` (unit, face frame): to the right
-    and down in a picture with the face upright, relative to the face's size."""
+    """Returns the network's mean error at each point of a face seen from ``direction`` (unit vector, face frame). The
+    error points right and down in a picture of the upright face, and is relative to the face's size."""
     return np.tensordot(view_terms(direction), point_table().view_bias, axes=1)
 
 
 def place_face(points_world: Float[np.ndarray, "n 3"], which: slice = slice(None)) -> tuple[Similarity, float]:
-    """Fits a mean face to some of the points, the indices ``which``. Returns its pose and scale (world_from_face), and
-    the relief.
+    """Fits the mean face to the points with the indices ``which``. Returns the face's pose and scale (world_from_face),
+    and the relief.
 
-    The scale is fitted to breadth and height only. The relief is the depth of the points divided by the mean face's: 1
-    for a mean face, 0 for a flat picture.
+    The scale is fitted to breadth and height only. The relief is the depth of the points divided by the mean face's
+    depth; a flat picture has 0.
     """
     shape = point_table().shape_mm[which]
     mean, middle = shape.mean(axis=0), points_world.mean(axis=0)

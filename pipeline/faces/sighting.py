@@ -1,7 +1,7 @@
-"""Searches the subject's face quickly, to judge a shot: which pictures lack it, and which way it is turned.
+"""Searches the subject's face quickly after a shot, to report which pictures lack it and where it looks.
 
-In: small pictures (``reduce_picture``) and their cameras. Leaves: ``FaceSighting``. The search is short: it ends after
-a few views without a face, and then tests only those cameras that must show it.
+The search uses small pictures (``reduce_picture``) and ends after a few views without a face. A face that was found is
+then searched in the other cameras that must show it.
 """
 
 from dataclasses import replace
@@ -29,8 +29,7 @@ MIN_WITNESSES = 2  # other cameras that show the face, before one is blamed that
 
 
 def reduce_picture(image: ImageRgb, camera: Camera, longest_px: int) -> tuple[UInt8[np.ndarray, "_ _ 3"], Camera]:
-    """Returns a picture and its camera reduced so that the picture's longer side is ``longest_px``; both unchanged if
-    it is not longer than that."""
+    """Scales a picture and its camera down so that the picture's longer side is at most ``longest_px``."""
     factor = longest_px / max(image.shape[:2])
     if factor >= 1.0:
         return image, camera
@@ -43,7 +42,7 @@ def sight_face(subject: SubjectFaces, rig: Rig, *, front: str) -> FaceSighting:
     """Returns which cameras lack the subject's face, whether its eyes are closed, and its angle from the front camera.
 
     Args:
-        subject: as ``find_subject`` finds it in small pictures with the effort ``GLANCE``, in 0.1 to 0.4 s at 640 px.
+        subject: result of ``find_subject`` with the effort ``GLANCE`` (0.1 to 0.4 s for pictures of 640 px).
         rig: the cameras of these pictures.
         front: the camera that the subject is to look at.
     """
@@ -56,7 +55,7 @@ def sight_face(subject: SubjectFaces, rig: Rig, *, front: str) -> FaceSighting:
 
 
 def turned_deg(world_from_face: Similarity, rig: Rig, front: str) -> tuple[float, float] | tuple[None, None]:
-    """Returns the angles (degrees, to the face's left and up) between a face and the front camera; None without one."""
+    """Returns the angles (degrees, to the face's left and up) from a face to the front camera, if there is one."""
     if not has_front(rig):
         return None, None
     left, up = gaze_from(world_from_face, rig[front].axis_world if front in rig.names else -_fan(rig))
@@ -65,20 +64,20 @@ def turned_deg(world_from_face: Similarity, rig: Rig, front: str) -> tuple[float
 
 
 def _turned(from_front_deg: float, from_middle_deg: float) -> float:
-    """Returns the angle from the front camera; 0 unless the face is also turned that way from the cameras' middle. With
-    rows of cameras the front one is above or below that middle; a face directed between the rows counts as straight."""
+    """Returns the angle from the front camera, or 0 if the face looks between the front camera and the middle of all
+    cameras. In a rig with rows of cameras, the front camera is above or below this middle."""
     agreed = from_front_deg * from_middle_deg > 0.0 and abs(from_middle_deg) >= MIN_OFF_MIDDLE_DEG
     return from_front_deg if agreed else 0.0
 
 
 def has_front(rig: Rig) -> bool:
-    """Tells whether the cameras stand on one side of the subject, so that one of them is the front."""
+    """Returns True if all cameras stand on one side of the subject, so that a front camera exists."""
     return float(np.linalg.norm(_fan(rig))) > MIN_FAN
 
 
 def _fan(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """Returns the mean unit vector from the subject to the cameras: length 1 if they are at one spot, 0 in a full
-    ring."""
+    """Returns the mean of the unit vectors from the subject to the cameras. The mean's length is 1 for cameras at the
+    same place, 0 for a full ring."""
     directions = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return directions.mean(axis=0)
@@ -92,14 +91,14 @@ def gaze_from(world_from_face: Similarity, axis_world: Float[np.ndarray, " 3"]) 
 
 
 def _missing(subject: SubjectFaces, face: MatchedFaces) -> tuple[str, ...]:
-    """Returns the cameras without a detection that must see the face according to the other cameras."""
+    """Returns the cameras that must see the face, according to the other cameras, but have no detection of it."""
     if len(face.detections) < MIN_WITNESSES:
         return ()
     return tuple(name for name in subject.expected if name not in face.detections and not subject.found.get(name))
 
 
 def file_pixels(pixels: Float[np.ndarray, "n 2"], read_by: Camera, recorded_by: Camera) -> Float[np.ndarray, "n 2"]:
-    """Converts pixels of a picture that was reduced and undistorted on reading to pixels of its file."""
+    """Converts pixels of a reduced and undistorted picture to pixels of its file."""
     small, full = read_by.intrinsics, recorded_by.intrinsics
     scaled = (pixels + 0.5) * (full.width / small.width, full.height / small.height) - 0.5
     lens = recorded_by.recorded

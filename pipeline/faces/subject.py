@@ -1,11 +1,11 @@
-"""Finds the subject's face in all views of a rig: searches a few views, then the expected position in the others.
+"""Finds the subject's face in all views of a rig: searches a few views, then the expected position in the other views.
 
-In: pictures and rig. Leaves: ``SubjectFaces``. Searching a picture takes 0.06 s, testing a known position 0.01 s. Views
-far apart are searched until two or more agree on a face; the face is then projected into all others.
+A search of a whole picture takes 0.06 s, a test at a known position 0.01 s. Views far apart are therefore searched
+until two or more agree on a face; the face is then projected into all other views.
 
-A face in only one view gets its pose from the mean adult's points. On rendered captures that pose differs from the
-result of all views by 5 degrees (median, up to 75 degrees from the camera; 17 for profiles). Its distance follows from
-the face's size: 9 % off (RMS), 24 % for profiles, plus the difference between the subject's head and the mean adult's.
+A face in only one view gets its pose from the mean adult's face points. On rendered captures this pose differs from the
+result of all views by 5 degrees (median; 17 degrees for profiles). The distance of such a face follows from the face's
+size, with an RMS error of 9 % (24 % for profiles) plus the difference between the subject's size and the mean adult's.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -52,15 +52,14 @@ MIN_INSIDE = 0.6  # share of a face's points within a picture
 
 @dataclass(frozen=True, slots=True)
 class SearchEffort:
-    """Holds how thoroughly the subject's face is searched.
+    """Holds the options that determine how thoroughly the subject's face is searched.
 
     Attributes:
         max_fruitless: the search ends after this many views without a face; None searches all views, and then for small
             faces.
-        min_facing: a known face is looked for in cameras to which it turns; the smallest cosine between both
-            directions.
-        rounds: how often that is repeated, as more views have the face.
-        with_eyes: whether irises and lids are found, too.
+        min_facing: smallest cosine between a face's direction and a camera's, for a search of the face in the camera.
+        rounds: how often the search in further cameras is repeated.
+        with_eyes: whether irises and lids are searched, too.
     """
 
     max_fruitless: int | None = None
@@ -75,7 +74,7 @@ THOROUGH = SearchEffort()
 @dataclass(frozen=True, slots=True, eq=False)
 class SubjectFaces:
     """Holds the faces found in each searched view, best first, and which of them are the subject's. If only one view
-    shows a face, and beyond doubt, its points are those of a mean adult."""
+    shows a face, with a very high score, the points are a mean adult's."""
 
     found: Mapping[str, tuple[FaceDetection, ...]]
     matched: MatchedFaces | None  # None where views that show faces do not agree on one
@@ -142,8 +141,8 @@ def _search(
     find: Callable[[Pyramid, FaceNetworks], tuple[FaceDetection, ...]],
     report: Callable[[float], None],
 ) -> tuple[dict[str, tuple[FaceDetection, ...]], TriangulatedFace | None]:
-    """Searches view after view until one face is confirmed. Returns the faces of the searched views, and the
-    subject's."""
+    """Searches view after view until one face is confirmed. Returns the faces of the searched views, and the subject's
+    face."""
     found: dict[str, tuple[FaceDetection, ...]] = {}
     face = None
     while left := [name for name in in_order if name not in found]:
@@ -165,8 +164,8 @@ def _search(
 
 
 def _next_view(left: Sequence[str], found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> str:
-    """Returns the view to search next: the first remaining one until a face is found, then one about ``APART_DEG`` from
-    the view of the best face."""
+    """Returns the next view to search: the first one left or, if a face was found, one about ``APART_DEG`` from the
+    best face's view."""
     seen = [name for name in found if found[name]]
     if not seen:
         return left[0]
@@ -181,7 +180,7 @@ def _next_view(left: Sequence[str], found: Mapping[str, tuple[FaceDetection, ...
 
 
 def _matched_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> MatchedFaces | None:
-    """Returns a face that is beyond doubt if no other face was found in any view."""
+    """Returns a face with a very high score if no other face was found in any view."""
     seen = [(name, faces) for name, faces in found.items() if faces]
     if len(seen) != 1 or len(seen[0][1]) != 1 or seen[0][1][0].score < CERTAIN_SCORE:
         return None
@@ -192,8 +191,8 @@ def _matched_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> 
 def _search_missing(
     scene: _Scene, face: TriangulatedFace, found: Mapping[str, tuple[FaceDetection, ...]]
 ) -> dict[str, tuple[FaceDetection, ...]]:
-    """Tests the views that must show the face but have no detection of it; new detections come before the view's
-    others."""
+    """Searches the face in views that must show it but have no detection of it. New detections come first in their
+    view."""
     added = {}
     points = face.world_from_face.apply(point_table().shape_mm)
     for name in _expected(face.world_from_face, scene.rig, scene.effort.min_facing):
@@ -220,7 +219,7 @@ def _expected(world_from_face: Similarity, rig: Rig, min_facing: float) -> Itera
 
 def place_from_one_view(face: FaceDetection, camera: Camera) -> Similarity | None:
     """Returns the pose (world_from_face, scale 1) in which a mean adult's points project to the pixels of one camera.
-    Returns None if no pose explains the points, or if they lie outside the lens."""
+    Returns None if no pose explains the points, or if their pixels cannot be undistorted."""
     shape, pixels = point_table().shape_mm, face.landmarks_px
     seen = np.ones(len(shape), bool)
     placed: Similarity | None = None
@@ -237,11 +236,11 @@ def place_from_one_view(face: FaceDetection, camera: Camera) -> Similarity | Non
 
 
 def match_alone(name: str, face: FaceDetection, camera: Camera) -> MatchedFaces | None:
-    """Returns a face from a single view in the form of ``matching``, with a mean adult's points. Returns None if
-    ``place_from_one_view`` does.
+    """Returns a ``MatchedFaces`` from a single view, with a mean adult's points. Returns None if
+    ``place_from_one_view`` returns None.
 
-    The pixels determine the points across the line of sight. The undetermined motions move all points together: along
-    their rays, and about the middle of the face.
+    The pixels determine the points perpendicular to the viewing rays. Motions of the whole face along the rays, and
+    rotations about its middle, get a large uncertainty.
     """
     placed = place_from_one_view(face, camera)
     if placed is None:
@@ -271,7 +270,7 @@ def match_alone(name: str, face: FaceDetection, camera: Camera) -> MatchedFaces 
 
 
 def _pose(points: Float[np.ndarray, "n 3"], normalised: Float[np.ndarray, "n 2"]) -> RigidTransform | None:
-    """Returns the least-squares camera_from_face of points and their positions in the image (X / Z, Y / Z)."""
+    """Computes camera_from_face by least squares from points and their normalised image positions (X / Z, Y / Z)."""
     if len(points) < 6 or not np.isfinite(normalised).all():
         return None
     found, turn, shift = cv2.solvePnP(points, normalised, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_SQPNP)

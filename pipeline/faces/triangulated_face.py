@@ -1,8 +1,7 @@
 """Triangulates a face's points from its detections in several views.
 
-In: one detection for each view. Leaves: ``TriangulatedFace``. The network has a bias that depends on the viewing
-direction (``points.view_bias``); it is subtracted once the face's pose is known. The more a point turns away from a
-camera, the larger is its noise.
+The landmark network has a bias that depends on the viewing direction (``points.view_bias``). The bias is subtracted
+once the face's pose is known. The more a point turns away from a camera, the larger is its noise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,10 +25,10 @@ ROUNDS = 2  # of how the face lies, and what follows from it
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangulatedFace:
-    """Holds points of one face in the world frame, with each view's pixels and noise in the order of ``detections``.
+    """Holds triangulated points of one face, with each view's pixels and noise in the order of ``detections``.
 
-    ``noise_px`` and ``points.covariances`` are independent from point to point; ``view_noise_px`` moves all points of a
-    view together.
+    The errors ``noise_px`` and ``points.covariances`` are independent for each point; ``view_noise_px`` is an error
+    common to all points of a view.
     """
 
     detections: Mapping[str, FaceDetection]
@@ -42,7 +41,7 @@ class TriangulatedFace:
 
     @property
     def misfits(self) -> dict[str, float]:
-        """Returns, for each view, the RMS of its residuals divided by their expected noise: about 1 if they agree."""
+        """Returns, for each view, the RMS of residuals divided by their expected noise (1 for a correct match)."""
         variance = self.noise_px[..., None] ** 2 + self.view_noise_px[:, None, None] ** 2
         squares = (self.points.residuals_px**2 / variance).mean(axis=(1, 2))
         return dict(zip(self.detections, np.sqrt(squares).tolist(), strict=True))
@@ -88,8 +87,8 @@ def point_noise_px(
     camera: Camera,
     which: slice = ALL_POINTS,
 ) -> Float[np.ndarray, " n"]:
-    """Returns the standard deviation (px, along each axis) of the independent error of each point in a view. It grows
-    as the skin at the point turns away from the camera."""
+    """Returns the standard deviation (px, along each axis) of the independent error of each point in a view. The error
+    grows as the skin at the point turns away from the camera."""
     straight, growth = point_table().point_noise
     normals = point_table().normals[which] @ world_from_face.rotation.T
     towards = camera.centre_world - points_world
@@ -121,6 +120,6 @@ def _noise_px(
     cameras: Sequence[Camera],
     which: slice,
 ) -> Float[np.ndarray, "v n"]:
-    """Returns ``point_noise_px`` of all views."""
+    """Returns ``point_noise_px`` for all views at once."""
     views = zip(sizes_px.tolist(), cameras, strict=True)
     return np.stack([point_noise_px(size, points_world, world_from_face, c, which) for size, c in views])

@@ -1,6 +1,6 @@
-"""Fuses depth maps to one closed surface: a signed distance on a sparse grid, its surface net, and its vertices refined
-by the views.
+"""Fuses depth maps to one closed surface: computes a signed distance on a sparse grid, extracts a mesh by surface nets,
+and moves its vertices to the depth maps.
 
-Enters: depth maps, silhouettes and, for what no camera sees, the fitted head. Leaves: a watertight mesh in the world
-frame (mm), with the part and the standard deviation of each vertex.
+The inputs are depth maps, silhouettes and, for unseen regions, the fitted head. The result is a watertight mesh in the
+world frame (mm), with a part label and a standard deviation for each vertex.
 """

@@ -1,8 +1,8 @@
-"""Compiled loops that find triangles of a mesh that are turned over, are folded, or cross each other.
+"""Contains the compiled loops that find flipped, folded and intersecting triangles of a mesh.
 
-Triangles are sorted into cubic cells by the middles of their boxes. A cell is as wide as the widest box, so that
-triangles that meet lie in neighbouring cells. Two triangles cross if an edge of one passes through the other; merely
-touching does not count.
+Triangles are sorted into cubic cells by the middles of their bounding boxes. A cell is as wide as the widest box, so
+intersecting triangles lie in neighbouring cells. Two triangles cross if an edge of one passes through the other;
+triangles that only touch do not cross.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from rig.jit import njit
 
 @njit(cache=True, nogil=True)
 def triangle_boxes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Returns the lowest and the highest corner of the box around each triangle, (f, 6)."""
+    """Returns the lowest and the highest corner of each triangle's bounding box, (f, 6)."""
     boxes = np.empty((len(faces), 6))
     for f in range(len(faces)):
         for axis in range(3):
@@ -24,7 +24,7 @@ def triangle_boxes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def any_corner(vertex: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Tells which triangles have a corner among the vertices ``vertex`` (v), (f)."""
+    """Returns a mask (f) of the triangles with a corner among the marked vertices ``vertex`` (v)."""
     found = np.empty(len(faces), np.bool_)
     for f in range(len(faces)):
         found[f] = vertex[faces[f, 0]] | vertex[faces[f, 1]] | vertex[faces[f, 2]]
@@ -35,8 +35,9 @@ def any_corner(vertex: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def turned_and_folded(
     vertices: np.ndarray, faces: np.ndarray, pairs: np.ndarray, near: np.ndarray, least_cosine: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Tells which triangles face against the mean normal of their corners (f), and of which ``pairs`` (e, 2) the
-    normals have a cosine below ``least_cosine`` (e); of the triangles ``near`` (f) alone."""
+    """Returns a mask (f) of triangles that face against the mean normal of their corners. Also returns a mask (e) of
+    triangle ``pairs`` (e, 2) whose normals have a cosine below ``least_cosine``. Only triangles ``near`` (f) are
+    tested."""
     normals, means = np.zeros((len(faces), 3)), np.zeros((len(vertices), 3))
     for f in range(len(faces)):
         if near[f]:
@@ -69,7 +70,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> float:
 
 @njit(cache=True, nogil=True)
 def beside_active(boxes: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """Tells which triangles lie in or beside a cell that holds the middle of an ``active`` triangle, (f)."""
+    """Returns a mask (f) of triangles in or beside a cell that contains the middle of an ``active`` triangle."""
     wide, low, high = 1e-9, np.full(3, np.inf), np.full(3, -np.inf)
     for f in range(len(boxes)):
         for axis in range(3):
@@ -103,11 +104,11 @@ def crossing_triangles(
     first: int,
     last: int,
 ) -> None:
-    """Marks triangles that cross another one, in ``crossing`` (f), in place. Considered are pairs with an ``active``
-    triangle at the positions ``first`` to ``last`` of ``order``. Threads may run at once: both write True.
+    """Marks triangles that cross another triangle in ``crossing`` (f), in place. The function tests pairs with an
+    ``active`` triangle at the positions ``first`` to ``last`` of ``order``. Threads may run at the same time.
 
-    ``order`` sorts the triangles by ``keys`` (already sorted) and ``spans`` is the number of cells, all as in
-    ``cells.Cells``; ``boxes`` (f, 6) is in that order.
+    ``order``, sorted ``keys`` and ``spans`` (the number of cells) are as in ``cells.Cells``; ``boxes`` (f, 6) is in the
+    sorted order.
     """
     ranges, cell = np.empty((COLUMNS, 2), np.int64), -1
     for position in range(first, last):
@@ -154,7 +155,7 @@ def _cross(vertices: np.ndarray, f: np.ndarray, g: np.ndarray) -> bool:
 
 @njit(cache=True, nogil=True, inline="always")
 def _beside(vertices: np.ndarray, f: np.ndarray, g: np.ndarray) -> bool:
-    """Whether all of ``g`` lies on one side of the plane of ``f``, touching it at most."""
+    """Returns True if triangle ``g`` lies on one side of the plane of triangle ``f`` or only touches it."""
     one = _side(vertices, f[0], f[1], f[2], g[0])
     two = _side(vertices, f[0], f[1], f[2], g[1])
     three = _side(vertices, f[0], f[1], f[2], g[2])
@@ -174,7 +175,7 @@ def _pierces(vertices: np.ndarray, p: int, q: int, face: np.ndarray) -> bool:
 
 @njit(cache=True, nogil=True, inline="always")
 def _side(v: np.ndarray, a: int, b: int, c: int, d: int) -> float:
-    """Six times the signed volume of a tetrahedron."""
+    """Returns six times the signed volume of a tetrahedron."""
     bx, by, bz = v[b, 0] - v[a, 0], v[b, 1] - v[a, 1], v[b, 2] - v[a, 2]
     cx, cy, cz = v[c, 0] - v[a, 0], v[c, 1] - v[a, 1], v[c, 2] - v[a, 2]
     dx, dy, dz = v[d, 0] - v[a, 0], v[d, 1] - v[a, 1], v[d, 2] - v[a, 2]

@@ -16,8 +16,8 @@ SIZES = 4  # classes of triangles, each half as wide as the last
 def crossing_faces(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], active: Bool[np.ndarray, " f"] | None = None
 ) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles cross another one. If ``active`` is not None, only pairs with at least one active triangle
-    are tested."""
+    """Returns a mask of triangles that cross another triangle. If ``active`` is not None, only pairs with at least one
+    active triangle are tested."""
     faces = faces.astype(np.int32)  # a copy: a model's own are read-only, which is another type
     if active is None:
         return _crossing_by_size(vertices, faces)
@@ -30,8 +30,8 @@ def crossing_faces(
 
 
 def _crossing_by_size(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles cross another one, one class of sizes at a time. Each class is tested against itself and
-    all smaller triangles in a grid of its own: cells as wide as the neck's triangles would hold too many of the face's.
+    """Returns a mask of triangles that cross another triangle. For speed the triangles are divided into size classes.
+    Each class is tested against itself and all smaller triangles in a grid with cells of its own size.
     """
     boxes, crossing = triangle_boxes(vertices, faces), np.zeros(len(faces), bool)
     wide = (boxes[:, 3:] - boxes[:, :3]).max(axis=1)
@@ -64,9 +64,9 @@ def _crossing(
 
 @traced
 def without_coincidences(mesh: Mesh) -> Mesh:
-    """Separates vertices that coincide in single precision, as files store them: each moves a little towards the mean
-    of its neighbours. A program that merges vertices by position would otherwise join sheets there and find the surface
-    open."""
+    """Separates vertices that coincide in single precision, as files store them, by a small move towards the mean of
+    their neighbours. Without this, a program that merges vertices by position would join separate sheets of the
+    surface."""
     stored = mesh.vertices.astype(np.float32)
     order = np.argsort(stored[:, 0])  # only what is equal there is sorted by all coordinates: a tenth of the time
     again = np.diff(stored[order, 0]) == 0.0

@@ -1,8 +1,8 @@
-"""Fuses all that the cameras see into one closed surface.
+"""Fuses the depth maps of all views into one closed surface.
 
-A signed distance is computed on a grid (``signed_distance``); its zero becomes a mesh (``surface_nets``); the vertices
-are moved to the depth maps (``refinement``), to the fitted head (``skin``) and, of hair, to its outlines (``hair``);
-triangles that are then turned, folded or crossing are mended (``untangling``)."""
+A signed distance is computed on a grid (``signed_distance``), and its zero level becomes a mesh (``surface_nets``). The
+vertices are moved to the depth maps (``refinement``) and to the fitted head (``skin``); hair is moved to its outlines
+(``hair``). At last flipped, folded or intersecting triangles are repaired (``untangling``)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -58,8 +58,8 @@ CONTRADICTED_WARNED = 0.002  # of a view's crop: what its outline leaves out and
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BustSurface:
-    """Holds the whole visible surface: one closed two-manifold piece that faces outwards. ``faults`` counts what is
-    wrong with its triangles after their repair, in single precision."""
+    """Holds the whole visible surface: one closed two-manifold piece that faces outwards. ``faults`` counts the bad
+    triangles that remain after the repair, in single precision."""
 
     mesh_world: Mesh
     deviation_mm: Float[np.ndarray, " v"]  # standard deviation along the normal
@@ -70,13 +70,13 @@ class BustSurface:
 
     @property
     def seen(self) -> Bool[np.ndarray, " v"]:
-        """Tells which vertices a photograph shows."""
+        """Returns a mask of the vertices that at least one view sees."""
         return self.views > 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthSurface:
-    """Holds the depth maps' surface in one piece, corrected for the matching windows' bias; it may cross itself."""
+    """Holds the surface fused from the depth maps, corrected for the matching bias; it may intersect itself."""
 
     mesh_world: Mesh
     safe_world: Float[np.ndarray, "v 3"]  # places (mm) with which the mesh cannot cross itself
@@ -103,16 +103,16 @@ def fuse(
     """Fuses the depth maps to one closed surface.
 
     Args:
-        depth_maps: one for each view; those without any known depth are left out.
-        silhouettes: by camera, at least of the depth maps' cameras.
+        depth_maps: one for each view; maps without any known depth are left out.
+        silhouettes: by camera, at least for the depth maps' cameras.
         rig: the cameras as calibrated, world frame.
         head_world: the fitted head, closed except at its neck (mm); None if there is none.
         bias: of the matching windows.
         spacing_mm: distance of the vertices.
         report: called with the stage's progress.
-        hair: of which the depth maps say nothing; None if there is none.
-        scatter: how far (0 to 1) the depth of hair is noise.
-        ears: vertices of each bare ear of the head, which is taken if few views agree on the depth.
+        hair: long hair without measured depth; None if there is none.
+        scatter: noise fraction (0 to 1) of the depth of hair.
+        ears: vertices of each bare ear of the head, which replaces the depth if few views agree.
 
     Raises:
         NoSurface: fewer than three views have any depth, or they contradict each other.
@@ -147,12 +147,12 @@ def finished(
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
 ) -> BustSurface:
-    """Makes the surface agree with the head and with the outlines of hair, removes self-intersections, and determines
-    what it shows.
+    """Combines the surface with the head and with the outlines of hair, removes self-intersections, and labels its
+    parts.
 
     Args:
         surface: from the depth maps.
-        votes: which part each point shows; None counts all that is seen as skin.
+        votes: part label of each point; None counts all seen points as skin.
         head: the delivered head with its deviation; None if there is none.
         silhouettes: by camera.
         rig: the cameras as calibrated, world frame.
@@ -192,7 +192,7 @@ def finished(
 
 
 def facing_a_camera(mesh_world: Mesh, rig: Rig) -> Bool[np.ndarray, " v"]:
-    """Tells which vertices turn their outside to a camera, whether or not something hides them."""
+    """Returns a mask of vertices that face any camera, even if they are occluded."""
     normals, facing = mesh_world.normals(), np.zeros(len(mesh_world.vertices), bool)
     for camera in rig:
         facing |= ((camera.centre_world - mesh_world.vertices) * normals).sum(axis=1) > 0.0
@@ -200,8 +200,8 @@ def facing_a_camera(mesh_world: Mesh, rig: Rig) -> Bool[np.ndarray, " v"]:
 
 
 def mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) -> Iterator[ReportWarning]:
-    """Yields a warning for each view whose outline leaves out much more than the other views' do. ``contradicted`` are
-    the shares of the crops that views leave out and others see solid."""
+    """Yields a warning for each view whose mask misses much more of the subject than the other views' masks.
+    ``contradicted`` are the fractions of the crops that the masks miss according to other views."""
     usual = CONTRADICTED_TIMES * float(np.median(contradicted)) if len(contradicted) else 0.0
     limit = max(CONTRADICTED_WARNED, min(usual, CONTRADICTED_SOFT))
     for name, share in zip(names, contradicted, strict=True):
@@ -211,8 +211,8 @@ def mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) -
 
 @traced
 def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
-    """Returns the mesh of the zero level, only the piece that is the subject, and safe positions of its vertices (mm,
-    world frame): with every vertex in the middle of its cell the mesh cannot cross itself."""
+    """Returns the mesh of the zero level, restricted to the subject, and safe vertex positions (mm, world frame). The
+    safe positions are the middles of the grid cells, with which the mesh cannot intersect itself."""
     grid, field = level.grid, level.field.copy()
     compose_well(field, grid.neighbours, grid.outer, TURNED_TO * grid.step_mm)
     net = surface_net(field, grid.index, grid.neighbours)
@@ -230,8 +230,9 @@ def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.nd
 def _subject(
     vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, head: Float[np.ndarray, "h 3"] | None
 ) -> Bool[np.ndarray, " f"]:
-    """Tells which faces belong to the subject. With a fitted head, that is the solid piece nearest to most of its
-    vertices, since a bystander may be larger. Without a head, it is the piece of greatest volume."""
+    """Returns a mask of the faces that belong to the subject. With a fitted head, the subject is the piece nearest to
+    most of the head's vertices, since a bystander may be larger. Without a head, the subject is the piece of greatest
+    volume."""
     piece = component_of(faces, len(vertices))
     towards = vertices[faces[:, 0]] - vertices.mean(axis=0)
     volume = np.bincount(piece[faces[:, 0]], (face_normals(vertices, faces) * towards).sum(axis=1))

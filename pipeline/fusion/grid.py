@@ -1,7 +1,7 @@
-"""Defines a sparse grid of nodes around a surface, refined by halving from a coarse box around everything.
+"""Defines a sparse grid of nodes around a surface, which starts as a coarse box and is refined by halving its step.
 
-Nodes are kept in the order of their keys ``(i * ny + j) * nz + k``. A neighbour at a fixed difference of keys is then
-found by walking two lists at once, without a hash table or a full volume.
+Nodes are sorted by their keys ``(i * ny + j) * nz + k``. Neighbours have a fixed difference of keys, so a merge of two
+sorted lists finds them without a hash table or a full volume.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from pipeline.geometry.surface_nets import link_nodes
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
     """Holds the nodes of a sparse grid; node i lies at ``corner + step_mm * index[i]``, world frame. ``neighbours`` are
-    the rows of the nodes towards -x +x -y +y -z +z, -1 if there is none; ``outer`` nodes lack one of their 26
+    the indices of the nodes towards -x +x -y +y -z +z, -1 if there is none; ``outer`` nodes lack one of their 26
     neighbours."""
 
     corner: Float[np.ndarray, " 3"]
@@ -30,44 +30,44 @@ class Grid:
         return len(self.index)
 
     def places(self, rows: np.ndarray | slice = slice(None)) -> Float[np.ndarray, "m 3"]:
-        """Returns where nodes lie (world frame, mm)."""
+        """Returns the positions of nodes (world frame, mm)."""
         return self.corner + self.step_mm * self.index[rows]
 
 
 def whole_box(corner: Float[np.ndarray, " 3"], edges_mm: Float[np.ndarray, " 3"], step_mm: float) -> Grid:
-    """Returns the grid with every node of a box, from its corner, edges and step (mm, world frame)."""
+    """Returns a grid with all nodes of a box, given its corner, edges and step (mm, world frame)."""
     shape = tuple(int(n) for n in np.ceil(edges_mm / step_mm).astype(int) + 1)
     index = np.stack(np.meshgrid(*(np.arange(n, dtype=np.int32) for n in shape), indexing="ij"), axis=-1)
     return _linked(corner, step_mm, (shape[0], shape[1], shape[2]), index.reshape(-1, 3))
 
 
 def refined(coarse: Grid, wanted: Bool[np.ndarray, "nx ny nz"]) -> Grid:
-    """Returns a grid of half the step.
+    """Returns a grid with half the step of ``coarse``.
 
-    Each node of ``coarse`` that ``wanted`` marks becomes eight nodes: one at its own position, and seven half a step
-    further along x, y and z."""
+    Each marked (``wanted``) node of ``coarse`` becomes eight nodes: one at its position, and seven half a step further
+    along x, y and z."""
     nx, ny, nz = coarse.shape
     shape = (2 * nx - 1, 2 * ny - 1, 2 * nz - 1)
     return _linked(coarse.corner, coarse.step_mm / 2, shape, kernels.halved(wanted))
 
 
 def everywhere(grid: Grid, values: Float32[np.ndarray, " n"], box: Float32[np.ndarray, "_ _ _"]) -> np.ndarray:
-    """Returns a volume of values over the grid's whole box: ``values`` at the grid's nodes, and elsewhere values
-    interpolated from ``box``, a volume of twice the step."""
+    """Returns a dense volume over the grid's box: ``values`` at the grid's nodes, and elsewhere values interpolated
+    from ``box``, a volume of twice the step."""
     fine = kernels.doubled(box)
     fine[tuple(grid.index.T)] = values
     return fine
 
 
 def marked_box(grid: Grid, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "nx ny nz"]:
-    """Returns a volume over the grid's whole box that is True at the chosen nodes."""
+    """Returns a dense volume over the grid's box that is True at the chosen nodes."""
     box = np.zeros(grid.shape, bool)
     box[tuple(grid.index[chosen].T)] = True
     return box
 
 
 def at_points(box: Grid, values: Float[np.ndarray, " n"], points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
-    """Returns the values of a whole box's nodes, interpolated linearly at points."""
+    """Interpolates the values of a dense volume linearly at points."""
     from scipy.ndimage import map_coordinates  # 0.3 s, and only a bust needs it
 
     at = ((points - box.corner) / box.step_mm).T

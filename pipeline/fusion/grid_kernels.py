@@ -1,13 +1,13 @@
-"""Compiled loops of ``pipeline.fusion.grid`` with a membrane through known values, and those that make its net a
-manifold.
+"""Contains the compiled loops that refine a sparse grid, interpolate a smooth field (membrane) on it, and make its
+surface net a manifold.
 
-The membrane is over-relaxed Gauss-Seidel on nodes that are coloured like a chequerboard: nodes of one colour are not
-neighbours, so that threads do not disturb each other and the result does not depend on their order.
+The membrane is solved by successive over-relaxation in a chequerboard order. Nodes of one colour are not neighbours, so
+the result does not depend on the order of threads.
 
-A net (``pipeline.geometry.surface_nets``) is a manifold exactly if the set of inside nodes is well composed (Latecki,
-*3D well-composed pictures*, 1997): no square of four nodes has inside nodes on one diagonal and outside nodes on the
-other, and no cell has two opposite corners that differ from its six others. The signs of single nodes are changed until
-that holds.
+A surface net (``pipeline.geometry.surface_nets``) is a manifold exactly if the set of inside nodes is well composed
+(Latecki, *3D well-composed pictures*, 1997). In a well-composed set no square of four nodes has inside nodes on one
+diagonal and outside nodes on the other, and no cell has two opposite corners that differ from its six others. The signs
+of single nodes are changed until both conditions hold.
 """
 
 from typing import NamedTuple
@@ -25,9 +25,9 @@ ROUNDS = 12  # in which the node nearest to the surface is turned over; later on
 
 @njit(cache=True, nogil=True)
 def halved(wanted: np.ndarray) -> np.ndarray:
-    """Returns the nodes of a grid with half the step, as positions (n, 3) int32 in the order of their keys. Each
-    ``wanted`` node (i, j, k) becomes up to eight nodes: (2 i, 2 j, 2 k), and those one further along x, y and z that
-    are inside the grid."""
+    """Returns the nodes of a grid with half the step, as grid indices (n, 3) int32 sorted by their keys. Each
+    ``wanted`` node (i, j, k) becomes up to eight nodes: (2 i, 2 j, 2 k) and its successors along x, y and z inside the
+    grid."""
     nx, ny, nz = wanted.shape
     count = 0
     for i in range(nx):
@@ -50,8 +50,8 @@ def halved(wanted: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def outermost(neighbours: np.ndarray) -> np.ndarray:
-    """Tells which nodes (n) of a sparse grid lack one of their 26 neighbours. ``neighbours`` (n, 6) has the rows of the
-    six nearest ones, -1 for none."""
+    """Returns a mask (n) of the nodes of a sparse grid that lack one of their 26 neighbours. ``neighbours`` (n, 6) has
+    the indices of the six nearest neighbours, -1 for none."""
     count = len(neighbours)
     full = np.ones(count, np.bool_)
     for axis in range(3):  # a node has all 3^d neighbours of d axes if it and both next to it have those of d - 1
@@ -64,8 +64,7 @@ def outermost(neighbours: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def interpolated(box: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Interpolates a coarse volume to nodes (n, 3) of half its step: the mean of the two, four or eight nodes around,
-    or the value of the same node."""
+    """Interpolates a coarse volume linearly at nodes (n, 3) of a grid with half its step."""
     out = np.empty(len(index), np.float32)
     for n in range(len(index)):
         i, j, k = index[n, 0], index[n, 1], index[n, 2]
@@ -110,8 +109,8 @@ def grown(marked: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def crossed(values: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
-    """Tells which nodes (n) are the lowest corner of a cell that has corners of both signs, so that the surface crosses
-    it."""
+    """Returns a mask (n) of the nodes that are the lowest corner of a cell with values of both signs, which the surface
+    crosses."""
     out = np.zeros(len(values), np.bool_)
     corners = np.empty(8, np.int64)
     for n in range(len(values)):
@@ -125,8 +124,8 @@ def crossed(values: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def crossed_at_rim(values: np.ndarray, neighbours: np.ndarray, outer: np.ndarray) -> bool:
-    """Tells whether the sign of ``values`` changes between two neighbouring ``outer`` nodes: the surface leaves the
-    grid there."""
+    """Returns True if the sign of ``values`` changes between two neighbouring ``outer`` nodes, so that the surface
+    leaves the grid."""
     for n in range(len(values)):
         for axis in range(3):
             other = neighbours[n, 2 * axis + 1]
@@ -136,8 +135,7 @@ def crossed_at_rim(values: np.ndarray, neighbours: np.ndarray, outer: np.ndarray
 
 
 class Membrane(NamedTuple):
-    """Holds what determines the field at each of n nodes: the value that it is drawn to and with which weight, and a
-    lower bound."""
+    """Holds the target value, its weight and the lower bound of a smooth field at each of n nodes."""
 
     target: np.ndarray
     weight: np.ndarray
@@ -154,11 +152,10 @@ def relax(
     first: int,
     last: int,
 ) -> None:
-    """Updates ``field`` (n), in place, at the rows ``free[first:last]``, nodes of one colour: one step towards
-    the minimum of ``sum w (u - target)^2 + sum over edges (u - u')^2`` subject to ``u >= bound``.
+    """Updates ``field`` (n), in place, at the nodes ``free[first:last]`` of one colour. The step reduces ``sum w (u -
+    target)^2 + sum over edges (u - u')^2`` subject to ``u >= bound``.
 
-    ``neighbours`` (n, 6) are the rows of adjacent nodes, -1 for none, and ``factor`` the over-relaxation (1: none,
-    below 2).
+    ``neighbours`` (n, 6) are the indices of adjacent nodes, -1 for none. ``factor`` is the over-relaxation (1 to 2).
     """
     target, weight, bound = membrane
     for at in range(first, last):
@@ -175,11 +172,11 @@ def relax(
 
 @njit(cache=True, nogil=True)
 def compose_well(field: np.ndarray, neighbours: np.ndarray, outer: np.ndarray, least: float) -> int:
-    """Changes the signs of nodes of ``field`` (n; mm, negative inside), in place, until its inside is well composed.
-    Such a node gets the value ``least`` or -``least``. Returns how often a sign was changed.
+    """Changes signs in ``field`` (n; mm, negative inside), in place, until the set of inside nodes is well composed. A
+    changed node gets the value ``least`` or -``least``. Returns the number of changes.
 
-    ``neighbours`` (n, 6) has the rows of adjacent nodes, -1 for none. ``outer`` nodes (n) are never changed, since the
-    surface would then lie in cells that the grid does not have.
+    ``neighbours`` (n, 6) has the indices of adjacent nodes, -1 for none. ``outer`` nodes (n) are never changed, since
+    the surface would then leave the grid.
     """
     corners, stale = np.empty(8, np.int64), np.ones(len(field), np.bool_)  # cells that have changed since their turn
     turned, changes, rounds = 0, 1, 0
@@ -222,7 +219,7 @@ def _mark_cells_about(node, neighbours, marked):
 
 @njit(cache=True, nogil=True, inline="always")
 def _culprit(field, outer, corners, inside, fill):
-    """The node to turn over in a cell that is not well composed, or -1: the one nearest to the surface."""
+    """Returns the node nearest to the surface if a cell is not well composed, since its sign must change; else -1."""
     worst, least = -1, np.inf
     for s in range(6):
         a, b = field[corners[SQUARES[s, 0]]] < 0, field[corners[SQUARES[s, 1]]] < 0
@@ -246,7 +243,7 @@ def _culprit(field, outer, corners, inside, fill):
 
 @njit(cache=True, nogil=True)
 def component_of(faces: np.ndarray, count: int) -> np.ndarray:
-    """Returns, for each of ``count`` vertices, the lowest vertex of its connected piece of the mesh, int32."""
+    """Returns, for each of ``count`` vertices, the lowest vertex index in its connected component, int32."""
     root = np.arange(count).astype(np.int32)
     for f in range(len(faces)):
         for k in range(2):

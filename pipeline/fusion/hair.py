@@ -1,13 +1,13 @@
-"""Decides what counts as hair, and makes its surface as smooth as pictures resolve it.
+"""Smooths the surface of hair, and handles long hair whose depth cannot be measured.
 
-Windows match chance patterns of strands: their depth scatters over millimetres and leaves gravel with pockets and
-handles. Its votes are therefore weak in the signed distance (``loosened``), and its vertices take the mean of those
-about them. Strands also let through what lies behind them, so that depth is that of their dense core or of the scalp:
-where the surface turns away from a camera, it is moved to as far inside all silhouettes as strands are that one sees.
-Hair that has a surface, as a helmet has, has depth nearly everywhere, and stays as it is.
+In hair, dense matching finds chance patterns of strands. The depth of hair therefore scatters over millimetres, and the
+fused surface would be rough, with pockets and handles. So depth of hair gets a small weight in the signed distance
+(``loosened``), and hair vertices are smoothed. Matching also looks through strands to the dense core of the hair or to
+the scalp. So at the silhouettes' rims hair is moved outwards until it is as far inside all silhouettes as visible
+strands. Hair with a smooth surface has depth nearly everywhere, and is not changed.
 
-Long hair, whose depth photographs hardly show, is a smooth shell inside the visual hull. Places that match here and
-there tell together how deep inside the hull it lies. The fitted head says nothing of hair that hangs free.
+Long hair often has hardly any measured depth. Such hair is modelled as a smooth shell inside the visual hull, whose
+distance from the hull is estimated from the few measured points.
 """
 
 from collections.abc import Mapping, Sequence
@@ -77,18 +77,17 @@ FAR_MM = 1000.0  # a length along the crop's rays, any
 def find_silent_hair(
     depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], votes: PartVotes | None, rig: Rig
 ) -> tuple[Places | None, Sequence[DepthMap], float]:
-    """Tells whether the subject has long hair of which the photographs hardly show the depth.
+    """Finds long hair that has hardly any measured depth.
 
     Args:
         depth_maps: of the views.
         parts: the part maps by camera, in pixels of the photographs.
-        votes: which part each point of the depth maps shows (``parts_over_head``); without it there is no such hair.
+        votes: part labels of the depth maps' points (``parts_over_head``); None means that no long hair is searched.
         rig: the cameras as calibrated, world frame.
 
     Returns:
-        Places (world, mm) of the hair on which some views agree, which only taken together tell how deep inside the
-        hull it lies, and the depth maps without it; or None and the depth maps, whose hair counts less if it scatters.
-        Third, how far (0 to 1) the depth of hair is noise.
+        The measured points (world frame, mm) of such hair, or None; the depth maps without this hair, or with less
+        weight for hair that scatters; and the noise fraction (0 to 1) of the depth of hair.
     """
     known = known_share(depth_maps, parts, rig)
     scatter = float(np.interp(known, SCATTERED_SHARE, (1.0, 0.0)))
@@ -115,7 +114,7 @@ def find_silent_hair(
 
 
 def only_where(kept: Bool[np.ndarray, "h w"], depth_map: DepthMap) -> DepthMap:
-    """Returns the depth map with nothing known elsewhere."""
+    """Returns the depth map with all pixels outside ``kept`` set to unknown."""
     return DepthMap(
         depth_map.camera,
         np.where(kept, depth_map.depth_mm, np.float32(0.0)),
@@ -126,8 +125,8 @@ def only_where(kept: Bool[np.ndarray, "h w"], depth_map: DepthMap) -> DepthMap:
 
 
 def without_specks(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> DepthMap:
-    """Returns the depth map; before plain clothes, of which hardly anything is known, without what is known here and
-    there of them and of skin: it is chance, and lies centimetres before the subject."""
+    """Removes isolated depths of skin and clothes from a depth map in which plain clothes have hardly any depth.
+    Isolated depths are chance matches and lie centimetres in front of the subject."""
     _, hair, clothes = np.moveaxis(shown_parts(depth_map, parts, rig) > LIKELY, 2, 0)
     known, (height, width) = depth_map.known[::PIXEL_EVERY, ::PIXEL_EVERY], depth_map.depth_mm.shape
     if not clothes.any() or known[clothes].mean() > PLAIN_SHARE:
@@ -137,8 +136,8 @@ def without_specks(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) 
 
 
 def shown_parts(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> Float[np.ndarray, "r c 3"]:
-    """Returns the probabilities of skin, hair and clothes at every ``PIXEL_EVERY``-th pixel of a crop, in either
-    direction; 0 where there is no part map."""
+    """Returns the probabilities of skin, hair and clothes at every ``PIXEL_EVERY``-th row and column of a crop; 0 where
+    there is no part map."""
     (fx, fy, cx, cy), turn, shift = placing(depth_map.camera)
     height, width = depth_map.depth_mm.shape
     row, column = np.mgrid[:height:PIXEL_EVERY, :width:PIXEL_EVERY]
@@ -150,7 +149,7 @@ def shown_parts(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> 
 
 
 def known_share(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig: Rig) -> float:
-    """Returns the share of the pixels of hair whose depth is known; 1 where there is hardly any hair."""
+    """Returns the fraction of hair pixels with known depth; 1 if there is hardly any hair."""
 
     def count(depth_map: DepthMap) -> Float[np.ndarray, " 3"]:
         skin, hair, _ = np.moveaxis(shown_parts(depth_map, parts, rig) > LIKELY, 2, 0)
@@ -163,7 +162,7 @@ def known_share(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], ri
 
 
 def loosened(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig, scatter: float) -> DepthMap:
-    """Returns the depth map with larger deviations of hair, as far as its depth is noise (``scatter``)."""
+    """Returns the depth map with enlarged standard deviations of hair, according to its noise fraction ``scatter``."""
     height, width = depth_map.depth_mm.shape
     hair = np.asarray(cv2.resize(shown_parts(depth_map, parts, rig)[..., Part.HAIR.channel], (width, height)))
     looser = 1.0 + (LOOSER - 1.0) * scatter * hair
@@ -171,7 +170,7 @@ def loosened(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig, scatte
 
 
 def local_share(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> Float32[np.ndarray, "h w"]:
-    """Returns, for each pixel of a crop, the share of the subject's pixels about it whose depth is known."""
+    """Returns, for each pixel of a crop, the fraction of the subject's pixels around it with known depth."""
     body = (shown_parts(depth_map, parts, rig).sum(axis=2) > LIKELY).astype(np.float32)
     known = depth_map.known[::PIXEL_EVERY, ::PIXEL_EVERY] * body
     distance_mm = float(np.median(depth_map.depth_mm[depth_map.known])) if depth_map.known.any() else FAR_MM
@@ -185,8 +184,8 @@ def local_share(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> 
 def distance_to_shell(
     hair: Places, views: ViewStack, box: Grid
 ) -> tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]:
-    """Returns, at the nodes of a whole box, the signed distance (mm, positive outside) to the shell, and how far a
-    photograph shows its outside there, 0 to 1: no silhouette bounds a surface that all cameras see from behind."""
+    """Returns, at the nodes of a dense box, the signed distance (mm, positive outside) to the shell of hair, and a
+    weight (0 to 1). The weight is 0 where no camera sees the shell's outside."""
     from scipy.ndimage import gaussian_filter  # only such hair needs it
 
     places = box.places()
@@ -209,27 +208,27 @@ def distance_to_shell(
 
 
 def depth_inside(hair: Places, views: ViewStack) -> tuple[PointTree, Float[np.ndarray, " _"]]:
-    """Returns the places of the hair, and how deep (mm) inside the hull each lies."""
+    """Returns the measured points of the hair, and the depth (mm) of each inside the visual hull."""
     deep = -distance_to_hull(hair, views)
     within = (deep > 0.0) & (deep < DEEPEST_MM)
     return PointTree.of(hair[within]), deep[within]
 
 
 def shell_deviation_mm(hair: Places, views: ViewStack) -> float:
-    """Returns the standard deviation (mm) of the shell: that of the depth inside the hull over all of the hair. Places
-    next to each other err alike (2 mm about their median, where true strands are 7 mm off)."""
+    """Returns the standard deviation (mm) of the shell: the spread of the depth inside the hull over all of the hair,
+    because neighbouring points have common errors."""
     return float(depth_inside(hair, views)[1].std())
 
 
 def distance_to_hull(places: Float[np.ndarray, "n 3"], views: ViewStack) -> Float[np.ndarray, " n"]:
-    """Returns how far (mm, negative inside) points lie outside the visual hull; -inf where no photograph reaches."""
+    """Returns the signed distance (mm, negative inside) of points to the visual hull; -inf outside all photographs."""
     edges_mm, outlines_mm = views.outside(places)
     return np.where(edges_mm > 0.0, -np.inf, outlines_mm).max(axis=0)
 
 
 def parts_over_head(votes: PartVotes, head_world: Mesh, stubble: bool = True) -> PartVotes:
-    """Returns the votes with the cells' heights over a head considered: skin that lies off it counts as hair, and with
-    ``stubble`` hair that lies on its skin as skin."""
+    """Corrects part labels by their cells' heights over the head: skin far above the head becomes hair. With
+    ``stubble``, hair close to the head becomes skin."""
     skin, hair = Part.SKIN.channel, Part.HAIR.channel
     both, out = votes.probability[:, skin] + votes.probability[:, hair], votes.probability.copy()
     far, near = nearest(PointTree.of(head_world.vertices), votes.places)
@@ -246,7 +245,7 @@ def parts_over_head(votes: PartVotes, head_world: Mesh, stubble: bool = True) ->
 
 @lru_cache(maxsize=1)  # a surface asks twice, before and after the head is refined
 def _cells_about(votes: PartVotes) -> Int[np.ndarray, "g c"]:
-    """Returns the rows of the cells nearest to each, itself among them."""
+    """Returns the indices of the cells nearest to each cell, itself included."""
     return nearest(PointTree.of(votes.places), votes.places, count=min(CELLS, len(votes.places)))[1].astype(np.int32)
 
 
@@ -261,13 +260,12 @@ def smooth_unresolved(
     seen: SeenVertices,
     held: Bool[np.ndarray, " v"],
 ) -> Mesh:
-    """Returns the mesh with the vertices of hair, clothes and neck, and those far from all that is seen, moved to the
-    mean of their surroundings: relief that is narrower is noise. Clothes and necks have edges: they move by little more
-    than their noise.
+    """Smooths the vertices of hair, clothes and neck, and vertices far from all seen ones, since their fine relief is
+    noise. Clothes and necks have edges, so they move by little more than their noise.
 
     ``mesh_world``: closed, mm. ``hair``, ``clothes``, ``neck``: probability that a vertex shows them. ``noise_mm``:
-    standard deviation of depth. ``seen``: by a view; the others are the hair or clothes next to them. ``held``: of the
-    cap that ends the bust; they stay, but for its edge.
+    standard deviation of depth. ``seen``: vertices that a view sees; other vertices take the part of the nearest of
+    these. ``held``: vertices of the flat end of the bust, which do not move except at its edge.
     """
     beside = neighbours(mesh_world.faces, len(hair))
     share = np.minimum(skin_share(beside, 1.0 - np.maximum(hair, clothes), seen), 1.0 - neck)
@@ -288,16 +286,16 @@ def smooth_unresolved(
 def grown_to_outlines(
     mesh_world: Mesh, hair: Float[np.ndarray, " v"], silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[Mesh, Float[np.ndarray, " v"]]:
-    """Moves the vertices of hair outwards to where the silhouettes show the hair to end.
+    """Moves the vertices of hair outwards to the hair's end in the silhouettes.
 
     Args:
         mesh_world: the fused surface, closed, mm.
-        hair: probability that a vertex shows hair of strands.
-        silhouettes: by camera; those that are not usable are left out.
+        hair: probability that a vertex shows loose hair.
+        silhouettes: by camera; unusable ones are left out.
         rig: the cameras as calibrated, world frame.
 
     Returns:
-        The moved mesh, and how far (mm) each vertex was moved.
+        The moved mesh, and the distance (mm) that each vertex was moved.
     """
     rig = rig.subset(name for name in rig.names if name in silhouettes and silhouettes[name].quality.usable)
     rows, moved_mm = np.flatnonzero(hair > 0.0), np.zeros(len(hair))
@@ -315,8 +313,8 @@ def grown_to_outlines(
 def depth_inside_outlines(
     places: Places, normals: Places, silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Returns how far (mm, at least 0) points lie inside all silhouettes, 0 where none bounds them; and the largest
-    cosine between their normals and the directions to cameras, and the smallest absolute one."""
+    """Returns the depth (mm, at least 0) of points inside all silhouettes; 0 if no silhouette bounds them. Also returns
+    the largest cosine between their normals and the directions to cameras, and the smallest absolute cosine."""
     inside_mm, cosines = np.full(len(places), np.inf), np.zeros((len(rig), len(places)))
     for k, camera in enumerate(rig):
         distance, towards = silhouettes[camera.name].distance, camera.centre_world - places

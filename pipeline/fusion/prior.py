@@ -1,9 +1,9 @@
-"""Guesses the surface where no camera sees it, or hardly: the fitted head, with hair as thick as where it is seen, and
-the visual hull, with a gap as wide as where the surface is seen.
+"""Predicts the surface where hardly any camera sees it, from the fitted head and the visual hull. The offsets of head
+and hull from the surface are extrapolated from regions that cameras see.
 
-Whichever lies nearer to the seen surface about a place counts more. Outlines leave a millimetre open about a skull,
-while a fitted head that takes a bald scalp for hair lies 6 to 12 mm too deep; below brows and chin, and before cameras
-that all stand on one side, it is the other way round.
+The predictor that lies nearer to the seen surface in the neighbourhood gets more weight. The hull is exact to a
+millimetre around a skull, where the fitted head may be 6 to 12 mm too deep. Below brows and chin, and with all cameras
+on one side, the head is better.
 """
 
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ CANDIDATES = 8  # of the head's triangles, for the one nearest to a place
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenSurface:
-    """Holds m points of the surface that is seen (world frame, mm), their signed distances to the visual hull (mm,
-    negative inside), and how much each counts."""
+    """Holds m points of the surface that cameras see (world frame, mm), their signed distances to the visual hull (mm,
+    negative inside), and their weights."""
 
     points: Float[np.ndarray, "m 3"]
     hull_mm: Float[np.ndarray, " m"]
@@ -40,14 +40,14 @@ class SeenSurface:
 def distance_to_subject(
     places: Float[np.ndarray, "n 3"], hull_mm: Float[np.ndarray, " n"], head_world: Mesh, seen: SeenSurface
 ) -> Float[np.ndarray, " n"]:
-    """Returns the signed distance (mm, positive outside) of points to the guessed surface; -inf near the open border
-    where the model ends.
+    """Returns the signed distance (mm, positive outside) of points to the predicted surface; -inf near the open border
+    of the head.
 
     Args:
         places: the points, world frame, mm.
         hull_mm: their signed distances to the visual hull.
         head_world: the fitted head.
-        seen: what says how far the surface lies from both.
+        seen: points of the seen surface, from which the offsets of head and hull are extrapolated.
     """
     vertices, normals = head_world.vertices[::EVERY], head_world.normals()[::EVERY]
     tree = PointTree.of(vertices)
@@ -62,9 +62,9 @@ def distance_to_subject(
 def _offsets(
     tree: PointTree, normals: Float[np.ndarray, "v 3"], seen: SeenSurface
 ) -> tuple[Float[np.ndarray, "2 v"], Float[np.ndarray, "2 v"]]:
-    """Returns how far (mm) the seen surface about each vertex lies outside the head and inside the hull, and the mean
-    squares (mm^2): means over vertices with points of their own, weighted by these and by the inverse square of the
-    distance. With too few of them the head alone counts, as it is."""
+    """Returns the offsets (mm) of the seen surface from the head and from the hull around each vertex of the head, and
+    their mean squares (mm^2). The offsets are extrapolated from vertices near seen points by inverse squared distances.
+    With too few points only the head is used, with offset 0."""
     vertices = tree.points
     far, near = nearest(tree, seen.points, within=THICKEST_MM)
     within = np.isfinite(far)
@@ -85,7 +85,7 @@ def _offsets(
 def distance_about_ears(
     head_world: Mesh, ears: Float[np.ndarray, "m 3"], places: Float[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Returns the rows of the points within ``EAR_MM`` of places on ears, and their signed distances (mm, positive
+    """Returns the indices of the points within ``EAR_MM`` of the ears, and their signed distances (mm, positive
     outside) to the head."""
     low, high = ears.min(axis=0) - EAR_MM, ears.max(axis=0) + EAR_MM
     rows = np.flatnonzero(((places > low) & (places < high)).all(axis=1))
@@ -97,7 +97,7 @@ def distance_about_ears(
 
 
 def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"], within_mm: float = RIM_MM) -> Bool[np.ndarray, " n"]:
-    """Tells which points lie near the head's open border, at the neck."""
+    """Returns a mask of the points near the head's open border at the neck."""
     rim = np.unique(boundary_edges(head_world.faces))
     if not len(rim):
         return np.zeros(len(places), bool)
@@ -105,6 +105,6 @@ def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"], within_mm: floa
 
 
 def below_head(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Tells which points lie beyond the head's open border: of its vertices the nearest is near the border."""
+    """Returns a mask of the points beyond the head's open border: their nearest head vertex is near it."""
     vertices = head_world.vertices[::EVERY]
     return near_rim(head_world, vertices)[nearest(PointTree.of(vertices), places)[1]]

@@ -1,5 +1,5 @@
-"""Moves the vertices to the depth maps, which restores detail below the grid's step, and measures the uncertainty of
-each, and which part of the surface is measured."""
+"""Moves the vertices of the fused surface to the depth maps, which restores detail finer than the grid. Also computes
+the standard deviation of each vertex, and which vertices are measured."""
 
 from dataclasses import dataclass, replace
 
@@ -30,8 +30,8 @@ ISLAND_MM2 = 100.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """Holds what the views measure at every vertex: its offset (mm) along the normal, ``information`` (1/mm2) and
-    ``scatter`` (mm2) as in ``vote_kernels.measure``, and how many ``views`` see it."""
+    """Holds the views' measurements at every vertex: its offset (mm) along the normal, ``information`` (1/mm2) and
+    ``scatter`` (mm2) as in ``vote_kernels.measure``, and the number of ``views`` that see it."""
 
     offset_mm: Float[np.ndarray, " v"]
     information: Float[np.ndarray, " v"]
@@ -41,8 +41,8 @@ class Measured:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenVertices:
-    """Tells which vertices a view sees (``themselves``), how far (mm) each one is from the nearest of them, and which
-    that is: the vertex itself where it is seen."""
+    """Holds a mask of the vertices that a view sees (``themselves``), and for each vertex the nearest seen vertex and
+    the distance (mm) to it."""
 
     themselves: Bool[np.ndarray, " v"]
     far_mm: Float[np.ndarray, " v"]
@@ -50,7 +50,7 @@ class SeenVertices:
 
     @classmethod
     def of(cls, vertices: Float[np.ndarray, "v 3"], seen: Bool[np.ndarray, " v"]) -> "SeenVertices":
-        """Finds, for each vertex, the nearest seen one and the distance to it, infinite where none is seen."""
+        """Finds, for each vertex, the nearest seen vertex and the distance to it; infinite if no vertex is seen."""
         far_mm, row, those = np.where(seen, 0.0, np.inf), np.arange(len(seen)), np.flatnonzero(seen)
         if len(those):
             far_mm[~seen], at = nearest(PointTree.of(vertices[those]), vertices[~seen])
@@ -58,15 +58,15 @@ class SeenVertices:
         return cls(seen, far_mm, row)
 
     def guess_deviation_mm(self) -> Float[np.ndarray, " v"]:
-        """Returns the standard deviation (mm) of a guess at each vertex, which grows with the distance; 0 where it is
-        seen."""
+        """Returns the standard deviation (mm) of unseen vertices, which grows with the distance to seen ones; 0 for
+        seen vertices."""
         return np.where(self.themselves, 0.0, np.minimum(EDGE_MM + SLOPE * self.far_mm, MAX_MM))
 
 
 @traced
 def refine_vertices(mesh_world: Mesh, views: ViewStack, step_mm: float) -> tuple[Mesh, Measured]:
-    """Moves the vertices along their normals to where the depth maps see the surface. Returns the moved mesh, and the
-    views' measurements at its vertices."""
+    """Moves the vertices along their normals to the surface in the depth maps. Returns the moved mesh, and the views'
+    measurements at its vertices."""
     starts, indices = neighbours(mesh_world.faces, len(mesh_world.vertices))
     mesh, root = mesh_world, np.full(len(mesh_world.vertices), np.sqrt(STIFFNESS))
     for _ in range(ROUNDS):
@@ -87,7 +87,7 @@ def neighbours(faces: Int[np.ndarray, "f 3"], count: int) -> tuple[Int64[np.ndar
 
 def measure_vertices(mesh: Mesh, normals: Float[np.ndarray, "v 3"], views: ViewStack, gate_mm: float) -> Measured:
     """Measures every vertex against the depth maps of all views. A view whose depth differs by more than ``gate_mm``
-    shows another surface and does not count."""
+    shows another surface and is ignored."""
     count = len(mesh.vertices)
     offset, information, scatter = (np.zeros(count) for _ in range(3))
     seen = np.zeros(count, np.uint8)
@@ -102,8 +102,8 @@ def measure_vertices(mesh: Mesh, normals: Float[np.ndarray, "v 3"], views: ViewS
 
 
 def without_islands(mesh: Mesh, measured: Measured) -> Measured:
-    """Returns the measurements with small patches discarded: the vertices of a connected patch of seen triangles
-    smaller than ``ISLAND_MM2`` count as seen by no view."""
+    """Discards the measurements on small patches: connected patches of seen triangles with an area below ``ISLAND_MM2``
+    then count as unseen."""
     seen = measured.views > 0
     faces = mesh.faces[seen[mesh.faces].all(axis=1)]
     piece = component_of(faces, len(seen))
@@ -113,14 +113,13 @@ def without_islands(mesh: Mesh, measured: Measured) -> Measured:
 
 
 def deviation_mm(seen: SeenVertices, measured: Measured) -> Float[np.ndarray, " v"]:
-    """Returns the standard deviation (mm) of each vertex along its normal: that of ``seen_deviation_mm``, or of a
-    guess."""
+    """Returns the standard deviation (mm) of each vertex along its normal, for seen and unseen vertices."""
     return np.where(seen.themselves, seen_deviation_mm(measured), seen.guess_deviation_mm())
 
 
 def seen_deviation_mm(measured: Measured) -> Float[np.ndarray, " v"]:
-    """Returns the standard deviation (mm) along the normal of every vertex that a view sees, from the views'
-    information or, if larger, their scatter; 0 for all other vertices."""
+    """Returns the standard deviation (mm) along the normal of every seen vertex, from the views' information or, if
+    larger, their scatter; 0 for unseen vertices."""
     seen = measured.views > 0
     views = measured.views[seen].astype(float)
     variance = np.maximum(1.0 / measured.information[seen], measured.scatter[seen] / np.maximum(views - 1.0, 1.0))

@@ -1,7 +1,7 @@
-"""Finds the curve along which a bust ends where outlines end it inside the pictures.
+"""Finds the curve at which a bust ends if masks cut the subject off inside the pictures.
 
-Masks of other programs cut a person off at the chest. Depth fails beside the cut, and the surface frays. The bust then
-ends at a smooth distance from the head, which meets neck, shoulders and chest nearly at right angles.
+Masks of other programs often end at the chest. Near a mask's end depth is unreliable, and the surface would have a
+ragged edge. The bust therefore ends at a distance from the head that is a smooth function of direction.
 """
 
 from dataclasses import dataclass
@@ -23,14 +23,14 @@ Points = Float[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rim:
-    """Holds the end of what is seen below a head: k points (world frame, mm), one in each sector around the head."""
+    """Holds the lower end of the seen surface: k points (world frame, mm), one in each sector around the head."""
 
     points: Float[np.ndarray, "k 3"]
     centre: Float[np.ndarray, " 3"]  # of the head
     across: Float[np.ndarray, "3 2"]  # two unit vectors across the direction from the head to its neck
 
     def share_ended(self, views: ViewStack) -> float:
-        """Returns the share (0 to 1) of the rim beyond which most pictures that hold the place show no subject."""
+        """Returns the fraction (0 to 1) of the rim's points beyond which most pictures show no subject."""
         outwards = self.points - self.centre
         frame_mm, outline_mm = views.outside(
             self.points + STEP_MM * outwards / np.linalg.norm(outwards, axis=1, keepdims=True)
@@ -39,7 +39,7 @@ class Rim:
         return float((2 * (held & (outline_mm > 0.0)).sum(axis=0) > held.sum(axis=0)).mean())
 
     def beyond_mm(self, places: Points) -> Float[np.ndarray, " n"]:
-        """Returns how far (mm, negative inside) points lie beyond the smooth rim."""
+        """Returns the signed distance (mm, negative inside) of points to the smooth rim."""
         far, direction = self._directions(self.points)
         radius = np.quantile(np.hypot(*direction.T), 0.9)
         terms = _terms(direction / radius)
@@ -51,15 +51,15 @@ class Rim:
         return far - middle - _terms(direction / radius) @ factors
 
     def _directions(self, places: Points) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
-        """Returns distances (mm) from the head's centre, and the two parts of unit directions across its axis."""
+        """Returns distances (mm) from the head's centre, and the unit directions' components across its axis."""
         way = places - self.centre
         far = np.linalg.norm(way, axis=1)
         return far, way @ self.across / np.maximum(far, 1e-9)[:, None]
 
 
 def rim_of(seen: Points, centre: Float[np.ndarray, " 3"], down: Float[np.ndarray, " 3"]) -> Rim | None:
-    """Returns the rim of the ``seen`` points below a head (world frame, mm); None if there are hardly any. ``down`` is
-    the unit vector from the head's ``centre`` to its neck."""
+    """Finds the rim of the ``seen`` points below a head (world frame, mm); None if there are too few points. ``down``
+    is the unit vector from the head's ``centre`` to its neck."""
     across = np.linalg.svd(down[None])[2][1:].T
     way = seen - centre
     far, angle = np.linalg.norm(way, axis=1), np.arctan2(*(way @ across).T)
@@ -72,7 +72,7 @@ def rim_of(seen: Points, centre: Float[np.ndarray, " 3"], down: Float[np.ndarray
 
 
 def _terms(direction: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 7"]:
-    """Returns the harmonic polynomials up to the third order, which have no bumps inside the rim."""
+    """Returns the harmonic polynomials of two variables up to third order, whose extrema lie on the boundary."""
     x, y = (direction * np.minimum(1.0, REACH / np.maximum(np.hypot(*direction.T), 1e-9))[:, None]).T
     return np.stack(
         [np.ones(len(x)), x, y, x * x - y * y, 2 * x * y, x**3 - 3 * x * y * y, 3 * x * x * y - y**3], axis=1

@@ -1,13 +1,13 @@
-"""Computes the signed distance to everything that the cameras see, on a sparse grid, from depth, silhouettes and the
-fitted head.
+"""Computes the signed distance to the subject's surface on a sparse grid, from depth maps, silhouettes and the fitted
+head.
 
-From a coarse box down to the requested spacing, every view votes at every node (``vote_kernels``) with the distance to
-the surface that it sees there, and with free space in front of it. Silhouettes bound the body from outside. Between
-votes a membrane interpolates (``grid_kernels``); what no camera sees is drawn to the fitted head with its hair and to
-the visual hull. Each finer level is solved around the surface of the one before.
+At every node each view contributes the distance to the surface that it sees, and free space in front of it
+(``vote_kernels``). Silhouettes bound the subject from outside. Between measured nodes a smooth field interpolates
+(``grid_kernels``). Unseen regions follow the fitted head and the visual hull. The grid is refined from a coarse box to
+the requested spacing; each finer level has nodes only near the surface of the coarser level.
 
-Volumetric fusion with free space: Curless and Levoy, *A volumetric method for building complex models from range
-images*, SIGGRAPH 1996; but votes are combined robustly, and silhouettes are inequalities.
+The method follows Curless and Levoy, *A volumetric method for building complex models from range images*, SIGGRAPH
+1996. In this module the views are combined robustly, and silhouettes are inequality constraints.
 """
 
 from collections.abc import Sequence
@@ -64,28 +64,28 @@ UNSEEN_DEPTH_MM = 200.0  # of a body beyond what is seen of it, at most
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cut:
-    """Holds at every node of a whole box how far (mm, positive outside) it lies beyond the bust's end."""
+    """Holds, at nodes of a dense box, the signed distance (mm, positive outside) to the end of the bust."""
 
     box: Grid
     beyond_mm: Float[np.ndarray, " n"]
     before_mm: Float[np.ndarray, " n"] | None = None  # how far nodes below the head lie before its chest; else -inf
 
     def distance_mm(self, places: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
-        """Returns how far (mm, negative inside) points lie beyond the bust's end."""
+        """Returns the signed distance (mm, negative inside) of points to the surface at which the bust ends."""
         return at_points(self.box, self.beyond_mm, places)
 
 
 @traced
 def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_world: Mesh | None) -> Cut:
-    """Determines where the bust ends: along a smooth surface where photographs or outlines end it, and at a plane
-    behind what cameras see. Photographs of several cameras end at several planes, whose edges nobody wants to see in a
-    shoulder; and behind neck and shoulders, where no camera looks, outlines alone leave hoods and slabs.
+    """Determines the surface at which the bust ends: a smooth surface near the borders of photographs or masks, and a
+    plane behind the seen surface. The smooth surface avoids edges where the borders of several photographs meet; the
+    plane removes unseen parts of the visual hull behind neck and shoulders.
 
     Args:
         box: a whole box of nodes.
         views: the cameras and their photographs' edges.
-        seen: points of the surface that is seen, world frame, mm.
-        head_world: the fitted head; without it only photographs' ends count.
+        seen: points of the seen surface, world frame, mm.
+        head_world: the fitted head; without a head only the borders of photographs are used.
     """
     from scipy.ndimage import gaussian_filter  # 0.05 s
 
@@ -124,9 +124,9 @@ class NoSurface(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Votes:
-    """Holds what all views together say of every node of a grid: the signed distance to the surface (mm), its weight
-    (above 0 only if a view sees the node), and the smallest distance (mm) by which the node lies outside the
-    silhouettes. See ``vote_kernels.vote``."""
+    """Holds the combined measurements of all views at every node of a grid: the signed distance to the surface (mm),
+    its weight (above 0 only if a view sees the node), and a lower bound (mm) from the silhouettes.
+    ``vote_kernels.vote`` computes them."""
 
     value: Field
     weight: Field
@@ -135,16 +135,16 @@ class Votes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """Holds the solution on one grid: at each node the signed distance (mm, negative inside)."""
+    """Holds the solution on one grid: the signed distance (mm, negative inside) at each node."""
 
     grid: Grid
     field: Field
 
 
 def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: float) -> Level:
-    """Computes the signed distance on one grid. It follows the votes where there are some, stays outside the
-    silhouettes, and is drawn to ``start``, which prevails where no view sees a node, or hardly. ``sweeps`` and
-    ``factor`` are those of the relaxation."""
+    """Computes the signed distance on one grid. The signed distance follows the views' votes, is positive outside the
+    silhouettes, and tends to ``start`` where hardly any view sees a node. ``sweeps`` and ``factor`` are parameters of
+    the relaxation."""
     reach = np.float32(REACH * grid.step_mm)
     start = np.clip(start, -reach, reach)
     blend = np.where(votes.weight < 0, UNDECIDED_BLEND_MM, BLEND_MM)
@@ -181,7 +181,7 @@ def votes_at(grid: Grid, views: ViewStack) -> Votes:
 
 
 def ended(votes: Votes, grid: Grid, cut: Cut) -> Votes:
-    """Returns the votes with the end of the bust among the bounds."""
+    """Adds the surface at which the bust ends to the lower bounds of the votes."""
     reach = REACH * grid.step_mm
     beyond = np.clip(cut.distance_mm(grid.places()), -reach, reach).astype(np.float32)
     return replace(votes, bound=np.maximum(votes.bound, beyond))
@@ -189,14 +189,14 @@ def ended(votes: Votes, grid: Grid, cut: Cut) -> Votes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadEars:
-    """Holds ears that are taken from the head, since depth shows only fragments of them."""
+    """Holds ears that are copied from the fitted head, since depth maps show only fragments of them."""
 
     head_world: Mesh
     around: Points  # vertices of such ears, as they were and as they lie: about them depth does not count
 
     @classmethod
     def of(cls, head_world: Mesh, ears: Sequence[Bool[np.ndarray, " v"]], views: ViewStack) -> "HeadEars":
-        """Lays the head's ears flat, as far as they stand out of the views' outlines. ``ears``: vertices of each."""
+        """Flattens the head's ears until they lie inside the silhouettes. ``ears``: vertex mask of each ear."""
         placed, around = head_world.vertices.copy(), list[Points]()
         for ear in ears:
             way = placed[ear].mean(axis=0) - placed.mean(axis=0)
@@ -210,7 +210,7 @@ class HeadEars:
         return cls(Mesh(placed, head_world.faces), np.concatenate(around))
 
     def among(self, grid: Grid, votes: Votes, start: Field) -> tuple[Votes, Field]:
-        """Returns the votes without those about the ears, and the start with the head's distance there."""
+        """Removes the votes near the ears, and sets the start field near the ears to the distance to the head."""
         rows, distance = distance_about_ears(self.head_world, self.around, grid.places())
         inner = ~grid.outer[rows]
         rows, distance = rows[inner], distance[inner]
@@ -230,7 +230,7 @@ def solve(
     ears: HeadEars | None = None,
 ) -> tuple[Level, Cut]:
     """Computes the signed distance near the surface, on a sparse grid with a step of ``spacing_mm``, from coarse to
-    fine. ``hair`` is the hair that depth maps miss, ``ears`` are those that they show in fragments."""
+    fine. ``hair`` is hair without measured depth, ``ears`` are ears with depth in fragments only."""
     halvings = 1
     while spacing_mm * 2**halvings < COARSEST_MM:
         halvings += 1
@@ -271,8 +271,8 @@ def _finer(
     cut: Cut,
     ears: HeadEars | None,
 ) -> Level:
-    """Computes the signed distance at half the step about the ``wanted`` nodes. ``cut`` tells where the bust ends. The
-    grid is widened while the surface would leave it; raises NoSurface if it still does after ``WIDENINGS``."""
+    """Computes the signed distance at half the step around the ``wanted`` nodes. ``cut`` is the end of the bust. The
+    grid is widened while the surface leaves it; raises NoSurface if it still does after ``WIDENINGS`` rounds."""
     for _ in range(WIDENINGS + 1):
         grid = refined(coarse, wanted)
         start = grid_kernels.interpolated(box, grid.index)
@@ -289,8 +289,8 @@ def _finer(
 def _box(
     depth_maps: Sequence[DepthMap], seen: Points, step_mm: float
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-    """Returns the corner and the edges (mm, world frame) of a box that holds the seen points and the space behind them
-    that an unseen body may fill."""
+    """Returns the corner and the edges (mm, world frame) of a box around the seen points and the unseen body behind
+    them."""
     low, high = np.percentile(seen, [STRAYS, 100 - STRAYS], axis=0)
     behind = np.array([depth_map.camera.axis_world for depth_map in depth_maps]) * UNSEEN_DEPTH_MM
     middle = np.median(seen, axis=0)
@@ -301,8 +301,8 @@ def _box(
 
 
 def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface, cut: Cut) -> Field:
-    """Returns the first guess of the signed distance: what views see for sure, and elsewhere the visual hull, cut down
-    to the fitted head and the hull's usual gap where there is a head."""
+    """Returns the start value of the signed distance. The start value is the measured distance where views certainly
+    see the surface, and elsewhere the distance to the surface predicted from visual hull and head."""
     prior = np.maximum(votes.value, votes.bound).astype(float)
     if head_world is not None:
         weak = (votes.weight > 0) & (votes.weight < WEAK) & (votes.bound < 0)
@@ -318,7 +318,7 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface,
 
 
 def _near_points(grid: Grid, points: Points) -> Bool[np.ndarray, "nx ny nz"]:
-    """Marks the nodes of cells that hold a seen point, and their neighbours, as a volume over the whole box."""
+    """Marks the nodes of cells that contain a seen point, and their neighbours, in a dense volume."""
     box = np.zeros(grid.shape, bool)
     at = np.floor((points - grid.corner) / grid.step_mm).astype(int)
     inside = ((at >= 1) & (at < np.array(grid.shape) - 1)).all(axis=1)

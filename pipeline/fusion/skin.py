@@ -1,19 +1,18 @@
-"""Combines the fused surface with the fitted head: the head is the prior of skin, depth is data.
+"""Combines the fused surface with the fitted head, which serves as the prior where the surface is skin.
 
 Each vertex of the surface has a height over the closest point of the head. The estimated heights u minimise
 
     sum_i w_i (d_i - u_i)^2 / (n_i s_i^2)  +  sum_i p_i k_i (u_i / l)^2  +  sum_(i, j) sqrt(k_i k_j) (u_i - u_j)^2,
 
-with the measured heights d and their standard deviation s, of which n neighbours err alike; the probability p that a
-place is skin; and the stiffness k of the head's own error, the inverse of its variance. So a noisy place takes the
-head's shape, a place without depth follows the head at the height of its rim, and a head that states a large error
-leaves the surface as depth shows it. Hair (p = 0) stays where it is, and fades into skin by p.
+where d are the measured heights and s their standard deviation, which n neighbours have in common. p is the probability
+of skin, and the stiffness k is the inverse variance of the head's error. Thus noisy regions take the head's shape, and
+regions without depth continue the heights at their border smoothly. A head with a large error hardly changes the
+measured surface. Hair (p = 0) is not changed, and p gives a smooth transition to skin.
 
-Which of the two is wrong where they contradict each other is decided by both deviations: w falls where a measured
-height differs from the estimate by several times the deviation of both (Geman and McClure's weights, from wide to
-narrow). A crater or a speck is rejected so, being alone; a whole neighbourhood that lies elsewhere (hair over skin, an
-open mouth) moves the estimate and stays. What depth and head differ by over a neighbourhood enlarges the head's
-deviation there: it states less than that where the model cannot make the subject (a statue, say).
+The robust weight w falls where a measured height differs from the estimate by several combined standard deviations
+(Geman and McClure's weights, from wide to narrow). The weight rejects single craters and specks, but keeps whole
+regions of different height, such as an open mouth. Where depth and head differ over a whole region, the head's standard
+deviation is enlarged, since the model cannot represent the subject there.
 """
 
 from dataclasses import dataclass
@@ -53,7 +52,7 @@ CANDIDATES = 3  # triangles compared for each vertex: twice as fast as six, off 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadSkin:
-    """Holds the delivered head as the prior of skin."""
+    """Holds the final head and its standard deviation as the prior of skin."""
 
     mesh_world: Mesh  # mm
     deviation_mm: PerVertex  # standard deviation of each vertex along its normal
@@ -61,7 +60,7 @@ class HeadSkin:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeightField:
-    """Holds what n vertices of a surface measure over a head."""
+    """Holds the heights of n vertices of a surface over the head."""
 
     row: Int64[np.ndarray, " n"]  # vertices that have a height
     height_mm: Float[np.ndarray, " n"]
@@ -78,15 +77,15 @@ def combine_with_head(
     seen: SeenVertices,
     hairy: Bool[np.ndarray, " v"],
 ) -> Mesh:
-    """Moves the vertices of skin along the head's normals to the estimate from depth and head.
+    """Moves the vertices of skin along the head's normals to the estimated heights.
 
     Args:
         mesh_world: the fused surface, closed, mm.
         skin: probability that a vertex shows skin; 0 where no view sees it.
-        head: the delivered head.
-        deviation_mm: standard deviation of depth along the normal, where a view sees the vertex.
-        seen: by any view.
-        hairy: vertices of hair's colour, among them skin under stubble or a beard.
+        head: the final head.
+        deviation_mm: standard deviation of depth along the normal, for vertices that a view sees.
+        seen: mask of the vertices that any view sees.
+        hairy: mask of the vertices with hair's colour, among them skin under stubble or a beard.
     """
     field = heights_over(head, mesh_world)
     if not len(field.row) or not seen.themselves.any():
@@ -124,29 +123,29 @@ def combine_with_head(
 
 
 def depth_deviation_mm(beside: Adjacency, stated_mm: PerVertex, seen: SeenVertices) -> PerVertex:
-    """Returns s, at least ``MIN_DEVIATION_MM``: the larger of a vertex' deviation and its surroundings' mean; where no
-    view sees the vertex, that of a guess."""
+    """Returns the standard deviation s of the measured heights, at least ``MIN_DEVIATION_MM``: the larger of a vertex's
+    value and the mean around it. For unseen vertices it grows with the distance to seen vertices."""
     around_mm = mean_around(beside, stated_mm, seen.themselves.astype(float))
     noise_mm = np.where(seen.themselves, np.maximum(stated_mm, around_mm), seen.guess_deviation_mm())
     return np.hypot(noise_mm, MIN_DEVIATION_MM)
 
 
 def head_stiffness(head_mm: PerVertex, unsure: PerVertex) -> PerVertex:
-    """Returns k (1/mm2) by the head's deviation, 0 to ``STIFFNESS / MIN_DEVIATION_MM**2``; where ``unsure`` exceeds 1
-    it falls with its square."""
+    """Returns the stiffness k (1/mm2) of the head, 0 to ``STIFFNESS / MIN_DEVIATION_MM**2``. Where ``unsure`` exceeds 1
+    the stiffness falls with its square."""
     return STIFFNESS / (np.maximum(head_mm, MIN_DEVIATION_MM) * np.maximum(unsure, 1.0)) ** 2
 
 
 def depth_information(noise_mm: PerVertex, seen: Bool[np.ndarray, " v"], area_mm2: float) -> PerVertex:
-    """Returns 1 / (n s^2) (1/mm2), 0 to ``1 / MIN_DEVIATION_MM**2``. n, at least 1, counts the vertices, of
-    ``area_mm2`` each, whose depths err alike."""
+    """Returns the information 1 / (n s^2) (1/mm2), 0 to ``1 / MIN_DEVIATION_MM**2``. n, at least 1, is the number of
+    vertices of ``area_mm2`` each that have a common depth error."""
     alike = np.pi * np.where(seen, CORRELATED_MM, GUESSES_CORRELATED_MM) ** 2 / area_mm2
     return 1.0 / (noise_mm**2 * np.maximum(alike, 1.0))
 
 
 def heights_over(head: HeadSkin, mesh_world: Mesh) -> HeightField:
-    """Returns the heights of the surface's vertices over the head, of those that lie within ``REACH_MM`` of it, face
-    its way, and are not beside the open rim of its neck."""
+    """Returns the heights of the surface's vertices over the head. Vertices farther than ``REACH_MM``, with another
+    normal, or near the neck's open border are left out."""
     vertices, normals, skin = mesh_world.vertices, mesh_world.normals(), head.mesh_world
     low, high = skin.vertices.min(axis=0) - REACH_MM, skin.vertices.max(axis=0) + REACH_MM
     row = np.flatnonzero(((vertices > low) & (vertices < high)).all(axis=1))
@@ -162,14 +161,14 @@ def heights_over(head: HeadSkin, mesh_world: Mesh) -> HeightField:
 
 
 def skin_share(beside: Adjacency, skin: PerVertex, seen: SeenVertices) -> PerVertex:
-    """Returns the probability that each vertex shows skin; where no view sees it, that of what is seen nearest."""
+    """Returns the probability that each vertex shows skin; an unseen vertex gets that of the nearest seen vertex."""
     around = mean_around(beside, skin, seen.themselves.astype(float))
     share = np.where(seen.themselves, skin, around[seen.nearest])
     return np.where(seen.themselves, skin, mean_around(beside, share, np.ones(len(skin))))
 
 
 def mean_around(beside: Adjacency, values: PerVertex, weight: PerVertex, steps: int = SURROUNDINGS) -> PerVertex:
-    """Returns, for each vertex of a closed mesh, the weighted mean of the values over its surroundings; about 0 where
-    no weight is near. ``beside`` are its ``neighbours``, ``steps`` how far it reaches along them."""
+    """Returns, for each vertex of a closed mesh, the weighted mean of the values around it (``steps`` edges); about 0
+    where all weights are 0. ``beside`` are the mesh's ``neighbours``."""
     both = blurred_over_mesh(np.stack([weight * values, weight], axis=1).astype(float), *beside, steps)
     return both[:, 0] / np.maximum(both[:, 1], 1e-6)

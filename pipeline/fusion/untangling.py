@@ -1,11 +1,10 @@
-"""Repairs a head's mesh so that no triangle is turned over, folded onto its neighbour, or passes through another.
+"""Repairs a mesh so that no triangle is flipped, folded onto its neighbour, or intersects another triangle.
 
-Expressions, kernel modes and displacements move vertices one by one, regardless of the surface: closed lips pass
-through each other, lids that close fold behind the brow, an ear sinks into the head. Each such spot, if need be with
-rings of triangles about it, first gets the shape of the model's clean mean head: the displacement from it is replaced
-by the membrane through the displacements about the spot, so that an ear remains an ear. Spots that are still not clean
-become membranes themselves: loops shrink to nothing, and two sheets that went through each other separate. All other
-vertices stay where they are."""
+Expressions and other displacements can make closed lips intersect, fold closing lids behind the brow, or push an ear
+into the head. Each bad region, if necessary with rings of triangles around it, first gets the shape of the model's mean
+head, which has no bad triangles. The region's displacement from the mean head is interpolated from the region's border,
+so that an ear remains an ear. Regions that are still bad become smooth surfaces through their border (membranes). All
+other vertices stay unchanged."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -38,8 +37,8 @@ Faces = Int[np.ndarray, "f 3"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Topology:
-    """Holds a mesh's triangles, the pairs of triangles that share an edge (``pairs``), and a sparse matrix with 1 for
-    every two vertices joined by an edge (``beside``)."""
+    """Holds a mesh's triangles, the pairs of triangles that share an edge (``pairs``), and the sparse adjacency matrix
+    of the vertices (``beside``)."""
 
     faces: Faces
     pairs: Int[np.ndarray, "e 2"]
@@ -48,12 +47,12 @@ class Topology:
 
 @dataclass(frozen=True, slots=True)
 class MeshFaults:
-    """Counts what is wrong with a mesh.
+    """Counts the bad triangles and edges of a mesh.
 
     Attributes:
         turned: triangles that face against the mean normal of their corners.
         folded: edges whose triangles' normals are more than ``MAX_FOLD_DEG`` apart.
-        crossing: triangles that another one passes through, neighbours over an edge excepted.
+        crossing: triangles that intersect another triangle other than a neighbour over an edge.
     """
 
     turned: int
@@ -80,17 +79,17 @@ def topology_of(faces: Faces, count: int) -> Topology:
 
 @lru_cache(maxsize=2)  # models are few, jobs are many
 def head_topology(model: HeadModel) -> Topology:
-    """Returns the topology of a model's full level."""
+    """Returns the topology of a head model's full mesh."""
     return topology_of(model.levels["full"].faces, model.levels["full"].count)
 
 
 def untangled_head(
     model: HeadModel, vertices: Vertices, deviation_mm: Float[np.ndarray, " v"]
 ) -> tuple[Mesh, Float[np.ndarray, " v"]]:
-    """Returns the head without degenerate triangles, and the standard deviation of each vertex enlarged by the distance
-    that it was moved.
+    """Repairs the head's bad triangles. Returns the vertices, and their standard deviations enlarged by the distances
+    moved.
 
-    ``model``: the head model. ``vertices``: full level, mm. ``deviation_mm``: standard deviation of each vertex.
+    ``model``: the head model. ``vertices``: full mesh, mm. ``deviation_mm``: standard deviation of each vertex.
     """
     clean = untangled(vertices, head_topology(model), clean_mean_head(model))
     moved_mm = np.linalg.norm(clean - vertices, axis=1)
@@ -99,7 +98,7 @@ def untangled_head(
 
 @lru_cache(maxsize=2)
 def clean_mean_head(model: HeadModel) -> Vertices:
-    """Returns the full level of the model's mean head (head frame, mm) without degenerate triangles."""
+    """Returns the full mesh of the model's mean head (head frame, mm) without bad triangles."""
 
     def make() -> dict[str, np.ndarray]:
         return {"vertices": untangled(model.vertices(np.zeros(0)), head_topology(model))}
@@ -109,14 +108,13 @@ def clean_mean_head(model: HeadModel) -> Vertices:
 
 
 def untangled(vertices: Vertices, topology: Topology, rest: Vertices | None = None) -> Vertices:
-    """Returns the vertices with every degenerate spot mended. The result is tested in single precision, as files
-    store it.
+    """Repairs all bad regions of a mesh. The result is tested in single precision, as files store it.
 
     Args:
         vertices: mm.
         topology: of the mesh.
-        rest: a shape of the same mesh without degenerate triangles, in any frame and scale; spots get its shape where
-            that makes them clean. None makes membranes of all spots.
+        rest: a shape of the same mesh without bad triangles, in any frame and scale, which is tried first for each bad
+            region. None replaces all bad regions by membranes.
     """
     out = vertices.astype(np.float32, order="C").astype(float)
     spoilt, touched = spoilt_faces(out, topology), np.zeros(len(out), bool)
@@ -129,9 +127,9 @@ def untangled(vertices: Vertices, topology: Topology, rest: Vertices | None = No
 
 
 def smooth_spots(vertices: Vertices, topology: Topology, safe: Vertices) -> Vertices:
-    """Returns the vertices (mm) of a fused surface without degenerate spots, tested in single precision. Small spots
-    become membranes; where thin sheets would collapse so, vertices go to the places ``safe``, at which the whole mesh
-    is clean."""
+    """Repairs the bad regions of a fused surface (mm), tested in single precision. Small regions become membranes;
+    where thin sheets would collapse, vertices move to the positions ``safe``, at which the whole mesh is free of
+    faults."""
     out = vertices.astype(np.float32, order="C").astype(float)
     spoilt, flat = spoilt_faces(out, topology), np.zeros_like(out)
     out, spoilt, touched = _mended(out, spoilt, topology, flat, SMALL_RINGS, enclosing=False)
@@ -154,9 +152,9 @@ def _mended(
     *,
     enclosing: bool = True,
 ) -> tuple[Vertices, Bool[np.ndarray, " f"], Bool[np.ndarray, " v"]]:
-    """Gives spots the shape ``shape``, displaced as their surroundings are, each at most as often as ``rings`` has
-    entries: how far it reaches at each time. Returns the vertices in single precision, the triangles that are still
-    spoilt, and the vertices that were moved. ``enclosing`` adds the small pieces that spots cut off."""
+    """Replaces bad regions by ``shape``, displaced like their border, in ``len(rings)`` rounds; ``rings`` is the number
+    of rings added in each round. Returns the vertices in single precision, a mask of the remaining bad triangles, and a
+    mask of the moved vertices. ``enclosing`` adds small pieces of the mesh that a region cuts off."""
     out, times, touched = vertices.copy(), np.zeros(len(vertices), int), np.zeros(len(vertices), bool)
     while spoilt.any() and times.max() < len(rings):
         times[np.unique(topology.faces[spoilt])] += 1
@@ -175,8 +173,8 @@ def _mended(
 def spoilt_faces(
     vertices: Vertices, topology: Topology, within: Bool[np.ndarray, " v"] | None = None
 ) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles are turned over, folded onto a neighbour, or crossing another one. If ``within`` is not
-    None, only triangles with a corner among those vertices, and those that they touch or cross, are tested."""
+    """Returns a mask of triangles that are flipped, folded onto a neighbour, or intersect another triangle. ``within``:
+    tests only triangles with a corner among these vertices, and their neighbours; None tests all."""
     active = None if within is None else any_corner(within, topology.faces)
     return turned_faces(vertices, topology, active) | crossing_faces(vertices, topology.faces, active)
 
@@ -184,8 +182,9 @@ def spoilt_faces(
 def turned_faces(
     vertices: Vertices, topology: Topology, active: Bool[np.ndarray, " f"] | None = None
 ) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles face against the mean normal of their corners, or are folded by more than ``MAX_FOLD_DEG``
-    against a neighbour. If ``active`` is not None, only those triangles and their neighbours are tested."""
+    """Returns a mask of triangles that face against the mean normal of their corners, or are folded by more than
+    ``MAX_FOLD_DEG`` against a neighbour. ``active``: tests only these triangles and their neighbours; None tests
+    all."""
     faces, count = topology.faces, len(vertices)
     near = np.ones(len(faces), bool) if active is None else _around(_around(active, faces, count), faces, count)
     turned, folded = _turned_and_folded(vertices, topology, near)
@@ -195,8 +194,8 @@ def turned_faces(
 
 
 def mesh_faults(vertices: Vertices, topology: Topology, moved: Bool[np.ndarray, " v"] | None = None) -> MeshFaults:
-    """Counts what is wrong with a mesh. Nothing that the model's own mean head has is excepted. If ``moved`` is not
-    None, no triangles crossed before those vertices moved, and only theirs are tested for it."""
+    """Counts the faults of a mesh, also those that the model's mean head has. ``moved``: tests only triangles at these
+    vertices for intersections; None tests all."""
     active = None if moved is None else any_corner(moved, topology.faces)
     turned, folded = _turned_and_folded(vertices, topology, np.ones(len(topology.faces), bool))
     return MeshFaults(int(turned.sum()), len(folded), int(crossing_faces(vertices, topology.faces, active).sum()))
@@ -205,15 +204,15 @@ def mesh_faults(vertices: Vertices, topology: Topology, moved: Bool[np.ndarray, 
 def _turned_and_folded(
     vertices: Vertices, topology: Topology, near: Bool[np.ndarray, " f"]
 ) -> tuple[Bool[np.ndarray, " f"], Int[np.ndarray, "e 2"]]:
-    """Returns which triangles face against the mean normal of their corners, and the pairs of triangles that are folded
-    at their common edge; of those in ``near`` alone."""
+    """Returns a mask of triangles that face against the mean normal of their corners, and the pairs of triangles that
+    are folded at their common edge. Only triangles in ``near`` are tested."""
     args = vertices, topology.faces, topology.pairs, near, np.cos(np.radians(MAX_FOLD_DEG))
     turned, folded = turned_and_folded(*args)
     return turned, topology.pairs[folded]
 
 
 def _around(chosen: Bool[np.ndarray, " f"], faces: Faces, count: int) -> Bool[np.ndarray, " f"]:
-    """Returns the chosen triangles and those that share a corner with them."""
+    """Returns a mask of the chosen triangles and of triangles that share a corner with them."""
     corner = np.zeros(count, bool)
     corner[faces[chosen]] = True
     return any_corner(corner, faces)
@@ -222,8 +221,8 @@ def _around(chosen: Bool[np.ndarray, " f"], faces: Faces, count: int) -> Bool[np
 def _with_rings(
     times: Int[np.ndarray, " v"], spoilt: Bool[np.ndarray, " f"], faces: Faces, rings: tuple[int, ...]
 ) -> Bool[np.ndarray, " v"]:
-    """Returns the vertices of all spots: the corners of the spoilt triangles and the ``rings`` about them, whose number
-    grows with how often a corner was spoilt."""
+    """Returns a mask of the vertices of all bad regions: the corners of bad triangles and ``rings`` of triangles around
+    them. The number of rings grows with the number of repairs at a corner."""
     spot, reach = np.unique(faces[spoilt]), np.zeros(len(times), int)
     reach[spot] = 1 + np.array(rings)[np.minimum(times[spot], len(rings)) - 1]
     for _ in range(int(reach.max()) - 1):
@@ -233,15 +232,15 @@ def _with_rings(
 
 
 def _with_enclosed(spot: Bool[np.ndarray, " v"], faces: Faces) -> Bool[np.ndarray, " v"]:
-    """Returns the spot together with the small pieces of the mesh that it cuts off from the rest."""
+    """Adds to a region the small pieces of the mesh that the region separates from the rest."""
     piece = component_of(faces[~any_corner(spot, faces)].astype(np.int32, copy=False), len(spot))
     size = np.bincount(piece[~spot], minlength=len(spot))
     return spot | (size[piece] < ENCLOSED_SHARE * len(spot))
 
 
 def _membrane(vertices: Vertices, rows: Int[np.ndarray, " r"], topology: Topology) -> Float[np.ndarray, "r 3"]:
-    """Returns the positions of the vertices ``rows`` at which each is the mean of its neighbours while all other
-    vertices stay."""
+    """Returns positions of the vertices ``rows`` at which each is the mean of its neighbours, with all other vertices
+    fixed."""
     beside, free = topology.beside[rows], np.zeros(len(vertices), bool)
     free[rows] = True
     count = np.asarray(beside.sum(axis=1)).ravel()

@@ -1,8 +1,8 @@
-"""Packs what all views show into flat arrays for compiled loops: depth, and the signed distance to the outline.
+"""Packs the depth maps of all views, and signed distances to the outlines, into flat arrays for compiled loops.
 
-A surface lies inside every silhouette. Where points of two views fall outside a third one's, that one is ignored: a bad
-mask cuts no hole. Close to an outline the depth is wrong: windows make thin things (frames of glasses, the edge of a
-collar) wider by their own size, in every view alike.
+The surface lies inside every silhouette. If depth points of two views fall outside the silhouette of a third view, this
+silhouette is ignored there, so that a bad mask cuts no hole. Close to an outline the depth itself may be wrong, since
+matching windows make thin things (frames of glasses, the edge of a collar) wider.
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,9 +48,9 @@ class ViewStack:
     """Holds the pixels of all views' crops in flat arrays, one view after the other.
 
     ``cameras`` has a row for each view: rotation (9), translation (3), fx fy cx cy, and the centre in the world frame
-    (3). ``shown`` has a row for each pixel, in the steps of ``vote_kernels``: normal (3, world frame, towards the
-    camera), standard deviation of the depth, and signed distances (negative inside) to the silhouette's contour and to
-    the edge of the photograph. With the depth these are 16 bytes a pixel.
+    (3). ``shown`` has a row of integers for each pixel, in units that ``vote_kernels`` defines: normal (3, world frame,
+    towards the camera), standard deviation of the depth, and signed distances (negative inside) to the silhouette's
+    contour and to the photograph's border.
     """
 
     cameras: Float[np.ndarray, "k 19"]
@@ -60,12 +60,12 @@ class ViewStack:
     shown: Int16[np.ndarray, "p 6"]
 
     def packed(self) -> Pixels:
-        """Returns the same arrays as a named tuple that compiled loops accept."""
+        """Returns the arrays as a named tuple, which compiled loops accept."""
         return Pixels(self.cameras, self.sizes, self.starts, self.depth_mm, self.shown)
 
     def outside(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 k n"]:
-        """Returns how far (mm, negative inside) points (world, mm) lie outside each photograph, and outside its
-        silhouette; inf and inf behind the camera."""
+        """Returns the signed distances (mm, negative inside) of points (world frame, mm) to each photograph's border
+        and to its silhouette; both are infinite behind the camera."""
 
         def outside_of(view: int) -> Float[np.ndarray, "2 n"]:
             camera, size = self.cameras[view], self.sizes[view][::-1]
@@ -118,8 +118,8 @@ def _packed(camera: Camera) -> Float[np.ndarray, " 19"]:
 
 @traced
 def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray, " k"]]:
-    """Removes the outlines where other views contradict them. Returns the views with those pixels' outline distance set
-    to ``SILENT_PX``, and for each view the share of its crop that was contradicted."""
+    """Disables outlines where other views contradict them. Returns the views with the outline distance of these pixels
+    set to ``SILENT_PX``, and for each view the contradicted fraction of its crop."""
 
     def wrong_pixels(v: int) -> Bool[np.ndarray, "h w"] | None:
         height, width = views.sizes[v]
@@ -141,8 +141,8 @@ def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray,
 
 
 def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels in and next to solid blocks. Keeps only connected groups of blocks that reach farther than
-    ``WIDENED_PX`` beyond the outline, since matching windows widen things by up to that."""
+    """Returns a mask of the pixels in and next to solid blocks. Only connected groups of blocks that extend more than
+    ``WIDENED_PX`` beyond the outline are kept, since matching windows widen things by up to this distance."""
     height, width = outline_px.shape
     count, found = cv2.connectedComponents(cv2.dilate(solid.view(np.uint8), np.ones((3, 3), np.uint8)))
     labels = np.asarray(found, np.int32)

@@ -1,6 +1,6 @@
-"""Compiled loops that combine the views' depths at a point: how far in front of the surface it lies, and whether
-silhouettes exclude the subject there; and what a view's outline says at its pixels, and other views against it. Also
-how far the vertices of a surface are from what the views see there, and the smoothing of these offsets.
+"""Contains compiled loops that combine the depths of all views at a point to a signed distance, and bound it by the
+silhouettes. Other loops write the outline distances of a view and find views that contradict them. The last loops
+measure the offsets of a mesh's vertices from the depth maps, and smooth these offsets.
 """
 
 from typing import NamedTuple
@@ -31,7 +31,7 @@ SURE_MM = 1.0  # points with a larger deviation do not count
 
 
 class Pixels(NamedTuple):
-    """Holds the arrays of ``view_stack.ViewStack``, by the same names."""
+    """Holds the arrays of ``view_stack.ViewStack`` under the same names."""
 
     cameras: np.ndarray
     sizes: np.ndarray
@@ -53,17 +53,18 @@ def vote(
     first: int,
     last: int,
 ) -> None:
-    """Combines the views at grid nodes ``first`` to ``last`` and fills, one entry for each node, ``value`` (mm,
-    positive outside), ``weight``, and ``bound`` (mm; ``value`` may not be smaller).
+    """Combines the views at grid nodes ``first`` to ``last``. Fills in, for each node, ``value`` (mm, positive
+    outside), ``weight``, and ``bound`` (mm), the smallest possible value.
 
-    A view's vote is the distance to the tangent plane of the pixel that shows the node. It is limited to ``reach`` in
-    front of that plane, and left out if the node lies more than ``behind`` behind it. The votes are combined by their
-    weighted median and the mean of those that agree with it; the weight falls with the square of the share that agrees.
-    A node without a vote has weight 0 (or ``UNDECIDED``) and the value of the visual hull, whose silhouettes are
-    continued beyond the photographs, or of a body of limited thickness behind a surface that is seen.
+    A view's vote is the distance to the tangent plane of the pixel at the node's projection. Votes are limited to
+    ``reach`` in front of the plane, and left out if the node lies more than ``behind`` behind it. The value is the mean
+    of the votes that agree with their weighted median; the weight falls with the square of their fraction. A node
+    without a vote has weight 0 (or ``UNDECIDED``). The value of such a node is the distance to the visual hull, or to
+    the back of a body of limited thickness behind a seen surface.
 
-    ``index`` (n, 3) and ``corner`` (3, world, mm) place the nodes, ``step_mm`` apart. ``limits`` are reach, behind,
-    largest difference of agreeing votes, and the deviation (mm) at which a vote has unit weight and its lower limit.
+    ``index`` (n, 3) and ``corner`` (3, world frame, mm) give the positions of nodes, ``step_mm`` apart. ``limits`` are
+    reach, behind, largest difference of agreeing votes, the deviation (mm) of unit weight and the lower limit of
+    deviations.
     """
     cameras, sizes, starts, depths, shown = views
     reach, behind, agreement, unit, floor = limits
@@ -116,8 +117,8 @@ def vote(
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def seen_at(camera: np.ndarray, place: np.ndarray) -> tuple[float, float, float]:
-    """Returns the depth (mm), column and row (px) of a point (world, mm) in a camera, a row of
-    ``view_stack.ViewStack.cameras``."""
+    """Projects a point (world frame, mm) into a camera, which is a row of ``view_stack.ViewStack.cameras``. Returns
+    depth (mm), column and row (px)."""
     x, y, depth = placed(camera, place[0], place[1], place[2])
     inverse = 1.0 / depth  # one division: they are what takes long here
     column, row = pinhole(inverse * x, inverse * y, camera[LENS:])
@@ -126,7 +127,7 @@ def seen_at(camera: np.ndarray, place: np.ndarray) -> tuple[float, float, float]
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def nearest_pixel(column: float, row: float, size: np.ndarray) -> tuple[int, float]:
-    """Returns the number (row by row) of the pixel nearest to a point, and how far (px) the point lies outside of the
+    """Returns the flat index of the pixel nearest to an image point, and the distance (px) of the point outside the
     image. ``size`` is height and width."""
     inside_column, inside_row = min(max(column, 0.0), size[1] - 1.0), min(max(row, 0.0), size[0] - 1.0)
     beyond = 0.0
@@ -138,16 +139,16 @@ def nearest_pixel(column: float, row: float, size: np.ndarray) -> tuple[int, flo
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def cosine(camera: np.ndarray, place: np.ndarray, depth: float, shown: np.ndarray) -> float:
     """Returns the cosine between a pixel's normal and the direction to the camera, times the ray's length for each mm
-    of depth. Multiplied by a difference in depth, it gives the distance to the pixel's tangent plane."""
+    of depth. The product with a difference in depth is the distance to the pixel's tangent plane."""
     x, y, z = place[0] - camera[CENTRE], place[1] - camera[CENTRE + 1], place[2] - camera[CENTRE + 2]
     return -NORMAL_STEP * (x * shown[NORMAL] + y * shown[NORMAL + 1] + z * shown[NORMAL + 2]) / depth
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def agreed(votes: np.ndarray, weights: np.ndarray, count: int, agreement: float) -> tuple[float, float]:
-    """Returns the mean of those votes that differ from the weighted median by at most ``agreement``, and their weight
-    times the square of the share of weight that they have; 0 and 0 without votes. Sorts the first ``count`` entries of
-    both arrays."""
+    """Returns the mean of the votes that differ from the weighted median by at most ``agreement``, and their weight
+    times the square of their fraction of the total weight; 0 and 0 without votes. Sorts the first ``count`` entries of
+    the two arrays."""
     if count == 0:
         return 0.0, 0.0
     total = 0.0
@@ -177,10 +178,10 @@ def agreed(votes: np.ndarray, weights: np.ndarray, count: int, agreement: float)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_contradicted(target: int, views: Pixels, blocks: np.ndarray, width: int) -> None:
-    """Marks blocks of the view ``target`` in which other views have a precise surface point outside of its outline:
-    sets bit v % 64 of ``blocks`` (rows, columns; words of 64 bits, changed in place) for each such view v.
+    """Marks blocks of the view ``target`` in which another view v has a precise surface point outside the target's
+    outline. Sets bit v % 64 of ``blocks`` (rows, columns; 64-bit words), in place.
 
-    ``width`` is the target's width in pixels. A block is ``BLOCK`` pixels wide.
+    ``width`` is the width of the target's image in pixels. A block is ``BLOCK`` pixels wide.
     """
     cameras, sizes, starts, depths, shown = views
     place = np.empty(3)
@@ -208,12 +209,12 @@ def mark_contradicted(target: int, views: Pixels, blocks: np.ndarray, width: int
 
 @njit(cache=True, nogil=True)
 def write_outline(crop: np.ndarray, lens: np.ndarray, width: int, distance: np.ndarray, shown: np.ndarray) -> None:
-    """Fills two columns of ``shown`` in steps of ``PIXEL_STEP``: the signed distances (px of the crop) to the
-    silhouette's contour and to the photograph's border, both negative inside, at the pixels of an undistorted crop.
+    """Fills two columns of ``shown``, in units of ``PIXEL_STEP``, at the pixels of an undistorted crop. The columns are
+    the signed distances (px of the crop, negative inside) to the silhouette's contour and to the photograph's border.
 
-    Outside the photograph the distance to the contour is that of the nearest pixel on its border, so that a shoulder
-    which the border cuts goes on. ``crop`` is fx, fy, cx, cy of the crop; ``lens`` that of the photograph
-    (``packed_lens``); ``width`` the crop's; ``distance`` (rows, columns) the silhouette's signed distance.
+    Outside the photograph the contour distance is copied from the nearest border pixel, so that a shoulder continues
+    beyond the border. ``crop`` is fx, fy, cx, cy of the crop, ``width`` its width; ``lens`` is the photograph's
+    (``packed_lens``); ``distance`` (rows, columns) is the silhouette's signed distance.
     """
     rows, columns = distance.shape
     steps = crop[0] / lens[0] / PIXEL_STEP  # a crop of fewer pixels has shorter distances
@@ -241,13 +242,13 @@ def measure(
     first: int,
     last: int,
 ) -> None:
-    """Measures the offset of vertices ``first`` to ``last`` (world, mm) from the surface that the views see, and fills
+    """Measures the offsets of vertices ``first`` to ``last`` (world frame, mm) from the depth maps' surface, and fills
     arrays with one entry for each vertex.
 
-    ``offset`` is the distance (mm along the vertex normal); ``information`` its inverse variance (mm^-2, views taken as
-    independent); ``scatter`` the weighted mean square of the views about it (mm^2); ``views`` the number of views that
-    agree. ``limits`` are the distance (mm) beyond which a view shows another surface, the largest difference (mm) of
-    agreeing views, and a lower limit of a view's standard deviation (mm).
+    ``offset`` is the distance (mm along the vertex normal); ``information`` its inverse variance (mm^-2) for
+    independent views; ``scatter`` the variance between the views (mm^2); ``views`` the number of views that agree.
+    ``limits`` are the distance (mm) beyond which a view shows another surface, the largest difference (mm) of agreeing
+    views, and a lower limit of a view's standard deviation (mm).
     """
     cameras, sizes, starts, depths, shown = seen
     gate, agreement, floor = limits
@@ -289,9 +290,9 @@ def measure(
 def depth_between(
     depths: np.ndarray, shown: np.ndarray, start: int, size: np.ndarray, column: float, row: float, near: int
 ) -> float:
-    """Returns the depth (mm) at a point between four pixels: interpolated if all four know the depth of one surface,
-    else that of the nearest pixel, whose row in ``shown`` is ``near``. ``start`` is the row of the view's first
-    pixel."""
+    """Returns the depth (mm) at a point between four pixels. The depth is interpolated if all four show the same
+    surface, else it is that of the nearest pixel, with index ``near`` in ``shown``. ``start`` is the index of the
+    view's first pixel."""
     c, r = min(int(column), size[1] - 2), min(int(row), size[0] - 2)
     a = start + r * size[1] + c
     b, d, e = a + 1, a + size[1], a + size[1] + 1
@@ -316,9 +317,9 @@ def smooth_offsets(
     sweeps: int,
     factor: float,
 ) -> np.ndarray:
-    """Returns offsets d (n) smoothed over the mesh: by ``sweeps`` of Gauss-Seidel from ``start``, over-relaxed by
-    ``factor``, it minimises ``sum information (d - offset)^2 + sum over edges r r' (d - d')^2``, with the
-    ``root_stiffness`` r of the edge's ends. The neighbours of vertex v are ``indices[starts[v]:starts[v + 1]]``."""
+    """Smooths offsets d (n) over the mesh. Minimises ``sum information (d - offset)^2 + sum over edges r r' (d -
+    d')^2`` by successive over-relaxation from ``start``, with the ``root_stiffness`` r at the edge's ends. The
+    neighbours of vertex v are ``indices[starts[v]:starts[v + 1]]``."""
     out = start.copy()
     for _ in range(sweeps):
         for v in range(len(out)):
@@ -336,8 +337,8 @@ def smooth_offsets(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def blurred_over_mesh(values: np.ndarray, starts: np.ndarray, indices: np.ndarray, steps: int) -> np.ndarray:
-    """Returns values (n, k) at vertices after ``steps`` in each of which a vertex takes the mean of its own and its
-    neighbours' mean. The neighbours of vertex v are ``indices[starts[v]:starts[v + 1]]``."""
+    """Smooths values (n, k) at vertices: in each of ``steps`` a value becomes the average of itself and its neighbours'
+    mean. The neighbours of vertex v are ``indices[starts[v]:starts[v + 1]]``."""
     one, other, last = values.copy(), np.empty_like(values), values.shape[1] - 1
     for _ in range(steps):
         for v in range(len(values)):

@@ -1,9 +1,9 @@
 """Writes the fitted head in every format that the settings request.
 
-head.ply, head.obj: world frame, mm. head.glb, head.usdz: head frame, metres, y up. head.stl, head.3mf: closed, mm, z
-up. texture/albedo.png: in the layout of head.glb and head.obj, if the settings ask for it; so are the textures of
-texture sets. With a texture, the first vertices of head.glb are those of head.ply in the same order; the vertices on
-the texture's seam are repeated at the end. With a normal map it has only some of the vertices (``rows_of_ply``).
+The files head.ply and head.obj are in the world frame in mm; head.glb and head.usdz in the head frame in metres, y up;
+head.stl and head.3mf are closed meshes in mm, z up. All textures have the UV layout of head.glb and head.obj. With a
+texture, head.glb has the vertices of head.ply in the same order, then copies of the vertices on the texture's seam.
+With a normal map, head.glb has only some of the vertices (``rows_of_ply``).
 """
 
 import math
@@ -51,7 +51,7 @@ PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # level 6 takes four times as long
 
 
 def write_head_ply(folder: Path, result: Reconstruction) -> None:
-    """Writes head.ply, and head.png if the settings request its texture. Raises OSError."""
+    """Writes head.ply, and its texture head.png if the settings request it. Raises OSError."""
     atlas = result.texturing.atlas
     named = atlas is not None and result.settings.outputs.ply_texture
     corner_uv = atlas.layout.uv[atlas.layout.faces] if atlas is not None and named else None
@@ -74,8 +74,8 @@ def write_formats(folder: Path, result: Reconstruction, head: Mesh) -> None:
     is missing, and OSError.
 
     Args:
-        folder: of the result.
-        result: what is written.
+        folder: the result folder.
+        result: the reconstruction.
         head: the head's mesh in the head frame, mm.
     """
     formats, atlas = result.settings.outputs.formats, result.texturing.atlas
@@ -106,7 +106,7 @@ def write_formats(folder: Path, result: Reconstruction, head: Mesh) -> None:
 
 
 def head_skin(result: Reconstruction, head: Mesh) -> Skin | None:
-    """Returns the texture of the head's files, with its maps; None without a texture."""
+    """Returns the texture for the head's files, with normal map and specular map; None without a texture."""
     texturing, kind = result.texturing, result.settings.outputs.image
     atlas, sets = texturing.atlas, texturing.sets
     if atlas is None:
@@ -128,7 +128,7 @@ def head_skin(result: Reconstruction, head: Mesh) -> Skin | None:
 
 
 def plain_skin(atlas: Atlas | None, kind: str) -> Skin | None:
-    """Returns a texture without maps; ``kind`` is a key of ``ENCODINGS``. None without one."""
+    """Returns a texture without further maps; None without a texture. ``kind`` is a key of ``ENCODINGS``."""
     if atlas is None:
         return None
     of, mime = atlas.layout, ENCODINGS[kind][1]
@@ -136,20 +136,20 @@ def plain_skin(atlas: Atlas | None, kind: str) -> Skin | None:
 
 
 def head_mesh(result: Reconstruction) -> Mesh:
-    """Returns the result's mesh in the head frame, in true millimetres: without the pose's rotation and translation,
-    but with its scale."""
+    """Returns the result's mesh in the head frame, in true millimetres: the pose's rotation and translation are undone,
+    its scale is kept."""
     mesh = result.mesh_world
     return Mesh(head_from_world(result).apply(mesh.vertices), mesh.faces, result.texturing.vertices.colours)
 
 
 def head_from_world(result: Reconstruction) -> RigidTransform:
-    """Returns the transform from the world to the head frame; lengths stay in true millimetres."""
+    """Returns the rigid transform from the world to the head frame, which keeps lengths in true millimetres."""
     place = result.head.fit.world_from_head
     return RigidTransform(place.rotation, place.translation).inverse()
 
 
 def _glb(result: Reconstruction, head: Mesh, normals: Float[np.ndarray, "v 3"]) -> bytes:
-    """Encodes head.glb, with morph targets around the photographed head if the settings request them."""
+    """Encodes head.glb, with morph targets if the settings request them."""
     skin, extras, blendshape_rig = head_skin(result, head), asset_extras(result), result.evidence.blendshape_rig
     if result.texturing.reduced is not None and skin is not None and result.texturing.atlas is not None:
         mapped = normal_mapped(head.vertices, normals, result.texturing.atlas.layout, result.texturing.reduced)
@@ -169,8 +169,8 @@ def encoded(image: UInt8[np.ndarray, "s s 3"], kind: str) -> bytes:
 
 
 def printable(head: Mesh) -> Mesh:
-    """Returns the head (head frame, mm) as a closed mesh for printing: z up, standing on z = 0. Raises NotAManifold if
-    a border touches itself."""
+    """Converts the head (head frame, mm) to a closed mesh for 3D printing, with z up and the lowest point at z = 0.
+    Raises NotAManifold if a border touches itself."""
     closed = close_borders(head)
     points = closed.vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
     points[:, 2] -= points[:, 2].min()
@@ -178,10 +178,10 @@ def printable(head: Mesh) -> Mesh:
 
 
 def close_borders(head: Mesh) -> Mesh:
-    """Returns the head (head frame, mm) as a closed mesh.
+    """Closes the openings of the head's mesh (head frame, mm).
 
-    The neck is closed by triangles around the middle of its border; open lids and lips are closed by a strip from
-    corner to corner. Raises NotAManifold if a border touches itself.
+    Triangles around the middle of the neck's border close the neck; strips of triangles from corner to corner close
+    open lids and lips. Raises NotAManifold if a border touches itself.
     """
     vertices, added = [head.vertices], [head.faces]
     count = len(head.vertices)
@@ -198,7 +198,7 @@ def close_borders(head: Mesh) -> Mesh:
 
 
 def write_set_textures(folder: Path, sets: SetTextures) -> None:
-    """Writes the textures below ``folder``, each under a temporary name first. Raises OSError."""
+    """Writes the textures of further photographs into ``folder``, each under a temporary name first. Raises OSError."""
     for name, atlas in sets.atlases.items():
         _write_png(folder / "sets" / f"{name}.png", atlas.image)
     if sets.specular is not None and sets.diffuse is not None:
@@ -210,13 +210,14 @@ def write_set_textures(folder: Path, sets: SetTextures) -> None:
 
 
 def write_skin_maps(folder: Path, atlas: Atlas, maps: SkinMaps) -> None:
-    """Writes the maps of a head's skin below ``folder``, each under a temporary name first. Raises OSError."""
+    """Writes the displacement and normal maps of the skin into ``folder``, under temporary names first. Raises
+    OSError."""
     for name, image in (("colour", atlas.image), ("normals", maps.normals), ("displacement", maps.displacement)):
         _write_png(folder / f"{name}.png", image)
 
 
 def strength_png(specular: Specular) -> bytes:
-    """Returns glTF's specular strength as a PNG: the strength is its alpha, and the pixels are white."""
+    """Encodes glTF's specular strength as the alpha channel of a white PNG."""
     alpha = specular.strength()
     white = np.full_like(alpha, 255)
     return cv2.imencode(".png", cv2.merge([white, white, white, alpha]), PNG_SPEED)[1].tobytes()
@@ -227,9 +228,9 @@ def _write_png(path: Path, image: UInt8[np.ndarray, "s s 3"] | UInt16[np.ndarray
 
 
 def landmarks_document(result: Reconstruction) -> dict[str, Any]:
-    """Returns ``landmarks.mrk.json``, a point list of 3D Slicer, as JSON types, with one control point for each
-    landmark: in the patient's axes LPS (to the left, posterior, superior; mm) with the head frame's origin and true
-    size. A point (x, y, z) of the head frame is (x, -z, y)."""
+    """Returns ``landmarks.mrk.json``, a point list of 3D Slicer, as JSON types. The control points are in the patient's
+    axes LPS (left, posterior, superior; mm) with the head frame's origin and true size. A point (x, y, z) of the head
+    frame becomes (x, -z, y)."""
     lps_from_world = RigidTransform(LPS_FROM_HEAD, np.zeros(3)) @ head_from_world(result)
     points = {
         name: MarkupPoint(lps_from_world.apply(landmark.position_mm), uncertainty(landmark.std_mm))
@@ -239,8 +240,7 @@ def landmarks_document(result: Reconstruction) -> dict[str, Any]:
 
 
 def uncertainty(std_mm: Float[np.ndarray, " 3"] | None) -> str:
-    """Returns the standard deviation as text: that of the distance, which is independent of rotation, and those of the
-    three world coordinates, as in report.json."""
+    """Formats a landmark's standard deviations as text: the distance's, then those of x, y and z in the world frame."""
     if std_mm is None:
         return "standard deviation unknown"
     x, y, z = (float(value) for value in std_mm)

@@ -1,9 +1,9 @@
-"""Draws the pictures of a result: input and fitted contour over each image, the contact sheet, and the turntable strip;
-also a head in clay or in colours, lit from its right front.
+"""Draws the pictures of a result: the contours of silhouette and fitted head over each image, the contact sheet, and
+the turntable strip. The module also renders a head as grey clay or in colours.
 
-A contour is painted from its signed distance d, with opacity ``half width + 1/2 - |d|``, so it is antialiased and has
-sub-pixel position. Vermilion and sky blue can be told apart with every kind of colour vision (Okabe and Ito, *Color
-Universal Design*, https://jfly.uni-koeln.de/color/); a dark border keeps them readable on any image.
+A contour is painted from its signed distance d with opacity ``half width + 1/2 - |d|``, so it is antialiased. Vermilion
+and sky blue can be told apart with every kind of colour vision (Okabe and Ito, *Color Universal Design*,
+https://jfly.uni-koeln.de/color/); a dark border keeps the lines readable on any image.
 """
 
 from collections.abc import Sequence
@@ -45,14 +45,14 @@ def overlay(
     label: str = "",
     parts: Float32[np.ndarray, "h w 3"] | None = None,
 ) -> ImageRgb:
-    """Draws the contour of the input (sky blue) and that of the fitted head (vermilion) on the image.
+    """Draws the contours of the silhouette (sky blue) and of the fitted head (vermilion) on the image.
 
     Args:
         image: the photograph.
         input_distance: signed distance to the silhouette, px.
-        fitted_mask: which pixels the fitted head covers.
+        fitted_mask: the pixels that the fitted head covers.
         label: text in a corner.
-        parts: probabilities of skin, hair and clothes, by which each pixel is tinted; None leaves it.
+        parts: probabilities of skin, hair and clothes, by which each pixel is tinted; None means no tint.
     """
     line = max(1.0, 1.5 * image.shape[1] / 1024)
     painted = image.copy() if parts is None else tinted(image, parts)
@@ -67,15 +67,15 @@ def overlay(
 
 
 def tinted(image: ImageRgb, parts: Float32[np.ndarray, "h w 3"]) -> ImageRgb:
-    """Returns the image with each pixel moved towards the parts' colours, in proportion to their probabilities."""
+    """Tints each pixel with the colours of skin, hair and clothes in proportion to their probabilities."""
     colours = TINT * np.array(list(PART_COLOURS.values()), np.float32)
     left = 1.0 - cv2.transform(parts, np.full((1, 3), TINT, np.float32))
     return cv2.convertScaleAbs(image * left[..., None] + cv2.transform(parts, colours.T))  # it rounds
 
 
 def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> Resized:
-    """Draws the difference of eq. (4) over a pale copy of the image, in a panel's size: sky blue where only the input
-    mask is, vermilion where only the model is."""
+    """Draws the difference of two masks (the paper's eq. 4) over a pale copy of the image, in a panel's size. Pixels
+    only in the input mask are sky blue, pixels only in the model's mask vermilion."""
     size = _fitted_size(image)
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     observed, model = (
@@ -91,7 +91,7 @@ def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[n
 
 
 def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]]) -> ImageRgb:
-    """Returns the image with lines of text on a darkened ground in its top left corner, each line in its own colour."""
+    """Writes lines of text, each in its own colour, on a dark ground in the top left corner of an image."""
     if not entries:
         return image
     scale = max(0.5, image.shape[1] / 1280)
@@ -109,8 +109,7 @@ def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]])
 def turntable(
     mesh_head: Mesh, colours: UInt8[np.ndarray, "v 3"], panel: tuple[int, int] = (280, 360)
 ) -> list[ImageRgb]:
-    """Draws the head from each of ``AZIMUTHS_DEG`` around its y axis. ``panel`` is width and height of each picture,
-    px."""
+    """Draws the head from each azimuth in ``AZIMUTHS_DEG``. ``panel`` is width and height of each picture, px."""
     box = mesh_head.vertices.min(axis=0), mesh_head.vertices.max(axis=0)
     return map_in_threads(lambda k: portrait(mesh_head, colours, box, AZIMUTHS_DEG[k], panel), len(AZIMUTHS_DEG))
 
@@ -119,8 +118,8 @@ def portrait(
     mesh: Mesh, colours: UInt8[np.ndarray, "v 3"], box: Box, azimuth_deg: float, panel: tuple[int, int], *,
     paper: tuple[int, int, int] = PAPER, lift: float = 0.0, share: float = 0.9,
 ) -> ImageRgb:  # fmt: skip
-    """Draws a mesh (head frame) from a direction about y and ``lift`` above it, supersampled twice. ``box``: opposite
-    corners of the part of the mesh that fills ``share`` of the ``panel`` (px)."""
+    """Draws a mesh (head frame) from an azimuth about y and an elevation ``lift``, with twofold supersampling. ``box``:
+    opposite corners of the part of the mesh that fills ``share`` of the ``panel`` (px)."""
     centre, radius = (box[0] + box[1]) / 2, float(np.linalg.norm(box[1] - box[0])) / 2
     width, height = 2 * panel[0], 2 * panel[1]
     azimuth, distance = np.radians(azimuth_deg), 6.0 * radius
@@ -133,8 +132,8 @@ def portrait(
 
 
 def contact_sheet(rows: Sequence[Sequence[tuple[str, Resized]]], key: Sequence[str] = ()) -> Resized:
-    """Returns one picture of rows of labelled pictures, each fitted into a panel of ``PANEL``. A key below them
-    explains the colours of ``difference``; ``key`` names the input and the model."""
+    """Arranges rows of labelled pictures in one picture, each scaled to fit the size ``PANEL``. A legend below explains
+    the colours of ``difference``; ``key`` names the input and the model."""
     width = max(len(row) for row in rows)
     blank = np.full((PANEL[1], PANEL[0], 3), PAPER, np.uint8)
     drawn = [[legend(_panel(image), [(text, (255, 255, 255))] if text else []) for text, image in row] for row in rows]
@@ -165,8 +164,8 @@ def _fitted_size(image: ImageRgb) -> tuple[int, int]:
 
 
 def _smooth_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Returns the distance (px) to a mask's contour, blurred so that a thin line along it is smooth; infinite beyond a
-    margin around the mask."""
+    """Returns the distance (px) to a mask's contour, blurred so that a thin line along the contour is smooth; infinite
+    beyond a margin around the mask."""
     distance = np.full(mask.shape, np.inf, np.float32)
     window = box_around(mask, MARGIN_PX)
     if mask[window].size:
@@ -175,8 +174,8 @@ def _smooth_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"
 
 
 def _near(distance: Float32[np.ndarray, "h w"], line: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the flat indices of pixels that a contour line and its dark rim may touch, and their distance (px) from
-    the line's middle."""
+    """Returns the flat indices of pixels that a contour line and its dark border may touch, and their distance (px)
+    from the line's middle."""
     flat = distance.ravel()
     index = np.flatnonzero((flat < line / 2 + 1) & (flat > -line / 2 - 1))
     return index, np.abs(flat[index])
@@ -201,10 +200,10 @@ def clay(
     paper: tuple[int, int, int] = PAPER,
     darkest: float = DARKEST,
 ) -> Resized:
-    """Draws a mesh (head frame, mm), supersampled twice.
+    """Draws a mesh (head frame, mm) with twofold supersampling.
 
-    ``mesh``: the head. ``colours``: sRGB of its vertices; None draws clay. ``azimuth_deg``: viewing direction, 0 from
-    the front, positive from the head's left. ``panel``: width and height of the picture, px. ``box``: two opposite
+    ``mesh``: the head. ``colours``: sRGB of its vertices; None draws grey clay. ``azimuth_deg``: viewing direction, 0
+    from the front, positive from the head's left. ``panel``: width and height of the picture, px. ``box``: two opposite
     corners (mm) of the drawn part, so that several meshes can share a scale; None fits the mesh. ``paper``: sRGB of the
     background. ``darkest``: brightness of surfaces in full shadow.
     """
@@ -216,7 +215,7 @@ def clay(
 def lit(
     mesh: Mesh, colours: UInt8[np.ndarray, "v 3"] | None = None, darkest: float = DARKEST
 ) -> UInt8[np.ndarray, "v 3"]:
-    """Returns the colours of the vertices (clay if None) shaded by the lamp."""
+    """Shades the colours of the vertices (grey clay if None) by a lamp at the head's right front."""
     cosine: Float[np.ndarray, " v"] = np.clip(mesh.normals() @ (LAMP / np.linalg.norm(LAMP)), 0.0, 1.0)
     base = SKIN if colours is None else colours.astype(float)
     return np.clip(base * (darkest + (1.0 - darkest) * cosine[:, None]), 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Draws pages of a PDF: A4, in the fonts that every reader has, with lines, tables and pictures."""
+"""Draws A4 pages of a PDF with text, tables and pictures, in the standard PDF fonts."""
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -16,7 +16,7 @@ JPEG_OPTIONS = (cv2.IMWRITE_JPEG_QUALITY, 92)
 
 class PdfPage(FPDF):
     """Draws A4 pages with a document's margins and fonts; characters outside Latin-1 become question marks. ``date``
-    (ISO 8601) is that of the document, so that the same content gives the same bytes."""
+    (ISO 8601) is the document's date, which makes the file's bytes reproducible."""
 
     def __init__(self, title: str, date: str) -> None:
         super().__init__(unit="mm", format="A4")
@@ -32,14 +32,14 @@ class PdfPage(FPDF):
         self.multi_cell(WIDTH_MM, LINE_MM * size / 9, latin(text), align="L", new_x="LMARGIN", new_y="NEXT")
 
     def pictures_of(self, row: Sequence[Resized], width_mm: float) -> None:
-        """Draws pictures in a row, each ``width_mm`` wide, and moves below them."""
+        """Draws pictures in a row, each ``width_mm`` wide, and moves the cursor below them."""
         top, height = self.get_y(), width_mm * row[0].shape[0] / row[0].shape[1]
         for column, image in enumerate(row):
             self.image(encode_image(".jpg", image, JPEG_OPTIONS), x=MARGIN_MM + column * width_mm, y=top, w=width_mm)
         self.set_y(top + height)
 
     def scale_of(self, legend: Resized, ends: tuple[str, str]) -> None:
-        """Draws a colour scale with words at both ends and 0 in the middle, and moves below it."""
+        """Draws a colour scale with words at both ends and 0 in the middle, and moves the cursor below it."""
         left, top, width = MARGIN_MM + 39, self.get_y(), 100
         self.image(encode_image(".jpg", legend, JPEG_OPTIONS), x=left, y=top, w=width, h=4)
         self.set_y(top + 4)
@@ -52,7 +52,7 @@ class PdfPage(FPDF):
     def table_of(
         self, header: Sequence[str], rows: Sequence[Sequence[str]], widths_mm: Sequence[float], inks: dict[int, tuple]
     ) -> None:
-        """Draws a table. ``inks``: colour of each row's last cell."""
+        """Draws a table. ``inks`` are the colours of the last cell of each row."""
         for number, row in enumerate([header, *rows], -1):
             self.set_font("Helvetica", style="B" if number < 0 else "", size=8.5)
             for column, (text, width) in enumerate(zip(row, widths_mm, strict=True)):
@@ -65,6 +65,5 @@ class PdfPage(FPDF):
 
 
 def latin(text: str) -> str:
-    """Returns the text with every character outside Latin-1, which the PDF's fonts lack, replaced by a question
-    mark."""
+    """Replaces every character outside Latin-1, which the PDF's fonts lack, by a question mark."""
     return text.encode("latin-1", "replace").decode("latin-1")

@@ -1,7 +1,7 @@
-"""Defines what a reconstruction is: the products of the stages, which ``pipeline.results.write`` writes.
+"""Defines the value ``Reconstruction``: the products of all stages, which ``pipeline.results.write`` writes.
 
-It holds everything that the result folder contains. Nothing in it depends on place or time, except the seconds of the
-stages (which reach report.json only, never head.ply).
+The value contains everything for the result folder. The value ``Reconstruction`` is reproducible, except for the
+seconds of the stages, which only report.json contains.
 """
 
 from collections.abc import Mapping
@@ -56,12 +56,12 @@ class Reconstruction:
 
     @property
     def mesh_world(self) -> Mesh:
-        """Returns the delivered head, full level, world frame, mm."""
+        """Returns the final head as a full-resolution mesh, world frame, mm."""
         return self.refined.mesh_world
 
     def widen_by_scale(self, sigma: float) -> "Reconstruction":
-        """Returns the result with standard deviations widened for cameras whose common scale has the relative standard
-        deviation ``sigma``, about the head's origin."""
+        """Enlarges the standard deviations for cameras whose common scale has the relative standard deviation
+        ``sigma``. The scale acts about the head's origin."""
         centre = self.head.fit.world_from_head.translation
 
         def widen(mesh: Mesh, deviation_mm: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
@@ -113,5 +113,5 @@ def asset_extras(result: Reconstruction) -> dict[str, Any]:
 
 
 def _ascii(text: str) -> str:
-    """Returns the text with every character that a PLY header cannot hold replaced by a question mark."""
+    """Replaces every character that a PLY header cannot contain by a question mark."""
     return "".join(c if c.isascii() and c.isprintable() else "?" for c in text)

@@ -51,7 +51,7 @@ ON_CHART, MEAN_ONE = "the chart's white is white", "the mean over the sphere is 
 
 
 def report_document(result: Reconstruction) -> Report:
-    """Returns the report as JSON types. Every number is finite; unknown ones are None."""
+    """Returns the report as JSON types. All numbers are finite; unknown numbers are None."""
     head, evidence, refined = result.head, result.evidence, result.refined
     document: Report = {
         "format": FORMAT,
@@ -164,8 +164,8 @@ def _morphs(blendshape_rig: BlendshapeRig) -> MorphsReport:
 
 
 def similarity_document(transform: Similarity) -> SimilarityReport:
-    """Returns the similarity in the paper's form ``x_world = s (R x_head + t)``; its translation is that of
-    ``transform`` divided by the scale."""
+    """Returns the similarity in the paper's form ``x_world = s (R x_head + t)``, where t is the translation of
+    ``transform`` divided by its scale."""
     translation = transform.translation / transform.scale
     return {"scale": transform.scale, "rotation": transform.rotation.tolist(), "translation": translation.tolist()}
 
@@ -197,7 +197,7 @@ def _sets(sets: SetTextures) -> SetsReport:
 
 
 def skin_document(maps: SkinMaps) -> SkinReport:
-    """Describes the maps of the skin."""
+    """Returns the report's entry about the skin's displacement and normal maps."""
     return {
         "size": len(maps.displacement),
         "mm_per_code": MM_PER_CODE,
@@ -252,7 +252,7 @@ def _bust(bust: Bust) -> BustReport:
 
 
 def _plain(value: Any) -> Any:
-    """Returns a nested document converted to JSON types, in which None stands for numbers that are not finite."""
+    """Converts a nested document to JSON types; numbers that are not finite become None."""
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -267,7 +267,7 @@ def _plain(value: Any) -> Any:
 
 
 def eyes_document(eyes: Mapping[str, Iris | UnseenEye], world_from_head: Similarity) -> dict[str, EyeReport]:
-    """Describes the eyes by side."""
+    """Returns the report's entry about each eye, by side."""
     return {side: _eye(eye, world_from_head) for side, eye in eyes.items()}
 
 

@@ -1,4 +1,4 @@
-"""Types of ``report.json``, format ``eigenhead-report/1``, on which other programs rely."""
+"""Declares the types of ``report.json`` (format ``eigenhead-report/1``), which other programs read."""
 
 from typing import NotRequired, TypedDict
 
@@ -21,8 +21,8 @@ class ViewReport(TypedDict):
 
 
 class CameraReport(TypedDict):
-    """Describes how well the head explains one camera. ``camera_shift`` is the correction of its pose: rotation (rad)
-    and translation (mm), applied to camera_from_world on the left."""
+    """Describes how well the head agrees with one camera's picture. ``camera_shift`` is the correction of the camera's
+    pose: rotation (rad) and translation (mm), applied to camera_from_world on the left."""
 
     used: bool
     iou: float | None
@@ -36,7 +36,7 @@ class CameraReport(TypedDict):
 
 
 class FaceReport(TypedDict):
-    """Describes the subject's face in a camera's picture; ``found`` is false where there is none."""
+    """Describes the subject's face in a camera's picture; ``found`` is false if no face was found."""
 
     found: bool
     box_px: list[float] | None
@@ -46,9 +46,9 @@ class FaceReport(TypedDict):
 
 
 class PoseReport(TypedDict):
-    """Describes the pose: its method (landmarks, features or silhouettes), the relative extra cost of the best other
-    pose, the distance of the head's landmarks from those in each camera's picture (relative to the face's size), and
-    whether the pose is doubtful."""
+    """Describes the pose: its method (landmarks, features or silhouettes) and the relative extra cost of the second
+    best pose. Also gives the distance between the landmarks of head and picture (relative to the face's size) for each
+    camera, and whether the pose is doubtful."""
 
     method: str
     rival: float | None
@@ -71,27 +71,28 @@ class Measured(TypedDict):
 
 
 class Placed(TypedDict):
-    """Describes a landmark's position (world, mm) with its standard deviations along the world's axes; ``std`` is null
-    if the solver computes none."""
+    """Describes a landmark's position (world frame, mm) with its standard deviations along the world's axes; ``std`` is
+    null if the solver computes none."""
 
     position: list[float]
     std: list[float] | None
 
 
 class GazeReport(TypedDict):
-    """Describes the direction of a gaze in one frame (degrees)."""
+    """Describes the direction of a gaze as azimuth and elevation (degrees) in one frame."""
 
     azimuth_deg: float
     elevation_deg: float
 
 
 class EyeReport(TypedDict):
-    """Describes an eye. ``seen`` is false where its iris was not found. ``cause`` then says why (``closed``,
+    """Describes an eye. ``seen`` is false if its iris was not found. ``cause`` then gives the reason (``closed``,
     ``few-views``, ``coarse``: too few pixels, ``unclear``: no clear border of the iris), and all other fields are null.
 
-    ``iris`` is the middle of the limbus (world, mm), ``radius`` its radius (mm). ``gaze`` is the unit vector of the
-    optical axis (world), ``std_deg`` its standard deviation in each direction. Azimuth and elevation of ``rig`` are in
-    the world frame (from z towards x, then towards y), of ``face`` in the head frame (to the subject's left, up)."""
+    ``iris`` is the centre of the iris' border (world frame, mm), ``radius`` its radius (mm). ``gaze`` is the unit
+    vector of the optical axis (world frame), ``std_deg`` its standard deviation in each direction. ``rig`` gives
+    azimuth (from z towards x) and elevation (towards y) in the world frame, ``face`` in the head frame (to the
+    subject's left, up)."""
 
     seen: bool
     cause: str | None
@@ -105,7 +106,7 @@ class EyeReport(TypedDict):
 
 
 class ExpressionReport(TypedDict):
-    """Describes one expression of the face: the model's name of it, the same in words, its weight from 0 to 1, and the
+    """Describes one facial expression: its name in the model, its name in plain words, its weight from 0 to 1, and the
     weight's standard deviation."""
 
     name: str
@@ -115,17 +116,17 @@ class ExpressionReport(TypedDict):
 
 
 class MorphsReport(TypedDict):
-    """Describes the morph targets of posed.glb: the weights for the head as photographed, and those of Apple's names
-    that move nothing because the model has no counterpart."""
+    """Describes the morph targets of posed.glb: their weights for the head as photographed, and Apple's names without
+    counterpart in the model, whose targets are zero."""
 
     weights: dict[str, float]
     without_counterpart: list[str]
 
 
 class TemplateReport(TypedDict):
-    """Describes the template whose vertex order head-NAME.obj has. ``sha256`` is that of its mesh's file.
-    ``registration`` has the figures that ``eigenhead template add`` printed; ``flame`` has those of its FLAME model's
-    fit, if it has one."""
+    """Describes the template mesh whose vertex order head-NAME.obj has. ``sha256`` is the digest of the mesh's file.
+    ``registration`` has the figures that ``eigenhead template add`` printed; ``flame`` has the figures of the FLAME
+    model's fit, if there is one."""
 
     name: str
     source: str
@@ -135,8 +136,8 @@ class TemplateReport(TypedDict):
 
 
 class SimilarityReport(TypedDict):
-    """Describes x_world = scale (rotation x_head + translation), mm. This is the paper's form (section 4.2), in which
-    the scale also applies to the translation."""
+    """Describes x_world = scale (rotation x_head + translation), mm, the paper's form (section 4.2). The scale also
+    applies to the translation."""
 
     scale: float
     rotation: list[list[float]]
@@ -152,9 +153,9 @@ class HairReport(TypedDict):
 
 
 class BustReport(TypedDict):
-    """Describes the bust, the whole visible surface. ``closed`` says whether every edge has two faces. ``flipped`` and
-    ``crossing`` count triangles, ``folded`` counts edges. Of its vertices on the face, ``face_silent_share`` is the
-    fraction without support by any view's depth, and ``guessed_share`` the part of it that the head did not measure."""
+    """Describes the bust, the whole visible surface. ``closed`` is true if every edge has two faces. ``flipped`` and
+    ``crossing`` count triangles, ``folded`` counts edges. ``face_silent_share`` is the fraction of the face's vertices
+    that no depth map supports; ``guessed_share`` is the fraction that the head did not measure either."""
 
     spacing_mm: float
     vertices: int
@@ -172,9 +173,9 @@ class BustReport(TypedDict):
 
 
 class SkinReport(TypedDict):
-    """Describes the maps in texture/. A code of the displacement map is ``mm_per_code`` along the normal of head.ply;
-    ``mid_code`` is zero. ``repeated`` is the fraction of the shading's power that two disjoint sets of views both show,
-    by octave of wavelength, the longest first."""
+    """Describes the maps in texture/. One code of the displacement map is ``mm_per_code`` along the normal of head.ply;
+    ``mid_code`` means no displacement. ``repeated`` is the fraction of the shading's power that two disjoint sets of
+    views share, by octave of wavelength, the longest first."""
 
     size: int
     mm_per_code: float
@@ -189,7 +190,7 @@ class SkinReport(TypedDict):
 
 class SpecularReport(TypedDict):
     """Describes texture/specular: each camera's exposure ratio (parallel to crossed picture), the ratio of negative to
-    positive light before clipping, the fraction of mirrored light at strength 1 in head.glb, and the material's assumed
+    positive light before clipping, the reflectance at specular strength 1 in head.glb, and the material's assumed
     roughness."""
 
     exposure: dict[str, float]
@@ -199,8 +200,8 @@ class SpecularReport(TypedDict):
 
 
 class SetsReport(TypedDict):
-    """Describes the textures of texture sets: their names and size (texels); ``specular`` is null without both sets
-    of polarised light."""
+    """Describes the textures of further sets of photographs: their names and size (texels). ``specular`` is null unless
+    crossed and parallel polarised pictures exist."""
 
     names: list[str]
     size: int
@@ -221,7 +222,7 @@ class TextureReport(TypedDict):
 
 
 class DetailReport(TypedDict):
-    """Describes which level of detail the fit reached, and the reason."""
+    """Describes the level of detail that the fit reached, and the reason."""
 
     level: str
     reason: str
@@ -229,7 +230,7 @@ class DetailReport(TypedDict):
 
 
 class Report(TypedDict):
-    """Describes ``report.json`` of a result."""
+    """Describes the whole ``report.json`` of a result."""
 
     format: str
     version: str
@@ -265,6 +266,6 @@ class Report(TypedDict):
 
 
 class AddedReport(TypedDict, total=False):
-    """Declares the report's fields for writers outside the method; they are None without such writers."""
+    """Declares the report's fields that application writers fill in; they are None without such writers."""
 
     template: TemplateReport

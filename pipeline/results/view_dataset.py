@@ -1,8 +1,8 @@
-"""Writes a capture as a data set of views: undistorted pictures, masks, and files with their cameras.
+"""Writes a capture as a training data set for novel-view methods: undistorted pictures, masks, and camera files.
 
-In: a capture, its silhouettes and rig. Out: the folder described in ``rig.formats.cameras.dataset_json``, with the used
-views. For GaussianAvatars the pictures show the subject on white, by pinhole cameras with square pixels and the
-principal point in the middle. For nerfstudio they have the original background and camera matrix.
+The folder is described in ``rig.formats.cameras.dataset_json``; it contains the used views. For GaussianAvatars the
+pictures show the subject on white, and the pinhole cameras have square pixels and the principal point in the middle.
+For nerfstudio the pictures keep the original background and camera matrix.
 """
 
 import math
@@ -41,8 +41,8 @@ THREADS = 4  # a view of four megapixels takes half a gigabyte while it is resam
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewDataset:
-    """Holds the content of a data set. ``head_world`` is a surface in the capture's world frame (mm) from which
-    training may start; ``flame`` is its FLAME parameters."""
+    """Holds the content of a data set. ``head_world`` is a mesh in the capture's world frame (mm) from which training
+    may start; ``flame`` holds the mesh's FLAME parameters."""
 
     capture: Capture
     rig: Rig
@@ -52,7 +52,7 @@ class ViewDataset:
 
     @property
     def rig_used(self) -> Rig:
-        """Returns the cameras whose views are used."""
+        """Returns the rig with only the cameras whose views are used."""
         return self.rig.subset(name for name, view in self.silhouettes.items() if view.quality.usable)
 
 
@@ -98,8 +98,8 @@ def _write_view(folder: Path, dataset: ViewDataset, camera: Camera, pinholes: Ri
 
 
 def _subject_share(dataset: ViewDataset, name: str) -> Plane:
-    """Returns the subject's share in every pixel, 0 to 1: from the capture's mask if it has one, else from the
-    sub-pixel contour."""
+    """Returns the fraction of every pixel that shows the subject, from the capture's mask or else from the sub-pixel
+    contour."""
     capture = dataset.capture
     if name in capture.soft_masks:
         return capture.soft_masks[name].astype(np.float32) / np.float32(255.0)
@@ -112,8 +112,8 @@ SPLINE_ORDER = 3
 
 
 def pinhole_of(lens: Intrinsics, *, centred: bool = False) -> Intrinsics:
-    """Returns the same camera without distortion. If ``centred``, it has square pixels and the principal point in the
-    middle of the picture, for formats that state only a field of view."""
+    """Returns the intrinsics without distortion. If ``centred``, they have square pixels and the principal point in the
+    middle of the picture, for file formats that give only a field of view."""
     if not centred:
         return Intrinsics(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
     focal = math.sqrt(lens.fx * lens.fy)
@@ -121,7 +121,7 @@ def pinhole_of(lens: Intrinsics, *, centred: bool = False) -> Intrinsics:
 
 
 def undistorted_picture(picture: Photograph, lens: Intrinsics, pinhole: Intrinsics) -> UInt8[np.ndarray, "y x 3"]:
-    """Returns the picture that ``pinhole`` would have taken; black where the lens shows nothing."""
+    """Undistorts a picture: returns what ``pinhole`` would show, with black pixels outside the original picture."""
     if lens == pinhole:
         return picture
     places = _sampled_pixels(lens, pinhole)
@@ -133,16 +133,15 @@ def undistorted_picture(picture: Photograph, lens: Intrinsics, pinhole: Intrinsi
 
 
 def undistorted_share(share: Plane, lens: Intrinsics, pinhole: Intrinsics) -> Float32[np.ndarray, "y x"]:
-    """Returns a mask's share of the subject in every pixel (0 to 1) in the pinhole's picture; 0 where the lens shows
-    nothing."""
+    """Undistorts a mask (0 to 1) to the pinhole's picture, with 0 outside the original picture."""
     if lens == pinhole:
         return share
     return map_coordinates(share, _sampled_pixels(lens, pinhole), order=1, mode="constant")
 
 
 def _sampled_pixels(lens: Intrinsics, pinhole: Intrinsics) -> Float[np.ndarray, "2 y x"]:
-    """Returns the row and column of the lens's picture for every pixel of the pinhole's; -1 beyond the radius up to
-    which the distortion is valid."""
+    """Returns the row and column in the distorted picture for every pixel of the pinhole's picture; -1 beyond the
+    radius up to which the distortion model is valid."""
     rows, columns = np.mgrid[: pinhole.height, : pinhole.width].astype(float)
     rays = np.stack([(columns - pinhole.cx) / pinhole.fx, (rows - pinhole.cy) / pinhole.fy], axis=-1).reshape(-1, 2)
     pixels = lens.distortion.apply(rays) * (lens.fx, lens.fy) + (lens.cx, lens.cy)

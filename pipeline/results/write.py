@@ -1,4 +1,4 @@
-"""Writes the result folder of docs/capture-format.md, and its pictures.
+"""Writes the result folder, which docs/capture-format.md describes, and its pictures.
 
     head.ply  head.glb  report.json  overlays/<camera>.png     fixed by docs/capture-format.md
     bust.ply  bust.glb  the whole visible surface; settings.outputs.surface says which of the two is written, or both
@@ -52,25 +52,25 @@ THREADS = 4  # cv2, NumPy and the rasteriser release the interpreter lock, and e
 
 @runtime_checkable
 class ResultWriter(Protocol):
-    """Declares a writer of files that the method does not know; ``write_result`` calls it in a thread of its own."""
+    """Declares the type of a function that writes further files of a result; ``write_result`` calls it in another
+    thread."""
 
     def __call__(self, folder: Path, result: Reconstruction, /) -> AddedReport | None:
-        """Writes files of its own into ``folder``, each under a temporary name first. Returns the fields that it fills
-        in report.json, or None. Raises OSError."""
+        """Writes files into ``folder``, each under a temporary name first. Returns the fields for report.json, or None.
+        Raises OSError."""
         ...
 
 
 def write_result(
     folder: Path, result: Reconstruction, capture: Capture, extra_writers: Sequence[ResultWriter] = ()
 ) -> None:
-    """Writes every file of a result, each under a temporary name first. Raises OSError, for example if the disk is
-    full.
+    """Writes every file of a result, each under a temporary name first. Raises OSError, as when the disk is full.
 
     Args:
-        folder: where the files go.
+        folder: the result folder.
         result: the reconstruction.
         capture: the capture that was reconstructed, as it was read.
-        extra_writers: what writes further files of the result, such as the head in a template's vertex order.
+        extra_writers: functions that write further files, such as the head in a template's vertex order.
     """
     capture = reassign_images(capture, pictures=result.views.assignment)
     head = head_mesh(result)
@@ -173,7 +173,7 @@ def _write_overviews(folder: Path, result: Reconstruction, capture: Capture, hea
 
 
 def _sheet(result: Reconstruction, capture: Capture, shown: list[str], panels: list[np.ndarray]) -> np.ndarray:
-    """Draws the contact sheet, one row for each camera: the front camera first, then others spread over the rig."""
+    """Draws the contact sheet, one row for each camera: the front camera first, then cameras spread over the rig."""
     front = [name for name in shown if name == result.alignment.front]
     others = [name for name in shown if name != result.alignment.front]
     spread = np.linspace(0, len(others) - 1, min(SHEET_ROWS - len(front), len(others))).round().astype(int)

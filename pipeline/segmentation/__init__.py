@@ -1,4 +1,5 @@
-"""Finds the subject in every photograph (section 5.4), with clean plates or without.
+"""Finds the subject's silhouette in every photograph (the paper's section 5.4), with or without clean plates (pictures
+of the empty studio).
 
-In: a capture and its rig. Out: a ``Silhouette`` for each camera, with its quality.
+A capture and its rig give a ``Silhouette`` with its quality for each camera.
 """

@@ -1,10 +1,10 @@
-"""Estimates the background behind the subject at the moment of the shot, from the clean plate.
+"""Estimates the background behind the subject from the clean plate, a picture of the empty studio.
 
 Between plate and shot the lamps drift, and a camera may change its exposure. So the plate is multiplied by a smooth
 gain field for each channel, estimated from the pixels that still show the background. The estimate starts at the mode
-of the log ratio of image to plate. The mode is the background's, even for a large subject, because the subject's ratios
-have no common value. The noise is measured from the residuals: as a function of brightness (photon noise grows with
-it), and for each pixel if several plates show more noise there.
+of the log ratio of image to plate. The background determines the mode, even for a large subject, because the subject's
+ratios have no common value. The noise is estimated from the residuals as a function of brightness. The noise is larger
+at pixels where several plates differ more.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ STEPS = 4  # of reweighting; the field moves by less than 0.1 grey level after t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Background:
-    """Holds the clean plates and their fit to the image: a gain field, the noise, and which pixels show the
+    """Holds the clean plates and their fit to the image: a gain field, the noise, and a mask of pixels that show the
     background."""
 
     plates: UInt8[np.ndarray, "p h w 3"]
@@ -43,22 +43,20 @@ class Background:
 
 
 def coarse_size(shape: tuple[int, ...], width: int) -> tuple[int, int]:
-    """Returns the width and height (px) of the coarse level: the image's, divided by the integer that brings the width
-    nearest to ``width``."""
+    """Returns the image size (px) divided by an integer, which brings the width as near as possible to ``width``."""
     factor = max(1, round(shape[1] / width))
     return max(1, shape[1] // factor), max(1, shape[0] // factor)
 
 
 def plate_tolerance(levels: Picture) -> Picture:
-    """Returns the difference (levels) to a plate that is still taken for unchanged background."""
+    """Returns the largest difference (levels) between image and plate that counts as unchanged background."""
     return TOLERANCE_LEVELS + TOLERANCE_SHARE * levels
 
 
 def estimate_background(
     image: UInt8[np.ndarray, "h w 3"], image_coarse: CoarsePicture, plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...]
 ) -> Background:
-    """Estimates the background of an image with the subject in it, by fitting a smooth gain field to the clean
-    plates."""
+    """Estimates the background of an image with the subject, by fitting a smooth gain field to the clean plates."""
     size = (image_coarse.shape[1], image_coarse.shape[0])
     small = np.stack([cv2.resize(plate, size, interpolation=cv2.INTER_AREA) for plate in plates]).astype(np.float32)
     plate_coarse = small.mean(axis=0)
@@ -102,8 +100,8 @@ def _tukey(square: Picture) -> Float32[np.ndarray, "h w"]:
 
 
 def _gain_field(image: Picture, plate: Picture, weight: Float32[np.ndarray, "h w"], sigma: float) -> Picture:
-    """Estimates the gain of the image over the plate at each pixel, by least squares in a Gaussian window. With no
-    background nearby it tends to the gain of the whole image."""
+    """Estimates the gain of the image over the plate at each pixel, by least squares in a Gaussian window. Far from
+    background pixels the gain tends to that of the whole image."""
     weighted = plate * cv2.merge([weight] * 3)
     size = (max(8, image.shape[1] // 4), max(8, image.shape[0] // 4))  # a smooth field needs no more
     num = cv2.resize(weighted * image, size, interpolation=cv2.INTER_AREA)
@@ -118,7 +116,7 @@ def _gain_field(image: Picture, plate: Picture, weight: Float32[np.ndarray, "h w
 
 def _image_noise(image: UInt8[np.ndarray, "h w 3"], plates: UInt8[np.ndarray, "p h w 3"]) -> Float32[np.ndarray, " 3"]:
     """Estimates the standard deviation (levels) of image minus plate from differences of neighbouring pixels, which
-    slow changes of light do not affect."""
+    smooth changes of light do not affect."""
     pairs = [image[::8, x::4].astype(np.float32) - plates[:, ::8, x::4].mean(axis=0) for x in (0, 1)]
     columns = min(pair.shape[1] for pair in pairs)
     steps = pairs[1][:, :columns] - pairs[0][:, :columns]
@@ -132,8 +130,8 @@ def _noise_by_level(
     plate_coarse: CoarsePicture,
     inliers: Bool[np.ndarray, "hc wc"],
 ) -> CoarsePicture:
-    """Estimates the noise (levels) of every coarse pixel from its brightness. The function of brightness is measured on
-    the background pixels."""
+    """Estimates the noise (levels) of every coarse pixel from its brightness. The noise as a function of brightness is
+    measured on the background pixels."""
     rows, columns = np.arange(3, image.shape[0], 6), np.arange(3, image.shape[1], 6)  # 20,000 samples are enough
     at = np.ix_(rows * inliers.shape[0] // image.shape[0], columns * inliers.shape[1] // image.shape[1])
     kept = inliers[at]
@@ -154,8 +152,8 @@ def _noise_by_level(
 
 
 def _with_temporal_noise(noise: CoarsePicture, plates: Float32[np.ndarray, "p hc wc 3"]) -> CoarsePicture:
-    """Adds to the noise the variation between the plates, if there are three or more: a flickering lamp, a moving
-    curtain."""
+    """Adds the variation between the plates, as by a flickering lamp or a moving curtain, if there are at least
+    three."""
     if len(plates) < 3:
         return noise
     small = plates / np.maximum(plates.mean(axis=(1, 2), keepdims=True), 1.0)  # changes of exposure are not noise

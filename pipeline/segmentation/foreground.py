@@ -1,14 +1,13 @@
-"""Decides which pixels show the subject. It works at a coarse level, where averaging reduces the noise to a quarter.
+"""Decides which pixels show the subject, in a reduced image, in which averaging reduces the noise to a quarter.
 
-It computes each pixel's log odds of foreground against the corrected background (``pipeline.segmentation.background``),
-counting soft shadows as background, and smooths them by mean-field sweeps. Links between neighbours are cut where the
-*difference* to the plate has an edge (Sun et al., *Background Cut*, ECCV 2006), so edges of the backdrop itself cut
-nothing. A pixel like the plate is surely background only where the subject has another colour: ``Decision.clear``.
-Elsewhere, and where a shadow might be a coat, ``pipeline.segmentation.segment`` asks the other cameras, and
-``reconsider`` decides again.
+The module computes each pixel's log odds of foreground against the corrected background
+(``pipeline.segmentation.background``), and smooths them by mean-field sweeps. Neighbours are coupled weakly where their
+*differences* to the plate differ (Sun et al., *Background Cut*, ECCV 2006), so edges of the backdrop have no effect. A
+pixel similar to the plate is certainly background only if the subject has another colour (``Decision.clear``). Other
+pixels are doubtful, as are pixels where a shadow might be a coat. For doubtful pixels,
+``pipeline.segmentation.segment`` uses the other cameras, and ``reconsider`` decides again.
 
-Soft shadows on the backdrop, and light that the subject reflects onto it, count as background; the coarse level finds
-them.
+Soft shadows on the backdrop, and light that the subject reflects onto the backdrop, count as background.
 """
 
 from dataclasses import dataclass, replace
@@ -65,7 +64,7 @@ Mask = Bool[np.ndarray, "h w"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """Holds the decision on a single image: what is subject and what is background. All arrays are at the coarse level;
+    """Holds which pixels of a single image show subject or background. All arrays have the size of the reduced image;
     without a subject the mask is empty."""
 
     coarse: Picture  # the image
@@ -87,7 +86,7 @@ class Decision:
 
 
 def decide(image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...]) -> Decision:
-    """Decides which pixels of one image show the subject, by a comparison with its clean plates at a coarse level."""
+    """Decides which pixels of one image show the subject, by a comparison with its clean plates in reduced size."""
     size = coarse_size(image.shape, COARSE_COLUMNS)
     coarse = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     background = estimate_background(image, coarse, empty_plates(plates))
@@ -117,15 +116,15 @@ def decide(image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_
 
 
 def doubtful(decision: Decision) -> Mask:
-    """Tells which pixels outside the mask might still be the subject: those near it where the subject and the plate
-    look alike. The other cameras decide about them."""
+    """Returns a mask of pixels outside the subject's mask that might show the subject: pixels near it where subject and
+    plate look alike. The other cameras decide about these pixels."""
     near = dilated(decision.mask, REACH) & ~decision.mask
     return near & ~decision.clear & (decision.own_odds > -ALLOWED)
 
 
 def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"]) -> Decision:
-    """Returns the decision revised by the other cameras. ``dissent`` counts, for each doubtful pixel, the cameras that
-    exclude the subject there; it is negative where they were not consulted."""
+    """Revises the decision by means of the other cameras. ``dissent`` is, for each doubtful pixel, the number of
+    cameras that exclude the subject; it is negative at all other pixels."""
     prior = np.where(dissent == 0, ALLOWED, np.where(dissent >= 3, -DENIED, 0.0))
     revised = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MAX_ODDS, MAX_ODDS)
     odds = np.where(dissent >= 0, revised, decision.odds).astype(np.float32)
@@ -137,8 +136,8 @@ def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"]) -> Decision:
 
 
 def _subject_colour_odds(image: Picture, mask: Mask, paint: Picture, chi2: Plane, variance: Picture) -> Plane:
-    """Returns the log odds that a pixel has a colour of the subject instead of the plate's: the subject's colour nearby
-    in its best shade, or any colour inside the mask."""
+    """Returns the log odds that a pixel has a colour of the subject instead of the plate's. Candidates are the
+    subject's colour nearby, scaled to the best brightness, and all colours inside the mask."""
     nearby = 0.5 * (chi2 - colours_apart(paint, image, variance) ** 2) - PAINT_ODDS
     bins = (image / (256 / PALETTE)).astype(np.int32).clip(0, PALETTE - 1)
     counts = np.zeros((PALETTE,) * 3, np.float32)
@@ -152,9 +151,9 @@ def _subject_colour_odds(image: Picture, mask: Mask, paint: Picture, chi2: Plane
 
 
 def find_mixtures(image: UInt8[np.ndarray, "_ _ 3"], coarse: Picture, background: Background) -> tuple[Plane, Plane]:
-    """Returns the squared difference of each coarse pixel from the plate (mean over the channels), and how much the
-    pixel mixes subject and plate, as strands of hair do: the variance of its quarters relative to that difference. A
-    pixel has four quarters at every picture size, so the measure does not depend on the size."""
+    """Returns the squared difference of each coarse pixel from the plate (mean over the channels). Also returns how
+    much the pixel mixes subject and plate, as strands of hair do: the variance of its four quarters relative to this
+    difference. The measure does not depend on the picture's size."""
     size = coarse.shape[1::-1]
     averaged = 2 * size[0] < image.shape[1]
     quarters = _quarters(image, (2 * size[0], 2 * size[1]))
@@ -168,8 +167,8 @@ def find_mixtures(image: UInt8[np.ndarray, "_ _ 3"], coarse: Picture, background
 
 
 def _quarters(image: UInt8[np.ndarray, "_ _ 3"], size: tuple[int, int]) -> Float32[np.ndarray, "_ _ 3"]:
-    """Returns the quarters of coarse pixels, as an image of ``size`` (width, height): means over areas, or interpolated
-    values if the image is smaller."""
+    """Scales an image to ``size`` (width, height), two pixels for each coarse pixel in both directions: by area means,
+    or by interpolation if the image is smaller."""
     method = cv2.INTER_AREA if size[0] <= image.shape[1] else cv2.INTER_LINEAR
     return cv2.resize(image, size, interpolation=method).astype(np.float32)
 
@@ -195,9 +194,8 @@ def colours_apart(colour: Picture, other: Picture, variance: Picture) -> Plane:
 
 
 def _other_colour(difference: Picture, paint: Picture, plate: Picture, variance: Picture) -> tuple[Mask, Plane]:
-    """Finds faint differences to the plate where the subject probably has another colour: neither a shadow nor a
-    mixture with the subject's colour nearby (``paint``) explains them. Also returns the remaining chi-squared, averaged
-    over nine pixels."""
+    """Finds faint differences to the plate that neither a shadow nor a mixture with the subject's colour nearby
+    (``paint``) explains. Also returns the remaining chi-squared, averaged over nine pixels."""
     weight = 3 / variance  # of a mean over nine pixels, whose errors are not all their own
     faint = ((difference**2 * weight) @ CHANNEL_SUM < MAX_FAINT_CHI2).astype(np.float32)
     mean = cv2.blur(difference * faint[:, :, None], (3, 3)) / np.maximum(cv2.blur(faint, (3, 3)), 0.1)[:, :, None]
@@ -212,15 +210,15 @@ def _other_colour(difference: Picture, paint: Picture, plate: Picture, variance:
 
 
 def _closed(mask: Mask) -> Mask:
-    """Returns the mask with gaps of up to four coarse pixels closed. The matting opens real gaps again, for example
-    between locks of hair. Where the subject has the backdrop's colour, it cannot, and the mask stays whole."""
+    """Closes gaps of up to four coarse pixels in the mask. The matting opens real gaps again, for example between locks
+    of hair, unless the subject has the backdrop's colour."""
     padded = np.pad(mask, CLOSING, mode="edge")
     return eroded(dilated(padded, CLOSING), CLOSING)[CLOSING:-CLOSING, CLOSING:-CLOSING]
 
 
 def whole_subject(mask: Mask, plain: Mask) -> tuple[Mask, tuple[float, ...]]:
-    """Returns the largest component of the mask with its small gaps and holes filled, and the areas of the other
-    components as shares of its area."""
+    """Returns the largest component of the mask with small gaps and holes filled, and the areas of the other components
+    relative to it."""
     mask = mask | (_closed(mask) & ~plain)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
     if count < 2:
@@ -252,8 +250,9 @@ def smooth_odds(odds: Plane, image: Picture, background: Background) -> Float[np
 
 
 def find_shadows(image: Picture, plate: Picture, chi2: Plane, variance: Picture, odds: Plane) -> tuple[Plane, Mask]:
-    """Returns the chi-squared of each pixel against the plate in its best shade, and which pixels are soft shadows or
-    reflected light. Those differ from the plate, a darker or brighter shade explains them, and they begin gradually."""
+    """Returns the chi-squared of each pixel against the plate scaled to the best brightness, and a mask of soft shadows
+    and reflected light. Shadows and reflected light differ from the plate only in brightness, and the difference begins
+    gradually."""
     ratio = ((image * plate / variance) @ CHANNEL_SUM) / np.maximum((plate**2 / variance) @ CHANNEL_SUM, 1e-6)
     strength = np.sqrt(chi2 / (2 * ANY_COLOUR_ODDS))
     best, soft = chi2, np.zeros(odds.shape, bool)
@@ -267,10 +266,10 @@ def find_shadows(image: Picture, plate: Picture, chi2: Plane, variance: Picture,
 
 
 def _soft_shadows(candidate: Mask, depth: Plane, strength: Plane) -> Mask:
-    """Returns the candidates that begin gradually, next to plain background that is already darker. A coat begins
-    abruptly, even within a shadow, and is left out.
+    """Returns the candidates that begin gradually, next to background that is already darker. A coat begins abruptly,
+    even within a shadow, and is left out.
 
-    ``strength`` is the difference to the plate; 1 is the smallest that is noticed.
+    ``strength`` is the difference to the plate; 1 is the smallest detectable difference.
     """
     across, down = (cv2.Sobel(depth, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0))
     candidate = candidate & (across**2 + down**2 < STEEP**2)
@@ -293,6 +292,6 @@ def _soft_shadows(candidate: Mask, depth: Plane, strength: Plane) -> Mask:
 
 
 def _means(values: Plane, where: Mask, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the mean value of each component over the pixels ``where``, and the number of these pixels."""
+    """Returns the mean value of each connected component over the pixels ``where``, and the number of these pixels."""
     sizes = np.bincount(labels[where], minlength=count)
     return np.bincount(labels[where], values[where], count) / np.maximum(sizes, 1), sizes

@@ -1,4 +1,4 @@
-"""Compiled loops of ``foreground``, ``segment`` and ``matting``."""
+"""Contains the compiled loops of ``foreground``, ``segment`` and ``matting``."""
 
 import numpy as np
 
@@ -24,9 +24,9 @@ def mean_field_sweeps(odds: np.ndarray, residual: np.ndarray, strength: float, s
     """Returns half the log odds (h, w) of each pixel after mean-field sweeps over its eight neighbours, by Gauss-Seidel
     in alternating order.
 
-    ``odds`` (h, w) are the log odds of each pixel by itself. Two neighbours are coupled by strength exp(-|difference|^2
-    / 18), where the difference is that of their ``residual`` (h, w, c; standard deviations); along diagonals by 0.71 of
-    that.
+    ``odds`` (h, w) are the log odds of each pixel alone. Two neighbours are coupled by strength exp(-|difference|^2 /
+    18), where the difference is between their ``residual`` (h, w, c; standard deviations). Diagonal neighbours are
+    coupled 0.71 times as strongly.
     """
     height, width = odds.shape
     steps = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -63,8 +63,8 @@ def mean_field_sweeps(odds: np.ndarray, residual: np.ndarray, strength: float, s
 
 @njit(cache=True, nogil=True)
 def undecided_pixels(odds: np.ndarray) -> np.ndarray:
-    """Returns the pixels (flat indices) that can change. A pixel can change if, within two pixels of it, log odds are
-    not clipped or differ from its own."""
+    """Returns the flat indices of the pixels that mean-field sweeps can change. A pixel can change if it has, within
+    two pixels, log odds that are not clipped or that differ from its own."""
     height, width = odds.shape
     out = np.empty(height * width, np.int64)
     count = 0
@@ -91,10 +91,10 @@ def least_dissent(
     distances: np.ndarray,
     scales: np.ndarray,
 ) -> np.ndarray:
-    """Returns, for each ray (n), the smallest number of cameras that see background at any one of its points, int8; -1
-    if no point is seen by ``MIN_WITNESSES`` cameras. Numbers above ``MAX_DISSENT`` are not counted further.
+    """Returns, for each ray (n), the smallest number (int8) of cameras that see background, over all points of the ray;
+    -1 if ``MIN_WITNESSES`` cameras see no point of it. The count stops above ``MAX_DISSENT``.
 
-    ``origin`` (3) and ``rays`` (n, 3) are in the world frame; points lie at distances in ``span`` (mm) along them.
+    ``origin`` (3) and ``rays`` (n, 3) are in the world frame; points lie at distances in ``span`` (mm) along the rays.
     ``cameras`` are rows of ``packed_camera``. ``distances`` (k, h, w) are distances (px) to each camera's mask,
     negative where unknown, in images reduced by ``scales`` (k).
     """
@@ -135,8 +135,8 @@ def least_dissent(
 
 @njit(cache=True, nogil=True, inline="always")
 def corner_of(x: int, size: int, small: int) -> tuple[int, float]:
-    """Maps the centre of pixel ``x`` of a larger image (``size`` pixels along this side) into a smaller one
-    (``small``); returns the pixel before it and the fraction of the way to the next one."""
+    """Maps the centre of pixel ``x`` of an image with ``size`` columns (or rows) into an image with ``small`` columns
+    (or rows). Returns the pixel before this position, and the fraction of the way to the next pixel."""
     at = min(max((x + 0.5) * small / size - 0.5, 0.0), small - 1.0)
     low = min(int(at), max(small - 2, 0))
     return low, at - low
@@ -144,14 +144,14 @@ def corner_of(x: int, size: int, small: int) -> tuple[int, float]:
 
 @njit(cache=True, nogil=True, inline="always")
 def interpolated_colour(a: np.ndarray, y: int, x: int, c: int, fy: float, fx: float) -> float:
-    """Returns channel ``c`` of an image (h, w, 3), interpolated between pixel (y, x) and the ones to its right and
+    """Returns channel ``c`` of an image (h, w, 3), interpolated between pixel (y, x) and the pixels to its right and
     below."""
     return bilinear(a[y, x, c], a[y, x + 1, c], a[y + 1, x, c], a[y + 1, x + 1, c], fx, fy)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def decoded_level(table: np.ndarray, code: float) -> float:
-    """Returns the linear light of a code (0 to 255, fractions allowed) by linear interpolation in ``table``."""
+    """Converts an sRGB code (0 to 255, fractions allowed) to linear light by linear interpolation in ``table``."""
     code = min(max(code, 0.0), 255.0)
     low = int(code)
     return table[low] + (code - low) * (table[low + 1] - table[low])
@@ -170,22 +170,22 @@ def solve_alpha(
     sigmas: tuple[float, float],
     first: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Computes how much of each pixel is subject (alpha), from image I, background B and the subject's colour F, all in
-    linear light. It is the least-squares solution of I - B = q F - alpha B. Here q is alpha times the subject's
-    brightness: near alpha and at most ``BRIGHTEST`` alpha. Alpha is near the coarse ``probability``; ``sigmas`` weigh
-    both.
+    """Computes the subject's fraction of each pixel (alpha) from image I, background B and the subject's colour F, all
+    in linear light. Alpha is the least-squares solution of I - B = q F - alpha B. Here q is alpha times the subject's
+    relative brightness, at most ``BRIGHTEST`` alpha. Priors with the standard deviations ``sigmas`` keep q near alpha,
+    and alpha near the coarse ``probability``.
 
     Args:
         table: linear light by sRGB code.
         image: (h, w, 3) codes.
         plates: clean plates (k, h, w, 3), whose mean is the background.
-        light: factor (r, c, 3) by which the background's light differs from the plates'.
+        light: ratio (r, c, 3) of the background's light to the plates'.
         sigma: standard deviation of the noise (r, c).
-        zone: (r, c); 0 outside, 1 band along the outline, 2 inside, 3 band where the first guess of F is no help.
+        zone: (r, c); 0 outside, 1 band along the outline, 2 inside, 3 band where the first estimate of F is unusable.
         probability: coarse alpha (r, c).
         subject: the subject's colour (r2, c2, 3), codes.
-        sigmas: standard deviations of alpha about the coarse one, and of the subject's brightness.
-        first: whether ``subject`` is a first guess.
+        sigmas: standard deviations of alpha about the coarse alpha, and of the subject's brightness.
+        first: whether ``subject`` is a first estimate.
 
     Returns:
         Alpha (-0.5 to 1.5) and, in the band, |F - B| in standard deviations of the noise (-1 elsewhere) and the inverse

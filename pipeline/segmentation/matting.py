@@ -1,15 +1,15 @@
-"""Finds a sub-pixel contour from a coarse mask: the alpha of pixels in a band around it.
+"""Finds a sub-pixel contour from a coarse mask: estimates the alpha of pixels in a band around the mask's outline.
 
-The background B of every pixel is known, and the subject's colour F is taken from just inside. In linear light a pixel
-is ``I = q F + (1 - alpha) B``. Here q is alpha times the local brightness of the subject, which darkens where its
-surface turns away from the camera. Least squares over the channels, with q close to alpha, gives alpha. The contour is
-where alpha is one half: for an edge blurred by any symmetric optics, that is the position of the edge.
+The background B of every pixel is known, and the subject's colour F is taken from pixels just inside the mask. In
+linear light a pixel is ``I = q F + (1 - alpha) B``. The factor q is alpha times the local brightness of the subject,
+which darkens where its surface turns away from the camera. Least squares over the channels, with q close to alpha,
+gives alpha. The contour is where alpha is one half, which is the position of the edge under any symmetric blur.
 
-Colours are mixed in linear light, not in sRGB codes: with codes the contour of dark hair was 0.25 px too far inside, on
-captures rendered by another program. Without q, the contour of cheeks, which darken towards their edge, was 0.2 px too
-far inside. B is first matched to the pixels just outside, so that a shadow or reflected light at the edge does not move
-it. F may vary (a dark edge, a lock of hair), so it is taken again inside the first contour. If the colours are too
-similar, alpha follows the coarse mask.
+Colours are mixed in linear light; with sRGB codes the contour of dark hair was 0.25 px too far inside. Without q, the
+contour of cheeks, which darken towards their edge, was 0.2 px too far inside. B is first matched to the pixels just
+outside the mask, so that a shadow or reflected light at the edge does not shift the contour. F may vary (a dark edge, a
+lock of hair), so it is estimated again inside the first contour. If the colours are too similar, alpha follows the
+coarse mask.
 """
 
 from dataclasses import dataclass
@@ -44,8 +44,8 @@ MARGIN_PX = 12  # around the band: beyond every window here and in what follows
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matte:
-    """Holds the subject's alpha (about 0 to 1, smoothed) within a box of the image, and the contrast to the background
-    along its contour."""
+    """Holds the subject's alpha (about 0 to 1, smoothed) in a box of the image, and the contrast to the background
+    along the contour."""
 
     alpha: Float32[np.ndarray, "hb wb"]
     box: tuple[slice, slice]  # rows and columns of the image; a margin without subject but at the image's own border
@@ -57,9 +57,8 @@ class Matte:
 def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision) -> Matte:
     """Computes the subject's alpha from a coarse decision.
 
-    Where the subject's colour differs clearly from the plate, alpha is solved in a band wide enough for thin hair far
-    outside the solid head. Elsewhere alpha follows the decision, which averages more pixels, and is solved only at its
-    border.
+    Where the subject's colour differs clearly from the plate, alpha is solved in a band that is wide enough for thin
+    hair. Where the colours are similar, alpha follows the coarse decision, and is solved only at its border.
     """
     background, mask, clear = decision.background, decision.mask, decision.clear
     probability = np.where(mask, np.maximum(decision.probability, 0.6), np.minimum(decision.probability, 0.4))
@@ -89,7 +88,7 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision) -> Matte:
 
 
 def _pixels(cells: tuple[slice, slice], coarse: tuple[int, ...], fine: tuple[int, ...]) -> tuple[slice, slice]:
-    """Returns the rows and columns of the image that a range of coarse rows and columns covers."""
+    """Returns the slices of image rows and columns that a range of coarse rows and columns covers."""
     rows, columns = (
         slice(round(part.start * many / few), round(part.stop * many / few))
         for part, few, many in zip(cells, coarse, fine, strict=False)
@@ -98,7 +97,7 @@ def _pixels(cells: tuple[slice, slice], coarse: tuple[int, ...], fine: tuple[int
 
 
 def _smooth(alpha: Plane, trust: Plane, sigma: float) -> Plane:
-    """Returns alpha averaged with weights ``trust`` (1 / variance), in a window that is wider where trust is low."""
+    """Smooths alpha with the weights ``trust`` (1 / variance), in a window that is wider where ``trust`` is low."""
     near = cv2.GaussianBlur(alpha, (0, 0), sigma)
     if not (trust < MAX_ALPHA_INFORMATION).any():
         return near
@@ -111,7 +110,7 @@ def _smooth(alpha: Plane, trust: Plane, sigma: float) -> Plane:
 def _light_outside(
     image: Float32[np.ndarray, "h w 3"], background: Background, mask: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Returns the ratio of the image to the expected background just outside the subject, extended to all pixels."""
+    """Returns the ratio of the image to the estimated background just outside the subject, extended to all pixels."""
     clear = ~dilated(mask, 2)
     if not clear.any():
         return np.ones_like(image)
@@ -122,9 +121,9 @@ def _light_outside(
 def _subject_inside(
     image: UInt8[np.ndarray, "h w 3"], alpha: Plane, coarse: Float32[np.ndarray, "hc wc 3"], reduction: float
 ) -> Float32[np.ndarray, "h2 w2 3"]:
-    """Returns the subject's colour near its contour, at half resolution, extended outwards from solid pixels inside. If
-    a coarse pixel has fewer than ``FULL_REDUCTION`` pixels of the picture, all distances shrink in proportion and no
-    pixel is left out."""
+    """Returns the subject's colour near its contour, at half resolution, extended outwards from certain pixels inside.
+    Distances are proportional to the size of a coarse pixel, if it is below ``FULL_REDUCTION`` pixels of the
+    picture."""
     share = min(reduction / FULL_REDUCTION, 1.0)
     step = 2 if share == 1 else 1
     size = (image.shape[1] // step, image.shape[0] // step)
@@ -138,8 +137,8 @@ def _subject_inside(
 
 
 def _along_contour(contrast: Plane, alpha: Plane) -> Float32[np.ndarray, " c"]:
-    """Returns the contrast at every pixel of the contour: its own or, beside the solved band, its neighbours'. It is 0
-    where neither was solved."""
+    """Returns the contrast at every pixel of the contour. Pixels outside the solved band get their neighbours'
+    contrast, or 0 if the neighbours are not solved either."""
     mask = alpha > 0.5
     nearby = np.where(contrast < 0, cv2.dilate(contrast, np.ones((3, 3), np.uint8)), contrast)
     return np.maximum(nearby, np.float32(0))[mask & ~eroded(mask, 1)]

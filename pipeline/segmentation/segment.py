@@ -1,20 +1,20 @@
-"""Subtracts the background (section 5.4): turns a capture into one silhouette for each camera.
+"""Computes one silhouette for each camera of a capture by background subtraction (the paper's section 5.4).
 
-First ``pipeline.segmentation.foreground`` decides which pixels show the subject, and asks other cameras about doubtful
-ones. Then ``pipeline.segmentation.matting`` finds the sub-pixel contour. Last the silhouettes of all cameras are
-compared. The paper says only "background subtraction". An unreliable view is reported: ``quality.usable`` is False if
-its mask would harm a fit, and ``quality.warnings`` say why. Masks of the operator override everything.
+First ``pipeline.segmentation.foreground`` decides which pixels show the subject; other cameras decide about doubtful
+pixels. Then ``pipeline.segmentation.matting`` finds the sub-pixel contour. Last the silhouettes of all cameras are
+compared. ``quality.usable`` is False if a mask would harm a fit, and ``quality.warnings`` give the reason. Masks that
+the operator supplies replace the computed masks.
 
-A coarse visual hull (figure 1) tells whether the silhouettes agree. Every camera votes on a grid of voxels: a voxel
-clearly outside the camera's silhouette is empty. A view can be wrong in two ways. *Strange* area is mask where at least
-two other cameras call every voxel on the ray empty: a moved chair, a passer-by. *Missing* area is no mask, although all
-other cameras keep voxels on the ray: hair or a coat in the colour of the backdrop. A voxel counts as empty only with
-two votes, so that one bad view does not make the others look bad. A camera has no vote on voxels outside its image.
+A coarse visual hull (the paper's figure 1) shows whether the silhouettes agree. A voxel is empty according to a camera
+that sees it clearly outside its silhouette. A view can be wrong in two ways. *Strange* area is mask where, according to
+at least two other cameras, every voxel on the ray is empty: a moved chair, a passer-by. *Missing* area is background in
+this view, although no other camera excludes the voxels on the ray: hair or a coat in the colour of the backdrop. Two
+cameras must agree that a voxel is empty, so that one bad view does not affect the others.
 
-A hull is larger than the subject, the more so the fewer cameras there are and the farther apart they stand: the hull of
-three cameras covers up to 11 % more than a true fourth mask. Missing area is therefore believed only if the view also
-*contradicts* the others: behind some of their mask it alone leaves no voxel. True masks never contradict each other,
-however few they are.
+A visual hull is larger than the subject, most of all with few cameras: the hull of three cameras covers up to 11 % more
+than a correct fourth mask. Missing area therefore counts only if the view also *contradicts* another camera: this view
+alone excludes all voxels behind a part of the other camera's mask. Correct masks never contradict each other, however
+few they are.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -73,7 +73,7 @@ MAX_CONTRADICTED = 0.5  # ... which contradicts less than this share of what the
 
 def segment(capture: Capture, rig: Rig, *, report: Progress) -> dict[str, Silhouette]:
     """Returns the silhouette of every camera of the rig. A capture without any plate or mask is segmented from the
-    photographs alone. Raises InputError if only some cameras have neither."""
+    photographs alone. Raises InputError if some cameras have a plate or mask and others have none."""
     if not capture.backgrounds and not capture.masks:
         return _without_plates(capture, rig, report)
     blind = [name for name in rig.names if name not in capture.masks and not capture.backgrounds.get(name)]
@@ -111,8 +111,8 @@ def segment(capture: Capture, rig: Rig, *, report: Progress) -> dict[str, Silhou
 
 
 def _without_plates(capture: Capture, rig: Rig, report: Progress) -> dict[str, Silhouette]:
-    """Finds the silhouettes without plates or masks. With few views the search starts at the face. With more views it
-    starts there only if too few silhouettes are usable otherwise."""
+    """Finds the silhouettes without plates or masks. With few views the search starts at the subject's face. With more
+    views the search starts at the face only if a search without a face finds too few usable silhouettes."""
     few = len(rig) < SEEDED_VIEWS
     found = _searched(capture, rig, find_head_seed(capture.images, rig) if few else None, report)
     if not few and _usable_count(found) < ENOUGH_USABLE * len(rig):
@@ -128,7 +128,7 @@ def _usable_count(silhouettes: Mapping[str, Silhouette]) -> int:
 
 
 def _searched(capture: Capture, rig: Rig, head: HeadSeed | None, report: Progress) -> dict[str, Silhouette]:
-    """Returns the silhouettes of a search that starts at ``head`` or, if None, where all cameras are directed."""
+    """Searches the silhouettes from a start at ``head`` or, if None, at the point to which all cameras are directed."""
     from pipeline.segmentation.without_plates.decide import decide_without_plates  # packages that few captures need
 
     found = decide_without_plates(
@@ -145,8 +145,8 @@ def _searched(capture: Capture, rig: Rig, head: HeadSeed | None, report: Progres
 
 
 def _doubted(silhouette: Silhouette) -> Silhouette:
-    """Rewords a silhouette's warning of a weak outline for captures without plates, where changing the backdrop would
-    not help."""
+    """Replaces a silhouette's warning about a weak outline by the message for captures without plates, since its advice
+    differs."""
     quality, weak = silhouette.quality, float(np.asarray(silhouette.quality.figures.get("weak_share", 1.0)))
     if weak <= MAX_WEAK_SHARE:
         return silhouette
@@ -158,14 +158,14 @@ def _doubted(silhouette: Silhouette) -> Silhouette:
 
 
 def _concerns(message: Message, code: str) -> bool:
-    """Tells whether a message has the given code, or has a remark with that code."""
+    """Returns True if a message, or a remark in it, has the given code."""
     remark = message.parameters.get("remark")
     return message.code == code or (isinstance(remark, Message) and remark.code == code)
 
 
 def _as_cut(share: Float32[np.ndarray, "h w"], counted: Bool[np.ndarray, "h w"] | None = None) -> Silhouette:
-    """Returns the silhouette of a view whose mask was cut along image edges; its outline is weak where overlapping
-    windows of the cut disagree. Only the outline of the pixels ``counted`` is judged; None means all."""
+    """Returns the silhouette of a view whose mask was cut along image edges. The outline is weak where overlapping
+    windows of the cut disagree. Only the outline of the pixels ``counted`` is judged; None means all pixels."""
     alpha, holes = _without_specks(share, np.zeros_like(share))
     mask = alpha > 0.5
     undecided = dilated(np.abs(share - 0.5) < UNDECIDED, 1)
@@ -178,8 +178,8 @@ def _as_cut(share: Float32[np.ndarray, "h w"], counted: Bool[np.ndarray, "h w"] 
 
 
 def _operators(mask: Bool[np.ndarray, "h w"], share: UInt8[np.ndarray, "h w"] | None) -> Silhouette:
-    """Returns the silhouette of a mask that the operator supplied. If the mask has soft edges (``share``), its outline
-    is where the share is one half."""
+    """Returns the silhouette of a mask that the operator supplied. If the mask has soft edges (``share``), the outline
+    is where ``share`` is one half."""
     if share is None:
         return replace(silhouette_from_mask(mask), quality=_mask_quality(mask))
     smooth = cv2.GaussianBlur(share * np.float32(1 / 255), (0, 0), ALPHA_BLUR_PX)
@@ -191,8 +191,8 @@ def _decided(image: ImageRgb, plates: tuple[ImageRgb, ...]) -> Decision:
 
 
 def _refined(image: ImageRgb, decision: Decision, counted: Bool[np.ndarray, "h w"] | None = None) -> Silhouette:
-    """Returns the sub-pixel silhouette of a coarse decision, or an unusable one if the mask is too small. Only the
-    outline of the pixels ``counted`` is judged; None means all."""
+    """Returns the sub-pixel silhouette of a coarse decision, or an unusable silhouette if the mask is too small. Only
+    the outline of the pixels ``counted`` is judged; None means all pixels."""
     if decision.mask.mean() < MIN_SUBJECT_SHARE:
         return _nothing(image.shape[:2], decision.background)
     matte = solve_matte(image, decision)
@@ -229,11 +229,11 @@ def _silhouette(matte: Matte, decision: Decision, counted: Bool[np.ndarray, "h w
 def _without_specks(
     alpha: Float32[np.ndarray, "h w"], coarse: Float32[np.ndarray, "h w"]
 ) -> tuple[Float32[np.ndarray, "h w"], int]:
-    """Returns the alpha of the subject's own component with holes from noise filled, and the number of holes left.
+    """Keeps only the subject's connected component in alpha, and fills holes from noise. Returns alpha and the number
+    of remaining holes.
 
-    A hole is noise if it is small. It is also noise if the ``coarse`` probability, which averages the sensor's noise,
-    is high all over it, as in skin in front of a backdrop of its colour. A real gap that large would show at the coarse
-    level too.
+    A small hole is noise. A larger hole is noise if the ``coarse`` probability, in which the sensor's noise is
+    averaged, is high in all of it. Such holes occur if skin has the colour of the backdrop.
     """
     mask = alpha > 0.5
     labels, areas = _labelled(mask, 4)
@@ -269,7 +269,7 @@ def _mask_quality(mask: Bool[np.ndarray, "h w"]) -> ViewQuality:
 def _quality(
     mask: Bool[np.ndarray, "h w"], components_holes: tuple[int, int], contrast: float, weak: float, figures: dict
 ) -> ViewQuality:
-    """Judges a mask by itself: which borders cut it off, its contrast and area, and the warnings that follow."""
+    """Judges a single mask: which image borders cut it off, its contrast and area, and the resulting warnings."""
     borders = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}
     cut_off = tuple(name for name, line in borders.items() if line.sum() > 2)
     warnings, fatal = [], []
@@ -296,8 +296,8 @@ def _quality(
 
 
 def _crown_side(mask: Bool[np.ndarray, "h w"]) -> str:
-    """Returns the image border next to the crown: the one opposite the border through which the body leaves the
-    picture. Cameras may be mounted on their side. The body fills nearly all of one border; a cut crown does not."""
+    """Returns the image border next to the crown. The crown's border is opposite the border through which the body
+    leaves the picture and which the body nearly fills. Cameras may be mounted on their side."""
     across, down = mask.sum(axis=0), mask.sum(axis=1)
     widest = {"top": down.max(), "bottom": down.max(), "left": across.max(), "right": across.max()}
     touched = {"top": mask[0].sum(), "bottom": mask[-1].sum(), "left": mask[:, 0].sum(), "right": mask[:, -1].sum()}
@@ -320,8 +320,8 @@ def count_rejecting_cameras(
     doubt: Bool[np.ndarray, "h w"], name: str, masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig
 ) -> Int8[np.ndarray, "h w"]:
     """Counts, for each doubtful pixel of camera ``name``, the other cameras that see no subject anywhere on its ray (at
-    most ``MAX_DISSENT``); -1 for pixels that are not doubtful, or that too few cameras see. Masks may be smaller than
-    the images; all are reduced by the same factor."""
+    most ``MAX_DISSENT``). The value is -1 for pixels that are not doubtful, or that too few cameras see. Masks may be
+    smaller than the images, all by the same factor."""
     out = np.full(doubt.shape, -1, np.int8)
     others = [camera for camera in rig if camera.name != name and masks[camera.name].any()]
     if len(others) < MIN_WITNESSES or not doubt.any():
@@ -340,8 +340,8 @@ def count_rejecting_cameras(
 
 
 def _stacked(masks: list[np.ndarray], widths: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns each pixel's distance to its camera's mask (mask pixels; 0 inside, negative beyond the image), and the
-    width of a mask pixel in image pixels."""
+    """Returns distance maps to each camera's mask (mask pixels; 0 inside, negative outside the image), and the width of
+    a mask pixel in image pixels."""
     height, width = max(mask.shape[0] for mask in masks), max(mask.shape[1] for mask in masks)
     out = np.full((len(masks), height, width), -1.0, np.float32)
     for k, mask in enumerate(masks):
@@ -363,14 +363,14 @@ class Votes:
 
 
 def voxel_grid(centre: Float[np.ndarray, " 3"], edge: float, count: int) -> Float[np.ndarray, "n 3"]:
-    """Returns the centres (world frame, mm) of a cube's voxels, ``count`` along each side."""
+    """Returns the centres (world frame, mm) of the voxels of a cube, ``count`` along each side."""
     line = (np.arange(count) + 0.5) / count - 0.5
     return centre + edge * np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def cast_votes(silhouettes: Mapping[str, Silhouette], rig: Rig, count: int = GRID) -> Votes:
-    """Projects the voxels of a coarse grid around the subject into every camera. Returns which of them each camera
-    sees, and which lie outside its silhouette."""
+    """Projects the voxels of a coarse grid around the subject into every camera. Returns which voxels each camera sees,
+    and which of them lie outside its silhouette."""
     centre, edge = hull_extent(silhouettes, rig)
     voxels = voxel_grid(centre, edge, count)
 
@@ -391,13 +391,13 @@ def cast_votes(silhouettes: Mapping[str, Silhouette], rig: Rig, count: int = GRI
 def judge_agreement(
     silhouettes: Mapping[str, Silhouette], rig: Rig, *, ready: Collection[str] = ()
 ) -> dict[str, Silhouette]:
-    """Compares each silhouette with those of the other cameras. Returns the same silhouettes with the disagreement
-    added to their quality.
+    """Compares each silhouette with the other cameras' silhouettes. Returns the silhouettes with the disagreement added
+    to their quality.
 
     Args:
-        silhouettes: by camera; those that are not usable are ignored.
+        silhouettes: by camera; unusable ones are ignored.
         rig: the cameras as calibrated.
-        ready: cameras whose mask was given by the operator; they get warnings, but stay usable.
+        ready: cameras with a mask from the operator; they get warnings, but stay usable.
     """
     trusted = [name for name in rig.names if silhouettes[name].quality.usable]
     if len(trusted) < MIN_CAMERAS:
@@ -424,7 +424,7 @@ def judge_agreement(
 
 def _shares(votes: Votes, k: int, mask: Bool[np.ndarray, "h w"]) -> tuple[float, float]:
     """Returns two areas of camera k as fractions of its mask: the part that other cameras exclude (strange), and the
-    part that all others contain but the mask lacks (missing)."""
+    part that the mask lacks although no other camera excludes it (missing)."""
     small = _reduced(mask)
     size, area = small.shape[::-1], max(float(small.sum()), 1.0)
     others = np.delete(np.arange(len(votes.seen)), k)
@@ -440,7 +440,7 @@ def _shares(votes: Votes, k: int, mask: Bool[np.ndarray, "h w"]) -> tuple[float,
 
 
 def _contradicted(votes: Votes, k: int, masks: Sequence[Bool[np.ndarray, "_ _"]]) -> float:
-    """Returns the fraction of another camera's mask behind which camera k alone leaves no voxel, averaged over the
+    """Returns the fraction of another camera's mask behind which camera k alone excludes all voxels, averaged over the
     other cameras."""
     shares = []
     for j in range(len(votes.seen)):
@@ -458,7 +458,7 @@ def _contradicted(votes: Votes, k: int, masks: Sequence[Bool[np.ndarray, "_ _"]]
 
 
 def _allowed(others: int) -> int:
-    """Returns how many of the other cameras may wrongly exclude a voxel: one if there are five or more, else none."""
+    """Returns how many of the other cameras may wrongly exclude a voxel: 1 if there are five or more, else 0."""
     return 1 if others >= 5 else 0
 
 
@@ -470,7 +470,7 @@ def _reduced(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "r c"]:
 def _splat(
     votes: Votes, k: int, chosen: Bool[np.ndarray, " n"], size: tuple[int, int], *, grow: bool = True
 ) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of camera k's reduced image that the chosen voxels cover."""
+    """Returns a mask of the pixels of camera k's reduced image that the chosen voxels cover."""
     drawn = np.zeros((size[1], size[0]), np.uint8)
     at = (votes.pixels[k][chosen] / REDUCTION).astype(int)
     drawn[np.clip(at[:, 1], 0, size[1] - 1), np.clip(at[:, 0], 0, size[0] - 1)] = 1

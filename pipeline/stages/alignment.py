@@ -1,4 +1,4 @@
-"""Determines the pose and scale of the head before its shape is known (section 4.2)."""
+"""Determines the pose and scale of the mean head before the shape is fitted (the paper's section 4.2)."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -28,8 +28,8 @@ from rig.rig import Rig
 class Alignment:
     """Holds the pose of the mean head, the camera that the subject faces, and the method used.
 
-    ``landmarks`` are those of the subject's face, if the pose came from them. ``rival`` is the extra cost of the best
-    other pose, relative to the cost (0.1 = 10 %), if the pose came from silhouettes.
+    ``landmarks`` are the face landmarks that determined the pose, if any. ``rival`` is the extra cost of the second
+    best pose, relative to the cost (0.1 = 10 %), if silhouettes determined the pose.
     """
 
     world_from_head: Similarity
@@ -40,8 +40,8 @@ class Alignment:
 
 
 def front_camera(rig: Rig, settings: Settings) -> str:
-    """Returns the name of the camera that the subject faces: the one in the settings, or else the middle one of the
-    rig. Raises EigenheadError if the settings name a camera that the rig does not have."""
+    """Returns the name of the camera that the subject faces. The result is the camera in the settings or, by default,
+    the middle camera of the rig. Raises EigenheadError if the settings name a camera that the rig does not have."""
     if settings.front is None:
         return rig.front_camera()
     if settings.front not in rig:
@@ -50,8 +50,8 @@ def front_camera(rig: Rig, settings: Settings) -> str:
 
 
 def align_head(context: ReconstructionContext, views: Views, faces: Faces) -> Staged[Alignment]:
-    """Aligns the mean head to the capture's feature points; without these, to the subject's face in the photographs;
-    and without a face, to the silhouettes. Refuses with TooFewFeatures, WrongFeatures, NoSubject."""
+    """Aligns the mean head to the capture's feature points. Without feature points the function uses the subject's face
+    in the photographs, and without a face the silhouettes. Refuses with TooFewFeatures, WrongFeatures, NoSubject."""
     model, rig, settings = model_basis(context.model, context.settings), context.rig, context.settings
     face = None if faces.subject is None else faces.subject.matched
     if views.capture.features and face is not None:
@@ -80,7 +80,7 @@ def align_head(context: ReconstructionContext, views: Views, faces: Faces) -> St
 def _without_features(
     context: ReconstructionContext, views: Views, faces: Faces, refusal: EigenheadError
 ) -> Staged[Alignment]:
-    """Refuses the feature points, or aligns the head without them."""
+    """Refuses wrong feature points, or aligns the head without them if the guards allow this."""
     overruled = context.guards.refuse(refusal)
     bare = replace(views, capture=replace(views.capture, features={}))
     found = align_head(context, bare, faces)

@@ -1,4 +1,4 @@
-"""Makes the bust: everything in view as one closed surface, in the photographs' colours."""
+"""Makes the bust: head, hair and clothes as one closed surface, in the photographs' colours."""
 
 from dataclasses import dataclass
 
@@ -38,9 +38,9 @@ FACE_REACH_MM = 10.0  # from the head's face: what lies farther in front of it i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapedBust:
-    """Holds the surface of the bust. Of its vertices on the face, ``face_silent_share`` (0 to 1) is the fraction
-    without support by any view's depth, and ``guessed_share`` the part of it that the refined head did not measure
-    either. ``likely_part`` is the part label of each vertex; an unseen vertex has the most likely one."""
+    """Holds the surface of the bust. ``face_silent_share`` (0 to 1) is the fraction of its face vertices that no depth
+    map supports. ``guessed_share`` is the fraction that the refined head did not measure either. ``likely_part`` is the
+    part label of each vertex; unseen vertices have the most likely label."""
 
     surface: BustSurface
     likely_part: UInt8[np.ndarray, " v"]
@@ -50,9 +50,9 @@ class ShapedBust:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bust:
-    """Holds the closed surface of everything in view, with its colours (sRGB). ``views`` is the number of images that
-    coloured each vertex; 0 if its colour was filled from its neighbours. ``spacing_mm`` is the grid's spacing.
-    ``atlas`` is its texture if the settings request GLB."""
+    """Holds the closed surface of head, hair and clothes, with its colours (sRGB). ``views`` is the number of images
+    that coloured each vertex; 0 means a colour interpolated from neighbours. ``spacing_mm`` is the grid's spacing.
+    ``atlas`` is the texture if the settings request GLB."""
 
     shaped: ShapedBust
     normals: Float[np.ndarray, "v 3"]
@@ -75,8 +75,8 @@ class Bust:
 def fuse_depth(
     context: ReconstructionContext, views: Views, head_world: Mesh, labels: PartLabels, depth: Depth
 ) -> Staged[DepthSurface | None]:
-    """Fuses the depth maps to one closed surface. Where no camera sees the subject it takes the fitted head; where long
-    hair has hardly any depth, a shell inside its outlines.
+    """Fuses the depth maps to one closed surface. Regions that no camera sees follow the fitted head. Long hair without
+    measured depth becomes a shell inside its outlines.
 
     Returns None if the settings request only the head. Returns None with the warning ``no-bust`` if the depth maps do
     not determine a surface.
@@ -106,7 +106,7 @@ def fuse_depth(
 
 
 def bare_ears(model: HeadModel, head_world: Mesh, votes: PartVotes) -> list[Bool[np.ndarray, " v"]]:
-    """Returns the vertices of each ear about which the votes are for skin rather than for hair."""
+    """Returns a vertex mask of each ear that the part labels show as skin rather than hair."""
     shares, left = part_shares(votes, head_world.vertices), model.vertices(np.zeros(0))[:, 0] > 0.0
     bare = shares[:, Part.SKIN.channel] - shares[:, Part.HAIR.channel]
     return [ear for side in (left, ~left) if bare[ear := pinnae(model) & side].sum() > 0.0]
@@ -119,8 +119,8 @@ def shape_bust(
     refined: RefinedHead,
     fused: DepthSurface | None,
 ) -> Staged[ShapedBust | None]:
-    """Combines the fused surface with the delivered head, extends hair to its outlines, and mends the triangles.
-    Returns None if ``fused`` is None. Warns ``bust-guessed`` if neither depth nor head measured most of the face."""
+    """Combines the fused surface with the final head, extends hair to its outlines, and repairs bad triangles. Returns
+    None if ``fused`` is None. Warns ``bust-guessed`` if neither depth nor head measured most of the face."""
     if fused is None:
         return Staged(None)
     head = HeadSkin(refined.mesh_world, refined.deviation_mm)
@@ -167,9 +167,9 @@ def colour_bust(
 def _likely_parts(
     surface: BustSurface, far_mm: Float[np.ndarray, " v"], near: Int[np.ndarray, " v"], model: HeadModel
 ) -> UInt8[np.ndarray, " v"]:
-    """Returns the most likely part of each vertex, from which unseen vertices get their colour: ``HAIR`` is the whole
-    scalp, bald or not, and everything far from the head; ``CLOTHES`` lie beyond the head's open border. ``far_mm`` and
-    ``near``: distance to the nearest vertex of the head, and its row."""
+    """Returns the most likely part label of each vertex, which selects the colour of unseen vertices. ``HAIR`` is the
+    whole scalp, bald or not, and everything far from the head; ``CLOTHES`` lie beyond the head's open border.
+    ``far_mm`` and ``near`` are the distance to the nearest vertex of the head, and its index."""
     part, unseen = surface.part.copy(), surface.part == Part.UNSEEN
     part[unseen] = Part.SKIN
     part[scalp(model)[near] | (unseen & (far_mm > OFF_HEAD_MM))] = Part.HAIR
@@ -179,8 +179,8 @@ def _likely_parts(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HairyHead:
-    """Holds the head pushed out to its hair, with its colours (sRGB), the number of images that coloured each vertex,
-    and its texture if the settings request one."""
+    """Holds the head with vertices moved outwards to the hair, its colours (sRGB), the number of images that coloured
+    each vertex, and its texture if the settings request one."""
 
     shell: HairShell
     normals: Float[np.ndarray, "v 3"]
@@ -192,9 +192,9 @@ class HairyHead:
 def push_out_hair(
     context: ReconstructionContext, views: Views, refined: RefinedHead, bust: Bust | None, coloured: Capture
 ) -> Staged[HairyHead | None]:
-    """Pushes the delivered head out to the bust's hair, if the settings request it, and colours it from the photographs
-    of ``coloured``. Returns None otherwise, and without a bust. Warns ``hair-beyond-head`` if the head's vertices do
-    not reach the hair."""
+    """Moves the final head's vertices outwards to the bust's hair, and colours them from the photographs of
+    ``coloured``. Returns None without a bust, or if the settings do not request this. Warns ``hair-beyond-head`` if the
+    head's vertices do not reach the hair."""
     settings, rig = context.settings, context.rig
     if bust is None or settings.outputs.surface != "hair":
         return Staged(None)

@@ -1,4 +1,4 @@
-"""Defines what every stage of one reconstruction may read."""
+"""Defines the inputs and resources that every stage of a reconstruction may use."""
 
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,7 +18,7 @@ from rig.rig import Rig
 
 @runtime_checkable
 class Segment(Protocol):
-    """Declares the function that computes the silhouettes of a capture: ``segment``, or one with a cache."""
+    """Declares the type of a function that computes the silhouettes of a capture, with or without a cache."""
 
     def __call__(self, capture: Capture, rig: Rig, /, *, report: Progress) -> dict[str, Silhouette]:
         """Returns the silhouette of every camera."""
@@ -27,7 +27,7 @@ class Segment(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReconstructionContext:
-    """Holds one capture with all inputs of its reconstruction, and the resources that the caller owns.
+    """Holds one capture with all inputs of its reconstruction, and resources of the caller.
 
     Attributes:
         capture: the shot as it was read.
@@ -35,7 +35,7 @@ class ReconstructionContext:
         model: the head model with all its modes.
         settings: of this reconstruction.
         renderer: an OpenGL context of the calling thread.
-        progress: called with a stage's name and the share of it that is done; raises Cancelled to stop.
+        progress: called with a stage's name and its finished fraction; raises Cancelled to stop.
         segment: computes the silhouettes of a capture; a caller that caches them passes its own function.
         read_original: reads a picture at the size of its file, for the detail ``pores``; None where there are no files.
         device: GPU that compares the photographs; None uses the processor.
@@ -57,8 +57,7 @@ class ReconstructionContext:
         return Guards(self.settings.anyway)
 
     def within_stage(self, name: str) -> "ReconstructionContext":
-        """Returns the context with all progress reported under the stage ``name``, whatever name the called code
-        reports."""
+        """Returns a context that reports all progress under the stage ``name``, whatever name the called code gives."""
         return replace(self, progress=partial(_report_as, self.progress, name))
 
 

@@ -1,4 +1,4 @@
-"""Measures depth in every view from the photographs, and finds which part of it belongs to the fitted head."""
+"""Computes a depth map for every view from the photographs, and finds which depth pixels lie on the fitted head."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ from pipeline.stereo.estimate import estimate_depth
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Depth:
-    """Holds the depth maps and their derived values: the parts (skin, hair, clothes) of the surface, the surface as
-    points with normals, the points on the face, and the bias of the depth as measured on the fitted face."""
+    """Holds the depth maps and values derived from them: part labels (skin, hair, clothes), surface points with
+    normals, points on the face, and the depth bias measured on the fitted face."""
 
     maps: tuple[DepthMap, ...]  # none where no stage needs them
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]  # as they were matched, without highlights
@@ -34,13 +34,13 @@ class Depth:
 
 
 def is_refined(head: HeadFit, settings: Settings) -> bool:
-    """Tells whether a later stage deforms the head to the measured surface: the fit must have used the photographs, and
-    the settings must request the detail ``fine``."""
+    """Returns True if a later stage deforms the head to the measured surface. The deformation requires a fit that used
+    the photographs, and the detail ``fine`` in the settings."""
     return head.detail.level == "photo" and settings.detail in FINE_LEVELS
 
 
 def measure_depth(context: ReconstructionContext, views: Views, head: HeadFit, labels: PartLabels) -> Staged[Depth]:
-    """Measures depth in every view if a later stage needs it. The fitted head limits the depths to search."""
+    """Computes depth maps if a later stage needs them. The fitted head limits the range of depths."""
     settings, mesh = context.settings, head.mesh_world
     maps: tuple[DepthMap, ...] = ()
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]] = views.capture.images

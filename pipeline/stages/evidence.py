@@ -1,4 +1,4 @@
-"""Judges the delivered head: how well it explains every camera, its measurements, and its expression."""
+"""Evaluates the final head: agreement with every camera, measurements, and expression."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -44,7 +44,7 @@ Masks = Mapping[str, Bool[np.ndarray, "h w"]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Holds the figures of the delivered head. Mappings by camera have an entry for every camera of the rig."""
+    """Holds the measured properties of the final head. Mappings by camera have an entry for every camera of the rig."""
 
     start_masks: Masks  # of the head that the fit started from
     fitted_masks: Masks
@@ -66,10 +66,10 @@ def judge_head(
     texturing: Texturing,
     pose: PoseEvidence,
 ) -> Staged[Evidence]:
-    """Measures the delivered head, and warns if it is not plausible.
+    """Measures the final head, and warns if it is not plausible.
 
-    Refuses with UnexplainedOutlines if the head explains hardly any outline and no face in the photographs confirms its
-    pose. The settings can allow such a head, for subjects with long hair all around, whose outlines are all hair.
+    Refuses with UnexplainedOutlines if the head fits hardly any outline and no face in the photographs confirms its
+    pose. The settings can allow a misfitting head, for subjects with long hair all around.
     """
     fit, model, rig, outputs = head.fit, head.model, context.rig, context.settings.outputs
     before = start_masks(model, alignment.world_from_head, rig)
@@ -108,11 +108,11 @@ def judge_head(
 def fit_with_read_face(
     context: ReconstructionContext, head: HeadFit, displaced: DeformedSurface
 ) -> tuple[Fit, float, frozenset[int]]:
-    """Returns three values: the fit with the expression from the deformed head; how many standard deviations a weight
-    must have to be reported; and the indices of the doubtful expressions, which are left out.
+    """Returns the fit with the expression from the deformed head. Also returns how many standard deviations a weight
+    must have to be reported, and the indices of doubtful expressions, which are left out.
 
-    The expression is re-estimated only if the fit's is not neutral. The lids always come from the points around the
-    eye, if these determine them (see ``told_lids``).
+    The expression is estimated again only if the fit has an expression. The lids always follow the measured points
+    around the eye, if these determine the lids (``told_lids``).
     """
     fit, model = head.fit, head.model
     rows = blinks_of(model)
@@ -137,14 +137,14 @@ def fit_with_read_face(
 
 
 def told_lids(lids: Mapping[str, float]) -> dict[str, float]:
-    """Returns how far each eye is closed, as a reportable weight: lids that are less than ``MIN_LIDS`` of the way down
-    count as open."""
+    """Returns how far each eye is closed (0 to 1), for the report. Values below ``MIN_LIDS`` become 0, which is
+    open."""
     return {side: share if share >= MIN_LIDS else 0.0 for side, share in lids.items()}
 
 
 def confirmed_closed(closed: frozenset[str], openings: Mapping[str, float]) -> frozenset[str]:
-    """Returns which eyes are closed: the fitted head's (``closed``), corrected by the measured ``openings`` of the lids
-    if these are clear."""
+    """Returns which eyes are closed. The fitted head's result ``closed`` is corrected where the measured ``openings``
+    are clear."""
     apart = {side for side, opening in openings.items() if opening > MAX_CLOSED_OPENING}
     return (closed | closed_by_openings(openings)) - apart
 
@@ -152,8 +152,8 @@ def confirmed_closed(closed: frozenset[str], openings: Mapping[str, float]) -> f
 def check_pose(
     context: ReconstructionContext, faces: Faces, alignment: Alignment, head: HeadFit, refined: RefinedHead
 ) -> Staged[PoseEvidence]:
-    """Compares the head's landmarks with the faces in the photographs, and the cost of its pose with the cost of the
-    best other pose."""
+    """Compares the head's landmarks with the faces in the photographs, and the pose's cost with the cost of the second
+    best pose."""
     evidence, warnings = judge_pose(
         refined.mesh_world,
         head.fit.world_from_head,

@@ -15,10 +15,10 @@ from rig.capture import Capture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Faces:
-    """Holds the subject's faces in the photographs; ``subject`` is None if the settings disable the search.
+    """Holds the subject's face in the photographs; ``subject`` is None if the settings disable the search.
 
     If the views agree on the face, ``eye_openings`` holds the opening of each eye (``faces.eyes``), and ``eyes`` the
-    irises or why they were not measured.
+    irises, or the reasons why they were not measured.
     """
 
     subject: SubjectFaces | None

@@ -1,6 +1,6 @@
-"""Fits the head to the outlines (section 4.4) by the solver in the settings, and then to the photographs.
+"""Fits the head to the outlines (the paper's section 4.4) by the solver in the settings, and then to the photographs.
 
-These are two stages, ``fit_outlines`` and ``fit_head``, because the pixels are labelled in between.
+The fit has two stages, ``fit_outlines`` and ``fit_head``, because the pixels are labelled between them.
 """
 
 from collections.abc import Mapping
@@ -42,7 +42,7 @@ MAX_COST_RISE = 1.1  # of a fit without its doubtful expressions: those that exp
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutlineFit:
-    """Holds a head fitted to the outlines alone. ``solution`` is the fit of the simplex method, or the state from which
+    """Holds a head fitted only to the outlines. ``solution`` is the fit of the simplex method, or the state from which
     the contour solver continues."""
 
     solution: ContourSolution | Fit
@@ -54,7 +54,7 @@ class OutlineFit:
 class HeadFit:
     """Holds a fit with its covariance, the model whose modes it uses, and the level of detail that it reached.
 
-    ``cranium`` names what forms the cranium's outline: hair, a cap of known thickness, or skin; None if unknown.
+    ``cranium`` states what forms the cranium's outline: hair, a cap of known thickness, or skin; None if unknown.
     """
 
     fit: Fit
@@ -66,21 +66,21 @@ class HeadFit:
 
     @property
     def mesh_world(self) -> Mesh:
-        """Returns the fitted head, full level, world frame, mm."""
+        """Returns the fitted head as a full-resolution mesh, world frame, mm."""
         return fitted_mesh(self.model, self.fit)
 
 
 def fitted_mesh(model: HeadModel, fit: Fit) -> Mesh:
-    """Returns the head that a fit describes, on the full level, world frame, mm."""
+    """Computes the full-resolution mesh of a fitted head, world frame, mm."""
     return Mesh(fit.world_from_head.apply(model.vertices(fit.coefficients)), model.levels["full"].faces)
 
 
 def fit_outlines(
     context: ReconstructionContext, views: Views, alignment: Alignment, cap: Cap | None
 ) -> Staged[OutlineFit]:
-    """Fits shape and pose to the silhouettes with the contour solver. If the settings name the simplex method, it then
-    refits the shape at the same pose. Outlines along the ``cap`` are moved inwards by its thickness and count as
-    skull."""
+    """Fits shape and pose to the silhouettes with the contour solver. If the settings choose the simplex method, the
+    function then fits the shape again at this pose. Outlines along the ``cap`` are moved inwards by its thickness and
+    then show the skull."""
     settings, rig = context.settings, context.rig
     bare = CapOutline(views.silhouettes, {})
     if cap is not None:
@@ -105,8 +105,8 @@ def fit_outlines(
 def refine_with_likely_face(
     outlines: ContourSolution, images: Mapping[str, ImageRgb], hair: HairProbability
 ) -> tuple[ContourSolution, Detail, frozenset[int]]:
-    """Refines the fit with the photographs. If the expression contradicts itself, refines again without its doubtful
-    parts, and takes that fit if it explains the photographs equally well. Also returns the doubtful expressions."""
+    """Refines the fit with the photographs. If the expression contradicts itself, the fit is repeated without doubtful
+    expressions, and kept if it explains the photographs equally well. Also returns the doubtful expressions."""
     solved, detail = refine_with_photographs(outlines, images, hair=hair)
     doubtful = doubtful_weights(solved.problem.model, solved.state.coefficients)
     if not doubtful:
@@ -119,8 +119,8 @@ def refine_with_likely_face(
 
 
 def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit, labels: PartLabels) -> Staged[HeadFit]:
-    """Refines the fit with the photographs inside the outlines, to the level of detail that settings and photographs
-    allow."""
+    """Refines the fit with the photographs' pixels inside the outlines. Settings and photographs limit the level of
+    detail."""
     settings, model, solved = context.settings, outlines.model, outlines.solution
     if isinstance(solved, Fit):
         return Staged(HeadFit(solved, model, Detail("span", compose("level-simplex"))))

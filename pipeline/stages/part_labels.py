@@ -1,4 +1,4 @@
-"""Labels each pixel as skin, hair or clothes, or as a cap of stated colour."""
+"""Labels each pixel as skin, hair or clothes, and finds a cap of known colour."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -26,19 +26,19 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartLabels:
-    """Holds the part map of each camera, the probabilities of skin, hair and clothes at every pixel; empty if no stage
-    needs them. A ``cap`` counts as clothes."""
+    """Holds, for each camera, a map of the probabilities of skin, hair and clothes at every pixel; empty if no stage
+    needs the maps. A ``cap`` counts as clothes."""
 
     maps: Mapping[str, PartMap]
     cap: Cap | None = None
 
     def hiding_probability(self) -> "OnePart":
-        """Returns, for each camera, the probability at every pixel that hair or the cap hides the skin."""
+        """Returns, for each camera, the probability at every pixel that hair or a cap hides the skin."""
         return OnePart(self.maps, Part.HAIR, {} if self.cap is None else self.cap.masks)
 
     def shares(self, camera: Camera, points: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
-        """Returns the probabilities (0 to 1) that a view shows skin, hair and clothes at points (world, mm). Without a
-        part map everything counts as skin."""
+        """Returns the probabilities (0 to 1) that a view shows skin, hair and clothes at points (world frame, mm).
+        Without a map everything counts as skin."""
         if camera.name not in self.maps:
             return np.tile([1.0, 0.0, 0.0], (len(points), 1))
         return parts_shown(points, self.maps[camera.name], camera)
@@ -50,8 +50,8 @@ class PartLabels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnePart(Mapping[str, Float32[ndarray, "_ _"]]):
-    """Holds the probability of one part at every pixel, by camera; it is 1 where one of the ``masks`` is true. Each map
-    is computed when it is read, because all of them would take four times the memory of their sources."""
+    """Holds the probability of one part at every pixel, by camera; it is 1 where one of the ``masks`` is true. A map is
+    computed only when it is read, to save memory."""
 
     maps: Mapping[str, PartMap]
     part: Part
@@ -71,8 +71,8 @@ class OnePart(Mapping[str, Float32[ndarray, "_ _"]]):
 
 
 def find_worn_cap(context: ReconstructionContext, views: Views, alignment: Alignment) -> Staged[Cap | None]:
-    """Finds the cap that the settings name by its colour in the photographs, on the mean head at its pose. Returns None
-    if the settings name no cap; also, with the warning ``cap-not-found``, if the photographs do not show it."""
+    """Finds the cap in the photographs by the colour in the settings, on the aligned mean head. Returns None if the
+    settings name no cap. Returns None with the warning ``cap-not-found`` if the photographs do not show the cap."""
     settings = context.settings.cap
     if settings.colour is None:
         return Staged(None)
@@ -96,8 +96,8 @@ def find_worn_cap(context: ReconstructionContext, views: Views, alignment: Align
 def label_parts(
     context: ReconstructionContext, views: Views, model: HeadModel, head_world: Mesh, cap: Cap | None
 ) -> Staged[PartLabels]:
-    """Labels the pixels of every photograph as skin, hair or clothes, starting from a fitted head: ``head_world`` (mm),
-    whose vertices are those of ``model``. Pixels of the ``cap`` are clothes."""
+    """Labels the pixels of every photograph as skin, hair or clothes, starting from the fitted head ``head_world`` (mm)
+    with the vertices of ``model``. Pixels of the ``cap`` count as clothes."""
     settings = context.settings
     if settings.detail not in PHOTO_LEVELS and settings.outputs.surface == "head":
         return Staged(PartLabels({}, cap))

@@ -1,4 +1,4 @@
-"""Runs stages, collects their warnings and seconds, and reports their progress. No other module does this."""
+"""Runs stages, collects their warnings and seconds, and reports their progress."""
 
 import threading
 import time
@@ -26,21 +26,21 @@ class Staged(Generic[T]):
 
 
 class Pending(Generic[T]):
-    """Holds the product of a stage that runs in another thread. ``product`` may be read once the block of
-    ``Recorder.beside`` has ended."""
+    """Holds the product of a stage that runs in another thread. ``product`` may be read after the end of the
+    ``Recorder.beside`` block."""
 
     product: T
 
 
 class RunningStage:
-    """Holds a running stage: the context that its functions read, and the warnings so far."""
+    """Holds the context and the warnings of a running stage."""
 
     def __init__(self, context: ReconstructionContext, warnings: list[ReportWarning]) -> None:
         self.context = context
         self._warnings = warnings
 
     def keep(self, staged: Staged[T]) -> T:
-        """Records the warnings of a stage's function, and returns its product."""
+        """Records the warnings of a ``Staged`` value, and returns its product."""
         self._warnings += staged.warnings
         return staged.product
 
@@ -49,8 +49,8 @@ class Recorder:
     """Runs stages in sequence, or one in parallel with others, and records their seconds and warnings.
 
     The context's ``progress`` is called when a stage begins, and by the stage as it advances; if it raises Cancelled,
-    the stage ends. A parallel stage reports no progress, and only the time spent waiting for it counts, so all seconds
-    add up to the job's. The seconds of stages with the same name are added up.
+    the stage ends. A parallel stage reports no progress. Only the time spent waiting for a parallel stage counts, so
+    that all seconds add up to the job's duration. The seconds of stages with the same name are added.
     """
 
     def __init__(self, context: ReconstructionContext) -> None:
@@ -61,18 +61,18 @@ class Recorder:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[RunningStage]:
-        """Reports that the stage begins, and counts the seconds of the block as its own."""
+        """Reports the beginning of a stage, and measures the seconds of the ``with`` block."""
         self._context.progress(name, 0.0)
         with self._count_seconds(name), span("stage", name):
             yield RunningStage(self._context.within_stage(name), self._warnings)
 
     @contextmanager
     def beside(self, name: str, run: Callable[[ReconstructionContext], Staged[T]]) -> Iterator[Pending[T]]:
-        """Runs a stage in a thread of its own while the block runs others, and waits for it at the end of the block.
-        With a single thread allowed, the stage runs before the block.
+        """Runs a stage in another thread during the ``with`` block, and waits for it at the end of the block. If only
+        one thread is allowed, the stage runs before the block.
 
-        The stage may use nothing that belongs to the calling thread, such as the renderer. If the block fails, the
-        stage is stopped when it next reports progress. Raises what the stage raises.
+        The stage may not use resources of the calling thread, such as the renderer. If the block fails, the stage is
+        stopped when it next reports progress. Exceptions of the stage are raised at the end.
         """
         pending, abandoned = Pending[T](), threading.Event()
 
@@ -112,9 +112,9 @@ class Recorder:
 
     @property
     def warnings(self) -> tuple[ReportWarning, ...]:
-        """Returns the warnings of all stages so far, in the order in which they ended."""
+        """Returns the warnings of all finished stages, in the order in which they ended."""
         return tuple(self._warnings)
 
     def seconds(self) -> dict[str, float]:
-        """Returns the seconds of every stage, and ``total`` since the recorder was made."""
+        """Returns the seconds of every stage, and the ``total`` since the recorder was created."""
         return self._seconds | {"total": time.perf_counter() - self._started}

@@ -1,4 +1,4 @@
-"""Deforms the fitted head to the surface that dense matching measured."""
+"""Deforms the fitted head to the surface from dense stereo."""
 
 from dataclasses import dataclass, replace
 
@@ -27,11 +27,11 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedHead:
-    """Holds the delivered head, free of degenerate triangles: the fitted head, or the one deformed to the measured
+    """Holds the final head mesh without degenerate triangles: the fitted head, perhaps deformed to the measured
     surface.
 
     ``deviation_mm`` is the posterior standard deviation of each vertex. ``displaced`` is the deformed surface; None if
-    the fitted head is delivered.
+    the head was not deformed.
     """
 
     mesh_world: Mesh  # full level, mm
@@ -44,7 +44,7 @@ def refine_head(
     context: ReconstructionContext, views: Views, faces: Faces, head: HeadFit, labels: PartLabels, depth: Depth
 ) -> Staged[RefinedHead]:
     """Deforms the fitted head to the measured surface. Returns the fitted head if the settings request less detail, or
-    if the surface shows too little of the face."""
+    if too little of the face was measured."""
     settings, fit, model, mesh = context.settings, head.fit, head.model, head.mesh_world
     deviation_mm = vertex_deviation_mm(model, fit)
     if not is_refined(head, settings):

@@ -1,4 +1,4 @@
-"""Computes the head's colours and texture (section 4.5)."""
+"""Computes the head's colours and texture (the paper's section 4.5)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texturing:
-    """Holds the delivered head's vertex colours, and the textures that the settings request."""
+    """Holds the vertex colours of the final head, and the textures that the settings request."""
 
     normals: Float[np.ndarray, "v 3"]
     depths: Mapping[str, Float32[np.ndarray, "_ _"]]  # mm, of the head in each camera; inf beside it
@@ -48,7 +48,7 @@ class Texturing:
 def texture_head(
     context: ReconstructionContext, views: Views, head: HeadFit, refined: RefinedHead, labels: PartLabels
 ) -> Staged[Texturing]:
-    """Colours the delivered head from the photographs, and paints its textures and maps."""
+    """Colours the final head from the photographs, and paints its textures and maps."""
     settings, rig, model, mesh = context.settings, context.rig, head.model, refined.mesh_world
     normals, depths, face = mesh.normals(), depth_maps(rig, mesh), model.levels["full"].face_region
     layout, layout_warnings = find_layout(model, settings)
@@ -106,7 +106,8 @@ def _read_pores(
     face: Bool[np.ndarray, " v"],
     chart: ChartColours | None,
 ) -> tuple[CloseViews | None, list[ReportWarning]]:
-    """Reads the full-size pictures for pores. Returns None, with a warning if there is no file or no texture."""
+    """Reads the full-size pictures for the detail ``pores``. Returns None for other details, or with a warning if files
+    are missing."""
     if context.settings.detail != "pores":
         return None, []
     if context.read_original is None or coloured.decision is None:

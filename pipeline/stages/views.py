@@ -1,4 +1,4 @@
-"""Finds the silhouettes (section 5.4), and decides which views are used."""
+"""Finds the silhouettes (the paper's section 5.4), and decides which views are used."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from rig.capture import Capture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """Holds the capture with every picture under the right camera, and its silhouettes; excluded views are marked as
-    not usable.
+    """Holds the capture with every picture under the right camera, and silhouettes; excluded views are marked as not
+    usable.
 
-    ``assignment`` has an entry for each camera with a wrong picture: the name under which its correct one was filed.
+    For each camera that had a wrong picture, ``assignment`` has the name under which the correct one was filed.
     """
 
     capture: Capture

@@ -1,4 +1,4 @@
-"""Measures the depth of the subject in every view from the photographs.
+"""Computes a depth map for every view by matching the photographs (multi-view stereo).
 
-In: photographs, silhouettes, the rig and the fitted head. Out: a ``DepthMap`` for each view (mm, normals, deviation).
+A ``DepthMap`` holds depths (mm), normals and standard deviations at the pixels of a view.
 """

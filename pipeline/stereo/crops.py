@@ -1,8 +1,8 @@
 """Prepares the photographs for dense matching: grey pinhole crops around the subject, at several sizes.
 
 A crop keeps its camera's pose and name, but has no lens distortion. A plane then maps from one view to another by a
-homography, which is nearly affine over a small window. So the lens costs one resampling of each photograph instead of
-one in each comparison.
+homography, which is nearly affine over a small window. So each photograph is undistorted once instead of in each
+comparison.
 """
 
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ BLUR_PX = 0.5  # before every halving, and of the full size: what is left is fit
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """Holds a crop at one size: its camera, grey values and distances to the outline, in pixels of this size."""
+    """Holds a crop at one size: its camera, grey values and signed distances to the outline, in pixels of this size."""
 
     camera: Camera
     grey: Float32[np.ndarray, "h w"]
@@ -41,8 +41,7 @@ class Level:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crop:
-    """Holds one camera's picture of the subject, cropped and undistorted; each of its ``levels`` is half as large as
-    the previous one."""
+    """Holds one camera's picture of the subject, cropped and undistorted, as an image pyramid with ``levels``."""
 
     levels: tuple[Level, ...]
     colour: Photograph
@@ -62,10 +61,10 @@ def make_crops(
     pixel_mm: float,
     at_world: Float[np.ndarray, " 3"],
 ) -> list[Crop]:
-    """Returns a crop for each camera with a photograph and a usable silhouette that is not empty.
+    """Returns a crop for each camera with a photograph and a usable, non-empty silhouette.
 
     ``images``: RGB photographs, by camera name. ``silhouettes``: by camera name. ``rig``: the cameras. ``pixel_mm``:
-    smallest width (mm, at ``at_world``) of a crop's pixel; finer photographs are reduced to it. ``at_world``: about the
+    smallest width (mm, at ``at_world``) of a crop's pixel; finer photographs are scaled down. ``at_world``: about the
     middle of the subject (mm).
     """
     found = []
@@ -106,10 +105,11 @@ def _crop(
 
 
 def crop_camera(camera: Camera, silhouette: Silhouette, scale: float) -> Camera:
-    """Returns a pinhole camera at the pose of ``camera`` whose image just contains the subject; its pixels are 1 /
-    ``scale`` as wide as the camera's. Width and height are multiples of 2^(``LEVELS`` - 1), so that they can be halved.
+    """Returns a pinhole camera at the pose of ``camera`` whose image just contains the subject. The pinhole camera's
+    pixels are 1 / ``scale`` as wide as the camera's. Width and height are multiples of 2^(``LEVELS`` - 1), for the
+    image pyramid.
 
-    Where the photograph cuts the subject off, the crop extends ``MARGIN_PX`` beyond the photograph; pixels there are
+    Where the photograph cuts the subject off, the crop extends ``MARGIN_PX`` beyond the photograph; these pixels are
     marked as unseen.
     """
     row, column = np.flatnonzero(silhouette.mask.any(axis=1)), np.flatnonzero(silhouette.mask.any(axis=0))
@@ -131,8 +131,8 @@ def crop_camera(camera: Camera, silhouette: Silhouette, scale: float) -> Camera:
 
 
 def lens_map(camera: Camera, pinhole: Camera) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Returns the column and the row (px) in the camera's photograph for each pixel of ``pinhole``. Both cameras have
-    the same pose."""
+    """Returns the column and the row (px) in the camera's photograph for each pixel of ``pinhole``, a camera with the
+    same pose."""
     k = pinhole.intrinsics
     x, y = np.empty((k.height, k.width), np.float32), np.empty((k.height, k.width), np.float32)
     fill_lens_map(k.values()[:4], packed_lens(camera), x, y)

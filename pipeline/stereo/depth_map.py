@@ -1,9 +1,9 @@
-"""Holds the surface from one photograph matched with its neighbours: depth, normal, and their uncertainty.
+"""Defines the depth map of one view: depth, normal and standard deviation at each pixel.
 
-Matching by windows has a bias. The whole surface lies a little too deep, and curved parts come out too flat: protruding
-parts (bridge of the nose, lips) are cut off, and hollows are filled. To first order the flattening is ``share`` times a
-height: that of the surface's mean over a 2.5 mm window above the surface itself. ``pipeline.detail.depth_bias``
-measures both errors on each capture.
+Window matching has a bias. The whole surface lies a little too deep, and curved parts come out too flat: protruding
+parts (bridge of the nose, lips) are cut off, and hollows are filled. To first order the flattening is ``share`` times
+the height of the surface's mean in a 2.5 mm window above the surface. ``pipeline.detail.depth_bias`` measures these two
+errors on each capture.
 """
 
 from dataclasses import dataclass
@@ -34,10 +34,10 @@ class Field:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthMap:
-    """Holds the surface that one camera sees, on the pixels of a pinhole crop around the subject.
+    """Holds the depth map of one camera, on the pixels of a pinhole crop around the subject.
 
-    ``camera`` has no distortion; its name and pose are those of the rig's camera. A pixel is known where its standard
-    deviation is finite; elsewhere depth, normal and ``views`` are 0.
+    ``camera`` has no distortion; its name and pose are those of the rig's camera. The depth of a pixel is known if its
+    standard deviation is finite; otherwise depth, normal and ``views`` are 0.
     """
 
     camera: Camera
@@ -48,19 +48,19 @@ class DepthMap:
 
     @property
     def known(self) -> Bool[np.ndarray, "h w"]:
-        """Tells which pixels have a known depth."""
+        """Returns a mask of the pixels with a known depth."""
         return np.isfinite(self.deviation_mm)
 
 
 def points_world(depth_map: DepthMap) -> Float[np.ndarray, "n 3"]:
-    """Returns the surface points (world frame, mm) of the known pixels, row by row."""
+    """Returns the surface points (world frame, mm) of the pixels with known depth, row by row."""
     pinhole, turn, shift = placing(depth_map.camera)
     return place_known(depth_map.depth_mm, depth_map.deviation_mm, pinhole, turn, shift)
 
 
 def placing(camera: Camera) -> tuple[Float[np.ndarray, " 4"], Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
-    """Returns the parameters of a camera without distortion for ``depth_map_kernels``: fx fy cx cy (px), and rotation
-    and translation (mm) of world_from_camera."""
+    """Packs a camera without distortion for ``depth_map_kernels``: fx fy cx cy (px), and rotation and translation (mm)
+    of world_from_camera."""
     k, pose = camera.intrinsics, camera.camera_from_world.inverse()
     turn, shift = (np.ascontiguousarray(each, float) for each in (pose.rotation, pose.translation))
     return np.array([k.fx, k.fy, k.cx, k.cy]), turn, shift
@@ -68,7 +68,7 @@ def placing(camera: Camera) -> tuple[Float[np.ndarray, " 4"], Float[np.ndarray, 
 
 @dataclass(frozen=True, slots=True)
 class WindowBias:
-    """Holds the bias of dense matching along the surface normal: ``common_mm`` everywhere, plus ``share`` times
+    """Holds the bias of window matching along the surface normal: ``common_mm`` everywhere, plus ``share`` times
     ``windowed_height``."""
 
     common_mm: float = 0.0
@@ -78,8 +78,8 @@ class WindowBias:
 def windowed_height(
     vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"], wanted: Bool[np.ndarray, " v"] | None = None
 ) -> Float[np.ndarray, " v"]:
-    """Computes how far (mm, along the normal) the mean of the surface over a window lies above each vertex. Parts of
-    the window that face another way do not count. Vertices outside ``wanted`` get 0; None means all vertices."""
+    """Computes the height (mm, along the normal) of the surface's mean in a window above each vertex. Parts of the
+    window with an opposite normal do not count. Vertices outside ``wanted`` get 0; None means all vertices."""
     order, keys, spans = sorted_into_cells(vertices, REACH_MM)
     chosen = np.ones(len(vertices), bool) if wanted is None else wanted[order]
     surface = np.concatenate([(vertices - vertices.min(axis=0)).T, normals.T])[:, order].astype(np.float32, order="C")
@@ -94,8 +94,7 @@ def windowed_height(
 
 
 def without_bias(mesh_world: Mesh, measured: Bool[np.ndarray, " v"], bias: WindowBias) -> Mesh:
-    """Returns the mesh with the bias of the matching windows subtracted at its measured vertices, along their
-    normals."""
+    """Subtracts the bias of window matching from the mesh's measured vertices, along their normals."""
     if bias == WindowBias():
         return mesh_world
     vertices, normals = mesh_world.vertices, mesh_world.normals()

@@ -1,10 +1,10 @@
-"""Compiled loops over the pixels of depth maps, the rays of a crop and the vertices of a surface; also over fields of
-depth and slopes: doubling their size, planes around each pixel, and specks.
+"""Contains the compiled loops that compute on depth maps: points, normals, agreement between views, search ranges,
+bias, upsampling, plane fits and the removal of specks.
 
-A speck is a piece of surface so small that it may be a chance match. Where skin has no texture, all depths along a ray
-match equally well, and overlapping windows make the same error. Such errors form pieces of a few windows' size, in
-front of or behind everything around them. Unlike a single wrong pixel, a speck is consistent in itself, so neither
-planes of neighbours nor an average removes it.
+A speck is a small separate piece of surface, which may be a wrong match. Where skin has no texture, all depths along a
+ray match equally well, and overlapping windows make the same error. Matching errors form pieces of a few windows' size,
+in front of or behind the surface around them. The pixels of a speck agree with each other, so neither planes of
+neighbours nor an average removes it.
 """
 
 import numpy as np
@@ -22,8 +22,8 @@ FAR_TOLERANCES = np.float32(20.0)  # along a ray: at the steepest slope the plan
 def place_known(
     depth: np.ndarray, deviation: np.ndarray, pinhole: np.ndarray, turn: np.ndarray, shift: np.ndarray
 ) -> np.ndarray:
-    """Returns the positions (n, 3; world, mm) of the pixels whose ``deviation`` is finite, row by row. ``pinhole`` is
-    fx fy cx cy; ``turn`` (3, 3) and ``shift`` (3) are those of world_from_camera."""
+    """Returns the surface points (n, 3; world frame, mm) of the pixels with finite ``deviation``, row by row.
+    ``pinhole`` is fx fy cx cy; ``turn`` (3, 3) and ``shift`` (3) are rotation and translation of world_from_camera."""
     height, width = depth.shape
     count = 0
     for row in range(height):
@@ -45,8 +45,8 @@ def place_known(
 def normals_of_known(
     depth: np.ndarray, slopes: np.ndarray, known: np.ndarray, pinhole: np.ndarray, turn: np.ndarray
 ) -> np.ndarray:
-    """Returns the unit normals (h, w, 3; world, towards the camera) of the surface at ``known`` pixels, 0 at others,
-    from depths (mm) and slopes (h, w, 2; mm a pixel). ``pinhole`` and ``turn`` as in ``place_known``."""
+    """Returns the unit normals (h, w, 3; world frame, towards the camera) at ``known`` pixels, 0 at others, from depths
+    (mm) and slopes (h, w, 2; mm per pixel). ``pinhole`` and ``turn`` are as in ``place_known``."""
     height, width = depth.shape
     normals = np.zeros((height, width, 3), np.float32)
     for row in range(height):
@@ -65,15 +65,15 @@ def normals_of_known(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, overlaps=False)
 def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreeing, before, apart):
-    """Fills three arrays for the pixels (h, w) of one view: the number of other views that have the surface at the same
-    point (``agreeing``), the number that see through the point to a surface behind it (``before``), and the mean
-    squared distance to those that agree (``apart``, mm^2).
+    """Compares the depths (h, w) of one view with other views. Fills in the number of views with the surface at the
+    same point (``agreeing``), the number of views that see a surface behind the point (``before``), and the mean
+    squared distance to the agreeing surfaces (``apart``, mm^2).
 
-    Two views agree if the point's distance from the other's plane is below ``tolerance_mm``, and below ``deviations``
-    standard deviations of both (or half of ``tolerance_mm``, if that is more). A view does not count if a nearer
-    surface hides the point from it. ``limits`` are ``tolerance_mm`` and ``deviations``. ``depth``, ``slopes`` and
-    ``deviation`` hold all views one after the other, this view from ``start`` on; ``ways`` are rows of
-    ``Stack.homographies``, ``lenses`` fx and fy of the others.
+    Two views agree if the point's distance from the other view's plane is below ``tolerance_mm``, and below
+    ``deviations`` combined standard deviations (or half of ``tolerance_mm``, if this is more). A view does not count if
+    a nearer surface hides the point from it. ``limits`` are ``tolerance_mm`` and ``deviations``. ``depth``, ``slopes``
+    and ``deviation`` hold all views one after the other, this view from ``start`` on; ``ways`` are rows of
+    ``Stack.homographies``, ``lenses`` fx and fy of the other views.
     """
     tolerance_mm, deviations = np.float32(limits[0]), np.float32(limits[1])
     far_mm, zero, half, one = tolerance_mm * FAR_TOLERANCES, np.float32(0.0), np.float32(0.5), np.float32(1.0)
@@ -126,7 +126,7 @@ def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreei
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _distance_at(distance_px, way, x, y):
-    """Returns the signed distance at the nearest pixel; beyond the crop, at its edge."""
+    """Returns another view's signed distance to the outline at the pixel nearest to a projected point."""
     width, height = int(way[WIDTH]), int(way[HEIGHT])
     column = min(max(int(x + 0.5), 0), width - 1)
     row = min(max(int(y + 0.5), 0), height - 1)
@@ -135,11 +135,11 @@ def _distance_at(distance_px, way, x, y):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_depth_range(start, ways, distance_px, slack_px, low, high, step, near, far):
-    """Fills ``near`` and ``far`` (h, w; mm of depth, 0 for none) for the pixels of one view: the first and the last
-    depth at which the point of the ray is inside the visual hull. Depths between may be outside.
+    """Fills ``near`` and ``far`` (h, w; mm of depth, 0 for none) with the first and the last depth at which each
+    pixel's ray is inside the visual hull. Depths between them may be outside.
 
-    Depths from ``low`` to ``high`` are tried at every ``step`` (mm). A point is inside if at least one other view sees
-    it, and none of them sees it more than ``slack_px`` outside its silhouette. ``distance_px`` holds the signed
+    Depths from ``low`` to ``high`` are tested in steps of ``step`` (mm). A point is inside if at least one other view
+    sees it, and no other view sees it more than ``slack_px`` outside its silhouette. ``distance_px`` holds the signed
     distances of all views, this view's from index ``start`` on; ``ways`` are rows of ``Stack.homographies``.
     """
     height, width = near.shape
@@ -172,12 +172,13 @@ def find_depth_range(start, ways, distance_px, slack_px, low, high, step, near, 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def windowed_heights(surface, wanted, keys, spans, window_mm, reach_mm, height_mm, first, last):
-    """Fills ``height_mm`` (v) of the ``wanted`` vertices: the height of their surroundings' mean along the normal.
+    """Fills ``height_mm`` (v) of the ``wanted`` vertices with the height, along the normal, of the mean of the surface
+    around them.
 
-    Weights are a Gaussian of ``window_mm`` that ends at ``reach_mm``, times the cosine between both normals where that
-    is positive. ``surface`` (6, v) holds positions and normals. All vertex arrays are sorted by the cells of
-    ``cells.Cells``, whose ``keys`` and ``spans`` these are; a cell is as wide as the reach. ``first`` and ``last``
-    bound the vertices, in that order.
+    Weights are a Gaussian of ``window_mm`` that ends at ``reach_mm``, times the cosine between the two normals if it is
+    positive. ``surface`` (6, v) holds positions and normals. All vertex arrays are sorted by the cells of
+    ``cells.Cells`` with ``keys`` and ``spans``; a cell is as wide as the reach. ``first`` and ``last`` bound the sorted
+    vertices.
     """
     ranges, cell = np.empty((COLUMNS, 2), np.int64), -1
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -207,9 +208,9 @@ def windowed_heights(surface, wanted, keys, spans, window_mm, reach_mm, height_m
 
 @njit(cache=True, nogil=True)
 def fill_lens_map(crop: np.ndarray, lens: np.ndarray, columns: np.ndarray, rows: np.ndarray) -> None:
-    """Fills ``columns`` and ``rows`` (h, w): the point (px) of the photograph for each pixel of a pinhole camera at the
-    same pose; ``BESIDE_PX`` if there is none. ``crop`` is fx, fy, cx, cy of the pinhole; ``lens`` that of the
-    photograph (``packed_lens``)."""
+    """Fills ``columns`` and ``rows`` (h, w) with the point (px) of the photograph for each pixel of a pinhole camera at
+    the same pose; ``BESIDE_PX`` if there is none. ``crop`` is fx, fy, cx, cy of the pinhole camera; ``lens`` is the
+    photograph's (``packed_lens``)."""
     height, width = columns.shape
     for row in range(height):
         for column in range(width):
@@ -221,9 +222,9 @@ def fill_lens_map(crop: np.ndarray, lens: np.ndarray, columns: np.ndarray, rows:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def double(depth, slopes, live, depth_out, slopes_out):
-    """Fills ``depth_out`` (2 h, 2 w) and ``slopes_out`` with the planes of (h, w) pixels at twice the size, at the
-    ``live`` pixels (2 h, 2 w), and 0 elsewhere. A pixel whose own parent is empty continues the plane of the nearest
-    parent around it."""
+    """Upsamples depths and slopes of (h, w) pixels to twice the size. Fills ``depth_out`` (2 h, 2 w) and ``slopes_out``
+    at the ``live`` pixels, and 0 elsewhere. A pixel without depth at the smaller size continues the nearest plane
+    around it."""
     height, width = depth.shape
     for row in range(2 * height):
         for column in range(2 * width):
@@ -248,12 +249,12 @@ def double(depth, slopes, live, depth_out, slopes_out):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def fit_planes(depth, slopes, information, radius, tolerance_mm, steepest, depth_out, slopes_out, relief_mm):
-    """Fits a plane to the depths (mm) around every pixel, within ``radius`` pixels. Depths are weighted by their
-    ``information`` (mm^-2), and by how well they agree with the current plane of the pixel (half at ``tolerance_mm``),
-    so that the fit does not reach across an edge.
+    """Fits a plane to the depths (mm) within ``radius`` pixels of every pixel. Depths are weighted by their
+    ``information`` (mm^-2) and by their agreement with the pixel's current plane (half at ``tolerance_mm``), so that
+    the fit does not extend across an edge.
 
-    Fills ``depth_out`` (moved to the plane as far as noise explains the offset), ``slopes_out`` (mm per pixel, at most
-    ``steepest``), and ``relief_mm``, the RMS deviation of the depths from the plane. Empty pixels stay empty.
+    Fills ``depth_out`` (moved to the plane if noise explains the offset), ``slopes_out`` (mm per pixel, at most
+    ``steepest``), and ``relief_mm``, the RMS deviation of the depths from the plane. Pixels without depth are left out.
     """
     height, width = depth.shape
     zero, one, tiny = np.float32(0.0), np.float32(1.0), np.float32(1e-9)
@@ -321,8 +322,8 @@ def fit_planes(depth, slopes, information, radius, tolerance_mm, steepest, depth
 def mark_specks(depth, slopes, gap_mm, most_px, specks):
     """Sets ``specks`` (h, w) at the pixels of every piece of surface that has at most ``most_px`` pixels.
 
-    Neighbouring pixels belong to one piece if their planes, extended half way to each other, are less than ``gap_mm``
-    apart.
+    Neighbouring pixels belong to the same piece if their planes, extended half way to each other, are less than
+    ``gap_mm`` apart.
     """
     height, width = depth.shape
     done, queue = np.zeros((height, width), np.bool_), np.empty(height * width, np.int64)
@@ -353,9 +354,9 @@ def mark_specks(depth, slopes, gap_mm, most_px, specks):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_specks(depth, slopes, specks, sweeps):
-    """Replaces depth and slopes at the pixels of ``specks``, in place, by the smoothest surface through the surrounding
-    pixels (least squares of the steps between neighbours), in ``sweeps`` of Gauss-Seidel. A speck without surrounding
-    pixels stays."""
+    """Replaces depth and slopes at the pixels of ``specks``, in place, by the smoothest surface through the pixels
+    around them (least squares of the steps between neighbours), in ``sweeps`` of Gauss-Seidel. A speck without pixels
+    around it stays."""
     height, width = depth.shape
     left = specks.copy()
     filled, count, ring = np.empty(height * width, np.int64), 0, -1
@@ -395,7 +396,7 @@ def _in_surface(depth, row, column):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _sum_beside(depth, row, column, left):
-    """Returns the sum of the depths of the four neighbours that are not ``left``, and their number."""
+    """Returns the sum of the depths of the four neighbouring pixels, except those marked ``left``, and their number."""
     total, sides = 0.0, 0
     for side in range(4):
         j, i = row + (0, 0, 1, -1)[side], column + (1, -1, 0, 0)[side]

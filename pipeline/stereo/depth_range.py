@@ -1,9 +1,9 @@
-"""Finds the range of depths along each ray where the subject can be: from the visual hull's front to the fitted head or
-the hull's back.
+"""Finds the range of possible depths of the subject along each ray: from the front of the visual hull to the fitted
+head or to the back of the hull.
 
 Hair lies between skull and hull, clothes inside the hull, and skin within a few mm of the fitted head, so the range is
-short. The range is found at the smallest size. Both of its bounds are smooth surfaces; the search interpolates their
-slopes for the depths between.
+short. The range is computed on the smallest crops. The range's two bounds are smooth surfaces, between which the search
+interpolates slopes.
 """
 
 from collections.abc import Sequence
@@ -36,8 +36,8 @@ STEEPEST = 3.0  # slope against the image plane: 72 degrees
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthRange:
-    """Holds the range of depths to search in one view: at each pixel the smallest and the largest depth (mm), 0 where
-    nothing is searched, and the slopes of both bounds by x and y (mm per pixel)."""
+    """Holds the range of depths to search in one view. Each pixel has the smallest and the largest depth (mm), 0 for no
+    search, and the slopes of these two bounds by x and y (mm per pixel)."""
 
     near: Plane
     far: Plane
@@ -51,11 +51,11 @@ def find_depth_ranges(
     head_world: Mesh | None,
     extent: tuple[Float[np.ndarray, " 3"], float],
 ) -> list[DepthRange]:
-    """Finds the range of depths to search in every view, at the size of ``stack``.
+    """Finds the range of depths to search in every view, at the image size of ``stack``.
 
     Args:
         crops: of the views.
-        least: the crops at their smallest size, where the range is first found.
+        least: the crops at their smallest size, at which the range is first computed.
         stack: the crops at the size of the search.
         head_world: the fitted head, world frame, mm; without it the range ends ``reach_mm`` behind the hull's front.
         extent: middle (world) and edge length (mm) of a cube that contains the subject.
@@ -71,7 +71,7 @@ def find_depth_ranges(
 def _bounds(
     crop: Crop, least: Stack, view: int, head_world: Mesh | None, extent: tuple[Float[np.ndarray, " 3"], float]
 ) -> tuple[Plane, Plane]:
-    """Returns the nearest and farthest depth (mm) of each pixel at the least size; 0 where no depth is possible."""
+    """Returns the nearest and farthest depth (mm) of each pixel at the smallest size; 0 where no depth is possible."""
     camera = crop.levels[-1].camera
     centre, edge = extent
     middle, half = float(camera.camera_from_world.apply(centre)[2]), 0.5 * np.sqrt(3.0) * edge
@@ -95,10 +95,11 @@ def _bounds(
 
 
 def _bound_by_head(near: Plane, far: Plane, room: Bool[np.ndarray, "h w"], head: Float[np.ndarray, "h w"]) -> None:
-    """Narrows the bounds in place to depths near the fitted head. ``head`` holds its depths (mm, infinite beside it).
+    """Narrows the bounds, in place, to depths near the fitted head. ``head`` is the head's depth map (mm, infinite
+    beside the head).
 
-    If all cameras stand on one side, the visual hull begins decimetres before the face. Then the bounds come from the
-    head: from its depth at the pixel or, beside it, from its least and greatest depth.
+    If all cameras stand on one side, the visual hull begins decimetres in front of the face. Then the bounds follow
+    from the head's depth at the pixel or, beside the head, from its least and greatest depth.
     """
     seen = room & np.isfinite(head)
     if not seen.any() or np.median((head - near)[seen]) < LOOSE_HULL_MM:
@@ -112,7 +113,7 @@ def _bound_by_head(near: Plane, far: Plane, room: Bool[np.ndarray, "h w"], head:
 
 
 def _enlarged(near: Plane, far: Plane, stack: Stack, view: int) -> DepthRange:
-    """Returns the bounds smoothed, enlarged to the size of ``stack`` and extended over every pixel of the subject."""
+    """Smooths the bounds, upsamples them to the size of ``stack``, and extends them over every pixel of the subject."""
     room = near > 0.0
     width, height = (int(side) for side in stack.size[view])
     distance = stack.image(stack.distance_px, view)
@@ -129,7 +130,7 @@ def _enlarged(near: Plane, far: Plane, stack: Stack, view: int) -> DepthRange:
 
 
 def _extended(values: Plane, room: Bool[np.ndarray, "h w"]) -> Plane:
-    """Returns the values blurred within the depth range; pixels outside take the value of the nearest pixel inside."""
+    """Blurs the values at pixels with a depth range; others take the value of the nearest such pixel."""
     weight = cv2.GaussianBlur(room.astype(np.float32), (0, 0), BOUND_BLUR_PX)
     smooth = cv2.GaussianBlur(np.where(room, values, np.float32(0.0)), (0, 0), BOUND_BLUR_PX) / np.maximum(weight, 1e-3)
     _, nearest = cv2.distanceTransformWithLabels(

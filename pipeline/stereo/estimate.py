@@ -1,23 +1,23 @@
-"""Measures depth, normal and standard deviation in every view, from the photographs.
+"""Computes depth, normal and standard deviation for every view by matching the photographs.
 
-In: photographs, silhouettes, the rig and the head fitted so far. Out: a ``DepthMap`` for each usable view. Every view
-is matched with its neighbours, from coarse to fine, by windows on slanted planes that neighbouring pixels propagate
-(Bleyer, Rhemann and Rother, *PatchMatch stereo*, 2011, https://doi.org/10.5244/C.25.14). Unlike there, nothing is
-random. Silhouettes and head bound the search (``depth_range``). Depths at even steps, joined by paths of least cost,
-give the first estimate (``first_fields``). Least squares then moves the windows to a fraction of a pixel and computes
-their information (Goesele et al., *Multi-view stereo for community photo collections*, 2007,
-https://doi.org/10.1109/ICCV.2007.4408933). Depths that no other view confirms are discarded (``agreement``).
+Every view is matched with its neighbours, from coarse to fine, by windows on slanted planes that propagate between
+pixels (Bleyer, Rhemann and Rother, *PatchMatch stereo*, 2011, https://doi.org/10.5244/C.25.14). In contrast to
+PatchMatch, no random numbers are used. Silhouettes and the fitted head bound the search (``depth_range``). Semi-global
+matching of depths at even steps gives the first estimate (``first_fields``). Least squares then moves the windows by
+fractions of a pixel and computes their information (Goesele et al., *Multi-view stereo for community photo
+collections*, 2007, https://doi.org/10.1109/ICCV.2007.4408933). Depths that no other view confirms are discarded.
 
-The first depths are searched twice. In the first search windows have the slant of the range's bounds. Where a
-photograph ends, no silhouette bounds the hull, and its wall is steeper than a shirt. Windows with that slant match
-nothing, although the photographs show the surface well. So in the second search the windows of wide ranges take the
-slant of the depths around them.
+The first depths are searched twice. In the first search windows have the slant of the range's bounds. At the border of
+a photograph no silhouette bounds the visual hull, whose side is then much steeper than the real surface, and windows
+with its slant do not match. So in the second search the windows in wide ranges have the slant of the depths around
+them.
 
-From one size of the photographs to the next, planes are enlarged, pixels take over better planes of their neighbours,
-and each moves to the best match. A part of the information from the smaller size is retained, limited by the relief
-around the pixel: its larger windows see shading that smaller ones do not, but miss detail below their size.
+From one image size to the next, planes are upsampled, pixels take over better planes of their neighbours, and each
+plane moves to the best match. A part of the information from the smaller size is kept, because its larger windows
+contain more shading. The kept part is smaller where the surface has relief, which large windows miss.
 
-The result does not depend on the order of work: each view is refined by itself, and all are compared at the end.
+Each view is refined by itself, and all views are compared at the end, so the result does not depend on the order of
+threads.
 """
 
 from collections.abc import Mapping, Sequence
@@ -89,11 +89,11 @@ def take_specks_off(
     depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"], pixel_mm: float, most_px: int
 ) -> Bool[np.ndarray, "h w"]:
     """Replaces, in place, small separate pieces of surface (at most ``most_px`` pixels) by a smooth surface through the
-    surrounding pixels. Returns which pixels were replaced.
+    pixels around them. Returns a mask of the replaced pixels.
 
-    A piece stays if it has no known surroundings: at an outline, where the surface may continue behind, or among many
-    other pieces that together exceed ``most_px``. (In one capture a quarter of the clothes are such neighbouring pieces
-    at the search's size. Two fifths of them are right; replacing them all lost 6 % of the clothes.)
+    A piece stays if no pixels around it have a known depth, as at an outline. A piece also stays if it is adjacent to
+    other pieces that together exceed ``most_px``. In one capture the replacement of all small pieces would have lost 6
+    % of the clothes.
     """
     specks = np.zeros(depth.shape, bool)
     mark_specks(depth, slopes, GAP_PX * pixel_mm, most_px, specks)
@@ -116,7 +116,7 @@ MAX_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
 
 
 def doubled(fields: Sequence[Field], stack: Stack) -> list[Field]:
-    """Returns the fields enlarged to twice their width and height, the size of ``stack``. They keep a part of their
+    """Upsamples the fields to twice their width and height, the size of ``stack``. The fields keep a part of their
     information."""
 
     def work(view: int) -> Field:
@@ -135,7 +135,7 @@ def doubled(fields: Sequence[Field], stack: Stack) -> list[Field]:
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """Holds the parameters with which planes are improved at one size of the photographs."""
+    """Holds the parameters of the plane refinement at one image size."""
 
     steps_px: tuple[int, ...]  # each pixel tries the planes of pixels that far away (odd)
     speck_px: int  # pieces of surface of so few pixels are replaced
@@ -143,7 +143,7 @@ class Pass:
 
 
 def refined(fields: Sequence[Field], matching: Matching, once: Pass) -> list[Field]:
-    """Improves the field of every view: pixels take over their neighbours' planes, small wrong pieces of surface are
+    """Refines the field of every view: pixels take over their neighbours' planes, small wrong pieces of surface are
     replaced, and least squares then moves the planes."""
 
     def work(view: int) -> Field:
@@ -180,7 +180,7 @@ def _refined(field: Field, matching: Matching, view: int, once: Pass) -> Field:
 
 
 def depth_maps(crops: Sequence[Crop], stack: Stack, fields: Sequence[Field]) -> tuple[DepthMap, ...]:
-    """Compares the full-size fields of all views with each other. Returns a depth map for each view, which holds only
+    """Compares the full-size fields of all views with each other. Returns a depth map for each view, with only the
     pixels that other views confirm."""
     matched = np.concatenate([(1.0 / np.sqrt(field.information + 1e-6)).ravel() for field in fields])
     depth = np.concatenate([field.depth.ravel() for field in fields])
@@ -207,8 +207,8 @@ def depth_maps(crops: Sequence[Crop], stack: Stack, fields: Sequence[Field]) -> 
 def stated_deviation(camera: Camera, field: Field, agreeing: UInt8[np.ndarray, "h w"], apart: Plane) -> Plane:
     """Returns the standard deviation (mm) of the depth at each pixel, along the ray.
 
-    ``camera``: camera of the view. ``field``: depths of the view. ``agreeing``: number of other views that have the
-    surface at the same point. ``apart``: mean squared distance to their surfaces, mm^2.
+    ``camera``: camera of the view. ``field``: depths of the view. ``agreeing``: number of other views with the surface
+    at the same point. ``apart``: mean squared distance to these views' surfaces, mm^2.
     """
     k = camera.intrinsics
     pixel_mm = np.maximum(field.depth, 1.0) / k.fx
@@ -242,11 +242,11 @@ MAX_NEIGHBOURS = 5
 
 def choose_neighbours(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"]) -> list[Int[np.ndarray, " _"]]:
     """Returns, for each camera, the indices of the cameras to match it with (may be empty), by increasing angle between
-    their lines of sight.
+    viewing directions.
 
     Args:
         cameras: of all views.
-        at_world: about the middle of the subject (mm), where the lines of sight meet.
+        at_world: about the middle of the subject (mm), to which the viewing directions point.
     """
     towards = np.stack([camera.centre_world - at_world for camera in cameras])
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
@@ -264,7 +264,7 @@ def choose_neighbours(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3
 
 
 def square_pattern(radius_px: int) -> Float32[np.ndarray, "2 s"]:
-    """Returns the offsets (across and down, px) of every pixel in a square about its middle."""
+    """Returns the offsets (across and down, px) of all pixels in a square from its middle."""
     side = np.arange(-radius_px, radius_px + 1, dtype=np.float32)
     down, across = np.meshgrid(side, side, indexing="ij")
     return np.stack([across.ravel(), down.ravel()])
@@ -288,14 +288,14 @@ def estimate_depth(
     report: Progress,
     device: ComputeDevice | None = None,
 ) -> tuple[DepthMap, ...]:
-    """Measures depth, normal and deviation in each photograph by matching it with its neighbours.
+    """Computes depth, normal and standard deviation for each photograph by matching it with neighbouring views.
 
     Args:
         images: RGB, by camera name.
         silhouettes: by camera name; a view whose silhouette is not usable is left out.
         rig: the cameras.
-        head_world: the head fitted so far (world, mm), which limits the depths to search; None if there is none.
-        report: called with ``"dense"`` and the share that is done; an exception that it raises stops the work.
+        head_world: the fitted head (world frame, mm), which limits the depths to search; None if there is none.
+        report: called with ``"dense"`` and the finished fraction; an exception that it raises stops the work.
         device: GPU that compares the windows; None uses compiled loops.
 
     Returns:
@@ -331,11 +331,10 @@ def estimate_depth(
 
 
 def find_search_level(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"]) -> int:
-    """Returns how often the crops are halved for the search, so that a pixel is about ``SEARCH_PIXEL_MM`` wide at the
-    subject.
+    """Returns the pyramid level of the first search, at which a pixel is about ``SEARCH_PIXEL_MM`` wide at the subject.
 
     Args:
-        cameras: of the crops at full size; one at least.
+        cameras: of the crops at full size; at least one.
         at_world: about the middle of the subject, mm.
     """
     depths = [float(camera.camera_from_world.apply(at_world)[2]) for camera in cameras]
@@ -345,8 +344,8 @@ def find_search_level(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3
 
 
 def first_fields(matching: Matching, depth_ranges: Sequence[DepthRange]) -> list[Field]:
-    """Finds a first depth in every view by trying depths at even steps through the range of each pixel, twice. The
-    fields have no information yet (0)."""
+    """Finds first depths in every view: matches depths at even steps through the range of each pixel, twice. The
+    information of the returned fields is 0."""
 
     def work(view: int) -> Field:
         room, matcher = depth_ranges[view], matching.matcher(view)
@@ -359,8 +358,8 @@ def first_fields(matching: Matching, depth_ranges: Sequence[DepthRange]) -> list
 
 
 def slanted(room: DepthRange, field: Field, lens: float) -> DepthRange:
-    """Returns the range with new slopes of both bounds where it is wider than ``WIDE_MM``: those of the depths around
-    the pixel. ``lens`` is the focal length in pixels."""
+    """Replaces the slopes of the range's bounds by those of the depths around the pixel where the range is wider than
+    ``WIDE_MM``. ``lens`` is the focal length in pixels."""
     live = field.depth > 0.0
     if not live.any():
         return room
@@ -371,8 +370,8 @@ def slanted(room: DepthRange, field: Field, lens: float) -> DepthRange:
 
 
 def slopes_around(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 2"]:
-    """Returns the slopes (mm a pixel, by x and y) of the plane that fits the depths around each pixel best. Depths of 0
-    are unknown; at least one must be known."""
+    """Returns the slopes (mm per pixel, by x and y) of the best-fitting plane of the depths around each pixel. Depths
+    of 0 are unknown; at least one must be known."""
     live = depth > 0.0
     row, column = np.mgrid[: depth.shape[0], : depth.shape[1]].astype(np.float64)
     known, height = live.astype(np.float64), np.where(live, depth - depth[live].mean(), 0.0)
@@ -389,15 +388,15 @@ def slopes_around(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w
 
 
 def label_strides(room: DepthRange) -> Int32[np.ndarray, "h w"]:
-    """Returns how many depths each pixel advances from one matched depth to the next: 1, 2, 4 and so on. A narrow range
+    """Returns the stride (1, 2, 4 and so on) of each pixel: only every stride-th depth label is matched. A narrow range
     needs fewer matched depths for the same spacing in mm."""
     depth = np.clip(room.far - room.near, REACH_MM / LABELS, REACH_MM)
     return (2 ** np.floor(np.log2(REACH_MM / depth))).astype(np.int32)
 
 
 def _cheapest(cost: Float32[np.ndarray, "h w d"], room: DepthRange, strides: Int32[np.ndarray, "h w"]) -> Field:
-    """Returns the field of the labels with the least aggregated path cost; the matching costs refine each within its
-    stride."""
+    """Returns the field of the depth labels with the least aggregated path cost, each refined within its stride by the
+    matching costs."""
     paths = np.empty_like(cost)
     aggregate(cost, room.far > 0.0, STEP_COST, EDGE_COST, paths)
     labels = cost.shape[2]

@@ -1,6 +1,6 @@
-"""Compares windows of the views with each other, at one size of the photographs: by compiled loops, or on a GPU.
+"""Compares windows of the views with each other, at one image size, by compiled loops or on a GPU.
 
-Loops and GPU compute the same; the loops are the reference. The GPU computes in single precision and in the driver's
+Loops and GPU run the same algorithm; the loops are the reference. The GPU computes in single precision and in another
 order of operations, so depths differ by hundredths of a millimetre.
 """
 
@@ -25,7 +25,7 @@ GROUP = 8  # invocations across and down of one group, as in shaders/matching.gl
 
 
 class Planes(NamedTuple):
-    """Holds the present plane of each pixel of a view, and its matching cost. The arrays are changed in place."""
+    """Holds the current plane of each pixel of a view, and its matching cost. The arrays are changed in place."""
 
     depth: Plane  # mm; 0 where there is none
     slopes: Float32[np.ndarray, "h w 2"]  # by x and y, mm a pixel
@@ -35,21 +35,21 @@ class Planes(NamedTuple):
 
 @runtime_checkable  # the tests check types of calls
 class Matcher(Protocol):
-    """Describes an object that compares windows of one view with its neighbours, on the assumption that each window
-    lies on a plane."""
+    """Declares the interface of an object that compares windows of one view with neighbouring views; each window lies
+    on a plane."""
 
     def sweep(
         self, room: DepthRange, strides: Int32[np.ndarray, "h w"], labels: int
     ) -> Float32[np.ndarray, "h w labels"]:
         """Returns the matching cost at ``labels`` depths, evenly spaced through the range of each pixel.
 
-        At a pixel with ``strides`` of n only every n-th depth is matched; the costs between are interpolated.
+        At a pixel with a stride of n only every n-th depth is matched; the other costs are interpolated.
         """
         ...
 
     def propagate(self, planes: Planes, parity: int, steps_px: Sequence[int], same_mm: float) -> None:
-        """Lets pixels take over the planes of neighbours where these cost less, for the pixels of one colour of a
-        chequerboard (``parity`` 0 or 1). Changes ``planes`` in place; ``matching_kernels.propagate`` says how."""
+        """Lets pixels of one colour of a chequerboard (``parity`` 0 or 1) take over cheaper planes of their neighbours.
+        Changes ``planes`` in place; ``matching_kernels.propagate`` describes the method."""
         ...
 
     def slide(self, most_px: float, depth: Plane, slopes: Float32[np.ndarray, "h w 2"]) -> tuple[Plane, Plane, Plane]:
@@ -60,14 +60,14 @@ class Matcher(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matching:
-    """Holds all views at one size, and how their windows are compared.
+    """Holds all views at one image size, and the parameters of their comparison.
 
     Attributes:
         stack: the views.
         neighbours: for each view, the views that it is compared with.
         pattern: offsets of a window's samples from its middle, across and down, px.
-        contrast_levels: a sample whose grey value differs by this from the middle's counts half.
-        device: GPU that compares; None uses compiled loops.
+        contrast_levels: difference from the middle's grey value at which a sample has half weight.
+        device: GPU for the comparison; None uses compiled loops.
         uploaded: the stack's pixels and distances on the device.
     """
 
@@ -79,7 +79,7 @@ class Matching:
     uploaded: tuple[DeviceArray, ...] = ()
 
     def matcher(self, view: int) -> Matcher:
-        """Returns a matcher for one view. It may be used by one thread at a time."""
+        """Returns a matcher for one view, which only one thread may use at a time."""
         if self.device is None:
             others = self.neighbours[view]
             return LoopMatcher(self.stack.match_arguments(view, others, self.pattern, self.contrast_levels))
@@ -94,8 +94,8 @@ def matching_on(
     pattern: Float32[np.ndarray, "2 s"],
     contrast_levels: float,
 ) -> Iterator[Matching]:
-    """Yields the matching of a stack whose pixels are on the device until the block ends. Without a device, or if the
-    stack is too large for it, compiled loops do the matching."""
+    """Uploads a stack to the GPU for the duration of a ``with`` block, and yields its ``Matching``. Without a GPU, or
+    if the stack is too large for it, compiled loops do the matching."""
     if device is None or stack.pairs.nbytes > device.largest_array:
         yield Matching(stack, neighbours, pattern, contrast_levels)
         return
@@ -178,8 +178,8 @@ class ShaderMatcher:
     def _run(
         self, shader: str, arrays: list[np.ndarray], written: list[int], *, across: int = 1, **uniforms: float
     ) -> None:
-        """Runs a shader over the view's pixels; one invocation takes ``across`` pixels of a row. ``written``: those of
-        ``arrays`` that it writes; they are bound after the ones that all shaders share."""
+        """Runs a shader over the view's pixels; one invocation takes ``across`` pixels of a row. ``written``: the
+        ``arrays`` that the shader writes; they are bound after the arrays that all shaders share."""
         width, height = self._size
         groups = -(-width // (across * GROUP)), -(-height // GROUP)
         first = len(self._shared)
@@ -190,9 +190,9 @@ class ShaderMatcher:
 
 
 def packed_ways(stack: Stack, view: int, others: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m 16"]:
-    """Returns the maps from a view's pixels to other views, one row each, in the memory layout of the struct Way of
-    shaders/matching.glsl. The last three numbers of a row are integers. There is at least one row, since no GPU buffer
-    may be empty."""
+    """Packs the maps from a view's pixels to other views, one row for each, in the memory layout of the struct Way in
+    shaders/matching.glsl. The last three numbers of a row are integers. The result has at least one row, since no GPU
+    buffer may be empty."""
     ways = stack.homographies(view, others)
     packed = np.zeros((max(len(ways), 1), 16), np.float32)
     packed[: len(ways), :12], packed[: len(ways), 12] = ways[:, :12], ways[:, 15]

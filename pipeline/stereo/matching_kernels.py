@@ -1,15 +1,13 @@
-"""Compiled loops that match a window of one view with another view. The window lies on a plane, which the other view
-sees slanted.
+"""Contains the compiled loops that match a window of one view with another view. The window lies on a plane, which maps
+it to the other view.
 
 Scores are zero-mean normalised cross-correlations, so that gain and offset of a camera have no effect. The norms
-include the noise of both views, so a window without texture correlates with nothing, even by chance.
+include the noise of the two views, so a window without texture has a low correlation with all others.
 
-A *way* is the map to another view, a row of 16 numbers (``Stack.homographies``): how a pixel and its depth map to that
-view, and where its pixels are stored. Arguments are few and small, since passing twenty arrays takes longer than
-matching a window. A *shade* is the unit in which ``Stack`` stores grey values.
+A *way* is a row of 16 numbers (``Stack.homographies``) that maps a pixel and its depth to another view, and gives the
+position of this view's pixels in memory. A *shade* is the unit in which ``Stack`` stores grey values.
 
-Some loops are the first search: they try depths at even steps along every ray, then make neighbouring rays agree. The
-others improve the depths: they take over planes from neighbours, or make least-squares steps.
+``sweep_view`` and ``aggregate`` search the first depths; ``propagate`` and ``slide`` refine them.
 """
 
 from typing import NamedTuple
@@ -36,7 +34,7 @@ HIGH = np.uint32(16)
 
 
 class Sight(NamedTuple):
-    """Holds a view to match, and everything needed to match it with other views."""
+    """Holds a view to match, and the other views and parameters of the matching."""
 
     start: int  # of its first pixel
     noise: float  # shades
@@ -48,7 +46,7 @@ class Sight(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Holds arrays that the loops of one view reuse instead of allocating them."""
+    """Holds working arrays that the loops of one view reuse."""
 
     window: np.ndarray  # zero-mean shades, weights
     scores: np.ndarray  # of the views that it is compared with
@@ -57,13 +55,13 @@ class Scratch(NamedTuple):
 
 
 def make_scratch(sight: Sight) -> Scratch:
-    """Returns the arrays that a sight's loops reuse. They may be used by one thread at a time."""
+    """Allocates the working arrays for a view, which only one thread may use at a time."""
     count, samples = len(sight.ways), sight.pattern.shape[1]
     return Scratch(np.empty((2, samples), np.float32), np.empty(count), np.empty(8), np.empty((count, 3)))
 
 
 class Loaded(NamedTuple):
-    """Holds the window around one pixel, as ``load_window`` made it."""
+    """Holds the window around one pixel, as ``load_window`` fills it."""
 
     column: int
     row: int
@@ -86,9 +84,9 @@ def load_window(sight, width, height, column, row, window):
     """Fills ``window`` (2, s) with the grey values (zero mean) and weights of the samples around a pixel. Returns the
     sum of the weights, and the weighted sum of squares.
 
-    Pixels outside the subject have no weight. Pixels of another brightness have little (half at the sight's
-    ``contrast``), so that a window at an outline or a crease covers one surface. ``width`` and ``height`` are those of
-    the view's image.
+    Pixels outside the subject have zero weight. Pixels of another brightness than the middle have a small weight (half
+    at the sight's ``contrast``), so that a window at an edge covers only one surface. ``width`` and ``height`` are the
+    image size.
     """
     pairs, pattern, start = sight.pairs, sight.pattern, np.uint64(sight.start)
     x0, y0, right, lowest = np.float32(column), np.float32(row), np.float32(width - 1), np.float32(height - 1)
@@ -119,11 +117,11 @@ def load_window(sight, width, height, column, row, window):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def place_window(way, z, z_x, z_y, column, row, reach, place):
-    """Computes where another view sees a window on a plane of depth ``z`` (mm) at the pixel (column, row) and slopes
-    ``z_x``, ``z_y`` (mm per pixel). Returns False if that view does not see all of it.
+    """Projects a window, on a plane of depth ``z`` (mm) at the pixel (column, row) and slopes ``z_x``, ``z_y`` (mm per
+    pixel), into another view. Returns False if this view does not see the whole window.
 
-    Fills ``place`` (8): the pixel x, y in that view; its derivatives by this view's pixel, x_x, x_y, y_x, y_y; and by
-    the depth, x_z, y_z (px per mm). ``reach`` is the result of ``farthest``.
+    Fills ``place`` (8) with the pixel x, y in the other view, its derivatives by the first view's pixel, x_x, x_y, y_x,
+    y_y, and its derivatives by the depth, x_z, y_z (px per mm). ``reach`` is the result of ``farthest``.
     """
     ray0, ray1, ray2 = turned(way, column, row, 1.0)
     depth = z * ray2 + way[11]
@@ -152,8 +150,8 @@ def distance_there(way, place, distance_px):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def correlate(way, place, sight, loaded):
-    """Returns the normalised cross-correlation of the loaded window with another view at ``place``, as ``place_window``
-    filled it."""
+    """Returns the normalised cross-correlation of the loaded window with another view at ``place``, the result of
+    ``place_window``."""
     pairs, pattern, noise = sight.pairs, sight.pattern, sight.noise
     window, total, energy = loaded.window, loaded.total, loaded.energy
     x, y = np.float32(place[0]), np.float32(place[1])
@@ -179,9 +177,9 @@ def correlate(way, place, sight, loaded):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def match(way, sight, loaded, z, z_x, z_y, reach, place):
-    """Returns the correlation of the loaded window with another view if the surface is the given plane. Returns NO_SAY
-    if that view does not see it, and AGAINST if that view shows the point outside the subject. Fills ``place`` as
-    ``place_window`` does."""
+    """Returns the correlation of the loaded window with another view, for a given plane. Returns NO_SAY if the other
+    view does not see the window, and AGAINST if it shows the point outside the subject. Fills ``place`` like
+    ``place_window``."""
     if not place_window(way, z, z_x, z_y, loaded.column, loaded.row, reach, place):
         return NO_SAY
     beside = distance_there(way, place, sight.distance_px)
@@ -194,11 +192,11 @@ def match(way, sight, loaded, z, z_x, z_y, reach, place):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def correlate_and_slide(way, place, sight, loaded, found):
-    """Fills ``found`` (3) with the correlation of the loaded window and, for a move along the ray, the gradient (1 /
-    mm) and the information (1 / mm^2) of the depth.
+    """Fills ``found`` (3) with the correlation of the loaded window, and the gradient (1 / mm) and the information (1 /
+    mm^2) of the depth along the ray.
 
-    It fits ``shade = gain (other + slope step) + offset`` by least squares, with gain and offset eliminated. The
-    variance of a sample is the residual after the best gain, plus noise.
+    The function fits ``shade = gain (other + slope step) + offset`` by least squares, with gain and offset eliminated.
+    The variance of a sample is the residual's variance plus noise.
     """
     pairs, pattern, noise = sight.pairs, sight.pattern, sight.noise
     window, total, energy = loaded.window, loaded.total, loaded.energy
@@ -243,8 +241,8 @@ def correlate_and_slide(way, place, sight, loaded, found):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def score_best_half(scores, count):
-    """Returns a cost: 1 minus the mean of the better half of the first ``count`` scores (two at least). The other views
-    may not see the point. Sorts ``scores``. A single score costs ``ALONE`` more; none costs ``NOT_COMPARED``."""
+    """Returns a cost: 1 minus the mean of the better half of the first ``count`` scores (at least two), since the other
+    half may not see the point. Sorts ``scores``. A single score adds ``ALONE``; no score gives ``NOT_COMPARED``."""
     for i in range(1, count):  # insertion sort, falling
         value = scores[i]
         j = i - 1
@@ -263,8 +261,8 @@ def score_best_half(scores, count):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def cost_of(sight, loaded, z, z_x, z_y, reach, place, scores):
-    """Returns the matching cost (0 to 2) of the loaded window with the other views if the surface is the given plane.
-    It is 2 if a view shows the point outside the subject."""
+    """Returns the matching cost (0 to 2) of the loaded window with the other views, for a given plane. The cost is 2 if
+    a view shows the point outside the subject."""
     count = 0
     for k in range(len(sight.ways)):
         score = match(sight.ways[k], sight, loaded, z, z_x, z_y, reach, place)
@@ -281,8 +279,8 @@ def sweep_view(sight, scratch, near, far, slopes, strides, cost):
     """Fills ``cost`` (h, w, labels) with the matching costs at evenly spaced depths from ``near`` to ``far`` (h, w;
     mm).
 
-    ``slopes`` (h, w, 4) are those of near by x and y, and of far by x and y, mm per pixel. ``strides`` (h, w): only
-    every n-th depth is matched, and the last; costs between are interpolated linearly.
+    ``slopes`` (h, w, 4) are the slopes of near by x and y, and of far by x and y, mm per pixel. At a pixel with
+    ``strides`` (h, w) of n only every n-th depth and the last are matched; other costs are interpolated linearly.
     """
     height, width, labels = cost.shape
     window, scores, place = scratch.window, scratch.scores, scratch.place
@@ -315,9 +313,9 @@ def aggregate(cost, live, small, large, out):
     """Fills ``out`` (h, w, labels) with the sum, over four directions, of the cost of the cheapest path through the
     image that ends at this pixel and label.
 
-    Hirschmueller, Stereo processing by semiglobal matching, 2008 (https://doi.org/10.1109/TPAMI.2007.1166), eq. (13): a
-    change of one label along the path costs ``small``, a larger one ``large``. Paths start anew at pixels that are not
-    ``live``.
+    The recursion is eq. (13) of Hirschmueller, Stereo processing by semiglobal matching, 2008
+    (https://doi.org/10.1109/TPAMI.2007.1166). A change of one label along the path costs ``small``, a larger change
+    ``large``. Paths restart at pixels that are not ``live``.
     """
     height, width, labels = cost.shape
     out[:] = 0.0
@@ -355,13 +353,13 @@ def aggregate(cost, live, small, large, out):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
 def propagate(sight, scratch, parity, steps, same_mm, fresh, depth, slopes, cost):
-    """Lets every pixel of one colour of the chequerboard (``parity``) try the planes of the neighbours ``steps`` pixels
-    away (odd, so of the other colour), and retains the cheapest of these and its own. Changes ``fresh``, ``depth``,
+    """Tests, at every pixel of one colour of a chequerboard (``parity``), the planes of the neighbours ``steps`` pixels
+    away (odd numbers). Each pixel keeps the cheapest of these planes and its own. Changes ``fresh``, ``depth``,
     ``slopes`` and ``cost`` (h, w) in place.
 
-    A cost below 0 is not yet known. A plane that differs from the current one by less than ``same_mm``, at the pixel
-    and one pixel beside it, is not tried. ``fresh`` marks planes that their neighbours have not tried yet; a pixel
-    whose cost is known tries only those. Planes taken over in this call become fresh.
+    A cost below 0 is not yet known. A plane that differs from the current plane by less than ``same_mm``, at the pixel
+    and one pixel beside it, is not tested. ``fresh`` marks planes that their neighbours have not tested yet; a pixel
+    with known cost tests only fresh planes. Planes taken over in this call become fresh.
     """
     height, width = depth.shape
     window, scores, place = scratch.window, scratch.scores, scratch.place
@@ -416,10 +414,10 @@ def _is_beside(fresh, row, column, steps):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
 def slide(sight, scratch, most_px, depth, slopes, place_mm, information, likeness):
-    """Makes one least-squares step on the depth of every pixel (h, w), with all views whose windows correlate well.
+    """Computes one least-squares step of the depth of every pixel (h, w), from all views whose windows correlate well.
 
     Fills ``place_mm`` (the new depth, at most ``most_px`` away in the most sensitive view), its ``information`` (mm^-2,
-    for independent samples; 0 where nothing is known), and ``likeness``, the mean correlation.
+    for independent samples; 0 if unknown), and ``likeness``, the mean correlation.
     """
     height, width = depth.shape
     ways, window, place, found = sight.ways, scratch.window, scratch.place, scratch.found

@@ -1,4 +1,4 @@
-"""Colours a fitted surface (section 4.5).
+"""Colours a fitted surface (the paper's section 4.5).
 
-In: a mesh in the world frame, photographs, silhouettes, the rig. Out: a colour for each vertex, or an atlas.
+The modules compute a colour for each vertex, or a texture image, from photographs, silhouettes and the rig.
 """

@@ -1,9 +1,9 @@
-"""Estimates the albedo: the texture without the light of the photographs.
+"""Estimates the albedo of a head: its texture without the shading and highlights of the photographs.
 
-In: the head, its photograph-like texture, linear colours of all views. Out: the light (``pipeline.texturing.light``),
-and an image of the skin's own reflectance in the texture's layout. Highlights move with the camera, so the darker views
-of a vertex show its matt colour. The texture is multiplied, in linear light, by a factor interpolated from the
-vertices: matt colour over photographed colour, divided by the shading. The texels thus retain their detail.
+The module takes the head, its texture and the linear colours of all views. The module returns the light
+(``pipeline.texturing.light``) and an image of the skin's reflectance with the texture's UV layout. Highlights move with
+the camera, so the darker views of a vertex show its matt colour. The albedo is the texture, in linear light, multiplied
+by a smooth factor: matt colour over photographed colour, divided by the shading.
 """
 
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ CODES = 65535
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Albedo:
-    """Holds the albedo image (sRGB, in the texture's layout) and the light that was removed from the texture."""
+    """Holds the albedo image (sRGB, with the texture's UV layout) and the light that was removed from the texture."""
 
     atlas: Atlas
     light: Light
@@ -53,8 +53,8 @@ def estimate_albedo(
 ) -> tuple[Albedo | None, list[ReportWarning]]:
     """Estimates the albedo of a textured head. Returns None and a warning if light and skin cannot be separated.
 
-    With a ``chart`` the albedo has the skin's true brightness and colour. Without a chart both follow a convention
-    (``pipeline.texturing.light``).
+    With a colour chart the albedo has the skin's true brightness and colour. Without a chart the mean light is assumed
+    to be 1 in each channel.
     """
     if atlas is None or around is None or coloured.dim is None:
         return None, [compose("no-albedo", reason=compose("albedo-without-texture"))]
@@ -78,9 +78,9 @@ def estimate_albedo(
 def shine_left(
     shown: Float[np.ndarray, "v 3"], dim: Float[np.ndarray, "v 3"], seen: Bool[np.ndarray, " v"], around: Neighbourhood
 ) -> Float[np.ndarray, " v"]:
-    """Returns the fraction of each vertex's light that is no highlight, from ``1 - MAX_SHINE`` to 1. It compares the
-    brightness of the colours ``shown`` with that of ``dim``, the colours in the darker views. Colour is not compared: a
-    highlight has the colour of its lamp, and the colour of a dim view is mostly noise."""
+    """Returns the fraction of each vertex's light that is not a highlight, from ``1 - MAX_SHINE`` to 1. The fraction is
+    the brightness of ``dim``, the colours in the darker views, divided by the brightness of ``shown``. Hue is not used:
+    a highlight has the hue of its lamp, and the hue in a dark view is mostly noise."""
     ratio = dim.sum(axis=1) / np.maximum(shown.sum(axis=1), 1e-4)
     ratio = np.where(seen, ratio, 1.0)
     ratio = around.calmed(ratio[:, None], CALM)[:, 0]

@@ -1,9 +1,9 @@
-"""Corrects colours by a colour chart in the clean plates.
+"""Corrects the colours of photographs by means of a colour chart that is visible in the clean plates.
 
-In: clean plates, some of which show the chart, and the photographs. Out: photographs as a camera with true colours
-would take them (linear sRGB, D65, white where the chart is white), for the texture alone; and the direction that the
-chart faced, so that the light removed from a head is that on the chart. A camera that saw no chart gets the mean
-correction of those that did; the balancing of views corrects the rest.
+The module takes the clean plates and the photographs. The module returns photographs with true colours (linear sRGB,
+D65, white where the chart is white), which only the texture uses. The module also returns the direction that the chart
+faced, from which the brightness of the studio's light follows. A camera that saw no chart gets the mean correction of
+the other cameras.
 """
 
 from collections.abc import Mapping

@@ -1,13 +1,13 @@
-"""Estimates the light in which a head was photographed, from its shading.
+"""Estimates the light in which a head was photographed, from the shading of the head.
 
-It has nine coefficients for each channel: spherical harmonics of second order, which describe 98 % of the shading of a
-matt surface in any distant light (Ramamoorthi and Hanrahan, *An Efficient Representation for Irradiance Environment
-Maps*, SIGGRAPH 2001). Light that the head blocks is first subtracted from the harmonics of each vertex (Sloan, Kautz
-and Snyder, *Precomputed Radiance Transfer*, SIGGRAPH 2002), so a dark nostril affects neither light nor skin.
+The light is given by spherical harmonics up to second order, nine coefficients for each channel. Spherical harmonics
+describe 98 % of the shading of a matt surface in any distant light (Ramamoorthi and Hanrahan, *An Efficient
+Representation for Irradiance Environment Maps*, SIGGRAPH 2001). The shading of a vertex leaves out light that the head
+itself blocks (Sloan, Kautz and Snyder, *Precomputed Radiance Transfer*, SIGGRAPH 2002).
 
-Skin of the face is assumed to have one colour; brows, lips and beards are outliers. A dark head in bright light and a
-bright head in dim light look the same, so the light's mean over the sphere is fixed at 1 in each channel. Light from
-directions that no part of the face sees is unknown, and tends to that mean.
+The skin of the face is assumed to have the same colour everywhere; brows, lips and beards are treated as outliers. A
+dark head in bright light and a bright head in dim light look the same, so the light's mean over the sphere is fixed at
+1 in each channel. From directions that no part of the face sees, the light is estimated close to that mean.
 """
 
 from dataclasses import dataclass
@@ -86,8 +86,8 @@ SURROUND = harmonics(spread_directions(DIRECTIONS)) * BAND_FACTORS  # unhidden w
 def transfer(
     mesh_world: Mesh, normals: Float[np.ndarray, "v 3"], around: Neighbourhood, directions: int = DIRECTIONS
 ) -> Float[np.ndarray, "v 9"]:
-    """Computes the brightness of each vertex, as if it were matt white, in a light of each harmonic alone. Light that
-    the mesh blocks is missing, except for the fraction that the blocking surface reflects."""
+    """Computes the brightness that each vertex of a matt white mesh has under each of the nine harmonics as the light.
+    Light that the mesh blocks is left out, except for the fraction that the blocking surface reflects."""
     unhidden = harmonics(normals) * BAND_FACTORS
     towards = spread_directions(directions)
     basis = harmonics(towards) * (4.0 / directions)  # the sphere's 4 pi by the matt surface's pi
@@ -116,8 +116,8 @@ def _lamp_camera(mesh: Mesh, towards: Float[np.ndarray, " 3"]) -> Camera:
 def _hidden(
     camera: Camera, mesh: Mesh, rows: Int[np.ndarray, " n"], cosine: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns the fraction of the four nearest pixels of the lamp's depth map that hide each vertex, that is, are
-    nearer to the lamp by more than the vertex's slope explains."""
+    """Returns the fraction of a lamp's light that is blocked at each vertex, as a shadow map gives it: a mean over the
+    four nearest pixels, with a depth tolerance for the surface's slope."""
     depth, _ = depth_map(camera, mesh.vertices, mesh.faces)
     points = mesh.vertices[rows]
     x, y = np.clip(project_points(camera, points), 0, MAP_PX - 1.001).T
@@ -136,8 +136,8 @@ def _hidden(
 def fit_light(
     white: Float[np.ndarray, "v 9"], colours: Float[np.ndarray, "v 3"], skin: Bool[np.ndarray, " v"]
 ) -> Light | None:
-    """Estimates the light from the linear colours of skin, which is assumed to have one colour. Returns None if there
-    are too few vertices or they are black.
+    """Estimates the light from the linear colours of skin, whose true colour is assumed to be the same everywhere.
+    Returns None if there are too few vertices, or if they are black.
 
     Args:
         white: the ``transfer`` of the vertices.
@@ -168,6 +168,6 @@ def fit_light(
 
 
 def _bounds(coefficients: Float[np.ndarray, "9 3"]) -> Float[np.ndarray, "n 9"]:
-    """Returns the harmonics of the directions that the fit makes darker than any studio is."""
+    """Returns the harmonics at the directions in which the estimated light is darker than in any real studio."""
     dark = (SURROUND @ coefficients).mean(axis=1) < MIN_UNHIDDEN
     return SURROUND[dark] if coefficients.any() else SURROUND[:0]

@@ -1,10 +1,9 @@
-"""Holds the neighbours of each vertex as compiled loops read them, interpolates unknown values, and corrects
-photographs so that they meet without a visible step.
+"""Stores mesh adjacency in compressed rows, interpolates unknown vertex values, and corrects photographs so that they
+meet without a visible seam.
 
-Waechter et al. (2014, section 4.3) search smooth additive corrections that make both sides of every seam agree; a
-correction common to all views stays free. Here the correction of a view is a smooth field (sRGB codes) that moves it to
-the colour on which all views agree, wherever it sees the head (a screened Poisson equation). Any views can then be
-blended.
+Waechter et al. (2014, section 4.3) add smooth corrections that make both sides of every seam agree. In this module each
+view gets a smooth correction (sRGB codes) on the whole surface that it sees. The correction moves the view's colours to
+the robust mean of all views (a screened Poisson equation), so any two views can be blended.
 """
 
 from dataclasses import dataclass
@@ -42,8 +41,8 @@ class Neighbourhood:
         return np.repeat(np.arange(len(self.starts) - 1, dtype=np.int32), np.diff(self.starts))
 
     def calmed(self, values: Float[np.ndarray, "v c"], rounds: int) -> Float[np.ndarray, "v c"]:
-        """Returns the values smoothed over the mesh: in each round a vertex's value becomes the average of itself and
-        its neighbours' mean."""
+        """Smooths values over the mesh: in each round a vertex's value becomes the average of itself and its
+        neighbours' mean."""
         count = len(self.starts) - 1
         share = 0.5 / np.maximum(np.diff(self.starts), 1)
         means = sparse.csr_array((np.repeat(share, np.diff(self.starts)), self.indices, self.starts), (count, count))
@@ -74,8 +73,9 @@ def fill_unknown(
     parts: UInt8[np.ndarray, " v"] | None = None,
 ) -> Float[np.ndarray, "v c"]:
     """Fills in the values (at most four channels) of unknown vertices smoothly from their neighbours. A piece of the
-    mesh without any known vertex gets the mean of all known ones. With ``parts``, a vertex is filled from known
-    vertices of its own part, if any; where two parts meet unknown, their values are blended over ``SEAM_RINGS``."""
+    mesh without any known vertex gets the mean of all known values. With ``parts`` (labels such as skin or hair), a
+    vertex is filled only from its own part, if possible. Filled parts that meet are blended over ``SEAM_RINGS``
+    rings."""
     if parts is None:
         return _fill(values, known, faces)
     out, sure = values.astype(float), known.copy()
@@ -114,8 +114,8 @@ def level_views(
     agreed: Float32[np.ndarray, "v 3"],
     around: Neighbourhood,
 ) -> Float32[np.ndarray, "k v 4"]:
-    """Computes the correction of each view at each vertex (sRGB codes; the fourth channel is 0) with which neighbouring
-    views meet without a visible step.
+    """Computes the correction of each view at each vertex (sRGB codes; the fourth channel is 0) that makes seams
+    between views invisible.
 
     Args:
         weights: how well each view sees each vertex; 0 = not seen.

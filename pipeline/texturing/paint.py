@@ -1,9 +1,9 @@
 """Paints the texture image: reads each texel from the photographs chosen for the vertices of its triangle.
 
-A texel is a point of the fitted surface. Its pixel in a photograph is interpolated from those of the triangle's
-corners. The corners' pixels include lens distortion; edges are a few pixels long. The photograph is read at that pixel
-with a sub-pixel window, and the corners' correction is added (``pipeline.texturing.neighbourhood``). If the corners
-chose different photographs, these are blended. A texel that no camera sees gets the vertices' colours."""
+A texel is a point on a triangle of the mesh. A texel's pixel in a photograph is interpolated from the projections of
+the triangle's corners. The photograph is read at a texel's pixel with a sub-pixel window, and the corners' colour
+correction is added (``pipeline.texturing.neighbourhood``). If different photographs were chosen for the corners, the
+photographs are blended. A texel that no camera sees gets the vertices' colours."""
 
 import cv2
 import numpy as np
@@ -73,8 +73,8 @@ def paint_texture(
 def texture_size(
     layout: Layout, mesh_world: Mesh, views: Rig, region: Int[np.ndarray, " n"], *, wanted: int | None = None
 ) -> int:
-    """Returns the width of the texture in texels: ``wanted`` or, if None, the smallest of ``SIZES`` whose texels in the
-    ``region`` (vertices of the face) are as fine as the photographs' pixels."""
+    """Returns the width of the texture in texels. The width is ``wanted`` or, if None, the smallest of ``SIZES`` whose
+    texels on the face (the vertices ``region``) are as fine as the photographs' pixels."""
     if wanted is not None:
         return wanted
     inside = layout.faces[np.isin(layout.source[layout.faces], region).all(axis=1)]
@@ -90,8 +90,8 @@ def texture_size(
 
 
 def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | None, list[ReportWarning]]:
-    """Returns the model's texture layout; None if no requested file has a texture, or if the model cannot be laid flat.
-    Also returns warnings about the model."""
+    """Returns the head model's UV layout and warnings. The layout is None if no requested file format has a texture, or
+    if the model cannot be unwrapped."""
     if not settings.outputs.textured or settings.texture.blend == "reference":
         return None, []
     try:
@@ -109,8 +109,8 @@ def paint_charts(
     region: Int[np.ndarray, " n"],
     wanted: int | None = None,
 ) -> Atlas | None:
-    """Paints the texture of a closed surface (mm) in charts along ``head_axes`` (columns, world frame), as fine as the
-    pictures are in the ``region`` (vertices). Returns None if the surface was coloured without a ``Decision``."""
+    """Paints the texture of a closed mesh (mm) in UV charts along ``head_axes`` (columns, world frame). The texture's
+    texels are as fine as the photographs' pixels at the vertices ``region``. Returns None without a ``Decision``."""
     if coloured.decision is None:
         return None
     towards = blurred_over_mesh(normals @ head_axes, *neighbours(mesh_world.faces, len(normals)), ROUNDS)
@@ -128,8 +128,8 @@ def paint_head(
     settings: Settings,
     full_size: Rig | None = None,
 ) -> Atlas | None:
-    """Paints the texture of the head, as fine as the pictures or, if not None, as those of the cameras ``full_size``.
-    Returns None if there is no layout or no camera saw the head."""
+    """Paints the texture of the head, with texels as fine as the photographs' pixels, or as those of the cameras
+    ``full_size``. Returns None if there is no UV layout or no camera saw the head."""
     if layout is None or coloured.decision is None:
         return None
     region = np.flatnonzero(face_region)

@@ -1,4 +1,4 @@
-"""Compiled loops of ``pipeline.texturing.paint``, and those of ``neighbourhood`` that fill unseen vertices."""
+"""Contains the compiled loops of ``pipeline.texturing.paint`` and ``pipeline.texturing.neighbourhood``."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ TAPS = 4
 
 
 class Pictures(NamedTuple):
-    """Holds the parts of the photographs that show the head, in sequence, and the pixel of each vertex in them."""
+    """Holds the photographs, cropped to the head, in one array, and the pixel of each vertex in each photograph."""
 
     codes: np.ndarray  # uint8 (n,), rows of pixels of three channels
     first: np.ndarray  # int64 (k,): where each begins
@@ -23,7 +23,7 @@ class Pictures(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """Holds, for every vertex, its views, their weights in the mean, and corrections of their colours (sRGB codes)."""
+    """Holds, for every vertex, the views that colour it, their weights and colour corrections (sRGB codes)."""
 
     slots: np.ndarray  # int32 (v, s), -1: no view
     shares: np.ndarray  # float32 (v, s)
@@ -34,8 +34,8 @@ class Choice(NamedTuple):
 
 @njit(cache=True, nogil=True, inline="always")
 def sample(pictures: Pictures, k: int, x: float, y: float, out: np.ndarray) -> None:
-    """Reads the codes at the point (x, y) of view k into ``out`` (3), with a window of 4 x 4 pixels. A point outside
-    the picture gets the codes of the border."""
+    """Reads the sRGB codes at the pixel (x, y) of view k into ``out`` (3), with a window of 4 x 4 pixels. A point
+    outside the picture gets the codes of the border."""
     width, height = pictures.width[k], pictures.height[k]
     x = min(max(x, 0.0), width - 1.0)
     y = min(max(y, 0.0), height - 1.0)
@@ -69,8 +69,8 @@ def sample(pictures: Pictures, k: int, x: float, y: float, out: np.ndarray) -> N
 def gather(
     corners: tuple[int, int, int], choice: Choice, view: np.ndarray, share: np.ndarray, added: np.ndarray
 ) -> int:  # fmt: skip
-    """Collects the views that colour a triangle: views of its corners that see all three corners. Returns their number
-    n; 0 if there is none.
+    """Collects the views that colour a triangle: each was chosen at one corner and sees all three. Returns the number n
+    of these views.
 
     Fills ``view`` (n), ``share`` (n, 3), the weight of each view at each corner, and ``added`` (3, 3), the correction
     (codes, RGB) at each corner.
@@ -109,8 +109,8 @@ def gather(
 
 @njit(cache=True, nogil=True, inline="always")
 def correction_of(corners: tuple[int, int, int], c: int, k: int, channel: int, choice: Choice) -> np.floating:
-    """Returns the correction of view k at corner c; if that corner does not use the view, at the first other corner
-    that does."""
+    """Returns the colour correction of view k at corner c, or at the first other corner if corner c does not use the
+    view."""
     for turn in range(3):
         v = corners[(c + turn) % 3]
         for s in range(choice.slots.shape[1]):
@@ -124,8 +124,8 @@ def paint_rows(
     image: np.ndarray, row: int, rows: int, which: np.ndarray, texels: np.ndarray, faces: np.ndarray,
     source: np.ndarray, pictures: Pictures, choice: Choice,
 ) -> None:  # fmt: skip
-    """Paints the triangles ``which`` of a texture's layout in place, into ``rows`` rows of ``image`` (h, w, 3; BGR)
-    from ``row`` on.
+    """Paints the triangles ``which`` of a UV layout into ``image`` (h, w, 3; BGR), in place. The function changes
+    ``rows`` image rows, the first of which is ``row``.
 
     ``texels`` (n, 2) are the corners' positions in the image, ``faces`` (f, 3) the layout's triangles, and ``source``
     (n) the head's vertex for each corner.
@@ -210,7 +210,7 @@ def by_rings(starts: np.ndarray, indices: np.ndarray, known: np.ndarray) -> np.n
 def first_guess(
     values: np.ndarray, starts: np.ndarray, indices: np.ndarray, order: np.ndarray, known: np.ndarray
 ) -> None:
-    """Sets each vertex of ``order`` in turn to the mean of those neighbours that are ``known`` by then. Changes
+    """Sets each vertex, in the given ``order``, to the mean of its neighbours that are already known. Changes
     ``values`` (v, LANES) and ``known`` (v) in place."""
     for v in order:
         total, count = np.zeros(LANES, np.float32), 0
@@ -226,8 +226,8 @@ def first_guess(
 def relax(
     values: np.ndarray, starts: np.ndarray, indices: np.ndarray, order: np.ndarray, sweeps: int, factor: float
 ) -> None:
-    """Moves the vertices of ``order`` towards the mean of their neighbours, by over-relaxed (``factor``) Gauss-Seidel
-    sweeps in alternating directions. Changes ``values`` (v, LANES) in place, four numbers at once."""
+    """Moves the values of the vertices ``order`` towards the mean of their neighbours by successive over-relaxation
+    with ``factor``. Sweeps alternate in direction. Changes ``values`` (v, LANES) in place."""
     for sweep in range(sweeps):
         for step in range(len(order)):
             v = order[step] if sweep % 2 == 0 else order[len(order) - 1 - step]

@@ -1,24 +1,24 @@
-"""Computes one colour for each vertex from the photographs (section 4.5).
+"""Computes one colour for each vertex from the photographs (the paper's section 4.5).
 
-In: the fitted mesh, the photographs, the silhouettes. Out: a colour for each vertex, and the number of images it comes
-from. ``blend = "reference"`` is the paper's weighted mean: a vertex counts in an image if it projects inside the
-silhouette and nothing lies in front of it; its weight is the dot product of normal and viewing direction.
+The module takes the fitted mesh, the photographs and the silhouettes. The module returns a colour for each vertex, and
+the number of images used. ``blend = "reference"`` is the paper's weighted mean: an image counts if the vertex projects
+inside its silhouette and is not occluded. The image's weight is the dot product of normal and viewing direction.
 
-The default differs, because real cameras differ and real edges are blurred: it leaves margins at contours and occluding
-edges (``visibility``), sharpens photographs where they have detail, and corrects gain and offset of each camera
-(``colour_balance``). Its mean is in linear light. It gives little weight to a view that differs from the others in any
-channel (a highlight, a shadow), and less to cameras with a large correction. Unseen vertices are interpolated.
+The default blending also handles cameras that differ and edges that are blurred. The default blending leaves margins at
+contours and occluding edges (``visibility``), sharpens photographs where they have detail, and corrects gain and offset
+of each camera (``colour_balance``). The default blending averages in linear light, and gives little weight to a view
+that differs from the others in any channel (a highlight, a shadow), and less to cameras with a large correction.
 
-In models whose eyes are openings, strips from lid to lid close them; all vertices of a strip lie on the rim that the
-lids hide. Such a strip takes its colours from the one photograph that sees most of it.
+In head models whose eyes are openings, strips of triangles from lid to lid close the openings; the vertices of a strip
+lie on the lids' hidden edges. A strip takes its colours from the one photograph that sees most of it.
 
-Each vertex is labelled with the photograph that gives its detail, after Waechter, Moehrle and Goesele, *Let There Be
-Color! Large-Scale Texturing of 3D Reconstructions* (ECCV 2014): the labels minimise a sum of two terms. The data term
-combines projected area and angle, the visibility of all neighbours, the difference of a view's colour from the others,
-and the camera's correction. The Potts term is the cost of edges between labels. It is highest where the views disagree,
-so seams avoid eyes and lips. Unlike there, labels belong to vertices: two photographs are blended in the ring of
-triangles at a seam. Belief propagation in alternating directions minimises the sum (Felzenszwalb and Huttenlocher,
-*Efficient Belief Propagation for Early Vision*, IJCV 2006).
+Each vertex is labelled with one photograph, which gives the texture's detail there (Waechter, Moehrle and Goesele, *Let
+There Be Color! Large-Scale Texturing of 3D Reconstructions*, ECCV 2014). The labels minimise a data term plus a Potts
+term. The data term combines projected area and angle, the visibility of all neighbours, the difference of a view's
+colour from the others, and the camera's correction. The Potts term is the cost of mesh edges between different labels.
+The Potts term is highest where the views disagree, so seams avoid eyes and lips. Waechter et al. label triangles; here
+vertices are labelled, and two photographs are blended in the triangles at a seam. Belief propagation minimises the sum
+(Felzenszwalb and Huttenlocher, *Efficient Belief Propagation for Early Vision*, IJCV 2006).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -98,8 +98,8 @@ NOISE_CODES = 2.0  # disagreement that noise makes in the dark
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texture:
-    """Holds the sRGB colour of each vertex, the number of photographs it comes from (0 = filled), and the gains and
-    offsets of the cameras. ``dim`` is the linear colour of each vertex in its darker views."""
+    """Holds the sRGB colour of each vertex, the number of photographs that it comes from (0: interpolated), and the
+    gains and offsets of the cameras. ``dim`` is the linear colour of each vertex in its darker views."""
 
     colours: UInt8[np.ndarray, "v 3"]
     views: UInt8[np.ndarray, " v"]
@@ -112,7 +112,7 @@ class Texture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shown:
-    """Holds how the views show a surface.
+    """Holds what limits the use of each view: occluding hair, labelled parts, measured depth.
 
     Attributes:
         likely: the part (a code of ``Part``) of each vertex if nobody sees it; ``HAIR`` is the scalp, bald or not.
@@ -133,8 +133,8 @@ class Shown:
     best_views: bool = False
 
     def weigh(self, weights: Weights, views: Rig) -> tuple[Weights, UInt8[np.ndarray, " v"]]:
-        """Returns the views' weights, 0 where a view, or the mean of all, hardly shows the surface. Also returns the
-        parts from which unseen vertices are filled: the hair of the scalp where most of it has hair."""
+        """Returns the views' weights, set to 0 where the surface is probably hidden, in a view or in the mean of all
+        views. Also returns the part (skin, hair or clothes) from which each unseen vertex takes its colour."""
         shares = np.zeros((*weights.shape, 3), np.float32)  # read where a view may colour
         for k, camera in enumerate(views):
             shares[k, weights[k] > 0] = self.shares(camera, weights[k] > 0)
@@ -152,7 +152,7 @@ class Shown:
         return weights, np.where(bare, Part.SKIN, self.likely).astype(np.uint8)
 
     def find_guessed(self, weights: Weights) -> Bool[np.ndarray, " v"]:
-        """Tells where the surface is a guess that views show only along their rims: a colour there counts half."""
+        """Returns a mask of vertices where no depth was measured and views see the surface only near its contour."""
         total = weights.sum(axis=0)
         guessed = np.zeros(len(total), bool) if self.measured is None else ~self.measured
         return guessed & (total < GUESS_SHARE * np.median(total[total > 0]))
@@ -188,10 +188,10 @@ def texture(
     """Computes the colour of each vertex from the photographs of the usable views. ``depths`` are the mesh's depth maps
     in these views (mm).
 
-    With ``around``, the edges of the mesh, the result also has a ``decision``: a view for each vertex. If ``dim_share``
-    is not None, it also has each vertex's colour in a darker view: views that are no brighter have that fraction of the
-    vertex's weight. A view counts half where it differs from the views' median by ``outlier``, relative to it. With
-    ``shown``, a view colours no vertex where it shows something in front of the mesh, or a guess at its rim.
+    With ``around``, the edges of the mesh, the result also has a ``decision``: the views chosen for each vertex. With
+    ``dim_share``, the result also has each vertex's colour at that quantile of the views' brightness, which is free of
+    highlights. A view counts half if it differs from the views' median by ``outlier``, relative to the median. With
+    ``shown``, a view colours no vertex that something in front of the mesh hides.
     """
     views, normals = usable_views(capture, silhouettes, rig), mesh_world.normals()
     if settings.blend == "reference":
@@ -235,8 +235,8 @@ def texture(
 
 
 def wide_doubtful_surface(weights: Weights, mesh_world: Mesh) -> Bool[np.ndarray, " v"]:
-    """Tells which vertices lie on a large region that no view shows with certainty, such as the back of a head before
-    frontal cameras, and its rim. Its colour is interpolated from certain vertices."""
+    """Returns a mask of the vertices on large regions that no view sees well, such as the back of a head in front of
+    frontal cameras. The colours of these vertices are interpolated from other vertices."""
     total = weights.sum(axis=0)
     unsure = total < SURE_SHARE * np.median(total[total > 0])
     faces = mesh_world.faces[unsure[mesh_world.faces].all(axis=1)]
@@ -246,8 +246,8 @@ def wide_doubtful_surface(weights: Weights, mesh_world: Mesh) -> Bool[np.ndarray
 
 
 def underexposed_views(weights: Weights, colours: Colours, share: float) -> Float32[np.ndarray, "v 3"]:
-    """Returns the linear colour of each vertex in a darker view: views that are no brighter than it have ``share`` of
-    the vertex's weight. The colour is black where no view sees the vertex."""
+    """Returns the linear colour of each vertex in one of its darker views: the weighted quantile ``share`` of the views
+    by brightness. The colour is black where no view sees the vertex."""
     order = np.argsort(np.where(weights > 0, colours.sum(axis=2), np.inf), axis=0)
     passed = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
     rank = np.argmax(passed >= share * passed[-1], axis=0)
@@ -266,8 +266,8 @@ def decide(
     *,
     around: Neighbourhood | None,
 ) -> Decision:
-    """Chooses a view for each vertex, and computes the corrections that hide the seams between views. Without
-    ``around``, it chooses the view that sees the vertex best, corrected to the colour on which all views agree."""
+    """Chooses a view for each vertex, and computes the colour corrections that hide the seams between views. Without
+    ``around`` (mesh edges), the view with the highest weight is chosen, and corrected to the views' mean colour."""
     if around is None:
         return take_best_views(views, weights, balanced, agreed, pictures)
     codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
@@ -281,7 +281,7 @@ def decide(
 
 
 def take_best_views(views: Rig, weights: Weights, balanced: Colours, agreed: Points, pictures: Pictures) -> Decision:
-    """Chooses for each vertex the view that sees it best. It gives the detail between vertices; at them views agree."""
+    """Chooses for each vertex the view with the highest weight, and corrects its colour to the mean of all views."""
     best, rows = weights.argmax(axis=0), np.arange(weights.shape[1])
     codes = [255 * srgb_from_linear(np.clip(each, 0, 1)) for each in (agreed, balanced[best, rows])]
     corrections = np.zeros((len(rows), 1, 4), np.float32)
@@ -300,7 +300,7 @@ def _by_name(rig: Rig, values: Float[np.ndarray, "k 3"]) -> dict[str, Rgb]:
 
 
 def _gain_warnings(gains: Mapping[str, Rgb]) -> tuple[ReportWarning, ...]:
-    """Returns a warning for one camera that is brighter or darker than the others, and one for several together."""
+    """Returns one warning about all cameras whose pictures are brighter or darker than those of the others."""
     strong = {
         name: 1 / min(gain) for name, gain in gains.items() if max(gain) > STRONG_GAIN or min(gain) < 1 / STRONG_GAIN
     }
@@ -324,7 +324,7 @@ def blend_as_paper(
     rig: Rig,
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
 ) -> Texture:
-    """Colours vertices exactly by section 4.5, in the images' own codes; interpolates those that no camera sees."""
+    """Colours vertices exactly as in the paper's section 4.5, in sRGB codes; interpolates unseen vertices."""
     from scipy.ndimage import map_coordinates  # for the paper's mean alone
 
     total, weights, views = np.zeros((len(normals), 3)), np.zeros(len(normals)), np.zeros(len(normals), np.uint8)
@@ -355,8 +355,8 @@ def fill_unobserved_patches(
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
     hidden: Bool[np.ndarray, " v"] | None = None,
 ) -> Decision:
-    """Returns the decision with a view added at the corners of each wide patch that a camera sees without its corners,
-    such as a strip that closes an eye. Patches with hair or clothes in front of ``hidden`` corners are left out."""
+    """Adds a view to the decision for each wide patch of triangles whose corners no camera sees, such as a strip that
+    closes an eye. Patches whose ``hidden`` corners lie behind hair or clothes are left out."""
     blind = ~(decision.weights > 0)[:, mesh_world.faces].all(axis=2).any(axis=0)  # no view sees all corners
     rows = np.flatnonzero(blind if hidden is None else blind & ~hidden[mesh_world.faces].any(axis=1))
     faces, normals, area = _parts(mesh_world, rows)
@@ -375,7 +375,7 @@ def fill_unobserved_patches(
 
 
 def _parts(mesh: Mesh, rows: Int[np.ndarray, " f"]) -> tuple[Faces, Float[np.ndarray, "f 3"], Float[np.ndarray, " f"]]:
-    """Returns triangles, their unit normals and areas (mm2)."""
+    """Returns the unit normals, areas (mm2) and corners of the triangles ``rows``."""
     faces = mesh.faces[rows]
     normals = face_normals(mesh.vertices, faces)
     doubled = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
@@ -383,7 +383,7 @@ def _parts(mesh: Mesh, rows: Int[np.ndarray, " f"]) -> tuple[Faces, Float[np.nda
 
 
 def _wide(faces: Faces, area: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles belong to patches that are large enough."""
+    """Returns a mask of the triangles that belong to large patches."""
     patch = _patches(faces)
     return np.bincount(patch, area)[patch] >= MIN_MM2 if len(faces) else np.zeros(0, bool)
 
@@ -428,13 +428,13 @@ def select_views(
     around: Neighbourhood,
     seam_cost: float = SEAM_COST,
 ) -> tuple[Int32[np.ndarray, " v"], Int32[np.ndarray, "v c"], Float32[np.ndarray, "v c"]]:
-    """Chooses a view for each vertex; -1 where no view sees it. Also returns the candidate views of each vertex and
-    their quality.
+    """Chooses a view for each vertex; -1 means that no view sees it. Also returns the candidate views of each vertex
+    and their quality.
 
     ``weights``: weights of the views by angle and distance, 0 = not seen. ``codes``: sRGB codes of every view at every
-    vertex, gains applied. ``levelled``: the same, corrected by ``pipeline.texturing.neighbourhood``, which leaves the
-    edge of a shadow. ``agreed``: codes on which the views agree. ``gains``: gains of the cameras; their product is 1.
-    ``around``: edges of the mesh. ``seam_cost``: cost of an edge between different views.
+    vertex, gains applied. ``levelled``: these codes after the smooth corrections of
+    ``pipeline.texturing.neighbourhood``. ``agreed``: mean codes of the views. ``gains``: gains of the cameras; their
+    product is 1. ``around``: edges of the mesh. ``seam_cost``: cost of an edge between different views.
     """
     quality = ring_quality(weights, around.starts, around.indices)
     best = quality.max(axis=1, keepdims=True)
@@ -460,7 +460,7 @@ def select_views(
 def _disagreement(
     codes: Float32[np.ndarray, "k v 3"], agreed: Float32[np.ndarray, "v 3"]
 ) -> Float32[np.ndarray, "v k"]:
-    """Returns the difference of each view from the others, relative to the usual difference."""
+    """Returns the colour difference of each view from the others at each vertex, relative to the usual difference."""
     off = (codes - agreed) / (DISAGREEMENT * agreed + NOISE_CODES)
     return np.sqrt(np.einsum("kvc,kvc->vk", off, off) / 3.0)
 
@@ -474,8 +474,8 @@ def add_similar_views(
     *,
     around: Neighbourhood,
 ) -> tuple[Int32[np.ndarray, "v s"], Float32[np.ndarray, "v s"]]:
-    """Adds to the chosen view of each vertex other views that differ from it only by noise, since their mean has less
-    noise. Views that differ by more, as in eyes, brows and lips, are left out, since blending them would blur.
+    """Adds to the chosen view of each vertex the views that differ from it only by noise, since a mean has less noise.
+    Views that differ by more (often at eyes, brows and lips) are left out, since blending them would blur the texture.
 
     Args:
         labels: the chosen view of each vertex, -1 = none.
@@ -500,10 +500,10 @@ def add_similar_views(
 def find_unlike(
     weights: Plane, colours: Float32[np.ndarray, "k n 3"], regions: Sequence[Bool[np.ndarray, " n"]]
 ) -> dict[int, float]:
-    """Returns the views (by row) whose face differs from the others', each with its correlation to them. Such a view is
-    left out before the next one is searched. Two views do not tell which is wrong. Views of one moment differ by gloss
-    and shade only (correlation 0.9 to 1.0); a mouth that is open in one of them gives 0.2 to 0.6, another person -0.5
-    to 0.3.
+    """Returns the views (row indices) in which the face differs from the other views, each with its correlation to
+    them. A view that is found is left out before the next search. With only two views no view is reported. Views of the
+    same moment differ only by gloss and shading (correlation 0.9 to 1.0). A mouth that is open in one view gives 0.2 to
+    0.6, another person -0.5 to 0.3.
 
     ``weights``: of each view at each vertex, 0 where it does not show the face. ``colours``: linear, cameras balanced.
     """
@@ -518,7 +518,7 @@ def find_unlike(
 
 
 def _judge(weights: Plane, level: Plane) -> tuple[float, float, int]:
-    """Returns, for the view least like the others: its correlation as a fraction of theirs, alone, and its row."""
+    """Finds the view least like the others. Returns its relative correlation, its correlation and its row."""
     alike = _likeness(weights, level)
     if np.isnan(alike).all():
         return np.inf, np.nan, 0
@@ -529,7 +529,7 @@ def _judge(weights: Plane, level: Plane) -> tuple[float, float, int]:
 
 
 def _likeness(weights: Plane, level: Plane) -> Float[np.ndarray, " k"]:
-    """Returns the correlation of each view's ``level`` with the others' mean; NaN for a view that sees too little."""
+    """Returns the correlation of each view's brightness with the others' mean; NaN if it sees too few vertices."""
     total, weighted, best = weights.sum(axis=0), (weights * level).sum(axis=0), weights.max(axis=0)
     found = np.full(len(weights), np.nan)
     for k, weight in enumerate(weights):

@@ -1,4 +1,4 @@
-"""Compiled loops of ``vertex_colours``, ``neighbourhood`` and ``visibility``."""
+"""Contains the compiled loops of ``vertex_colours``, ``neighbourhood`` and ``visibility``."""
 
 import numpy as np
 
@@ -17,8 +17,8 @@ RING_SHARE = 0.7  # of a view's quality that the neighbours decide: beside an oc
 
 @njit(cache=True, nogil=True)
 def ring_quality(weights: np.ndarray, starts: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Returns the quality (v, k) of each view at each vertex: a mixture of its own weight and the smallest weight of
-    its neighbours, which is small near occlusions. ``weights`` is (k, v)."""
+    """Returns the quality (v, k) of each view at each vertex. The quality mixes the vertex's weight with the smallest
+    weight of its neighbours, which is small near occlusions. ``weights`` is (k, v)."""
     cameras, count = weights.shape
     out = np.zeros((count, cameras), np.float32)
     for v in range(count):
@@ -35,8 +35,8 @@ def ring_quality(weights: np.ndarray, starts: np.ndarray, indices: np.ndarray) -
 
 @njit(cache=True, nogil=True)
 def best_candidates(costs: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ``most`` cheapest views (v, most) of each vertex, the cheapest first (-1 where there are fewer), and
-    their costs. ``costs`` is (v, k)."""
+    """Returns the ``most`` views of lowest cost (v, most) for each vertex, the lowest first, and their costs. Missing
+    views are -1. ``costs`` is (v, k)."""
     count, cameras = costs.shape
     views = np.full((count, most), -1, np.int32)
     found = np.full((count, most), NEVER, np.float32)
@@ -64,13 +64,13 @@ def propagate(
     cameras: int,
     sweeps: int,
 ) -> np.ndarray:
-    """Labels each vertex with a view by min-sum belief propagation with a Potts term. Returns the position of the label
-    among the vertex's candidates, -1 without any.
+    """Labels each vertex with a view by min-sum belief propagation with a Potts term. Returns the label's position
+    among the vertex's candidate views; -1 without candidates.
 
     ``views`` and ``costs`` (v, candidates) are the results of ``best_candidates``. ``penalty`` (e) is the cost of
-    different views at both ends of a directed edge; ``starts``, ``indices`` and ``opposite`` are those of
-    ``Neighbourhood``. A message is stored at its edge, for the candidates of the receiving vertex, relative to the
-    message for any other label.
+    different views at both ends of a directed edge. ``starts``, ``indices`` and ``opposite`` come from
+    ``Neighbourhood``. A message along an edge is stored for the candidate views of the receiving vertex, relative to
+    the message for any other label.
     """
     count, most = views.shape
     messages = np.zeros((len(indices), most), np.float32)  # of edge e = (v, w): what w tells v
@@ -121,9 +121,9 @@ def level_view(
     sweeps: int,
     factor: float,
 ) -> None:
-    """Computes the correction of one view: replaces ``aims`` (v, 4; codes) in place by the field c that minimises
-    ``|c_v - aim_v|^2 + strength |c_v - c_w|^2``, summed over the ``seen`` vertices v and their edges (v, w), by
-    over-relaxed Gauss-Seidel."""
+    """Computes the smooth colour correction c of one view, and writes it into ``aims`` (v, 4; codes). The correction
+    minimises ``|c_v - aim_v|^2 + strength |c_v - c_w|^2``, summed over the ``seen`` vertices v and their edges (v, w),
+    by successive over-relaxation."""
     rows = np.flatnonzero(seen)
     fixed = aims.copy()
     s, kept = np.float32(strength), np.float32(1.0 - factor)
@@ -149,8 +149,8 @@ def differences(
     labels: np.ndarray, views: np.ndarray, detail: np.ndarray, weights: np.ndarray, starts: np.ndarray,
     indices: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Returns the mean squared difference in detail (k, v, 3; codes) between each candidate view (v, candidates) and
-    the chosen view, over the vertex and those neighbours that both see; -1 if there are none."""
+    """Returns the mean squared difference of ``detail`` (k, v, 3; codes) between each candidate view (v, candidates)
+    and the chosen view. The mean is over the vertex and its neighbours that both views see; -1 if there are none."""
     count, most = views.shape
     out = np.full((count, most), np.float32(-1.0), np.float32)
     for v in range(count):
@@ -177,8 +177,8 @@ def differences(
 def fill_slots(
     labels: np.ndarray, views: np.ndarray, shares: np.ndarray, slots: int
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Returns the chosen view of each vertex and the other views with the largest weights: views (v, slots), -1 = none,
-    and their weights, which sum to 1."""
+    """Returns the chosen view of each vertex and the views with the next largest shares (v, slots; -1: none). Also
+    returns their shares, scaled to sum 1."""
     count, most = views.shape
     found = np.full((count, slots), -1, np.int32)
     weight = np.zeros((count, slots), np.float32)
@@ -261,7 +261,7 @@ def blend_views(weights: np.ndarray, colours: np.ndarray, outlier: float) -> tup
 
 @njit(cache=True, nogil=True, inline="always")
 def nearest_sample(depth: np.ndarray, row: int, column: int, reach: int) -> float:
-    """Returns the smallest depth (mm) within ``reach`` pixels of a pixel, across and down."""
+    """Returns the smallest depth (mm) in a square window that extends ``reach`` pixels around a pixel."""
     nearest = np.inf
     for j in range(max(0, row - reach), min(depth.shape[0], row + reach + 1)):
         for i in range(max(0, column - reach), min(depth.shape[1], column + reach + 1)):
@@ -279,11 +279,11 @@ def visibility_weights(
     pixel_angle: float,
     limits: tuple[float, float, float, float],
 ) -> np.ndarray:
-    """Returns the weight (float32) with which one camera sees each point (v); 0 where it does not.
+    """Returns the weight (float32) with which one camera sees each point (v); 0 for a point that it does not see.
 
-    A point counts if it lies inside the silhouette by a margin, and no nearer surface of the depth map hides it. Its
-    weight is cosine^sharpness / depth^2, reduced towards the margin, and ``POOR`` times that at a flat angle or beside
-    an occluding edge.
+    A point counts if it lies inside the silhouette by a margin, and no nearer surface of the depth map hides it. A
+    point's weight is cosine^sharpness / depth^2, reduced towards the margin, and ``POOR`` times that at a flat angle or
+    beside an occluding edge.
 
     Args:
         pixels: of the points (v, 2).

@@ -1,11 +1,11 @@
-"""Computes which camera sees which point of a surface, with what weight, and in what colour (section 4.5).
+"""Computes which camera sees which point of a surface, with which weight and colour (the paper's section 4.5).
 
-The paper requires a projection inside the silhouette and no occlusion. Real edges are blurred and fits are not exact.
-So a margin is kept to the contour (no background on the mesh) and to occluding edges of the head itself (no nose on the
-cheek behind it). At an occluding edge the nearest surface in a small window decides, corrected for the surface's own
-slope. A view near an occluding edge, or at a flat angle, counts only where no better view exists.
+The paper requires that a point projects inside the silhouette and is not occluded. Real edges are blurred and fits are
+not exact, so points near the contour or near an occluding edge are also excluded. To find occluding edges, a point is
+compared with the nearest depth in a small window, corrected for the surface's slope. A view near an occluding edge, or
+at a flat angle, counts only where no better view exists.
 
-This module also holds the choice of photographs for each vertex, and the photographs packed for compiled loops.
+This module also packs the photographs, and the choice of photographs for each vertex, for compiled loops.
 """
 
 from collections.abc import Mapping, Sequence
@@ -67,7 +67,8 @@ def see_points(
 
 
 def unclipped(colours: Float32[np.ndarray, "v 3"]) -> Float32[np.ndarray, " v"]:
-    """Returns a factor for the weight of each colour: 1 well below the end of the scale, falling to almost 0 at it.
+    """Returns a factor for the weight of each colour: it falls from 1 well below the largest code to almost 0 at this
+    code.
 
     A clipped value does not show how bright a point is, so a view with a longer exposure would make it too dark. Where
     all views are clipped the result is still white.
@@ -80,8 +81,8 @@ def unclipped(colours: Float32[np.ndarray, "v 3"]) -> Float32[np.ndarray, " v"]:
 def see_weights(
     camera: Camera, silhouette: Silhouette, depth: Float32[np.ndarray, "h w"], points: Vertices, normals: Vertices
 ) -> Float32[np.ndarray, " v"]:
-    """Returns the weight with which ``camera`` sees each point of a surface (world frame, mm); 0 where it does not.
-    ``depth`` is the surface's depth map in that camera."""
+    """Returns the weight with which ``camera`` sees each point of a surface (world frame, mm); 0 for a point that it
+    does not see. ``depth`` is the surface's depth map in that camera."""
     pixels, depths = project_points(camera, points), camera_depths(camera, points)
     return visibility_weights(
         pixels,
@@ -95,11 +96,11 @@ def see_weights(
 
 
 def sharpened(image: Photograph, inside: Bool[np.ndarray, "h w"], amount: float) -> Photograph:
-    """Sharpens a photograph where it has detail, which removes part of the blur of the lens and of the sampling window.
-    ``amount`` is that of an unsharp mask.
+    """Sharpens a photograph where it has detail. ``amount`` is the strength of the unsharp mask.
 
-    Plain sharpening would amplify noise as well. It is therefore scaled as in a Wiener filter: by the fraction of the
-    local power that exceeds noise. Most of a head is smooth, so the median power over the head is taken for noise.
+    Plain sharpening would amplify noise as well. The sharpening is therefore scaled as in a Wiener filter, by the
+    fraction of the local power that exceeds the noise power. Most of a head is smooth, so the noise power is the median
+    power over the head.
     """
     box = box_around(inside, 0)
     if not amount or not inside[box].size:
@@ -116,7 +117,7 @@ def sharpened(image: Photograph, inside: Bool[np.ndarray, "h w"], amount: float)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """Holds the photographs that colour each vertex.
+    """Holds the choice of photographs that colour each vertex.
 
     Attributes:
         views: the cameras of the photographs.
@@ -135,16 +136,16 @@ class Decision:
     pictures: Pictures
 
     def choice(self, colours: UInt8[np.ndarray, "v 3"]) -> Choice:
-        """Returns the decision in the form of the compiled loops. ``colours`` (sRGB codes of the vertices) are used in
-        triangles that no view sees."""
+        """Packs the decision for the compiled loops. Triangles that no view sees get ``colours``, the sRGB codes of the
+        vertices."""
         filled = np.zeros((len(colours), 4), np.float32)
         filled[:, :3] = colours
         return Choice(self.slots, self.shares, self.corrections, filled, self.weights)
 
 
 def window_table(sigma: float) -> Float32[np.ndarray, "_ _"]:
-    """Returns the Gaussian weights for reading four neighbouring pixels, one row for each sub-pixel position between
-    the middle two. ``sigma`` is in pixels."""
+    """Returns the Gaussian weights of four neighbouring pixels, one row for each sub-pixel position between the middle
+    two. ``sigma`` is in pixels."""
     phase = np.arange(PHASES + 1) / PHASES
     weights = np.exp(-0.5 * ((np.arange(TAPS) - 1 - phase[:, None]) / sigma) ** 2)
     return (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -159,8 +160,8 @@ def pack_pictures(
     *,
     mesh_world: Mesh,
 ) -> Pictures:
-    """Packs the part of each photograph around its silhouette into one array, with the camera's gain and offset
-    applied."""
+    """Crops each photograph to its silhouette, applies the camera's gain and offset, and packs all crops into one
+    array."""
     boxes = [box_around(masks[camera.name], TAPS) for camera in views]
     parts = [image[box] for image, box in zip(images, boxes, strict=True)]
     first = np.cumsum([0] + [part.size for part in parts])

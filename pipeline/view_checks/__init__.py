@@ -1,5 +1,6 @@
-"""Decides which views a job may use. Finds exchanged pictures, cameras that moved, a calibration of another rig, and
-outlines too large or too small for a head.
+"""Decides which views of a capture are used. Finds exchanged pictures, cameras that moved, the calibration of another
+rig, and outlines of the wrong size.
 
-In: silhouettes and the rig. Out: the views that agree, corrected where the correction is certain, and warnings.
+The checks compare the silhouettes with the calibrated cameras. The checks return the consistent views, repaired where
+the repair is certain, and warnings.
 """

@@ -1,12 +1,12 @@
-"""Checks whether every picture is filed under the camera that took it, before anything is fitted.
+"""Checks, before the fit, whether every picture is filed under the camera that took it.
 
-After swapped cables or renamed files, two cameras hold each other's pictures, or three in a ring, or all names are off
-by one. A plane through two camera centres that touches the subject touches both silhouettes (Wong and Cipolla,
-*Structure and motion from silhouettes*, ICCV 2001), provided that each silhouette belongs to its camera: correct
-pictures miss by tenths of a pixel, exchanged ones by tens.
+Swapped cables or renamed files exchange the pictures of two cameras, or of more cameras in a cycle. A plane through two
+camera centres that touches the subject is tangent to both silhouettes (Wong and Cipolla, *Structure and motion from
+silhouettes*, ICCV 2001). The error of this tangency is tenths of a pixel for correct pictures, and tens of pixels for
+exchanged pictures.
 
-In: silhouettes and the rig. Out: the picture that each camera should have, and how certain that is. A camera that was
-moved, or whose mask is bad, contradicts the others with every picture, and retains its own.
+The module returns the picture that each camera should have, and whether this is certain. A camera that was moved, or
+whose mask is bad, contradicts the others with every picture, and keeps its own.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,9 +46,9 @@ MIN_CAMERAS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assignment:
-    """Holds which cameras hold each other's pictures. ``pictures`` has an entry for every camera that holds another's
-    picture: the name under which its own is filed. ``overwhelming`` is whether the misfit of the tangent planes becomes
-    so much smaller by the exchange that no doubt is left.
+    """Holds the exchange of pictures among cameras. For every camera that has another camera's picture, ``pictures``
+    has the name under which its own picture is filed. ``overwhelming`` is True if the exchange reduces the misfit of
+    the tangent planes so much that it is certain.
     """
 
     pictures: Mapping[str, str]
@@ -79,8 +79,8 @@ def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignme
 
 
 def own_misfit(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, float]:
-    """Returns, for each camera, how much its picture contradicts the others (mean robust misfit of its tangent planes):
-    about 0.2 for the right picture, 0.5 and more for another camera's."""
+    """Returns, for each camera, the mean robust misfit of its tangent planes with the other cameras. The misfit is
+    about 0.2 for the right picture, 0.5 and more for another camera's picture."""
     seen, hulls = outlined(silhouettes, rig)
     if len(seen) < MIN_CAMERAS:
         return dict.fromkeys(seen.names, CUT_OFF_MISFIT)
@@ -88,8 +88,7 @@ def own_misfit(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, flo
 
 
 def rings(pictures: Mapping[str, str]) -> list[tuple[str, ...]]:
-    """Returns the cycles of an exchange. In (a, b, c) camera a's picture is filed under b, b's under c, and c's under
-    a."""
+    """Returns the cycles of an exchange. In (a, b, c) camera a's picture is filed under b, b's under c, c's under a."""
     left, found = dict(pictures), []
     while left:
         first = min(left)
@@ -118,8 +117,7 @@ def _ring_message(ring: tuple[str, ...], what: Message) -> Message:
 
 
 def outlined(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Rig, list[Float[np.ndarray, "_ 2"]]]:
-    """Returns those cameras of the rig whose mask is thicker than a few pixels somewhere, and the convex hulls (px) of
-    their outlines."""
+    """Returns the cameras whose mask is thicker than a few pixels, and the convex hulls (px) of their outlines."""
     seen = rig.subset(
         name for name in rig.names if name in silhouettes and silhouettes[name].distance.min() < -INSET_PX
     )
@@ -127,8 +125,8 @@ def outlined(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Rig, list
 
 
 def tangency_errors_px(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np.ndarray, "n n 2"]:
-    """Returns the error (px of both images together) between the two images of each tangent plane, two planes for each
-    pair of cameras, with all pictures as filed. ``hulls`` are the outlines' convex hulls, px."""
+    """Returns the error (px, in both images together) of each tangent plane, two planes for each pair of cameras, with
+    all pictures as filed. ``hulls`` are the outlines' convex hulls, px."""
     cameras = list(rig)
     touches = [_touches(camera, hulls[i : i + 1], i, cameras) for i, camera in enumerate(cameras)]
     angle, step = (np.stack([touch[k][0] for touch in touches]) for k in range(2))
@@ -136,13 +134,13 @@ def tangency_errors_px(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> F
 
 
 def _miss_px(gap: Float[np.ndarray, "*n"], step: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Converts gaps in angle to pixels: divides by the change of angle per pixel. NaN if that is undefined, as for two
-    cameras at one place."""
+    """Converts differences in angle to pixels: divides by the change of angle per pixel. Returns NaN if this change is
+    undefined, as for two cameras at the same place."""
     return np.divide(gap, step, out=np.full(gap.shape, np.nan), where=step > MIN_SLOPE)
 
 
 def mean_misfit(errors_px: Float[np.ndarray, "n n 2"], cut_off: float | None = None) -> Float[np.ndarray, " n"]:
-    """Returns the mean robust misfit of each camera's tangent planes. Planes hidden by the image border count as
+    """Returns the mean robust misfit of each camera's tangent planes. Planes beyond the image border count as
     ``cut_off``; None leaves them out."""
     there = np.isfinite(errors_px)
     of_each = np.where(there, _robust(errors_px, ROBUST_SIGMAS * _noise_px(errors_px[there])), cut_off or 0.0)
@@ -151,8 +149,8 @@ def mean_misfit(errors_px: Float[np.ndarray, "n n 2"], cut_off: float | None = N
 
 
 def _judged(held: Int[np.ndarray, " n"], misfit: Float32[np.ndarray, "n n n n"], rig: Rig) -> Assignment:
-    """Returns the permutation ``held`` as an assignment; an empty one if it gains too little or an exchanged picture
-    still contradicts the others."""
+    """Converts the permutation ``held`` to an assignment. Returns an empty assignment if the permutation hardly reduces
+    the misfit, or if an exchanged picture still contradicts the others."""
     identity = np.arange(len(rig))
     displaced = np.flatnonzero(held != identity)
     if not len(displaced):
@@ -167,22 +165,22 @@ def _judged(held: Int[np.ndarray, " n"], misfit: Float32[np.ndarray, "n n n n"],
 
 
 def _noise_px(errors_px: Float[np.ndarray, " n"]) -> float:
-    """Estimates the standard deviation (px) of a plane's error from the best quarter, since half of the planes may
-    belong to exchanged pictures."""
+    """Estimates the standard deviation (px) of a tangent plane's error from the best quarter of all planes, since half
+    of them may belong to exchanged pictures."""
     quarter = float(np.quantile(np.abs(errors_px), 0.25)) if len(errors_px) else 0.0
     return float(np.clip(quarter / 0.3186, MIN_NOISE_PX, MAX_NOISE_PX))
 
 
 def _robust(miss_px: np.ndarray, scale_px: float) -> np.ndarray:
-    """Returns the misfit of each plane, 0 to 1 (Geman and McClure)."""
+    """Returns the robust misfit of each tangent plane, 0 to 1 (Geman and McClure)."""
     return miss_px**2 / (miss_px**2 + scale_px**2)
 
 
 def _misfit_tensor(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float32[np.ndarray, "n n n n"]:
-    """Returns, for all i, a, j, b, the robust misfit of the two outer planes of cameras i and j, if camera i held
-    picture a and camera j picture b.
+    """Returns, for all i, a, j, b, the robust misfit of the two tangent planes of cameras i and j if camera i took
+    picture a and camera j took picture b.
 
-    A picture whose size is not the camera's counts as cut off.
+    A picture with another size than the camera's counts as cut off.
     """
     cameras, count = list(rig), len(rig)
     angle, step = np.full((2, count, count, count, 2), np.nan)  # camera i, picture a, the other camera j; top, bottom
@@ -202,9 +200,9 @@ def _misfit_tensor(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float
 def _touches(
     camera: Camera, hulls: Sequence[Float[np.ndarray, "_ 2"]], index: int, cameras: Sequence[Camera]
 ) -> tuple[Float[np.ndarray, "h n 2"], Float[np.ndarray, "h n 2"]]:
-    """Treats each silhouette as this camera's. Returns the angles (rad) of the two outermost planes through this and
-    each other camera that touch the silhouette, and the change of angle per pixel. NaN where the image border cuts the
-    tangent off."""
+    """Computes, for each silhouette in this camera, the angles (rad) of the two planes through this and each other
+    camera's centre that are tangent to the silhouette. Also returns the change of angle per pixel. The values are NaN
+    for a tangent beyond the image border."""
     pixels, ends = np.concatenate(hulls), np.cumsum([0, *map(len, hulls)])
     rays = camera.rays_world(pixels)
     k = camera.intrinsics
@@ -228,7 +226,7 @@ def _touches(
 
 
 def _pencil(cameras: Sequence[Camera], i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ``epipolar_plane_axes`` of two cameras, the same for (i, j) and (j, i)."""
+    """Returns the ``epipolar_plane_axes`` of two cameras, which are the same for (i, j) and (j, i)."""
     one, two = cameras[min(i, j)], cameras[max(i, j)]
     return epipolar_plane_axes(one, two, one.axis_world + two.axis_world)
 
@@ -238,8 +236,9 @@ def _size(camera: Camera) -> tuple[int, int]:
 
 
 def _least_misfit(misfit: Float32[np.ndarray, "n n n n"], rig: Rig) -> Int[np.ndarray, " n"]:
-    """Finds the permutation of least misfit by exchanging two pictures at a time, from the pictures as filed. If all
-    names are off by the same number, no single exchange helps; so the search also starts from those permutations."""
+    """Finds the permutation of least misfit by exchanging two pictures at a time, starting with the pictures as filed.
+    If all file names are shifted by the same number, no single exchange helps, so the search also starts with shifted
+    names."""
     count = len(rig)
     sizes = [_size(camera) for camera in rig]
     allowed = np.array([[one == two for two in sizes] for one in sizes])
@@ -272,7 +271,7 @@ def _descended(
 
 
 def _rows(misfit: Float32[np.ndarray, "n n n n"], held: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-    """Returns the misfit of camera i with each picture a, while all other cameras hold the pictures ``held``."""
+    """Returns the misfit of camera i with each picture a, while all other cameras have the pictures ``held``."""
     every = np.arange(len(held))
     return misfit[:, :, every, held].sum(axis=2, dtype=float)
 

@@ -1,18 +1,17 @@
-"""Checks, before each fit, whether a camera has moved since the calibration, from the silhouettes alone.
+"""Checks by means of the silhouettes, before each fit, whether a camera has moved since the calibration.
 
-A plane through two camera centres that touches the subject touches both silhouettes: epipolar tangency, at frontier
-points (Ramanathan, Steinbach and Girod 2000, the paper's reference for calibration from silhouettes). Hair and
-shoulders are as useful as skin, since the subject is rigid within a shot. Eleven cameras give about fifty such
-equations, exact to 0.2 px. A camera rotated by a small angle shifts its whole image; all equations of that camera then
-agree on one shift.
+A plane through two camera centres that touches the subject is tangent to both silhouettes (epipolar tangency;
+Ramanathan, Steinbach and Girod 2000). Hair and shoulders are as useful as skin, since the subject is rigid within a
+shot. Eleven cameras give about fifty tangency equations, exact to 0.2 px. A small rotation of a camera shifts its whole
+image, so all equations of this camera give the same shift.
 
 A loose mask is too large on every side, while a shifted image is off in one direction; tangencies on opposite sides
-distinguish the two. In a close-up most tangencies are on one side, with twice the pixels per millimetre. Both causes
-then explain them: the camera is reported with both, and its view is still used. Strands of hair that one camera
-resolves and another does not would cause errors of several pixels. So the planes touch a curve inside the outline,
-beyond the reach of strands, at the same depth in mm for every camera.
+distinguish these causes. In a close-up most tangencies are on one side, and both causes are possible: the camera is
+reported with both, and its view is still used. Strands of hair that only some cameras resolve would cause errors of
+several pixels. So the planes are tangent to a curve that lies inside the outline by the same distance in mm for every
+camera.
 
-In: silhouettes and the rig. Out: the cameras that have moved, by how much, and with what certainty.
+The module returns the cameras that have moved, with the size and the significance of the shift.
 """
 
 from collections.abc import Mapping
@@ -47,7 +46,7 @@ CHANCE = 0.01  # that a good camera disagrees so much with the rest (F test)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift:
-    """Holds a camera whose silhouette lies away from the position that the other cameras predict.
+    """Holds a camera whose silhouette is shifted from the position that the other cameras predict.
 
     Attributes:
         camera: its name.
@@ -77,10 +76,10 @@ class Drift:
 
 
 def find_drift(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Drift, ...]:
-    """Finds cameras that have moved since the calibration, or seem to have because of a loose mask, in the order of
-    their shifts (largest first).
+    """Finds cameras that have moved since the calibration, or appear to have moved because of a loose mask, the largest
+    shift first.
 
-    The worst camera is removed before the next one is searched, since it disturbs the equations of its neighbours.
+    The worst camera is removed before the next search, since it distorts the equations of its neighbours.
     """
     usable = rig.subset(name for name in rig.names if name in silhouettes and silhouettes[name].quality.usable)
     tangencies = find_tangencies(silhouettes, usable, INSET_MM)
@@ -98,7 +97,7 @@ def find_drift(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Drift, 
 
 
 def _judge(name: str, tangencies: list[Tangency], camera: Camera) -> Drift | None:
-    """Returns the shift that the camera's tangencies agree on; None if there are too few of them or the shift is not
+    """Returns the shift that explains the camera's tangencies; None if there are too few or the shift is not
     significant."""
     rest = _normalised([t for t in tangencies if name not in t.cameras])
     scale = max(1.0, 1.4826 * float(np.median(np.abs(rest)))) if len(rest) else 1.0
@@ -116,7 +115,7 @@ def _judge(name: str, tangencies: list[Tangency], camera: Camera) -> Drift | Non
 
 
 def _normalised(tangencies: list[Tangency]) -> Float[np.ndarray, " n"]:
-    """Returns the error of each tangency in standard deviations, for contours with an error of ``NOISE_FLOOR_PX``."""
+    """Returns the error of each tangency in standard deviations, for outlines with an error of ``NOISE_FLOOR_PX``."""
     excess = np.array([t.excess_px[0] for t in tangencies])
     slopes = np.array([t.steepness for t in tangencies]).reshape(-1, 2)
     return excess * slopes[:, 0] / (NOISE_FLOOR_PX * np.hypot(slopes[:, 0], slopes[:, 1]))
@@ -124,11 +123,11 @@ def _normalised(tangencies: list[Tangency]) -> Float[np.ndarray, " n"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShiftEquations:
-    """Holds the equations ``normal . shift + outward * loose = excess`` of one camera's n tangencies, in its pixels.
-    The unknowns are the shift of its image and the width by which its mask is too large all around (``loose``).
+    """Holds the equations ``normal . shift + outward * loose = excess`` of one camera's n tangencies (px). The unknowns
+    are the shift of the image and the width by which the mask is too large all around (``loose``).
 
     ``outward`` is 1 where ``normal`` points out of the subject, else -1. ``pixels`` is the standard deviation of each
-    equation for a contour noise of one pixel in both pictures; ``contour_noise_px`` is the actual one.
+    equation for an outline noise of one pixel in both pictures; ``contour_noise_px`` is the actual noise.
     """
 
     normals: Float[np.ndarray, "n 2"]
@@ -139,12 +138,12 @@ class ShiftEquations:
 
     @property
     def noise_px(self) -> Float[np.ndarray, " n"]:
-        """Returns the standard deviation of each equation, px."""
+        """Returns the standard deviation of each tangency equation, px."""
         return self.contour_noise_px * self.pixels
 
     @classmethod
     def of(cls, name: str, tangencies: list[Tangency], contour_noise_px: float) -> "ShiftEquations":
-        """Builds the equations of the camera ``name`` from those tangencies in which it takes part."""
+        """Builds the equations of the camera ``name`` from its tangencies with other cameras."""
         involved = [(t, side) for t in tangencies for side in range(2) if t.cameras[side] == name]
         ratio = np.array([t.steepness[1 - side] / t.steepness[side] for t, side in involved])
         return cls(
@@ -156,8 +155,8 @@ class ShiftEquations:
         )
 
     def missed(self, shift_px: Float[np.ndarray, " 2"], loose_px: float) -> Float[np.ndarray, " n"]:
-        """Returns the residual of each equation, in standard deviations, if the image is shifted by ``shift_px`` and
-        the mask is too large by ``loose_px``."""
+        """Returns the residual of each equation, in standard deviations, for an image shift ``shift_px`` and a mask too
+        large by ``loose_px``."""
         return (self.normals @ shift_px + self.outward * loose_px - self.excess_px) / self.noise_px
 
 
@@ -177,8 +176,7 @@ class ShiftTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shift:
-    """Holds a shift (px), its standard deviation (px), and its size in standard deviations; the mask is taken as
-    tight."""
+    """Holds an image shift (px), its standard deviation (px), and its size in standard deviations, for a tight mask."""
 
     shift_px: Float[np.ndarray, " 2"]
     deviation_px: float
@@ -186,8 +184,8 @@ class _Shift:
 
 
 def _robust_shift(equations: ShiftEquations) -> _Shift:
-    """Finds the shift of least robust misfit, starting from the best of those that pairs of equations propose. If all
-    equations have one direction, the shift at right angles to it stays zero."""
+    """Finds the image shift of least robust misfit, starting from the best solution of a pair of equations. If all
+    equations have the same direction, the perpendicular shift stays zero."""
     pairs = np.stack(np.triu_indices(len(equations.excess_px), 1), axis=1)
     pairs = pairs[np.abs(np.linalg.det(equations.normals[pairs])) > MIN_INDEPENDENT]
     met = np.linalg.solve(equations.normals[pairs], equations.excess_px[pairs][:, :, None])[:, :, 0]
@@ -203,8 +201,8 @@ def _robust_shift(equations: ShiftEquations) -> _Shift:
 
 
 def _beyond_loose_masks(equations: ShiftEquations, found: _Shift) -> float:
-    """Returns by how many standard deviations the shift explains the tangencies better than a loose mask: the root of
-    the difference in cost, 0 if the loose mask explains them as well."""
+    """Returns the significance, in standard deviations, of a shift compared with a loose mask: the root of the
+    difference in cost, or 0 if a loose mask explains the tangencies as well."""
     deviation_px = LOOSE_PX * float(np.median(equations.pixels))
     proposed = np.append(equations.outward * equations.excess_px, 0.0)
     loose = min(
@@ -218,20 +216,20 @@ def _cost(equations: ShiftEquations, shift_px: Float[np.ndarray, " 2"], loose_px
 
 
 def _explains(before: Float[np.ndarray, " n"], after: Float[np.ndarray, " n"]) -> bool:
-    """Tells whether the shift removes enough of the misfit, also without the equation that it improves most. A bad
-    stretch of outline affects one tangent plane, a moved camera all of its planes."""
+    """Returns True if a shift removes enough of the misfit, even without the equation that it improves most. A bad part
+    of an outline affects one tangent plane, a moved camera all of its planes."""
     others = np.arange(len(before)) != np.argmax(before - after)
     return all(after[k].sum() <= (1.0 - MIN_GAIN) * before[k].sum() for k in (slice(None), others))
 
 
 def _disagrees(misfits: Float[np.ndarray, " n"], rest: Float[np.ndarray, " m"]) -> bool:
-    """Tells whether the other cameras' planes agree better among themselves than with this camera's, by more than
-    chance allows (F test of the mean misfits)."""
+    """Returns True if the other cameras' tangent planes agree significantly better among themselves than with this
+    camera (F test of the mean misfits)."""
     if not len(rest) or not rest.any():
         return True
     return bool(fdtrc(len(misfits), len(rest), misfits.mean() / rest.mean()) < CHANCE)
 
 
 def _misfits(miss: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Returns the robust misfit, 0 to 1, of each miss in standard deviations."""
+    """Converts errors in standard deviations to robust misfits, 0 to 1."""
     return _LOSS.cost(miss**2) / ROBUST_SIGMAS**2

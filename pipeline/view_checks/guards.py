@@ -1,9 +1,9 @@
-"""Holds the one place through which every refusal of a capture goes.
+"""Decides about every refusal of a capture.
 
-A guard refuses a capture only if two independent kinds of evidence agree and the head would otherwise be wrong. Missing
-or damaged input needs no such evidence: its reader refuses it.
+A capture is refused only if two independent kinds of evidence agree that the head would be wrong. Missing or damaged
+input is refused when it is read.
 
-In: the error that a check would raise, and the face in the photographs. Out: that error, or a warning instead.
+Given the error that a check would raise, the module raises it or returns a warning instead.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,10 +26,10 @@ DAMAGED = ("pictures-the-same",)  # codes of refusals that leave no head possibl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceEvidence:
-    """Holds the evidence of the subject's face about the capture: where the face is, which way is up, and which views
-    show it there. The face has a human's size, and its landmarks meet within their noise.
+    """Holds what the subject's face shows about a capture: where the face is, which way is up, and which views show it
+    there. The face has a human's size, and its landmarks triangulate within their noise.
 
-    ``missed`` are the views that must show the face but do not show it there.
+    ``missed`` are the views that do not show the face at its predicted position, although they must see it.
     """
 
     centre_world: Float[np.ndarray, " 3"]
@@ -43,12 +43,12 @@ class FaceEvidence:
         return self.rotation[:, 1]
 
     def skull_world(self, from_face_mm: tuple[float, float, float]) -> Float[np.ndarray, " 3"]:
-        """Returns the point ``from_face_mm`` behind the face."""
+        """Returns the point (world frame, mm) that lies ``from_face_mm`` behind the face."""
         return self.centre_world + self.rotation @ np.array(from_face_mm)
 
     @property
     def holds_the_rig(self) -> bool:
-        """Tells whether most cameras in front of the face show it where the calibration predicts it."""
+        """Returns True if most cameras in front of the face show it where the calibration predicts it."""
         return len(self.views) > 2 * len(self.missed)
 
 
@@ -68,7 +68,7 @@ FindFace = Callable[[Mapping[str, ImageRgb], Rig], FaceEvidence | None]
 
 @dataclass(frozen=True, slots=True)
 class Guards:
-    """Decides whether a capture is refused. With ``anyway``, a refusal becomes a warning of a doubtful pose."""
+    """Decides whether a capture is refused. With ``anyway``, a refusal becomes a warning that the pose is doubtful."""
 
     anyway: bool = False
     find_face: FindFace = find_face_evidence

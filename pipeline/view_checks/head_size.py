@@ -1,19 +1,15 @@
-"""Checks the outlined head before a fit, from silhouettes, cameras and the subject's face: its size, and whether the
-crown has the same height in every view.
+"""Checks the size of the head in the silhouettes before a fit, and whether the crown has the same height in every view.
 
 Cameras from another program have an arbitrary unit if no known length was supplied. If the outlines are three times too
-large, a fitted model lies inside the face, and every outline counts as clutter. The diameter of an outline needs no
-model: below the crown, an outline is wider than twice the distance from the crown, until it is as wide as a round
-head's diameter. At the subject's distance that is 150 to 290 mm for people, hair included.
+large, a fitted model lies inside the face, and every outline is treated as clutter. The head's diameter is measured
+without a model: at the distance d below the crown at which the outline is 2 d wide, the diameter is 2 d. The head's
+diameter is 150 to 290 mm for people, hair included.
 
-Up is the face's direction. Without a face it is that of the pictures or, for cameras mounted on their side, that of the
-rig, whichever lets more outlines meet in one head. A mask may end anywhere and touch any border, so no border tells
-which way is down. A face of a human's size contradicts every outline: nothing is refused then.
+The face gives the upward direction. Without a face the pictures or the rig give it, whichever makes more outlines
+consistent with the same head. Nothing is refused if the photographs show a face of a human's size.
 
-A crown is nearly round: planes that touch it from above, one through each camera, have nearly the same distance from
-the skull's middle. If a mask ends below the crown, its plane passes nearer.
-
-In: silhouettes, the rig and the face. Out: the diameter, the heights of the crowns, and messages about them.
+A crown is nearly round, so planes through each camera that touch it from above have nearly the same distance from the
+skull's middle. If a mask ends below the crown, its plane passes nearer.
 """
 
 from collections.abc import Callable, Mapping
@@ -49,13 +45,13 @@ Discs = Mapping[str, tuple[Float[np.ndarray, " 2"], float]]  # by camera: middle
 
 
 def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig, face: FaceEvidence | None = None) -> float | None:
-    """Returns the median of the head's diameter (mm) over the views whose outlines meet in one head; None if these are
+    """Returns the median of the head's diameter (mm) over the views with consistent outlines; None if these views are
     too few, or fewer than half of all.
 
     Args:
         silhouettes: by camera; unusable ones are ignored.
         rig: the cameras as calibrated.
-        face: says which way is up and where the head is, if it is known.
+        face: gives the upward direction and the head's position, if it is known.
     """
     solid = {
         name: _without_strands(silhouettes[name].mask)
@@ -71,8 +67,8 @@ def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig, face: Face
 def _diameters_mm(
     solid: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig, up_world: Vector, face: FaceEvidence | None
 ) -> list[float]:
-    """Returns the head's diameter (mm) in each view whose disc lies at the head's position in the other views or at the
-    face; none if these are less than ``MIN_MEETING`` of the views that show a crown."""
+    """Returns the head's diameter (mm) in each view whose outline lies at the head's position in the other views or at
+    the face. Returns none if these views are less than ``MIN_MEETING`` of the views that show a crown."""
     found = {name: crown_disc(mask, turns_to_upright(rig[name], up_world)) for name, mask in solid.items()}
     discs = {name: disc for name, disc in found.items() if disc is not None}
     point = _middle(discs, rig) if face is None else face.centre_world
@@ -88,8 +84,8 @@ def _diameters_mm(
 def find_low_crowns(
     silhouettes: Mapping[str, Silhouette], rig: Rig, find_face: Callable[[], FaceEvidence | None]
 ) -> dict[str, float]:
-    """Returns how far (mm) the crown in a view lies below the other views' crown, for views where it is more than
-    ``MAX_LOW_MM``. The face is searched only if the outlines alone are suspicious."""
+    """Returns how far (mm) the crown in a view lies below the crown of the other views, for views with more than
+    ``MAX_LOW_MM``. The face is searched only if the outlines are suspicious."""
     solid = {name: _without_strands(s.mask) for name, s in silhouettes.items() if s.quality.usable and name in rig}
     pictures_up = -np.mean([camera.camera_from_world.rotation[1] for camera in rig], axis=0)
     found = {name: crown_disc(mask, turns_to_upright(rig[name], pictures_up)) for name, mask in solid.items()}
@@ -113,7 +109,7 @@ def _low_crowns(
 
 def crown_height_mm(mask: Mask, camera: Camera, middle_world: Vector, up_world: np.ndarray) -> float | None:
     """Returns the distance (mm) from the middle of the skull to the plane through the camera that touches the mask from
-    above; None if the mask is empty or ends at the picture's border there."""
+    above. Returns None if the mask is empty or its top is at the picture's border."""
     middle, above = camera.project(np.stack([middle_world, middle_world + 50.0 * up_world]))
     up = (above - middle) / np.linalg.norm(above - middle)
     across = np.array([-up[1], up[0]])
@@ -155,14 +151,14 @@ def judge_head_size(
     guards: Guards = STRICT,
     masks_given: bool = False,
 ) -> list[ReportWarning]:
-    """Returns a warning if the outlined head is unusually large or small. Refuses with WrongScale if its size is
-    impossible and no face of a human's size contradicts that.
+    """Returns a warning if the head is unusually large or small. Refuses with WrongScale if its size is impossible,
+    unless a face of a human's size was found.
 
     Args:
         silhouettes: by camera; unusable ones are ignored.
         rig: the cameras as calibrated.
         find_face: finds the subject's face; called only if the outlines are suspicious.
-        guards: what is refused.
+        guards: decides about refusals.
         masks_given: whether the masks are the operator's and may show only a part of the head.
     """
     diameter = head_diameter_mm(silhouettes, rig)
@@ -193,8 +189,8 @@ def _size_message(diameter_mm: float) -> Message:
 
 
 def crown_disc(mask: Mask, turns: int) -> tuple[Float[np.ndarray, " 2"], float] | None:
-    """Returns the middle (px) and diameter (px) of the head in a mask that is upright after ``turns`` quarter turns
-    (anticlockwise); None if its crown lies outside the picture."""
+    """Returns the middle (px) and diameter (px) of the head in a mask that ``turns`` quarter turns (anticlockwise) make
+    upright; None if its crown lies outside the picture."""
     upright = np.rot90(mask, turns)
     rows = np.flatnonzero(upright.any(axis=1))
     if not len(rows) or rows[0] == 0:
@@ -230,8 +226,8 @@ def turns_to_upright(camera: Camera, up_world: Vector) -> int:
 
 
 def _middle(discs: Discs, rig: Rig) -> Vector | None:
-    """Returns the point (world) on most discs. It takes the best of the points where two rays nearly meet, then the
-    point nearest to the rays through all discs that contain it. A single wrong outline must not move it."""
+    """Returns the point (world frame) that projects into most of the head's discs. Candidates are points where the rays
+    of two views nearly meet; the best is refined by least squares over all discs that contain it."""
     if len(discs) < MIN_VIEWS:
         return None
     cameras = [rig[name] for name in discs]
@@ -246,7 +242,7 @@ def _middle(discs: Discs, rig: Rig) -> Vector | None:
 
 
 def _on_discs(points: Float[np.ndarray, "n 3"], discs: Discs, rig: Rig) -> Bool[np.ndarray, "n v"]:
-    """Tells, for each point and camera, whether the point lies in front of the camera and projects into its disc."""
+    """Returns, for each point and camera, whether the point lies in front of the camera and projects into its disc."""
     on = []
     for name, (middle, diameter) in discs.items():
         off = np.linalg.norm(rig[name].project(points) - middle, axis=1)  # NaN behind a camera, which is not less

@@ -1,9 +1,8 @@
-"""Files every picture under the camera that took it, before anything is measured in the picture.
+"""Assigns every picture to the camera that took it, before any measurement in the pictures.
 
-In: a capture as it was filed, and a function that segments it. Out: capture and silhouettes under the right cameras,
-and the exchanges found. Another camera's clean plate gives no useful mask, so plates are first matched to pictures by
-the background that both show. Then the pictures, with their plates, are matched to cameras
-(``pipeline.view_checks.camera_assignment``).
+The module returns capture and silhouettes under the right cameras, and the exchanges found. Another camera's clean
+plate gives no useful mask, so plates are first matched to pictures by their common background. Then the pictures, with
+their plates, are matched to cameras (``pipeline.view_checks.camera_assignment``).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -45,8 +44,8 @@ Segmentation = Callable[[Capture], dict[str, Silhouette]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageAssignment:
-    """Holds a capture and its silhouettes with every picture filed under the right camera. ``pictures`` and ``plates``
-    have an entry for each camera with a wrong one: the name under which its correct one was filed."""
+    """Holds a capture and its silhouettes with every picture filed under the right camera. For each camera that had a
+    wrong picture or plate, ``pictures`` and ``plates`` have the name under which the correct one was filed."""
 
     capture: Capture
     silhouettes: Mapping[str, Silhouette]
@@ -65,7 +64,7 @@ class ExchangedPictures(EigenheadError):
 
 
 class SamePictures(EigenheadError):
-    """Reports that several cameras hold the same picture and too few different ones remain."""
+    """Reports that several cameras have the same picture and that too few different pictures remain."""
 
     def __init__(self, duplicates: Mapping[str, str], count: int) -> None:
         names = some_of(sorted({*duplicates, *duplicates.values()}))
@@ -73,7 +72,7 @@ class SamePictures(EigenheadError):
 
 
 class WrongRig(EigenheadError):
-    """Reports pictures that these cameras cannot have taken."""
+    """Reports that the calibrated cameras cannot have taken the pictures."""
 
 
 def assign_images(
@@ -87,12 +86,12 @@ def assign_images(
     """Segments a capture, and files exchanged pictures and plates under the right cameras.
 
     ``capture``: the capture as it was read. ``rig``: the cameras as calibrated. ``segmented``: computes the silhouettes
-    of a capture; called again after every change. ``exchanged``: whether to repair or refuse an exchange that is beyond
-    doubt. ``guards``: decides about refusals.
+    of a capture; called again after every change. ``exchanged``: whether a certain exchange is repaired or refused.
+    ``guards``: decides about refusals.
 
-    Refuses with: ExchangedPictures: an exchange that the settings forbid to repair, or one that is uncertain while the
-    face confirms no picture as filed. SamePictures: fewer than three pictures are different. WrongRig: most cameras
-    contradict the others, no exchange explains it, and the face does not confirm the rig.
+    Refuses with ExchangedPictures if the settings forbid a repair, or if the exchange is uncertain and the face
+    confirms no picture. Refuses with SamePictures if fewer than three pictures differ. Refuses with WrongRig if most
+    cameras contradict the others, no exchange is found, and the face does not confirm the rig.
     """
     overruled: list[ReportWarning] = []
     plates = misplaced_plates(capture, rig)
@@ -139,7 +138,7 @@ def assign_images(
 
 
 def _check_rig(capture: Capture, rig: Rig, distinct: Mapping[str, Silhouette], guards: Guards) -> list[ReportWarning]:
-    """Refuses another rig's cameras, unless the face confirms the rig. Returns the warnings that replace a refusal."""
+    """Refuses the calibration of another rig, unless the face confirms the rig. Else returns warnings."""
     wrong = wrong_rig(distinct, rig)
     if not wrong:
         return []
@@ -150,10 +149,10 @@ def _check_rig(capture: Capture, rig: Rig, distinct: Mapping[str, Silhouette], g
 
 
 def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
-    """Returns, for each camera whose clean plate is another camera's, the name under which its own plate is filed.
+    """Returns, for each camera that has another camera's clean plate, the name under which its own plate is filed.
 
-    Only cameras whose picture hardly resembles its plate are compared. An exchange counts only if every plate in it
-    fits its new picture clearly better.
+    Only cameras whose picture differs much from its plate are compared. An exchange is accepted only if every exchanged
+    plate fits its new picture clearly better.
     """
     named = [name for name in rig.names if name in capture.images and capture.backgrounds.get(name)]
     pictures = {name: thumbnail(capture.images[name]) for name in named}
@@ -171,15 +170,15 @@ def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
 
 
 def thumbnail(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "r c 3"]:
-    """Returns the logarithm of the image's levels, reduced to ``PLATE_COLUMNS`` columns."""
+    """Returns the logarithm of an image's levels, reduced to ``PLATE_COLUMNS`` columns."""
     rows = max(1, round(image.shape[0] * PLATE_COLUMNS / image.shape[1]))
     small = cv2.resize(image, (PLATE_COLUMNS, rows), interpolation=cv2.INTER_AREA)
     return np.log(small.astype(np.float32) + 1.0)
 
 
 def common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarray, "_ _ 3"]) -> float:
-    """Returns the fraction of the picture's pixels that show the same as the plate, apart from a difference in
-    exposure. Both are results of ``thumbnail``."""
+    """Returns the fraction of the picture's pixels that equal the plate's, apart from a difference in exposure. Picture
+    and plate are results of ``thumbnail``."""
     if picture.shape != plate.shape:
         return 0.0
     ratio = (picture - plate).reshape(-1, 3)
@@ -189,9 +188,9 @@ def common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarra
 
 
 def duplicate_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:
-    """Returns the cameras whose picture is a copy of another camera's, perhaps encoded anew, each with that camera.
+    """Returns the cameras whose picture is a copy of another camera's, perhaps re-encoded, each with the other camera.
 
-    The camera whose silhouette contradicts the others least retains the picture, if it contradicts them little.
+    The camera whose silhouette contradicts the other cameras least keeps the picture, if it contradicts them little.
     """
     groups: list[list[str]] = []
     for name in (name for name in rig.names if name in capture.images):
@@ -214,7 +213,7 @@ def duplicate_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig
 
 
 def _same(one: UInt8[np.ndarray, "_ _ 3"], two: UInt8[np.ndarray, "_ _ 3"]) -> bool:
-    """Whether two pictures differ by no more than a JPEG's rounding, on a grid of their pixels."""
+    """Returns True if two pictures differ by no more than JPEG rounding, on a grid of their pixels."""
     if one.shape != two.shape:
         return False
     a, b = (image[::61, ::7].astype(np.int16) for image in (one, two))
@@ -224,8 +223,8 @@ def _same(one: UInt8[np.ndarray, "_ _ 3"], two: UInt8[np.ndarray, "_ _ 3"]) -> b
 
 
 def _composed(plates: Mapping[str, str], pictures: Mapping[str, str]) -> dict[str, str]:
-    """Returns, for each camera, the name under which its plates are filed: the exchange of plates among pictures
-    combined with that of pictures among cameras."""
+    """Returns, for each camera, the name under which its plates are filed. The result combines the exchange of plates
+    among pictures with the exchange of pictures among cameras."""
     found = {}
     for name in plates.keys() | pictures.keys():
         picture = pictures.get(name, name)
@@ -235,7 +234,7 @@ def _composed(plates: Mapping[str, str], pictures: Mapping[str, str]) -> dict[st
 
 def _filed_back(capture: Capture, pictures: Mapping[str, str], rig: Rig) -> Capture:
     """Returns the capture with pictures and plates under the right cameras. Feature points move with the pictures or
-    stay, whichever gives the smaller contradiction."""
+    stay, whichever gives the smaller triangulation error."""
     moved = reassign_images(capture, pictures=pictures, plates=pictures, points=pictures)
     kept = replace(moved, features=capture.features)
     return min((moved, kept), key=lambda filed: _contradiction(filed.features, rig))

@@ -1,13 +1,11 @@
-"""Checks whether the pictures fit the rig's distortion: they may be undistorted while the rig has coefficients, or the
-reverse. Also checks whether the principal points count pixels from 1. Outlines hardly show such faults: heads' crowns
-are equally far from the middle of all pictures, so all tangencies move alike.
+"""Checks whether the pictures have the rig's lens distortion: they may be undistorted while the rig has coefficients,
+or the reverse. The module also checks whether the principal points count pixels from 1. Outlines hardly show these
+faults, since all heads' crowns are equally far from the middle of their pictures.
 
-Points of the subject in three or more views show them by the errors of their rays. One number is estimated with its
-standard deviation: a factor on all coefficients (1 if they fit the pictures, 0 if the pictures are undistorted) or, if
-there are no coefficients, one radial coefficient for all cameras. The second number is one shift of all principal
-points, equally to the right and down.
-
-In: photographs, silhouettes and the rig. Out: a warning, or none.
+The faults appear in the reprojection errors of subject points in three or more views. The first estimated number, with
+its standard deviation, is a factor on all distortion coefficients: 1 if they fit the pictures, 0 if the pictures are
+undistorted. For a rig without coefficients the first number is a radial coefficient of all cameras. The second
+estimated number is a common shift of all principal points, equally to the right and down.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -51,8 +49,8 @@ class Estimate:
 def judge_distortion(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> list[ReportWarning]:
-    """Returns a warning if only the rig or only the pictures have distortion, or if the principal points are counted
-    from another corner."""
+    """Returns a warning if only the rig or only the pictures have distortion, or if the principal points have another
+    pixel origin."""
     usable = [name for name in rig.names if name in images and silhouettes[name].quality.usable]
     seen = _around_front(rig.subset(usable))
     if len(seen) < MIN_VIEWS or any(camera.recorded is not None for camera in seen):
@@ -77,7 +75,7 @@ def judge_distortion(
 
 
 def _judge_counting(tracks: SceneTracks, seen: Rig) -> list[ReportWarning]:
-    """Returns a warning if all principal points are off equally to the right and down."""
+    """Returns a warning if all principal points are shifted equally to the right and down."""
 
     def read(shift_px: float) -> Rig:
         return seen.with_intrinsics(lambda k: replace(k, cx=k.cx - shift_px, cy=k.cy - shift_px))
@@ -89,7 +87,7 @@ def _judge_counting(tracks: SceneTracks, seen: Rig) -> list[ReportWarning]:
 
 
 def _around_front(rig: Rig) -> Rig:
-    """Returns at most ``MAX_VIEWS`` cameras: those nearest to the front one."""
+    """Returns the cameras nearest to the front camera, at most ``MAX_VIEWS``."""
     if len(rig) <= MAX_VIEWS:
         return rig
     front = rig[rig.front_camera()].centre_world
@@ -98,8 +96,8 @@ def _around_front(rig: Rig) -> Rig:
 
 
 def estimate(tracks: SceneTracks, read: Callable[[float], Rig], values: Sequence[float] | np.ndarray) -> Estimate:
-    """Estimates one number on which a rig depends: the value with the smallest reprojection errors of the tracks.
-    ``read`` returns the rig for a number. The search starts at the best of ``values``."""
+    """Estimates one parameter of a rig by minimising the reprojection errors of the tracks. ``read`` returns the rig
+    for a value of the parameter. The search starts at the best of ``values``."""
     from scipy.optimize import fminbound  # a quarter of a second
 
     def missed(value: float) -> Float[np.ndarray, "n 2"]:
@@ -129,8 +127,8 @@ def _times(lens: Distortion, share: float) -> Distortion:
 
 
 def _effect(rig: Rig, silhouettes: Mapping[str, Silhouette]) -> float:
-    """Returns how far the lenses move the subject's farthest pixels, as a fraction of the picture's width: the median
-    over the cameras."""
+    """Returns the lens distortion of the subject's outermost pixels, as a fraction of the picture's width (median over
+    the cameras)."""
     moved = []
     for camera in rig:
         k = camera.intrinsics

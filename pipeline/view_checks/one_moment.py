@@ -1,13 +1,12 @@
-"""Finds views that show another moment or another person than the rest: their face or lips lie elsewhere.
+"""Finds views that show another moment or another person than the other views, by the positions of face and lips.
 
-The landmarks of each view are compared with those triangulated from the other views. Two distances are judged. One is
-that of the whole face or of its upper half (which no jaw moves), whichever is less: the head has moved, or is
-another's. The other is between the lips: the mouth has opened. The noise of both distances has two parts: the common
-error of a view's landmarks, and the uncertainty of the other views. A mouth that is open in all views is no sign: its
-landmarks differ by half of the opening.
+The face landmarks of each view are compared with landmarks triangulated from the other views. The first test measures
+the offset of the whole face or of its upper half, whichever is less: it shows that the head has moved, or is another
+person's. The second test measures the change of the distance between the lips: it shows that the mouth has opened or
+closed. The noise of both offsets has two parts: the common error of a view's landmarks, and the uncertainty of the
+other views.
 
-In: the faces found in the photographs. Out: the views that differ, each with a warning. Two changes are not found: a
-head that moved towards a camera or away from it, and an opening mouth seen from the side.
+Two changes are not found: a head that moved towards a camera or away from it, and an opening mouth seen from the side.
 """
 
 from collections.abc import Container, Mapping
@@ -42,7 +41,7 @@ UPPER_LIP, LOWER_LIP = [0, 37, 267, 13, 82, 312, 81, 311], [17, 84, 314, 14, 87,
 
 
 class _Offset(NamedTuple):
-    """Holds the offset of a view's face, or of its lower lip from the upper one, from that in the other views."""
+    """Holds how far the face in one view, or its lower lip relative to the upper lip, deviates from the other views."""
 
     sigmas: float
     distance_mm: float
@@ -50,8 +49,8 @@ class _Offset(NamedTuple):
 
 
 def judge_moments(subject: SubjectFaces | None, rig: Rig) -> list[ReportWarning]:
-    """Returns a warning for each view that shows another moment or person. A view is removed before the next is
-    searched: the one without which the others agree. Of three views, each possibly wrong, all that differ are named."""
+    """Returns a warning for each view that shows another moment or person. A view that is found is removed before the
+    next search. If only three views exist, all that differ are named, since each of them may be wrong."""
     face, odd = None if subject is None else subject.matched, list[_Offset]()
     if subject is None or face is None:
         return []
@@ -70,7 +69,7 @@ def judge_moments(subject: SubjectFaces | None, rig: Rig) -> list[ReportWarning]
 
 
 def _list_differing(shown: Mapping[str, FaceDetection], matched: Container[str], rig: Rig) -> list[_Offset]:
-    """Returns the views that differ from the other matched ones, worst first; from all views if one is matched."""
+    """Returns the views that differ from the other matched views, the worst first."""
     offsets = []
     every = {name: seen for name, seen in shown.items() if name in matched}
     joint = triangulate_face(every, rig) if len(every) >= MIN_JOINT else None
@@ -109,5 +108,5 @@ def _offset(name: str, seen: FaceDetection, face: TriangulatedFace, rig: Rig, ca
 
 
 def _lips_apart(points: Float[np.ndarray, "468 d"]) -> Float[np.ndarray, " d"]:
-    """Returns the distance of the lower lip from the upper one, in pixels or mm."""
+    """Returns the distance of the lower lip from the upper lip, in the unit of the points (pixels or mm)."""
     return np.median(points[LOWER_LIP], axis=0) - np.median(points[UPPER_LIP], axis=0)

@@ -1,14 +1,12 @@
-"""Checks before the fit whether these cameras took the pictures, from silhouettes and calibration.
+"""Checks, before the fit, whether the calibration belongs to the pictures, by means of the silhouettes.
 
-If most cameras contradict the others, other interpretations are tried. The pictures may be reflected about their
-principal points (a mirrored rig), flipped, or turned by 180 degrees, or by 90 if square. Poses may follow another
-convention (``rig.plausibility``), which is not obvious if the cameras stand on a sphere around the world's origin.
+If most cameras contradict the others, other interpretations of the calibration are tried. The pictures may be mirrored,
+flipped, or rotated by 180 degrees, or by 90 if square. Poses may follow another convention (``rig.plausibility``).
 Intrinsics may belong to pictures that were cropped, reduced or taken at another zoom (``LensReading``). The message
-names the interpretation under which tangent planes touch both outlines of each pair. If there is none, the calibration
-belongs to another rig, or to this one before a change. If many planes nevertheless agree closely, the masks are loose:
-they include a shadow on the wall, or some lack hair. If a single camera contradicts the others, the message names it.
-
-In: silhouettes and the rig. Out: the fault and its remedy, or nothing.
+names the interpretation under which epipolar tangent planes touch both outlines of each pair of cameras. If no
+interpretation fits, the calibration belongs to another rig, or the rig was changed. If many planes nevertheless agree
+closely, the masks are loose: they include a shadow on the wall, or some lack hair. If a single camera contradicts the
+others, the message names it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -57,9 +55,9 @@ Turn = Callable[[Pixels, Intrinsics], Pixels]
 
 
 def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None:
-    """Finds out why most cameras contradict each other: pictures are turned or mirrored, the file has another
+    """Finds out why most cameras contradict each other: pictures are rotated or mirrored, the calibration has another
     convention or other lenses, or it belongs to another rig. Returns a message with the remedy; None if most cameras
-    agree or only the outlines are loose.
+    agree or only the masks are loose.
 
     Args:
         silhouettes: by camera; views without a usable mask are ignored.
@@ -76,7 +74,7 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None
 
 
 def _contradiction(seen: Rig, hulls: Sequence[Pixels]) -> Message | None:
-    """Returns why most of the cameras ``seen`` contradict each other, as ``wrong_rig`` does."""
+    """Returns a message why most of the cameras ``seen`` contradict each other; None if they do not."""
     if len(seen) < MIN_CAMERAS:
         return None
     as_written = _median_misfit(hulls, seen)
@@ -112,8 +110,8 @@ def _judged_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
 
 
 def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
-    """Tells whether most outlines contradict the others because of loose masks. Meant for rigs with which ``wrong_rig``
-    finds no fault."""
+    """Returns True if most outlines contradict the others because of loose masks. ``wrong_rig`` must have found no
+    fault."""
     seen, hulls = outlined({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
     return len(seen) >= MIN_CAMERAS and _median_misfit(hulls, seen) >= MIN_WRONG
 
@@ -129,11 +127,11 @@ class LensReading:
 
     @property
     def is_other(self) -> bool:
-        """Tells whether the intrinsics differ from the calibrated ones by more than loose outlines explain."""
+        """Returns True if the intrinsics differ from the calibrated ones by more than loose masks explain."""
         return bool(abs(np.log(self.factor)) >= OTHER_FACTOR or max(map(abs, self.shift)) >= OTHER_SHIFT)
 
     def message(self) -> Message:
-        """Returns the message that refuses the rig and states the difference of its lenses."""
+        """Returns the message that the rig's intrinsics are wrong, with their difference."""
         k = self.rig.cameras[0].intrinsics
         changes = []
         if abs(self.factor - 1.0) >= MIN_FACTOR:
@@ -151,7 +149,7 @@ def find_lens_reading(hulls: Sequence[Pixels], rig: Rig, misfit: Callable[[Rig],
     Args:
         hulls: convex hulls of the outlines (px), in the order of the rig.
         rig: the cameras as calibrated.
-        misfit: returns how badly a rig fits.
+        misfit: function that returns the misfit of a rig.
     """
     from scipy.optimize import minimize  # a quarter of a second, and few rigs are wrong
 
@@ -181,8 +179,8 @@ def _with_lenses(rig: Rig, at: Float[np.ndarray, " 3"]) -> Rig:
 
 
 def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
-    """Returns the one camera that contradicts all others while these agree without it; None if there is none. That
-    camera was moved farther than ``camera_drift`` can measure, or its pose or mask is wrong."""
+    """Returns the single camera that contradicts all others, if the others agree; else None. A camera that contradicts
+    all others was moved farther than ``camera_drift`` can measure, or its pose or mask is wrong."""
     seen, hulls = outlined({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
     if len(seen) < MISPLACED_AMONG:
         return None
@@ -197,17 +195,17 @@ def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | N
 
 
 def _median_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
-    """Returns the median over the cameras of each one's mean robust misfit (0 to 1); NaN if too few cameras have enough
-    planes."""
+    """Returns the median over the cameras of the mean robust misfit (0 to 1) of their tangent planes; NaN if too few
+    cameras have enough planes."""
     errors_px = tangency_errors_px(hulls, rig)
     speaking = np.isfinite(errors_px).sum(axis=(1, 2)) >= MIN_PLANES
     return float(np.median(mean_misfit(errors_px)[speaking])) if speaking.sum() >= MIN_CAMERAS else np.nan
 
 
 def are_loose(missed: Float[np.ndarray, "c c p"]) -> bool:
-    """Tells whether so many planes agree closely that these cameras must have taken the pictures, however loose the
-    masks. ``missed`` is the error of each plane at each other camera's outline, as a fraction of the picture's width;
-    NaN for none."""
+    """Returns True if so many tangent planes agree closely that the calibration is right and the masks are loose.
+    ``missed`` is the error of each plane at each other camera's outline, as a fraction of the picture's width; NaN
+    without a plane."""
     quarter, half = np.nanquantile(missed, (0.25, 0.5))
     return bool(quarter <= MAX_LOOSE_QUARTER and (half <= LOOSE_HALF or quarter <= LOOSE_BIMODAL * half))
 

@@ -1,8 +1,7 @@
-"""Decides, before a fit, which views of a capture are used, and why the others are not.
+"""Decides, before a fit, which views of a capture are used, and gives reasons for the excluded views.
 
-In: a capture, its rig, and a function that segments it. Out: every picture under its own camera, silhouettes with the
-unreliable ones marked, and warnings with the reasons. ``reconstruct`` begins with this step; ``eigenhead check`` runs
-only this step.
+The module returns every picture under its own camera, silhouettes with the unreliable ones marked, and warnings.
+``reconstruct`` begins with this step; the command ``eigenhead check`` runs only this step.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -65,7 +64,7 @@ class TooFewViews(EigenheadError):
 @dataclass(frozen=True, slots=True, eq=False)
 class UsableViews:
     """Holds a capture with every picture under the right camera, and its silhouettes; excluded views are marked as not
-    usable. ``pictures`` has an entry for each camera with a wrong picture: the name under which its correct one was
+    usable. For each camera that had a wrong picture, ``pictures`` has the name under which the correct one was
     filed."""
 
     capture: Capture
@@ -85,11 +84,12 @@ def usable_views(
     """Segments a capture, files exchanged pictures correctly, and marks views that contradict the others as not usable.
 
     ``capture``: the capture as it was read. ``rig``: the cameras as calibrated. ``segmented``: computes the silhouettes
-    of a capture. ``exchanged``: whether to repair or refuse an exchange of pictures that is beyond doubt. ``guards``:
-    decides about refusals.
+    of a capture. ``exchanged``: whether a certain exchange of pictures is repaired or refused. ``guards``: decides
+    about refusals.
 
-    Refuses with: ExchangedPictures, WrongRig: see ``assign_images``. WrongScale: see ``judge_head_size``. TooFewViews:
-    fewer than ``MIN_VIEWS`` silhouettes are usable (``MIN_VIEWS_OF_FACE`` if the subject's face is found).
+    Refuses with ExchangedPictures, SamePictures or WrongRig (``assign_images``) and WrongScale (``judge_head_size``).
+    Refuses with TooFewViews if fewer than ``MIN_VIEWS`` silhouettes are usable (``MIN_VIEWS_OF_FACE`` if the face is
+    found).
     """
     assigned = assign_images(capture, rig, segmented, exchanged=exchanged, guards=guards)
     find_face = cache(lambda: guards.find_face(assigned.capture.images, rig))
@@ -125,7 +125,7 @@ def without_moved_cameras(
     silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[dict[str, Silhouette], dict[str, ReportWarning]]:
     """Marks the views of cameras that moved since the calibration as not usable. Also returns warnings by camera, for
-    each moved camera and for each camera whose mask may be loose instead."""
+    cameras that moved and for cameras whose mask may be loose."""
     kept, warnings = dict(silhouettes), dict[str, ReportWarning]()
     for drift in find_drift(silhouettes, rig):
         if drift.moved:
@@ -139,8 +139,8 @@ def without_moved_cameras(
 
 
 def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
-    """Returns the warnings about the quality of single views as warnings of the report. A warning that holds for many
-    views appears once."""
+    """Returns the report's warnings about the quality of single views. A warning that holds for many views appears
+    once."""
     remarks_by_code: dict[str, list[Message]] = {"view-left-out": [], "view": [], "mask-doubtful": []}
     for name, silhouette in silhouettes.items():
         quality = silhouette.quality
@@ -158,8 +158,8 @@ def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
 
 
 def _doubt(remark: Message) -> ReportWarning:
-    """Returns the warning of a doubtful mask: for one view or, if the remark holds for several, for the first of them
-    with the number of the others."""
+    """Returns the warning about a doubtful mask. If the same remark holds for several views, the warning names the
+    first and the number of the others."""
     located = remark if remark.code == "located" else remark.parameters["fault"]
     assert isinstance(located, Message)
     camera, fault = str(located.parameters["where"]), located.parameters["fault"]
@@ -187,8 +187,8 @@ MIN_PIXELS, MIN_COMPARED = 500, 3  # of a subject, and views, that tell anything
 def with_picture_faults(
     silhouettes: Mapping[str, Silhouette], capture: Capture, suspects: Collection[str], rig: Rig
 ) -> dict[str, Silhouette]:
-    """Returns the silhouettes with the warnings of each suspect replaced by their cause, the fault of its picture.
-    Views with a turned picture are not usable."""
+    """Replaces the warnings of each view in ``suspects`` by their cause, a fault of its picture. Views with a rotated
+    or flipped picture are marked as not usable."""
     found = dict(silhouettes)
     blurred = blurred_views(capture.images, silhouettes) if suspects else {}
     misfits = own_misfit({camera: s for camera, s in silhouettes.items() if s.quality.usable}, rig) if suspects else {}
@@ -203,12 +203,12 @@ def with_picture_faults(
 
 
 def _turns(image: np.ndarray) -> dict[Message, np.ndarray]:
-    """Returns a picture or a mask turned by 180 degrees and flipped, each with a message about the change."""
+    """Returns a picture or a mask rotated by 180 degrees, and flipped, each with a message about the change."""
     return {turn: np.ascontiguousarray(image[ways]) for turn, ways in TURNS.items()}
 
 
 def turned_against_plate(capture: Capture, name: str) -> Message | None:
-    """Returns the fault of a picture that matches its clean plate only after a turn by 180 degrees or a flip."""
+    """Returns the fault of a picture that matches its clean plate only after a rotation by 180 degrees or a flip."""
     plates = capture.backgrounds.get(name, ())
     if name not in capture.images or not plates:
         return None
@@ -221,8 +221,8 @@ def turned_against_plate(capture: Capture, name: str) -> Message | None:
 
 
 def turned_against_others(silhouettes: Mapping[str, Silhouette], name: str, rig: Rig) -> Message | None:
-    """Returns the fault of a picture that, together with its plate, agrees with the other cameras' outlines only after
-    a turn by 180 degrees or a flip."""
+    """Returns the fault of a picture whose outline agrees with the other cameras only after a rotation by 180 degrees
+    or a flip of picture and plate."""
     others = {camera: s for camera, s in silhouettes.items() if s.quality.usable and camera != name}
     if len(others) < MIN_COMPARED or not silhouettes[name].mask.any():
         return None
@@ -241,7 +241,7 @@ def turned_against_others(silhouettes: Mapping[str, Silhouette], name: str, rig:
 
 
 def blurred_views(images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette]) -> dict[str, Message]:
-    """Returns the fault of each picture whose subject has much less fine detail than in the other views."""
+    """Returns the fault of each picture in which the subject has much less fine detail than in other views."""
     known = {name: _detail(image, silhouettes[name]) for name, image in images.items() if name in silhouettes}
     details = {name: detail for name, detail in known.items() if detail is not None}
     if len(details) < MIN_COMPARED:
@@ -256,7 +256,7 @@ def blurred_views(images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silh
 
 def plates_brightness(capture: Capture) -> float | None:
     """Returns the brightness of the clean plates divided by that of the pictures, in linear light; None if the
-    exposures are equal. The subject covers less than half of a picture, so the median is that of the backdrop."""
+    exposures are equal. The medians are used, since the subject covers less than half of a picture."""
     ratios = []
     for name, plates in capture.backgrounds.items():
         if name in capture.images and plates and plates[0].shape == capture.images[name].shape:
@@ -270,7 +270,7 @@ def plates_brightness(capture: Capture) -> float | None:
 
 
 def _detail(image: ImageRgb, silhouette: Silhouette) -> float | None:
-    """Returns the variation (levels) of the subject's pixels within a few pixels; None if too few are visible."""
+    """Returns the local variation (levels) of the subject's pixels; None if too few are visible."""
     inside = silhouette.distance < -INSET_PX
     if np.count_nonzero(inside) < MIN_PIXELS:
         return None

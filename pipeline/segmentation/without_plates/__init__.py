@@ -1,5 +1,5 @@
-"""Finds the subject in the photographs of a capture without clean plates and masks. The subject is the object at which
-all cameras are directed.
+"""Finds the subject in photographs without clean plates and masks. The subject is the object to which all cameras are
+directed.
 
-``decide`` combines volume, colours, occupancy, and a plate guessed from the surroundings.
+The module ``decide`` combines colours, a voxel volume, and a background estimated from the pixels around the subject.
 """

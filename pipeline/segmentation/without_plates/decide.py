@@ -1,11 +1,10 @@
-"""Decides, in every view of a capture without plates and masks, which pixels show the subject, and how the subject's
-edge is found.
+"""Decides which pixels show the subject in every view of a capture without plates and masks.
 
-Matting must know the background behind the subject's border. In front of a studio's backdrop it is guessed well from
-what is beside the subject. In front of a plain backdrop the pixels beside the subject are a good guess of it. In front
-of clutter, or where subject and ground have one colour, the guess is bad, and a coarse mask may be a hand's breadth too
-wide. Such a view is cut along image edges: windows along the outline are cut one by one (Rother et al., *GrabCut*,
-SIGGRAPH 2004, in OpenCV) with local colours, and overlapping windows are averaged (Bai et al., *Video SnapCut*, 2009).
+Matting must know the background behind the subject's border. With a plain backdrop the pixels beside the subject give a
+good estimate. With a cluttered background, or one of the subject's colour, the estimate is bad, and a coarse mask may
+be 10 cm too wide. If the estimate is bad, the mask is cut along image edges instead: windows along the outline are
+segmented one by one with local colours (Rother et al., *GrabCut*, SIGGRAPH 2004, in OpenCV), and overlapping windows
+are averaged (Bai et al., *Video SnapCut*, 2009).
 """
 
 from collections.abc import Callable, Mapping
@@ -52,8 +51,8 @@ MIN_PIECE = 100  # px of outline
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WithoutPlates:
-    """Holds the views in two groups: ``decisions`` go to the matting; ``shares`` are the subject's fraction of each
-    pixel (full size) in views that were cut along edges."""
+    """Holds the views in two groups: ``decisions`` for matting, and ``shares``, the subject's fraction of each pixel
+    (full size) in views that were cut along edges."""
 
     decisions: Mapping[str, Decision]
     shares: Mapping[str, Float32[np.ndarray, "_ _"]]
@@ -66,8 +65,8 @@ def decide_without_plates(
     head: HeadSeed | None = None,
     report: Callable[[float], None] = lambda share: None,
 ) -> WithoutPlates:
-    """Decides which pixels of every photograph show the subject, without plates. ``head`` is the head's position; None
-    if no face was found."""
+    """Decides which pixels of every photograph show the subject, without plates. ``head`` is the head's position, or
+    None."""
     small = {name: _reduced(images[name], COARSE_COLUMNS).astype(np.float32) for name in rig.names}
     sizes = {name: image.shape[:2] for name, image in small.items()}
     points = find_scene_points(images, rig, report=partial(_between, report, 0.0, POINTS_SHARE))
@@ -103,8 +102,8 @@ def decide_without_plates(
 def background_seen(
     points: ScenePoints, name: str, width: int, size: tuple[int, int], volume: ViewingVolume, plane: Plane | None
 ) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of a reduced image (``size``: height, width) around those scene points that are background:
-    far from the subject, or on the plane under it."""
+    """Returns a mask of the pixels of a reduced image (``size``: height, width) around scene points of the background,
+    which are far from the subject, or on the plane under it."""
     seen_points = points.points[points.rows[name]]
     behind = np.linalg.norm(seen_points - volume.centre_world, axis=1) > volume.radius_mm
     if plane is not None:
@@ -117,7 +116,7 @@ def background_seen(
 
 def solid_around(core: Bool[np.ndarray, "h w"], share: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     """Returns the subject's fraction of each pixel in a cut of a person, with the head's ``core`` added and holes
-    filled. (A cut may take a highlight on a forehead for the wall.)"""
+    filled, since a cut may leave out a highlight on a forehead."""
     subject = np.pad(((share > 0.5) | core).view(np.uint8), 1)
     cv2.floodFill(subject, None, (0, 0), 2)
     return np.where(core | ((subject[1:-1, 1:-1] == 0) & (share <= 0.5)), np.float32(1.0), share)
@@ -146,8 +145,8 @@ MIN_NOISE = 0.7  # levels: what a sensor and 8 bits leave
 def decision_without_plate(
     image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], found: CoarseMask, *, solid: bool = False
 ) -> Decision:
-    """Returns a decision for the matting, with a background estimated from the pixels around the mask. If ``solid``,
-    the subject is a head, and holes in the mask are filled: they are skin or hair of the wall's colour."""
+    """Returns a decision for matting, with a background estimated from the pixels around the mask. If ``solid``, the
+    subject is a head, and holes in the mask are filled."""
     mask, others = whole_subject(found.mask, found.odds < -1)
     odds = found.odds
     if solid:
@@ -169,8 +168,8 @@ def decision_without_plate(
 def estimated_background(
     image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], outside: Bool[np.ndarray, "h w"]
 ) -> Background:
-    """Estimates the background behind the subject from the pixels ``outside`` it; the noise includes the error of that
-    guess."""
+    """Estimates the background behind the subject from the pixels ``outside``; its noise includes the estimate's
+    error."""
     guess = spread(coarse, outside.astype(np.float32), NEARBY_PX)
     size = (image.shape[1], image.shape[0])
     share = cv2.resize(cv2.GaussianBlur(outside.astype(np.float32), (0, 0), 1.0), size, interpolation=cv2.INTER_LINEAR)
@@ -188,7 +187,7 @@ def estimated_background(
 
 
 def _pixel_noise(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, " 3"]:
-    """Returns the noise (levels) of one pixel in each channel, from differences of neighbouring pixels, most of which
+    """Estimates the noise (levels) of a pixel in each channel from differences of neighbouring pixels, most of which
     lie on no edge."""
     steps = image[::4, 1:].astype(np.float32) - image[::4, :-1]
     return (1.4826 * np.median(np.abs(steps), axis=(0, 1)) / np.sqrt(2)).astype(np.float32)
@@ -211,8 +210,8 @@ MIN_OFF_CENTRE = 0.08  # of the radius: the place that all cameras look at is no
 
 
 def standing_plane(points_world: Float[np.ndarray, "n 3"], centre_world: Vector, radius_mm: float) -> Plane | None:
-    """Finds a plane that contains many scene points and has hardly any behind it. ``plane . (x, 1)`` is the distance
-    (mm), positive on the subject's side; None if there is no such plane."""
+    """Finds the plane on which the subject stands: it contains many scene points, and hardly any lie behind it. ``plane
+    . (x, 1)`` is the distance (mm), positive on the subject's side; None if no plane is found."""
     near = points_world[np.linalg.norm(points_world - centre_world, axis=1) < 2 * radius_mm]
     if len(near) < MIN_POINTS:
         return None
@@ -236,8 +235,8 @@ def standing_plane(points_world: Float[np.ndarray, "n 3"], centre_world: Vector,
 def ball_above(
     plane_world: Plane, points_world: Float[np.ndarray, "n 3"], centre_world: Vector, radius_mm: float
 ) -> tuple[Vector, float]:
-    """Returns the centre (world) and radius (mm) of a ball around the scene points above the plane; a margin covers
-    parts without points."""
+    """Returns the centre (world frame) and radius (mm) of a ball around the scene points above the plane, with a margin
+    for parts without points."""
     height = points_world @ plane_world[:3] + plane_world[3]
     inside = np.linalg.norm(points_world - centre_world, axis=1) < radius_mm
     standing = points_world[inside & (height > 2 * NEAR * radius_mm)]
@@ -270,7 +269,7 @@ def _through(three: Float[np.ndarray, "3 3"], centre: Vector) -> Plane | None:
 
 
 def _refined(plane: Plane, points: Float[np.ndarray, "n 3"], centre: Vector, radius: float) -> Plane:
-    """Returns the plane fitted by least squares to the points near it."""
+    """Refines a plane by least squares over the points near it."""
     for _ in range(3):
         on = points[np.abs(points @ plane[:3] + plane[3]) < NEAR * radius]
         middle = on.mean(axis=0)
@@ -282,7 +281,8 @@ def _refined(plane: Plane, points: Float[np.ndarray, "n 3"], centre: Vector, rad
 
 @dataclass(frozen=True, slots=True)
 class Bands:
-    """Holds how far (pixels of the cut images) inside and outside an outline its edge is searched."""
+    """Holds the widths (pixels of the cut images) of the bands inside and outside an outline in which its edge is
+    searched."""
 
     inside: int
     outside: int
@@ -293,8 +293,8 @@ BANDS = (Bands(14, 8), Bands(8, 6))
 
 
 def cut_along(image: UInt8[np.ndarray, "h w 3"], mask: Mask, bands: Bands) -> Float32[np.ndarray, "h w"]:
-    """Cuts the image in windows along the mask's outline. Returns, for each pixel, the fraction of its windows that
-    assign it to the subject; a window counts more near its middle."""
+    """Segments the image in windows along the mask's outline. Returns, for each pixel, the weighted fraction of windows
+    that assign it to the subject; a window has more weight near its middle."""
     height, width = mask.shape
     inner, outer = eroded(mask, bands.inside), ~dilated(mask, bands.outside)
     side = min(WINDOW, height, width)
@@ -318,7 +318,8 @@ def cut_along(image: UInt8[np.ndarray, "h w 3"], mask: Mask, bands: Bands) -> Fl
 
 
 def _cut(image: UInt8[np.ndarray, "h w 3"], mask: Mask, inner: Mask, outer: Mask) -> Mask | None:
-    """Cuts one window into subject and background; None if too few of its pixels are certain on either side."""
+    """Segments one window into subject and background. Returns None if too few pixels are certainly subject or
+    background."""
     if min(np.count_nonzero(inner), np.count_nonzero(outer)) < MIN_SAMPLES:
         return None
     kinds = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -337,8 +338,8 @@ def cut_views(
     *,
     report: Callable[[float], None],
 ) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """Returns the subject's fraction of each pixel in every view, at the size of ``images``. ``volume`` is built for
-    the size of ``masks``."""
+    """Returns the subject's fraction of each pixel in every view, at the size of ``images``. ``volume`` belongs to the
+    size of ``masks``."""
     wide = {name: _resized(mask, images[name].shape[:2]) for name, mask in masks.items()}
     shares: dict[str, Float32[np.ndarray, "_ _"]] = {}
     for step, bands in enumerate(BANDS):
@@ -357,7 +358,7 @@ def _carved(
     masks: Mapping[str, Bool[np.ndarray, "_ _"]],
     volume: ViewingVolume,
 ) -> dict[str, Bool[np.ndarray, "_ _"]]:
-    """Returns the cut masks without the pixels that the other views' cuts exclude."""
+    """Removes from the cut masks the pixels that the masks of other views exclude."""
     odds = {
         name: (MAX_ODDS * (2 * cv2.resize(share, masks[name].shape[::-1], interpolation=cv2.INTER_AREA) - 1))
         for name, share in shares.items()

@@ -1,4 +1,4 @@
-"""Locates the head by its face, if the subject faces some of the cameras. The search for masks starts there."""
+"""Locates the head by its face in the photographs, as the start of the search for masks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ UPRIGHT = 0.7  # sine of the angle between view and up
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadSeed:
-    """Holds the head's centre, upward direction and size in the world (mm), and the face's landmarks (px) in the views
+    """Holds the head's centre, upward direction and size (world frame, mm), and the face's landmarks (px) in the views
     that show the face."""
 
     centre_world: Float[np.ndarray, " 3"]
@@ -44,8 +44,8 @@ def find_head_seed(images: Mapping[str, ImageRgb], rig: Rig) -> HeadSeed | None:
 
 
 def head_core(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of a reduced image (``size``: height, width) that surely show the head: the disc of the skull
-    and the outline of the face."""
+    """Returns a mask of the pixels of a reduced image (``size``: height, width) that certainly show the head: a disc
+    for the skull and the outline of the face."""
     core = np.zeros(size, np.uint8)
     scale = size[1] / camera.intrinsics.width
     centre_camera = camera.camera_from_world.apply(seed.centre_world)
@@ -61,8 +61,9 @@ def head_core(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[np.
 
 
 def beside_head(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of a reduced image (``size``: height, width) that certainly do not show the subject: above the
-    chin, and farther to the side than hair reaches. No pixel is marked if the camera is above or below the head."""
+    """Returns a mask of the pixels of a reduced image (``size``: height, width) that certainly do not show the subject:
+    above the chin, and farther to the side than hair extends. The mask is empty if the camera is above or below the
+    head."""
     centre_camera = camera.camera_from_world.apply(seed.centre_world)
     up = (camera.camera_from_world.rotation @ seed.up_world)[:2]
     if centre_camera[2] <= seed.skull_mm or np.linalg.norm(up) < UPRIGHT:
@@ -78,7 +79,7 @@ def beside_head(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[n
 
 
 def above_chin(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of an image (``size``: height, width) that are not below the chin, where clothes begin."""
+    """Returns a mask of the pixels of an image (``size``: height, width) that are not below the chin."""
     up_camera = camera.camera_from_world.rotation @ seed.up_world
     chin = seed.centre_world + CHIN_MM * seed.skull_mm / SKULL_MM * seed.up_world
     if camera.camera_from_world.apply(chin)[2] <= 0:

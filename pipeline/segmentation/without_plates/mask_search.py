@@ -1,15 +1,15 @@
-"""Finds coarse masks of all views together: colours tell which pixels look like the subject, other views tell what
-really stands there.
+"""Finds coarse masks of all views together, from colour models and from the consistency between views.
 
-Geometry gives the start: a disc around the point that all cameras are directed at is the subject. The image border is
-background, except at the bottom, where the body leaves the image. From there colours and space take turns. A view first
-learns its background from that border alone. Later it learns from pixels outside its mask that other views reject too:
-a coat that it has not found yet must not become background.
+The search starts with a disc of certain subject around the point to which all cameras are directed. The image border is
+background, except at the bottom, where the body leaves the image. Then two steps alternate: colour models give log
+odds, and the views are combined in a voxel volume. A view's background colours are first learned from the image border.
+Later the background colours are learned from pixels outside its mask that other views also exclude, so that a coat
+which is not yet in the mask does not become background.
 
-Each view has its own background. The subject is the same in all views, but the light may change its colours: half of
-its colour density comes from all views together, half from the view itself. Where the densities of both overlap (a grey
-coat before a grey wall), nearby colours distinguish better than those of the whole image. So each histogram is combined
-with a Gaussian of the mean and scatter in a window (Bai et al., *Video SnapCut*, SIGGRAPH 2009, use such local models).
+Each view has its own background colours. The subject's colour density is the mean of two densities, over all views and
+over the view alone, since the light may differ between views. If subject and background have similar colours (a grey
+coat in front of a grey wall), local colours distinguish them better. So each histogram is combined with a Gaussian of
+the colours in a window (as in Bai et al., *Video SnapCut*, SIGGRAPH 2009).
 """
 
 from collections.abc import Callable, Mapping
@@ -60,7 +60,7 @@ MAX_COLOUR_ODDS = 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Holds which pixels of a reduced image certainly show the subject, and which certainly show background."""
+    """Holds masks of the pixels of a reduced image that certainly show the subject, and certainly show background."""
 
     subject: Mask
     background: Mask
@@ -68,8 +68,8 @@ class Samples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
-    """Holds the pixels of a view that geometry alone decides: certain subject, certain background, and those that can
-    show the subject at all."""
+    """Holds three masks of a view that follow from geometry: certain subject, certain background, and possible
+    subject."""
 
     core: Mask
     border: Mask
@@ -79,8 +79,8 @@ class Seeds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarseMask:
-    """Holds the log odds of the subject from colours, neighbours and other views, and the one connected ``mask`` that
-    follows."""
+    """Holds the log odds of the subject from colours, neighbours and other views, and the resulting connected
+    ``mask``."""
 
     odds: Float32[np.ndarray, "h w"]
     mask: Mask
@@ -90,7 +90,7 @@ class CoarseMask:
 def find_seeds(
     camera: Camera, volume: ViewingVolume, up_world: Vector, size: tuple[int, int], head: HeadSeed | None = None
 ) -> Seeds:
-    """Finds the seeds of a view whose reduced image has ``size`` (height, width)."""
+    """Computes the geometric masks of a view whose reduced image has ``size`` (height, width)."""
     height, width = size
     row, column = np.mgrid[:height, :width]
     middle = (camera.project(volume.centre_world[None])[0] + 0.5) * (width / camera.intrinsics.width) - 0.5
@@ -121,7 +121,8 @@ def search_masks(
     report: Callable[[float], None],
 ) -> dict[str, CoarseMask]:
     """Finds the subject's mask in every reduced image. ``background``: pixels that certainly do not show the subject.
-    ``bounded``: the volume holds all of the subject, so pixels beyond it become background from an early round on."""
+    ``bounded``: whether the volume contains the whole subject, so that pixels outside it become background in an early
+    round."""
     up = guessed_up(rig) if head is None else head.up_world
     sizes = {name: image.shape[:2] for name, image in images.items()}
     seeds = {camera.name: find_seeds(camera, volume, up, sizes[camera.name], head) for camera in rig}
@@ -174,7 +175,7 @@ def _learn(found: CoarseMask, known: Mask, *, border: bool) -> Samples:
 
 
 def _one_piece(mask: Mask, core: Mask) -> Mask:
-    """Returns the component of the mask that holds most of the core or, if none does, the largest."""
+    """Returns the component of the mask that contains most of the core or, if none does, the largest component."""
     count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=4)
     if count < 2:
         return mask
@@ -184,8 +185,8 @@ def _one_piece(mask: Mask, core: Mask) -> Mask:
 
 
 def _with_texture(image: Picture) -> Picture:
-    """Returns a grey photograph with two of its equal channels replaced by the local mean and scatter; colour
-    photographs are returned unchanged."""
+    """Replaces two channels of a grey photograph by the local mean and scatter, as texture features; returns colour
+    photographs unchanged."""
     if np.ptp(image, axis=2).max() > MAX_GREY:
         return image
     grey = image[:, :, 0]
@@ -195,13 +196,13 @@ def _with_texture(image: Picture) -> Picture:
 
 
 def _noise(image: Picture) -> Vector:
-    """Estimates the noise (levels) of each channel from differences of neighbours, at least 1; weave and texture count
-    as noise."""
+    """Estimates the noise (levels) of each channel, at least 1, from differences of neighbouring pixels; fine texture
+    counts as noise."""
     return np.maximum(1.4826 * np.median(np.abs(np.diff(image, axis=1)), axis=(0, 1)) / np.sqrt(2), 1.0)
 
 
 def histogram(colours: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "b b b"]:
-    """Counts how many pixels fall in each bin of colour."""
+    """Counts the pixels in each bin of a colour histogram."""
     counts = np.zeros((BINS,) * 3, np.float32)
     np.add.at(counts, tuple(_bins(colours).T), 1.0)
     return counts
@@ -217,8 +218,9 @@ def colour_odds(
 ) -> Float32[np.ndarray, "h w"]:
     """Returns the log odds of subject against background for every pixel, from its colour.
 
-    ``image``: reduced. ``samples``: certain pixels. ``common``: the subject's colour counts in all views. ``noise``:
-    grey levels. ``nearby``: whether colours near the pixel count; it needs nearly complete samples.
+    ``image``: reduced image. ``samples``: certain pixels. ``common``: the subject's colour histogram over all views.
+    ``noise``: standard deviation in grey levels. ``nearby``: whether local colour models are used, which need nearly
+    complete samples.
     """
     subject = _log_density(image, (common, histogram(image[samples.subject])))
     background = _log_density(image, (histogram(image[samples.background]),))
@@ -234,7 +236,7 @@ def _bins(colours: np.ndarray) -> np.ndarray:
 
 
 def _log_density(image: Picture, counts: tuple[Float32[np.ndarray, "b b b"], ...]) -> Float[np.ndarray, "h w"]:
-    """Returns the log of the mean density (levels^-3) of several histograms at each pixel's colour."""
+    """Returns the logarithm of the mean density (levels^-3) of several histograms at each pixel's colour."""
     density = np.zeros((BINS,) * 3)
     for one in counts:
         smooth = gaussian_filter(one, HISTOGRAM_BLUR, mode="constant")
@@ -243,8 +245,8 @@ def _log_density(image: Picture, counts: tuple[Float32[np.ndarray, "b b b"], ...
 
 
 def _log_nearby(image: Picture, mask: Mask, scatter: Float32[np.ndarray, " 3"]) -> Float[np.ndarray, "h w"]:
-    """Returns the log density (levels^-3) of each pixel's colour under a Gaussian fitted to the colours of ``mask``
-    near the pixel."""
+    """Returns the log density (levels^-3) of each pixel's colour under a Gaussian of the colours of ``mask`` near the
+    pixel."""
     weight = mask.astype(np.float32)
     mean, square = spread(image, weight, NEARBY_PX), spread(image * image, weight, NEARBY_PX)
     variance = np.maximum(square - mean * mean, 0) + scatter**2

@@ -1,9 +1,8 @@
-"""Divides the space in view into voxels, and combines the evidence of the other views along a pixel's ray.
+"""Divides the space around the subject into voxels, and combines the log odds of other views along each pixel's ray.
 
-In: a rig and the sizes of its reduced images. Out: for every voxel its pixel in every view. A voxel belongs to the
-subject only if no view that sees it rejects it, as in the visual hull (figure 1). Views vote by log odds instead of
-masks (Franco & Boyer, *Fusion of multi-view silhouette cues using a space occupancy grid*, ICCV 2005), so that a view
-in doubt has no effect.
+As in the visual hull (the paper's figure 1), a voxel belongs to the subject only if no view that sees it excludes it.
+Views are combined by log odds instead of masks (Franco & Boyer, *Fusion of multi-view silhouette cues using a space
+occupancy grid*, ICCV 2005), so that an uncertain view has no effect.
 """
 
 from collections.abc import Mapping
@@ -26,7 +25,7 @@ SOLID_ODDS = 0.5  # log odds that all pixels around a voxel must have in a view 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewingVolume:
-    """Holds the voxels of a ball around the point that all cameras are directed at, and their pixel in each view."""
+    """Holds the voxels of a ball around the point to which all cameras are directed, and their pixels in each view."""
 
     centre_world: Float[np.ndarray, " 3"]
     radius_mm: float
@@ -36,9 +35,9 @@ class ViewingVolume:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OtherViews:
-    """Holds, for each pixel of one view, what all other views contribute on its ray: ``support``, the largest sum of
-    their log odds at a voxel (negative if they exclude the subject), and ``solid``, whether the ray meets a voxel that
-    none of them doubts."""
+    """Holds the evidence of all other views for each pixel of one view. ``support`` is the largest sum of their log
+    odds at a voxel on the pixel's ray (negative if they exclude the subject). ``solid`` is True if no other view doubts
+    some voxel on the ray."""
 
     support: Float32[np.ndarray, "h w"]
     solid: Bool[np.ndarray, "h w"]
@@ -47,8 +46,8 @@ class OtherViews:
 def viewing_ball(
     rig: Rig, centre_world: Float[np.ndarray, " 3"] | None = None
 ) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Returns centre (world) and radius (mm) of a ball that reaches to the corners of the median image.
-    ``centre_world`` replaces the centre; None takes the point that the cameras are directed at."""
+    """Returns centre (world frame) and radius (mm) of a ball that extends to the corners of the median image.
+    ``centre_world`` replaces the centre; None means the point to which the cameras are directed."""
     centre = rig.centre_world() if centre_world is None else centre_world
     radius = float(
         np.median(
@@ -69,9 +68,8 @@ def viewing_volume(
     *,
     plane_world: Float[np.ndarray, " 4"] | None = None,
 ) -> ViewingVolume:
-    """Builds the volume from a ``ball``, centre and radius (mm), for reduced images of ``sizes`` (height, width).
-    ``plane_world`` is the plane on which the subject stands: only the side where ``plane . (x, 1)`` is positive is
-    retained."""
+    """Builds the volume of a ``ball``, centre and radius (mm), for reduced images of ``sizes`` (height, width).
+    ``plane_world`` is the plane on which the subject stands; voxels with a negative ``plane . (x, 1)`` are left out."""
     centre, radius = ball
     line = ((np.arange(CELLS) + 0.5) / CELLS * 2 - 1) * radius
     offsets = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -92,7 +90,7 @@ def viewing_volume(
 
 
 def reachable(volume: ViewingVolume, name: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Tells which pixels of a view have a voxel on their ray."""
+    """Returns a mask of the pixels of a view that have a voxel on their ray."""
     mask = np.zeros(size[0] * size[1], np.uint8)
     places = volume.places[name]
     mask[places[places >= 0]] = 1

@@ -1,2 +1,2 @@
-"""Lays a mesh flat for its texture: the position of each triangle, on the full and on a reduced mesh, and the normals
-lost by the reduction."""
+"""Computes UV layouts of the full mesh and of a mesh with fewer triangles, and a normal map with the detail lost by the
+reduction."""

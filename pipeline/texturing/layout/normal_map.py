@@ -1,12 +1,11 @@
-"""Computes the normal map of a reduced mesh: an image that turns its normals to those of the full mesh.
+"""Computes the normal map of a mesh with fewer triangles: an image that stores the normals of the full mesh.
 
-In: the head, its layout, the reduced layout. Out: the reduced mesh with normals and tangents, and its normal map as
-glTF defines it: x along the tangent, +Y up in the image, z along the normal. Tangents are those of MikkTSpace
-(Mikkelsen, *Simulation of Wrinkled Surfaces Revisited*, 2008), which glTF prescribes and viewers interpolate: the mean
-over a vertex's corners of the direction in which u grows, in the vertex's tangent plane, weighted by the corner's
-angle. https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes-overview
+The normal map follows glTF: x along the tangent, +Y up in the image, z along the normal. Tangents follow MikkTSpace
+(Mikkelsen, *Simulation of Wrinkled Surfaces Revisited*, 2008), as glTF prescribes. The tangent of a vertex is the
+direction in its tangent plane in which u grows, averaged over the triangles at the vertex with their angles as weights.
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes-overview
 
-A texel shows the same point of the head in the normal map and in the texture, so shape and colour agree.
+The normal map and the texture have the same UV layout, so shape and colour agree at every texel.
 """
 
 from dataclasses import dataclass
@@ -36,7 +35,7 @@ FACE_WEIGHT = 8.0  # of an error in the face region
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedLayout:
-    """Holds a texture layout reduced to fewer triangles. ``rows`` are the vertices of the full layout that remain,
+    """Holds a UV layout reduced to fewer triangles. ``rows`` are the kept vertices as indices in the full layout,
     ``faces`` the triangles as indices into ``rows``."""
 
     rows: Int[np.ndarray, " n"]
@@ -44,7 +43,7 @@ class ReducedLayout:
 
 
 def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
-    """Returns the reduced texture layout of a model's full level, computed once from its mean head and cached."""
+    """Computes the reduced UV layout of a head model's full mesh from its mean head, and caches the result."""
     mean, region = model.vertices(np.zeros(0)), model.levels["full"].face_region
 
     def make() -> dict[str, np.ndarray]:
@@ -59,8 +58,8 @@ def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
 def reduce(
     layout: Layout, vertices: Vertices, importance: Float[np.ndarray, " v"], count: int = FACES
 ) -> ReducedLayout:
-    """Reduces the texture layout of a mesh to ``count`` triangles or a few more; its border stays unchanged.
-    ``importance`` multiplies the error of each vertex: the layout stays denser where it is high."""
+    """Reduces the UV layout of a mesh to ``count`` triangles or a few more, and keeps its border unchanged.
+    ``importance`` is a weight for each vertex; the mesh stays denser where the weight is high."""
     source = layout.source
     ((rows, faces),) = decimate(
         vertices[source],
@@ -93,7 +92,7 @@ class NormalMapped:
 def normal_mapped(
     vertices: Vertices, normals: Vertices, layout: Layout, reduced: ReducedLayout, size: int = SIZE_PX
 ) -> NormalMapped:
-    """Reduces the full mesh of a head (mm, unit normals). Returns it with a normal map of the lost detail."""
+    """Reduces a head's mesh (mm, unit normals) to fewer triangles; computes a normal map of the lost detail."""
     rows = layout.source[reduced.rows]
     places, reduced_normals, uv = vertices[rows], normals[rows], layout.uv[reduced.rows]
     tangents = vertex_tangents(places, reduced_normals, uv, reduced.faces)
@@ -113,8 +112,8 @@ def normal_mapped(
 
 
 def vertex_tangents(vertices: Points, normals: Points, uv: Pixels, faces: Faces) -> Float[np.ndarray, "n 4"]:
-    """Computes the tangents of MikkTSpace at the vertices; the fourth number is the sign of the bitangent. All
-    triangles must have the same orientation in the layout, whose v points downwards."""
+    """Computes MikkTSpace tangents (v, 4) at the vertices; the fourth number is the sign of the bitangent. All
+    triangles must have the same orientation in UV space, where v points downwards."""
     corners, flat = vertices[faces], uv[faces]
     edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     (s, t), (p, q) = (flat[:, 1] - flat[:, 0]).T, (flat[:, 2] - flat[:, 0]).T
@@ -134,7 +133,7 @@ def vertex_tangents(vertices: Points, normals: Points, uv: Pixels, faces: Faces)
 
 
 def _laid(directions: Points, normals: Points) -> Points:
-    """Returns unit vectors in the planes of the normals."""
+    """Projects directions into the tangent planes of the normals and scales them to unit length."""
     return _unit(directions - np.einsum("nx,nx->n", directions, normals)[:, None] * normals)
 
 
@@ -143,15 +142,15 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _image(uv: Pixels, faces: Faces, values: Float[np.ndarray, "n k"], size: int) -> Float32[np.ndarray, "s s k"]:
-    """Returns the vertices' values interpolated over the layout; NaN outside it."""
+    """Returns an image with the vertices' values interpolated over the triangles' UV coordinates, and NaN elsewhere."""
     texels, ones = size * uv - 0.5, np.ones(len(uv))
     _, shown = rasterise(texels, ones, faces, size, size)
     return interpolate(shown, texels, ones, faces, values.astype(np.float32))
 
 
 def _in_frame(wanted: Picture, tangent: Picture, normal: Picture, sign: np.float32) -> Picture:
-    """Returns the wanted unit vectors as multiples of tangent, bitangent and normal; these are not orthogonal once
-    interpolated."""
+    """Returns unit vectors in the basis of tangent, bitangent and normal, which interpolation has made slightly
+    oblique."""
     lean = np.einsum("yxc,yxc->yx", tangent, normal)
     bitangent = _unit(sign * np.cross(normal, tangent))
     x, z = (np.einsum("yxc,yxc->yx", wanted, axis) for axis in (tangent, normal))

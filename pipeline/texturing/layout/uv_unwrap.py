@@ -1,16 +1,16 @@
-"""Lays a head flat, for a texture with more detail than one colour for each vertex.
+"""Computes the UV layout of a head or of a bust for a texture.
 
-The surface is cut from the nape over the back of the head to the crown. It is then spread on a square with slightly
-bulging sides, the neck at the bottom. Every inner vertex is a mean of its neighbours with mean-value weights (Floater,
-*Mean value coordinates*, CAGD 2003), so no two triangles overlap (Tutte's theorem). Parts that become too small (nose,
-ears) are enlarged by rounds of reweighting that keep the weights positive (Yoshizawa, Belyaev and Seidel, *A fast and
-simple stretch-minimizing mesh parameterization*, SMI 2004).
+The head's mesh is cut from the nape over the back of the head to the crown. The mesh's border is then mapped to a
+square with slightly bulging sides, the neck at the bottom. Every inner vertex is placed at the weighted mean of its
+neighbours with mean-value weights (Floater, *Mean value coordinates*, CAGD 2003), so no two triangles overlap (Tutte's
+theorem). Parts that become too small in the layout (nose, ears) are enlarged by changing the weights repeatedly
+(Yoshizawa, Belyaev and Seidel, *A fast and simple stretch-minimizing mesh parameterization*, SMI 2004).
 
-The layout is made from a model's mean head, so that texels of any two subjects correspond.
+The layout is computed from a head model's mean head, so that a texel shows the same place of every subject's head.
 
-The bust's surface is laid flat in several charts instead. Each triangle goes to one of six directions (along the head's
-axes), the one that its surroundings face, and is drawn as seen from there. If one sheet lies behind another (the head
-behind an ear), the hidden sheet gets a chart of its own. Charts are packed in rows of equal height.
+The bust's mesh, in contrast, is divided into several UV charts. Each triangle is projected along one of six directions
+(the head's axes), the one that the surface around it faces. If one part of the surface hides another (an ear the head),
+the hidden part gets a chart of its own. Charts are packed in rows of equal height.
 """
 
 from dataclasses import dataclass
@@ -47,7 +47,7 @@ SIDE_SHARE = 2 / 3  # of the cut that is one of the square's sides; the rest is 
 
 
 class NoLayout(EigenheadError):
-    """Reports a mesh that cannot be laid flat: it is not one piece with one open border."""
+    """Reports a mesh that cannot be unwrapped, since it is not one piece with one open border."""
 
     def __init__(self) -> None:
         super().__init__(compose("model-without-layout"))
@@ -55,8 +55,8 @@ class NoLayout(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Holds a mesh cut open and laid flat. ``source`` is the mesh vertex of each layout vertex; ``uv`` is its position
-    in the unit square, v downwards as in glTF."""
+    """Holds the UV layout of a mesh that was cut open. ``source`` is the mesh vertex of each layout vertex; ``uv`` is
+    its position in the unit square, v downwards as in glTF."""
 
     uv: Float[np.ndarray, "n 2"]
     faces: Faces
@@ -65,15 +65,15 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Atlas:
-    """Holds a texture layout and the image (sRGB) that belongs to it."""
+    """Holds a UV layout and its texture image (sRGB)."""
 
     layout: Layout
     image: UInt8[np.ndarray, "s s 3"]
 
 
 def unwrap(vertices: Float[np.ndarray, "v 3"], faces: Faces) -> Layout:
-    """Cuts a head open from the nape to the crown, and lays it flat in the unit square. Raises NoLayout unless the mesh
-    is one piece with one open border, at the neck."""
+    """Cuts the mesh of a head open from the nape to the crown, and maps it to the unit square. Raises NoLayout unless
+    the mesh is one piece with one open border, at the neck."""
     border = _border(faces)
     back = int(border[np.argmin(vertices[border, 2] + np.abs(vertices[border, 0]))])
     crown = int(np.argmax(vertices[:, 1]))
@@ -95,12 +95,12 @@ def unwrap(vertices: Float[np.ndarray, "v 3"], faces: Faces) -> Layout:
 
 
 def _edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
-    """Returns directed edges: corner 0 to 1 of all faces, then 1 to 2, then 2 to 0."""
+    """Returns the directed edges of the faces: corner 0 to 1 of all faces, then 1 to 2, then 2 to 0."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def _border(faces: Faces) -> Int[np.ndarray, " b"]:
-    """Returns the vertices of the one open border, in the order of its directed edges."""
+    """Returns the vertices of the mesh's only open border, in the order of its directed edges."""
     edges, base = _edges(faces).astype(np.int64), int(faces.max()) + 1
     known = np.unique(edges @ [base, 1])
     open_edges = known[~np.isin(known, edges @ [1, base])]
@@ -115,7 +115,7 @@ def _border(faces: Faces) -> Int[np.ndarray, " b"]:
 
 
 def _path(vertices: Float[np.ndarray, "v 3"], faces: Faces, start: int, end: int) -> Int[np.ndarray, " p"]:
-    """Returns the shortest path on edges that prefers the symmetry plane and touches the border only at its start."""
+    """Returns a short path along mesh edges, near the symmetry plane; it touches the border only at its start."""
     edges = _edges(faces)
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     length *= 1 + np.abs(vertices[edges].mean(axis=1)[:, 0])
@@ -129,7 +129,8 @@ def _path(vertices: Float[np.ndarray, "v 3"], faces: Faces, start: int, end: int
 
 
 def _cut_open(faces: Faces, count: int, path: Int[np.ndarray, " p"]) -> tuple[Faces, Int[np.ndarray, " n"]]:
-    """Returns the faces with the path's vertices doubled (except its end), and the original of each vertex."""
+    """Cuts the mesh along a path, whose vertices are duplicated. Returns faces, and original indices of the
+    vertices."""
     edges = _edges(faces)
     beside = np.flatnonzero(np.isin(edges, path).any(axis=1))
     face_of = dict(zip(map(tuple, edges[beside].tolist()), (beside % len(faces)).tolist(), strict=True))
@@ -151,7 +152,7 @@ def _cut_open(faces: Faces, count: int, path: Int[np.ndarray, " p"]) -> tuple[Fa
 
 
 def _frame(loop: Float[np.ndarray, "b 3"], corner: int, top: int) -> Float[np.ndarray, "b 2"]:
-    """Places the border: the neck from the lower left to the lower right, then up the cut and over the top."""
+    """Returns the border's UV positions: first the neck along the bottom, then the cut along the other sides."""
     ends = np.concatenate([loop, loop[:1]])
     walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ends, axis=0), axis=1))])
     neck, crown, whole = walked[corner], walked[top], walked[-1]
@@ -168,7 +169,7 @@ def _frame(loop: Float[np.ndarray, "b 3"], corner: int, top: int) -> Float[np.nd
 
 
 def _mean_value_weights(points: Float[np.ndarray, "n 3"], faces: Faces, count: int) -> scipy.sparse.csr_array:
-    """Returns in row i the weights of vertex i's neighbours, ``(tan(a / 2) + tan(b / 2)) / |ij|``."""
+    """Returns the mean-value weights ``(tan(a / 2) + tan(b / 2)) / |ij|`` of vertex i's neighbours j in row i."""
     rows, columns, values = [], [], []
     for k in range(3):
         i, j, other = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
@@ -188,7 +189,7 @@ def _mean_value_weights(points: Float[np.ndarray, "n 3"], faces: Faces, count: i
 def _settled(
     weights: scipy.sparse.csr_array, count: int, loop: Int[np.ndarray, " b"], frame: Float[np.ndarray, "b 2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Puts every inner vertex at the weighted mean of its neighbours."""
+    """Returns UV positions in which every inner vertex is the weighted mean of its neighbours."""
     uv = np.zeros((count, 2))
     uv[loop] = frame
     inner = np.setdiff1d(np.arange(len(uv)), loop)
@@ -200,7 +201,7 @@ def _settled(
 
 
 def _stretch(points: Float[np.ndarray, "n 3"], uv: Float[np.ndarray, "n 2"], faces: Faces) -> Float[np.ndarray, " n"]:
-    """Returns how many times longer (RMS) the surface around each vertex is than its image, relative to the whole."""
+    """Returns the RMS stretch from UV space to the surface around each vertex, relative to that of the whole mesh."""
     a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
     (s, t), (p, q) = (uv[faces[:, 1]] - uv[faces[:, 0]]).T, (uv[faces[:, 2]] - uv[faces[:, 0]]).T
     determinant = s * q - t * p
@@ -216,7 +217,7 @@ def _stretch(points: Float[np.ndarray, "n 3"], uv: Float[np.ndarray, "n 2"], fac
 def draw_over_layout(
     layout: Layout, values: Float[np.ndarray, "n k"] | UInt8[np.ndarray, "n k"], size: int
 ) -> Float32[np.ndarray, "s s k"]:
-    """Draws values of a layout's vertices as an image; texels beside the layout get those of the nearest one."""
+    """Draws values of a UV layout's vertices as an image; texels outside get the nearest value inside."""
     texels, ones = size * layout.uv - 0.5, np.ones(len(layout.uv))
     _, shown = rasterise(texels, ones, layout.faces, size, size)
     drawn = interpolate(shown, texels, ones, layout.faces, np.ascontiguousarray(values, np.float32))
@@ -236,15 +237,15 @@ def spread_texels(image: Float32[np.ndarray, "s s k"], known: Bool[np.ndarray, "
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelLayout:
-    """Holds the texture coordinates of a model's full level and which of its vertices are neighbours."""
+    """Holds the UV layout of a head model's full-resolution mesh and the neighbours of each vertex."""
 
     layout: Layout
     around: Neighbourhood
 
 
 def model_layout(model: HeadModel) -> ModelLayout:
-    """Returns the texture layout of a model. It is made from the model's mean head, so that texels of any two subjects
-    correspond. Raises NoLayout for a surface that is not one piece with one open border."""
+    """Returns the UV layout of a head model, computed from its mean head. Raises NoLayout for a surface that is not one
+    piece with one open border."""
     faces = model.levels["full"].faces
     mean = model.vertices(np.zeros(0))
 
@@ -267,7 +268,7 @@ def model_layout(model: HeadModel) -> ModelLayout:
 
 @traced
 def lay_out_charts(mesh: Mesh, towards: Float[np.ndarray, "v 3"]) -> Layout:
-    """Returns the layout of a closed mesh (mm, the head's axes); ``towards``: normals of each vertex's surroundings."""
+    """Divides a closed mesh (mm, head frame) into UV charts. ``towards``: smoothed normals of the vertices."""
     count, rows = len(mesh.vertices), np.arange(len(mesh.faces))
     seen = [_seen_from(mesh.vertices, direction) for direction in range(6)]
     flat = np.stack([each[0] for each in seen])
@@ -298,14 +299,14 @@ def lay_out_charts(mesh: Mesh, towards: Float[np.ndarray, "v 3"]) -> Layout:
 
 
 def _six(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6"]:
-    """Returns the components of normals along +x, -x, +y, -y, +z and -z."""
+    """Returns the components of normals along the six directions +x, -x, +y, -y, +z and -z."""
     return np.stack([normals, -normals], axis=2).reshape(-1, 6)
 
 
 def _seen_from(
     vertices: Float[np.ndarray, "n 3"], direction: int
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Returns the vertices (mm; x to the right, y down) and their depths as seen from a direction."""
+    """Projects vertices (mm) along a direction. Returns image coordinates (mm; x to the right, y down) and depths."""
     axis, sign = direction // 2, 1.0 - 2.0 * (direction % 2)
     right, up = ((2, 1), (0, 2), (0, 1))[axis]
     turn = sign if axis == 2 else -sign
@@ -318,14 +319,14 @@ def _hidden(
     depth: Float[np.ndarray, " v"],
     size: Int[np.ndarray, " 2"],
 ) -> Int[np.ndarray, " h"]:
-    """Returns the rows of the triangles that lie behind others in a picture of this ``size``."""
+    """Returns the indices of the triangles that are hidden behind others in a depth map of ``size`` pixels."""
     first, last = (rasterise(pixels, FAR_MM + sign * depth, faces, size[1], size[0])[1] for sign in (1.0, -1.0))
     hidden = np.unique(last[first != last])
     return hidden if len(hidden) < len(faces) else np.zeros(0, int)
 
 
 def _packed(flat: Float[np.ndarray, "n 2"], piece: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-    """Places the charts in the unit square, all at one scale; ``piece`` is the chart of each vertex."""
+    """Places the UV charts in the unit square, all at the same scale; ``piece`` is the chart of each vertex."""
     chart = np.unique(piece, return_inverse=True)[1]
     order = np.argsort(chart, kind="stable")
     starts = np.searchsorted(chart[order], np.arange(chart.max() + 1))
@@ -337,7 +338,7 @@ def _packed(flat: Float[np.ndarray, "n 2"], piece: Int[np.ndarray, " n"]) -> Flo
 
 
 def _on_shelves(size: Float[np.ndarray, "c 2"], side: float) -> Float[np.ndarray, "c 2"] | None:
-    """Returns the upper left corners of charts placed side by side, the highest first; None if they do not fit."""
+    """Returns the upper left corners of UV charts placed in rows, the tallest charts first; None if they do not fit."""
     gap = CHART_MARGIN * side
     corner, (x, y, shelf) = np.empty_like(size), (gap, gap, 0.0)
     for k in np.argsort(-size[:, 1], kind="stable").tolist():

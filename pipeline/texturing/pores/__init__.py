@@ -1,5 +1,5 @@
-"""Reads the pores of the skin from the full-size pictures.
+"""Estimates the skin's finest relief, such as pores, from the full-size pictures.
 
-In: the coloured head, its layout, a reader of full-size pictures. Out: a texture with their detail, the relief of the
-skin (mm) and its normals, in the layout. The mesh does not change.
+The modules take the coloured head, its UV layout and a function that reads full-size pictures. The modules return a
+texture with the pictures' detail, the relief of the skin (mm) and a normal map. The mesh does not change.
 """

@@ -1,16 +1,17 @@
 """Estimates the skin's relief and its fine colours from two disjoint sets of full-size pictures.
 
-A furrow turns the skin towards or away from the light. A relief h changes the logarithm of the diffuse light by ``-g .
-grad h``; g is the light's tangential gradient by the normal, divided by the light (Pentland, *Linear shape from
-shading*, IJCV 1990). In a patch of skin, a few millimetres wide, this multiplies each wave by a factor, so it can be
-inverted. Waves at right angles to g do not change the shading: they cannot be recovered, and are estimated near zero.
+A relief h changes the logarithm of the diffuse shading by ``-g . grad h``. The vector g is the tangential gradient of
+the shading by the normal, divided by the shading (Pentland, *Linear shape from shading*, IJCV 1990). In a patch of
+skin, a few millimetres wide, shading multiplies each Fourier component of the relief by a constant factor, so the
+shading can be inverted to the relief. Waves at right angles to g do not change the shading, so their height is
+estimated near zero.
 
 Pictures have noise and highlights, and the geometry and the cameras are off by a pixel. So the views are split into two
-disjoint sets, and the shift between the two is removed. For each patch and octave of wavelength, only the fraction of
-the power that both sets show is retained. This test does not separate colour from relief; ``COLOUR`` sets how strongly
-colour counts as shading.
+disjoint sets, and the image shift between the sets is removed. For each patch and octave of wavelength, a Wiener filter
+keeps the fraction of the power that both sets share. The Wiener filter does not separate colour from relief; ``COLOUR``
+is the fraction of the colour's variation that counts as shading.
 
-The texture gets, in the same way, the repeated part of the difference between full size and working size.
+The same filter extracts detail for the texture from the difference between pictures of full and of working size.
 """
 
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ EMPTY = 128  # code of texels beside the layout
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TexelFrames:
-    """Holds small images over the layout, one value for each texel of ``COARSE``.
+    """Holds small images, ``COARSE`` texels wide, of quantities that vary slowly over the texture.
 
     Attributes:
         metric: uu, uv and vv of the squared length (mm2) of a step by one whole image along u and v.
@@ -48,13 +49,13 @@ class TexelFrames:
     skin: Float32[np.ndarray, "s s"]
 
     def image_mm(self) -> float:
-        """Returns the width (mm) of the image at the scale of most of the skin."""
+        """Returns the width (mm) of the whole image at the median scale of the skin."""
         metric = self.metric[self.skin > min(0.5, float(self.skin.max()))]
         area2 = metric[:, 0] * metric[:, 2] - metric[:, 1] ** 2
         return float(np.median(np.maximum(area2, 0.0)) ** 0.25) if len(area2) else 1.0
 
     def at(self, image: Float32[np.ndarray, "s s *c"], x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Reads an image at points (x, y) of the unit square."""
+        """Interpolates an image at points (x, y) of the unit square."""
         column, row = ((COARSE * at - 0.5).astype(np.float32) for at in (x, y))
         return cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
@@ -67,7 +68,7 @@ def texel_frames(
     shading: Float[np.ndarray, " v"],
     skin: Float[np.ndarray, " v"],
 ) -> TexelFrames:
-    """Computes the images of a head.
+    """Computes metric, light slopes and skin share of a head as small images over its UV layout.
 
     ``layout``: the layout of its vertices. ``mesh_world``: the head (mm). ``normals``: unit normals of the vertices.
     ``light``: coefficients of the light (``pipeline.texturing.light``). ``shading``: brightness of the vertices in that
@@ -86,7 +87,7 @@ def texel_frames(
 
 
 def light_slopes(normals: Float[np.ndarray, "v 3"], light: Float[np.ndarray, "9"]) -> Float[np.ndarray, "v 3"]:
-    """Returns the gradient of the light by the normal, projected into the surface."""
+    """Returns the gradient of the shading by the normal, projected into the tangent plane."""
     by_axis = []
     for axis in np.eye(3):
         either = [harmonics(_unit(normals + sign * STEP * axis)) * BAND_FACTORS @ light for sign in (1.0, -1.0)]
@@ -99,7 +100,7 @@ def _unit(vectors: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
 
 
 def _steps(layout: Layout, mesh: Mesh) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Returns the steps on the surface (mm) for a whole image along u and v: means over each corner's triangles."""
+    """Returns the derivatives of the surface point (mm) by u and by v at each vertex, as means over its triangles."""
     corners, flat = mesh.vertices[layout.source][layout.faces], layout.uv[layout.faces]
     edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     (s, t), (p, q) = (flat[:, 1] - flat[:, 0]).T, (flat[:, 2] - flat[:, 0]).T
@@ -118,7 +119,7 @@ def _sums(faces: Int[np.ndarray, "f 3"], values: Float[np.ndarray, "f 3"], count
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strips:
-    """Holds a layout's triangles in an image ``size`` texels wide and high, sorted by rows."""
+    """Holds a UV layout's triangles in an image ``size`` texels wide and high, sorted by image rows."""
 
     layout: Layout
     size: int
@@ -128,7 +129,7 @@ class Strips:
 
     @classmethod
     def of(cls, layout: Layout, size: int, wanted: Bool[np.ndarray, " v"] | None = None) -> "Strips":
-        """Places the layout in the image: the triangles with a ``wanted`` vertex, or all."""
+        """Places the triangles of a UV layout in the image: all of them, or only those with a ``wanted`` vertex."""
         texels = size * layout.uv - 0.5
         rows = texels[layout.faces, 1]
         low, high = rows.min(axis=1), rows.max(axis=1)
@@ -137,7 +138,7 @@ class Strips:
         return cls(layout, size, texels, low, high)
 
     def paint(self, first: int, rows: int, pictures: Pictures, choice: Choice) -> UInt8[np.ndarray, "r s 3"]:
-        """Paints ``rows`` rows (BGR codes) from row ``first`` on, which may be negative."""
+        """Paints ``rows`` image rows (BGR codes), starting at row ``first``, which may be negative."""
         strip = np.full((rows, self.size, 3), EMPTY, np.uint8)
         which = np.flatnonzero((self.high >= first) & (self.low <= first + rows - 1))
         moved = self.texels - (0.0, float(first))
@@ -162,7 +163,7 @@ Spectra = Complex[np.ndarray, "n p q"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkinDetail:
-    """Holds the skin's relief and fine brightness from full-size pictures, over a layout.
+    """Holds the skin's relief and fine brightness from full-size pictures, as images with the texture's UV layout.
 
     Attributes:
         heights_mm: the relief, along the normals.
@@ -177,7 +178,7 @@ class SkinDetail:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HalfPictures:
-    """Holds two disjoint sets of views in the painter's form, at full size and at working size."""
+    """Holds two disjoint sets of views with packed pictures, at full size and at working size."""
 
     full: Pictures
     work: Pictures
@@ -185,7 +186,7 @@ class HalfPictures:
 
 
 def estimate_detail(strips: Strips, halves: HalfPictures, frames: TexelFrames) -> SkinDetail:
-    """Estimates relief and brightness over a layout, one row of patches after the other."""
+    """Estimates the skin's relief and fine brightness over a UV layout, one row of patches after the other."""
     size = strips.size  # and the side of a patch, a power of two, for skin at the layout's usual scale
     side = int(np.clip(2 ** round(np.log2(PATCH_MM * size / frames.image_mm())), 16, 256))
     hop, figures = side // 2, np.zeros((OCTAVES, 2))
@@ -212,8 +213,8 @@ def estimate_detail(strips: Strips, halves: HalfPictures, frames: TexelFrames) -
 
 
 def _painted(strips: Strips, halves: HalfPictures) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Returns the logarithm of the light in both sets of full-size pictures, and its difference from the pictures of
-    working size (float16, whose steps are as small as the noise of the pictures' codes)."""
+    """Returns the logarithm of the full-size pictures' light in both sets of views, and its difference from the
+    pictures of working size. The arrays are float16, whose rounding is below the pictures' noise."""
     size = strips.size
     full, added = (list(np.zeros((2, size, size), np.float16)) for _ in range(2))
 
@@ -235,10 +236,10 @@ def log_light(codes: np.ndarray) -> Float32[np.ndarray, "r s"]:
 
 
 def without_slow(light: Float32[np.ndarray, "r s"], side: int) -> Float32[np.ndarray, "r s"]:
-    """Returns a strip without structures wider than a third of a patch, whose edges would leak into all waves.
+    """Subtracts structures wider than a third of a patch, which would leak into all Fourier components.
 
-    The wide Gaussian is computed on fewer texels: in a texture of 8192 that takes a fiftieth of the time, and strips of
-    noise differ by at most 0.3 % of their spread."""
+    The wide Gaussian is computed on a downsampled strip, which takes a fiftieth of the time for a texture of 8192
+    texels. On pure noise the downsampling changes the result by at most 0.3 % of the noise's spread."""
     height, width = light.shape
     step = max(side // BLURRED_SIDE, 1)
     coarse = cv2.resize(light, (width // step, height // step), interpolation=cv2.INTER_AREA)
@@ -254,8 +255,8 @@ def _row_of_patches(
     frames: TexelFrames,
     figures: Float[np.ndarray, "o 2"],
 ) -> tuple[Float32[np.ndarray, "r s"], Float32[np.ndarray, "r s"]] | None:
-    """Returns heights and brightness of one row of patches, windowed so that rows add up; None without skin. Adds the
-    powers to ``figures``."""
+    """Returns heights and brightness of one row of patches, windowed so that overlapping rows can be added; None
+    without skin. Adds the power spectra to ``figures``."""
     side = len(full[0])
     hop = side // 2
     columns = np.arange(-hop, size, hop)
@@ -295,8 +296,8 @@ def _row_of_patches(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Holds the waves of square patches of one size: frequency (cycles per mm), shading of a wave of 1 mm height, and
-    the octave of each wave (-1: discarded)."""
+    """Holds the Fourier components of square patches of one size. Each component has a frequency (cycles per mm), the
+    shading that 1 mm of height causes, and an octave (-1: discarded)."""
 
     side: int
     per_mm: Float32[np.ndarray, "n p q"]
@@ -305,7 +306,7 @@ class Patches:
 
     @classmethod
     def of(cls, side: int, metric: Float[np.ndarray, "n 3"], slope: Float[np.ndarray, "n 2"]) -> "Patches":
-        """Describes patches.
+        """Computes the Fourier components of patches.
 
         Args:
             side: texels.
@@ -323,8 +324,8 @@ class Patches:
         return cls(side, per_mm, shading, octave)
 
     def shift_between(self, first: Spectra, second: Spectra) -> Spectra:
-        """Returns the phase shift of each wave that moves the first set half-way to the second; its conjugate moves the
-        second set half-way back. Shifts above ``MAX_SHIFT_MM`` are not searched."""
+        """Returns the phase factor of each wave that shifts the first set half-way to the second. The factor's
+        conjugate shifts the second set half-way to the first. Only shifts up to ``MAX_SHIFT_MM`` are searched."""
         cross = np.where(self.octave >= 0, np.conj(first) * second, np.complex64(0.0))
         peaks = np.fft.fftshift(fields_of(cross, self.side), axes=(1, 2))
         fu, fv = waves_by_texel(self.side)
@@ -340,8 +341,8 @@ class Patches:
         return np.exp(np.complex64(-1j * np.pi) * (fu * shifts[:, :1, None] + fv * shifts[:, 1:, None]))
 
     def repeating(self, first: Spectra, second: Spectra) -> tuple[Float32[np.ndarray, "n p q"], np.ndarray]:
-        """Returns each wave's Wiener weight in the mean of two sets of views, and for each octave the repeated power
-        and the whole power."""
+        """Returns the Wiener weight of each wave in the mean of two sets of views. Also returns, for each octave, the
+        power that both sets share and the total power."""
         common = np.real(first * np.conj(second))
         either = np.abs(first) ** 2 + np.abs(second) ** 2
         weight, powers = np.zeros(self.per_mm.shape, np.float32), np.zeros((OCTAVES, 2))
@@ -355,12 +356,12 @@ class Patches:
         return weight, powers
 
     def common(self, first: Spectra, second: Spectra) -> Spectra:
-        """Returns the waves that two sets of views share."""
+        """Returns the Fourier components that two sets of views share."""
         return 0.5 * self.repeating(first, second)[0] * (first + second)
 
     def relief(self, first: Spectra, second: Spectra) -> tuple[Spectra, Float[np.ndarray, "o 2"]]:
-        """Returns the waves of the relief from those of the shading in two sets of views, and the powers from
-        ``repeating``."""
+        """Returns the Fourier components of the relief, given those of the shading in two sets of views. Also returns
+        the powers from ``repeating``."""
         weight, powers = self.repeating(first, second)
         noise2 = np.maximum((2 * np.pi * COLOUR * self.per_mm) ** 2, 1e-12)
         gain = weight * np.conj(self.shading) / (np.abs(self.shading) ** 2 + noise2)
@@ -368,17 +369,17 @@ class Patches:
 
 
 def fields_of(waves: Complex[np.ndarray, "n s h"], side: int) -> Float32[np.ndarray, "n s s"]:
-    """Returns the fields of Fourier transforms, ``side`` texels wide and high."""
+    """Returns the inverse Fourier transforms of patches ``side`` texels wide and high."""
     return np.asarray(scipy.fft.irfft2(waves, (side, side)))
 
 
 def waves_by_texel(side: int) -> tuple[Float32[np.ndarray, "p q"], Float32[np.ndarray, "p q"]]:
-    """Returns the frequencies (cycles per texel, across and down) of the waves of a square field."""
+    """Returns the frequencies (cycles per texel, across and down) of the Fourier components of a square patch."""
     down, across = np.meshgrid(np.fft.fftfreq(side), np.fft.rfftfreq(side), indexing="ij")
     return across.astype(np.float32), down.astype(np.float32)
 
 
 def _vertex(three: Float32[np.ndarray, " 3"]) -> float:
-    """Returns the offset of a peak from the middle one of three neighbouring values, by the parabola through them."""
+    """Returns the offset of a peak from the middle one of three neighbouring values, by a parabola."""
     bend = float(three[0] - 2 * three[1] + three[2])
     return 0.0 if bend >= 0 else float(np.clip(0.5 * (three[0] - three[2]) / bend, -0.5, 0.5))

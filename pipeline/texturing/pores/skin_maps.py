@@ -1,8 +1,7 @@
-"""Makes the maps of a head's skin: displacement and normals in the texture's layout.
+"""Makes the displacement map and the normal map of a head's skin, with the texture's UV layout.
 
 Displacement is along the interpolated normals of head.ply; one code is ``MM_PER_CODE``, and ``MID_CODE`` means no
-displacement. Normals are in the frame of glTF: x along the tangent (where u grows), y up in the image, z along the
-normal.
+displacement. Normals are in glTF's tangent frame: x along the tangent, y up in the image, z along the normal.
 """
 
 from collections.abc import Mapping
@@ -41,7 +40,7 @@ STRIP_ROWS = 128
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloseViews:
-    """Holds the full-size pictures of some views, packed.
+    """Holds the full-size pictures of some views, packed into one array.
 
     Attributes:
         views: the cameras that take just these pictures.
@@ -65,11 +64,11 @@ def read_close_views(
     sources: Mapping[str, str],
     chart: ChartColours | None = None,
 ) -> CloseViews:
-    """Reads, one after the other, the pictures of the views that see most of the face, and keeps the head's part.
+    """Reads the full-size pictures of the views that see most of the face, and crops them to the head.
 
-    ``read``: returns a picture at the size of its file. ``mesh_world``: the head. ``coloured``: holds the cameras'
-    gains and offsets, and a decision. ``face``: vertices of the face. ``sources``: for exchanged pictures, the camera
-    name under which a camera's picture is filed. ``chart``: corrections that the pictures of working size got.
+    ``read``: function that returns a camera's picture at full size. ``mesh_world``: the head. ``coloured``: holds the
+    cameras' gains and offsets, and the chosen views. ``face``: vertices of the face. ``sources``: if pictures were
+    exchanged, the camera name under which each camera's picture is filed. ``chart``: colour corrections by a chart.
     """
     decision = coloured.decision
     assert decision is not None, "the head has a texture"
@@ -92,7 +91,7 @@ def read_close_views(
 
 
 def _head_of(camera: Camera, image: ImageRgb, mesh: Mesh) -> tuple[Camera, UInt8[np.ndarray, "_ _ 3"]]:
-    """Returns the camera of a rectangle around the head and a copy of its pixels, so that the rest can be freed."""
+    """Crops a picture to the head. Returns the crop's camera, and a copy of its pixels, which frees the picture."""
     k = camera.intrinsics.at_size(image.shape[1], image.shape[0])
     pixels = project_points(replace(camera, intrinsics=k), mesh.vertices)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
@@ -107,7 +106,7 @@ def _head_of(camera: Camera, image: ImageRgb, mesh: Mesh) -> tuple[Camera, UInt8
 def plain_choice(
     views: Int32[np.ndarray, "v s"], shares: Float32[np.ndarray, "v s"], weights: Float32[np.ndarray, "k v"]
 ) -> Choice:
-    """Returns the choice of these views without colour corrections."""
+    """Packs views and their shares for the compiled loops, without colour corrections."""
     nothing = np.zeros((*views.shape, 4), np.float32)
     grey = np.full((len(views), 4), GREY, np.float32)
     return Choice(views, shares, nothing, grey, np.ascontiguousarray(weights))
@@ -116,7 +115,7 @@ def plain_choice(
 def mean_of(
     members: Bool[np.ndarray, " k"], weights: Float[np.ndarray, "k v"], most: int
 ) -> tuple[Int32[np.ndarray, "v s"], Float32[np.ndarray, "v s"]]:
-    """Returns the ``most`` best of the views ``members`` for each vertex (-1: none) and their weights in its mean."""
+    """Returns the ``most`` views of highest weight among ``members`` at each vertex (-1: none), and their shares."""
     allowed = np.where(members[:, None], weights, 0.0)
     order = np.argsort(-allowed, axis=0, kind="stable")[:most]
     chosen = np.take_along_axis(allowed, order, axis=0)
@@ -126,7 +125,7 @@ def mean_of(
 
 
 def halves_of(close: CloseViews, world_from_head: Similarity) -> HalfPictures:
-    """Returns two disjoint sets of views: every second view around the head, and the others."""
+    """Divides the views into two disjoint sets, alternating in their order around the head."""
     towards = np.array([camera.centre_world for camera in close.views]) - world_from_head.translation
     in_head = towards @ world_from_head.rotation
     around = np.argsort(np.arctan2(in_head[:, 0], in_head[:, 2]), kind="stable")
@@ -180,12 +179,12 @@ def skin_maps(
     skin: Float[np.ndarray, " v"],
     world_from_head: Similarity,
 ) -> tuple[SkinMaps, Atlas]:
-    """Estimates the skin's relief from the full-size pictures. Returns the maps, and the texture with their detail.
+    """Returns displacement and normal maps of the skin from full-size pictures, and the texture with their detail.
 
-    ``layout``: layout of the head. ``atlas``: texture of the head, which sets the size of the maps. ``mesh_world``: the
-    head (mm). ``normals``: unit normals of its vertices. ``coloured``: its colours. ``close``: the full-size pictures.
-    ``face``: vertices from whose shading the light is estimated. ``skin``: probability that a vertex shows skin.
-    ``world_from_head``: pose, which orders the views around the head.
+    ``layout``: UV layout of the head. ``atlas``: texture of the head, which sets the size of the maps. ``mesh_world``:
+    the head (mm). ``normals``: unit normals of its vertices. ``coloured``: colours of the vertices. ``close``: the
+    full-size pictures. ``face``: vertices from whose shading the light is estimated. ``skin``: probability that a
+    vertex shows skin. ``world_from_head``: pose of the head.
     """
     white = transfer(mesh_world, normals, layout.around)
     light = fit_light(white, linear_from_srgb(coloured.colours / 255.0), (coloured.views > 0) & face)
@@ -206,14 +205,14 @@ def skin_maps(
 
 
 def codes_of(heights_mm: Float32[np.ndarray, "r s"]) -> UInt16[np.ndarray, "r s"]:
-    """Returns heights as codes of the displacement map."""
+    """Converts heights to codes of the displacement map."""
     return np.clip(np.rint(heights_mm / np.float32(MM_PER_CODE)) + MID_CODE, 0, 65535).astype(np.uint16)
 
 
 def normal_codes(
     heights_mm: Float32[np.ndarray, "s s"], rows: slice, frames: TexelFrames
 ) -> UInt8[np.ndarray, "r s 3"]:
-    """Returns some rows of the normal map of a relief."""
+    """Computes the image rows ``rows`` of the normal map from the relief's heights."""
     size = heights_mm.shape[1]
     low, high = max(rows.start - 1, 0), min(rows.stop + 1, size)
     by_row = np.gradient(heights_mm[low:high], axis=0) if high - low > 1 else np.zeros_like(heights_mm[low:high])
@@ -249,7 +248,7 @@ def skin_share(
 
 
 def sharpened_atlas(atlas: Atlas, brightness: Float16[np.ndarray, "s s"]) -> Atlas:
-    """Returns a texture with its light multiplied by the exponential of ``brightness``."""
+    """Multiplies the linear light of a texture by the exponential of ``brightness``."""
     size = len(atlas.image)
     stored: UInt8[np.ndarray, "s s 3"] = np.empty((size, size, 3), np.uint8)  # blue first, as the painter's
 

@@ -1,6 +1,5 @@
-"""Colours a head with further photographs from the same cameras.
+"""Paints further textures of a head from further photographs by the same cameras, for example in polarised light.
 
-In: the head with its decision about views, and the capture's texture sets. Out: a texture for each set, in the head's
-layout. Sets in polarised light also give the light that the skin scatters (diffuse) and the light that its surface
-mirrors (specular).
+The modules take the head, the views chosen for each vertex, and the capture's further sets of photographs. The modules
+return a texture for each set. Sets in polarised light also give the diffuse and the specular reflection of the skin.
 """

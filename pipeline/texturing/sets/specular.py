@@ -1,13 +1,13 @@
-"""Separates mirrored from scattered light by two sets in polarised light.
+"""Separates specular from diffuse reflection by means of two sets of photographs in polarised light.
 
-Lamps behind a filter send polarised light. Mirrored light stays polarised; light scattered inside the skin does not. A
-lens filter crossed with the lamps' passes half of the scattered light only. A parallel one passes mirrored light and
-half of the scattered (Ma et al., *Rapid Acquisition of Specular and Diffuse Normal Maps*, EGSR 2007). So, in linear
-light, ``cross`` is the diffuse part and ``parallel / exposure - cross`` the specular one.
+The lamps send polarised light. Specular reflection stays polarised; light scattered inside the skin does not. A lens
+filter crossed with the lamps' filter passes only half of the diffuse light. A parallel lens filter passes the specular
+light and half of the diffuse light (Ma et al., *Rapid Acquisition of Specular and Diffuse Normal Maps*, EGSR 2007). So,
+in linear light, ``cross`` is the diffuse part and ``parallel / exposure - cross`` the specular part.
 
-Exposures may differ, so their ratio is measured for each camera, from colour alone. Mirrored light has the lamps'
-colour, near grey in a balanced picture; differences between channels come from scattered light, and their ratio is that
-of the exposures. The median over the head removes pixels where this does not hold.
+The exposures of the two pictures may differ, so their ratio is measured for each camera. Specular light is nearly grey
+in a picture with white balance, so differences between colour channels come from diffuse light. The ratio of these
+differences in the two pictures is the ratio of the exposures. The median over the head removes outliers.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ STRIP_ROWS = 256
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Specular:
-    """Holds the light that a head's surface mirrors.
+    """Holds the specular reflection of a head.
 
     Attributes:
         light: linear, in the textures' units: the mean over the views that see a texel, 0 where none does.
@@ -56,7 +56,7 @@ class Specular:
     exchanged: bool
 
     def strength(self) -> UInt8[np.ndarray, "s s"]:
-        """Returns the codes of glTF's specular strength: 255 mirrors ``NORMAL_SHARE`` of white light."""
+        """Returns the codes of glTF's specular strength; 255 is a reflection of ``NORMAL_SHARE`` of white light."""
         share = self.light.astype(np.float32).mean(axis=2) / NORMAL_SHARE
         return np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
 
@@ -67,8 +67,8 @@ def exposure_ratios(
     silhouettes: Mapping[str, Silhouette],
     names: Sequence[str],
 ) -> dict[str, float]:
-    """Measures the ratio of each camera's exposures, parallel picture to crossed picture. A camera that sees no colour
-    gets the median of the others; 1 if none sees any."""
+    """Measures the ratio of the exposures of each camera's parallel and crossed pictures. A camera that sees no colour
+    gets the median of the others, or 1 if no camera sees any."""
     found = map_in_threads(
         lambda k: _exposure(cross[names[k]], parallel[names[k]], silhouettes[names[k]].mask), len(names)
     )
@@ -107,11 +107,11 @@ def specular_light(
     *,
     size: int,
 ) -> Specular:
-    """Computes the mirrored light of every texel.
+    """Computes the specular reflection at every texel.
 
-    ``cross``: pictures without mirrored light, by camera. ``parallel``: pictures with mirrored light, by camera.
-    ``gains``: by camera and channel, from the texture of the crossed set. ``decision``: weights with which the cameras
-    see each vertex. ``silhouettes``: by camera. ``layout``: layout of the head. ``size``: width of the map in texels.
+    ``cross``: pictures without specular light, by camera. ``parallel``: pictures with specular light, by camera.
+    ``gains``: of each camera and channel in the crossed pictures. ``decision``: weights with which cameras see
+    vertices. ``silhouettes``: by camera. ``layout``: UV layout of the head. ``size``: width of the map in texels.
     """
     views = decision.views
     exposure = exposure_ratios(cross, parallel, silhouettes, views.names)
@@ -154,8 +154,8 @@ def specular_light(
 
 
 def _lamp_colour(light: Float32[np.ndarray, "s s 3"]) -> Float32[np.ndarray, "s s 3"]:
-    """Returns the colour of mirrored light around each texel, with mean 1. The lamps have one colour, so differences
-    between texels are noise."""
+    """Returns the colour of specular light around each texel, scaled to mean 1. The colour is smoothed, since all lamps
+    have the same colour and differences between texels are noise."""
     size = len(light)
     coarse = cv2.resize(light, (COLOUR_SIDE, COLOUR_SIDE), interpolation=cv2.INTER_AREA)
     coarse = cv2.GaussianBlur(coarse, (0, 0), 1.0)

@@ -1,8 +1,8 @@
-"""Colours a head by the texture sets of its capture.
+"""Paints a texture of the head from each further set of photographs in the capture.
 
-Weights and chosen views are those of the head's texture, so a texel shows the same pixel of the same camera in all
-sets. Only values that depend on the set's own light are estimated anew: the cameras' gains, the agreed colours and the
-corrections at seams.
+Weights and chosen views are the same as in the head's main texture, so a texel shows the same pixel of the same camera
+in all sets. Only values that depend on the set's light are estimated again: the cameras' gains, the mean colours and
+the seam corrections.
 """
 
 from collections.abc import Mapping
@@ -36,15 +36,15 @@ CROSS, PARALLEL = "cross", "parallel"  # names of the sets in polarised light
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetTextures:
-    """Holds the texture of each set, in the layout of the head's texture. ``specular`` is None unless both sets of
-    polarised light exist."""
+    """Holds a texture for each set of photographs, with the UV layout of the head. ``specular`` is None unless crossed
+    and parallel polarised pictures exist."""
 
     atlases: Mapping[str, Atlas]
     specular: Specular | None
 
     @property
     def diffuse(self) -> Atlas | None:
-        """Returns the texture of the scattered light; None without crossed pictures."""
+        """Returns the texture of the diffuse reflection; None without pictures in crossed polarised light."""
         return self.atlases.get(CROSS)
 
 
@@ -58,7 +58,7 @@ def colour_by_sets(
     atlas: Atlas | None,
     settings: TextureSettings,
 ) -> tuple[SetTextures | None, list[ReportWarning]]:
-    """Paints a texture of each set, and separates diffuse from specular light if there are sets in polarised light.
+    """Paints a texture from each set of photographs. Sets in polarised light also give the specular reflection.
 
     Args:
         sets: pictures by set and camera.
@@ -70,7 +70,7 @@ def colour_by_sets(
         settings: of the texture.
 
     Returns:
-        None without sets; None and a warning where the head has no texture.
+        The textures and warnings. The textures are None without sets, or if the head has no texture.
     """
     if not sets:
         return None, []
@@ -100,7 +100,7 @@ def set_texture(
     size: int,
     settings: TextureSettings,
 ) -> tuple[Atlas, Float[np.ndarray, "k 3"]]:
-    """Paints the texture of one set. Also returns the gain of each camera and channel (k, 3).
+    """Paints a texture from one set of photographs. Also returns the gain of each camera and channel (k, 3).
 
     ``images`` (of the set) and ``silhouettes`` are by camera. ``decision``: the views that colour each vertex.
     ``mesh_world``: the head (mm). ``size``: width of the texture in texels.
