@@ -51,7 +51,7 @@ def sha256_of(path: Path) -> str:
 
 
 def cache_folder() -> Path:
-    """Returns the folder named by EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead. """
+    """Returns the folder named by EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead."""
     configured = os.environ.get(CACHE)
     if configured:
         return Path(configured)

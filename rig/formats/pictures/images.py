@@ -75,7 +75,7 @@ def is_picture(path: Path) -> bool:
 def write_image(
     path: Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"], quality: int = 95, *, parents: bool = True
 ) -> None:
-    """Writes RGB or grey pixels in the format of the suffix. ``quality`` applies to JPEG. ``parents`` creates missing
+    """Writes RGB or grey pixels in the format of the suffix. ``quality`` is JPEG's. ``parents`` creates missing
     folders."""
     options = (cv2.IMWRITE_JPEG_QUALITY, quality) if path.suffix == ".jpg" else PNG_OPTIONS
     write_atomically(path, encode_image(path.suffix, image, options), parents=parents)
@@ -106,8 +106,7 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def page_count(path: Path) -> int:
-    """Returns the number of pictures in a TIFF or WebP file, or 1 for other and damaged files. Only the first picture
-    is ever read."""
+    """Returns the number of pictures in a TIFF or WebP file, or 1 for other and damaged files."""
     if path.suffix.lower() not in PAGED_SUFFIXES:
         return 1
     try:
@@ -157,7 +156,7 @@ def cut_out_alpha(path: Path) -> Plane | None:
 
     Returns None if the file has no alpha channel, is too large or damaged, or if the opaque part cannot be a subject. A
     subject is in the middle, and at least the fraction ``CUT_AWAY_LEAST`` of the picture around it is transparent.
-    Rounded corners, or the empty rim of an undistorted picture, are less."""
+    Rounded corners and empty rims of undistorted pictures are smaller."""
     data, suffix = path.read_bytes(), path.suffix.lower()
     if data.startswith(PNG):
         if len(data) <= PNG_COLOUR_TYPE or data[PNG_COLOUR_TYPE] not in PNG_WITH_ALPHA:
@@ -310,7 +309,7 @@ def heif_header(data: bytes) -> Any:
 
 
 def _in_srgb(pixels: ImageRgb, profile: bytes) -> ImageRgb:
-    """Converts colours from ``profile`` (such as Display P3 or Adobe RGB) to sRGB. An unreadable profile is treated as
+    """Converts colours from ``profile`` (such as Display P3 or Adobe RGB) to sRGB. An unreadable profile counts as
     sRGB."""
     from PIL import ImageCms
 

@@ -143,8 +143,7 @@ def _constant_fault(value: float, common: tuple[float, float]) -> Message:
 
 
 def _levels(plane: Plane, span: tuple[float, float]) -> list[float]:
-    """Returns the values that fill areas, in ascending order. Among close values, returns only the most frequent
-    one."""
+    """Returns the values that fill areas, in ascending order. Of close values, returns the most frequent."""
     low, high = span
     exact = plane.dtype.kind in "ui" and high - low < BINS
     count = int(high - low) + 1 if exact else BINS
@@ -165,8 +164,7 @@ def _levels(plane: Plane, span: tuple[float, float]) -> list[float]:
 
 
 def _is_area(pixels: Bool[np.ndarray, "h w"]) -> bool:
-    """Returns whether most True pixels have only True neighbours, unlike the pixels of one grey level in a soft
-    edge."""
+    """Returns whether most True pixels have only True neighbours, unlike those of one grey level in a soft edge."""
     within = cv2.erode(pixels.astype(np.uint8), np.ones((3, 3), np.uint8))
     return bool(np.count_nonzero(within) > AREA_WITHIN * np.count_nonzero(pixels))
 

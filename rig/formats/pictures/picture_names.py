@@ -56,8 +56,7 @@ def is_junk(name: str) -> bool:
 def entry(folder: Path, name: str) -> Path:
     """Returns the path of the file or folder ``name`` in a folder, ignoring case, because operating systems change it.
 
-    If no such file exists, returns the path with exactly this name. Raises InputError if two names differ only in
-    case."""
+    If none exists, returns the path with exactly this name. Raises InputError if two names differ only in case."""
     found = [path for path in sorted(folder.iterdir()) if path.name.casefold() == name] if folder.is_dir() else []
     if len(found) > 1:
         raise InputError(folder.name, [compose("names-of-other-case", names=[path.name for path in found])])
@@ -159,8 +158,7 @@ def _naming_one(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Fo
 
 
 def _numbered(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Matches files whose words are only those that distinguish cameras ("00.png" to cam00), if each camera has a
-    file."""
+    """Matches files that have only the words that distinguish cameras ("00.png" to cam00), if each camera has one."""
     ways = list(cameras.values())
     head = next((i for i, said in enumerate(zip(*ways, strict=False)) if len(set(said)) > 1), None)
     if head is None or len(cameras) < 2:

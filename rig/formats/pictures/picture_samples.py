@@ -78,8 +78,7 @@ def _measure(path: Path) -> tuple[int | None, bool]:
 
 
 def _depth_and_channels(path: Path) -> tuple[int, int]:
-    """Returns bits per sample and samples per pixel from the header of a PNG or TIFF file, or 8 and 3 for other
-    formats."""
+    """Returns bits per sample and samples per pixel from the header of a PNG or TIFF; 8 and 3 for other formats."""
     with path.open("rb") as file:
         data = file.read(HEADER_BYTES)
     if data.startswith(PNG) and len(data) > 25:
@@ -125,8 +124,7 @@ def fill_rims(
 
 
 def _without_rim(image: ImageRgb, other: ImageRgb) -> ImageRgb:
-    """Fills the empty rim of a picture from ``other``. Returns the picture unchanged if it has no rim or both have
-    one."""
+    """Fills the empty rim of a picture from ``other``. Returns it unchanged if it has no rim or both have one."""
     rim = empty_rim(image)
     if rim is None or rim.mean() > MAX_SHARE or (rim & ~_empty(other)).mean() < MIN_SHARE:
         return image
