@@ -229,8 +229,8 @@ def _take_shots(state: BundleState, shots: Sequence[str], used: set[str]) -> tup
 
 
 def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped: Sequence[Dropped]) -> list[Message]:
-    """Returns a message for each camera with more excluded views than valid views. Such a camera may be mirrored,
-    because a mirrored camera can agree with the others in any single shot."""
+    """Returns a message for each camera with more excluded views than valid views. A mirrored camera may have this
+    fault, because it can agree with other cameras in any single shot."""
     left, lost = Counter(view.camera for view in views), Counter(drop.camera for drop in dropped)
     return [
         compose("views-contradict", camera=name, count=lost[name], all=lost[name] + left[name])
@@ -330,8 +330,8 @@ def _covariances(
     of both on the subject's image (px). The covariance of the poses includes the uncertainty of the lenses
     (``effective_pose``), because a later fit treats the intrinsics as exact.
 
-    Corners of one view share an error if cameras were not simultaneous or the board bends. So the covariance for
-    independent corners is multiplied by a factor (``_design_effect``)."""
+    Corners of one view share an error if cameras were not simultaneous or the board bends. The covariance for
+    independent corners is therefore multiplied by the factor ``_design_effect``."""
     full = fit.solution.covariance() * _design_effect(fit)
     cameras = len(fit.names)
     block = full[: cameras * PER_CAMERA, : cameras * PER_CAMERA].reshape(cameras, PER_CAMERA, cameras, PER_CAMERA)

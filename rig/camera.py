@@ -45,7 +45,7 @@ class Distortion:
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
     def max_valid_radius(self) -> float:
-        """Returns the radius, in units of ``X / Z``, up to which the distortion is one-to-one. Beyond it the radial
+        """Returns the radius, in units of ``X / Z``, up to which the distortion is one-to-one. Beyond the radius, the
         model maps points back inwards."""
         return _turning_radius(self.k1, self.k2, self.k3)
 

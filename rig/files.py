@@ -40,7 +40,7 @@ def unfinished(folder: Path, name: str = "*") -> Iterator[Path]:
 
 
 def document_sha256(document: Mapping[str, Any]) -> str:
-    """Computes the SHA-256 of a document's canonical JSON. Results identify settings and inputs by it."""
+    """Computes the SHA-256 of a document's canonical JSON. Results store such digests of their settings."""
     return hashlib.sha256(json.dumps(document, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 

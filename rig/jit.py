@@ -1,13 +1,13 @@
 """Compiles Python functions with Numba, and caches the machine code under a hash of its sources for later processes.
 
-The function ``njit`` of this module is Numba's, with another cache. Numba's cache is an index for each function beside
-the source file, and starts empty in every checkout. It ignores changes to a called function in another file. It loses
-or mixes entries when two processes write one index, and a full disk or a damaged file makes a job fail. In this
-module's cache, each compiled function is one file in ``cache_folder()/kernels``, written atomically. The file's name is
-the SHA-256 of all that the machine code depends on: byte code and constants of the function and its callees, argument
-types, the processor, and the versions of Python, Numba and LLVM.
+The function ``njit`` of this module replaces the cache of Numba's ``njit``. Numba's cache is an index for each function
+beside the source file, and starts empty in every checkout. Numba's cache ignores changes to a called function in
+another file. It loses or mixes entries when two processes write one index, and a full disk or a damaged file makes a
+job fail. In this module's cache, each compiled function is one file in ``cache_folder()/kernels``, written atomically.
+The file's name is the SHA-256 of all that the machine code depends on: byte code and constants of the function and its
+callees, argument types, the processor, and the versions of Python, Numba and LLVM.
 
-Code is compiled for the instructions that all x86-64 processors since 2013 have (``PORTABLE_CPU``). So a container, a
+Code is compiled for the instructions that all x86-64 processors since 2013 have (``PORTABLE_CPU``). Thus a container, a
 wheel or a CI's cache can carry machine code to other machines. Code for one specific processor was not faster: with
 AVX-512 a job took as many CPU seconds.
 
@@ -97,7 +97,7 @@ def njit(
 
 
 class KeptFunction:
-    """Reads and writes the machine code of one function on disk. It replaces Numba's cache object."""
+    """Reads and writes the machine code of one function on disk. Numba uses the object as its cache."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher

@@ -89,7 +89,7 @@ def _principal_point_faults(rig: Rig) -> list[Message]:
 
 def _through_lens(camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
     """Returns normalised coordinates ``X / Z, Y / Z`` without and with distortion, on a grid over the middle of the
-    picture. They are NaN at pixels without a ray.
+    picture. The coordinates are NaN at pixels without a ray.
 
     If the picture files are undistorted on reading, the grid covers the undistorted picture. Pixels of a fisheye
     outside this grid are never used, so the lens model need not be valid there."""

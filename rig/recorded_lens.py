@@ -1,9 +1,9 @@
 """Models lenses that Brown-Conrady distortion cannot represent, and undistorts their pictures on reading.
 
-The rest of the program treats a camera with such a lens as a pinhole: ``Camera.intrinsics`` has no distortion, and
-``Camera.recorded`` is the lens of the picture files. The pinhole and the lens have the same focal lengths, principal
-point and size, so that the resolution in the middle of the picture does not change. Pixels of a fisheye outside the
-pinhole's picture are dropped.
+The rest of the program treats a camera with one of these lenses as a pinhole: ``Camera.intrinsics`` has no distortion,
+and ``Camera.recorded`` is the lens of the picture files. The pinhole and the lens have the same focal lengths,
+principal point and size, so that the resolution in the middle of the picture does not change. Pixels of a fisheye
+outside the pinhole's picture are dropped.
 
 The Kannala-Brandt model is ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`` with ``theta``
 the angle to the axis (https://docs.opencv.org/4.x/db/d58/group__calib3d__fisheye.html). The rational model has OpenCV's

@@ -1,8 +1,8 @@
 """Computes errors of cameras that do not depend on the arbitrary choice of the world frame, which no image determines.
 
-Moving all cameras together changes no image. So calibrations are compared, and covariances stated, in the gauge in
-which the images of the subject's region move least. Let ``W`` (6 C x 6 C, block-diagonal) be the sum of ``J^T J`` over
-points on a sphere of the subject's size, with ``J`` the derivative of a pixel by a left perturbation of
+Moving all cameras together changes no image. Calibrations are therefore compared in the gauge (choice of world frame)
+in which the images of the subject's region move least. Let ``W`` (6 C x 6 C, block-diagonal) be the sum of ``J^T J``
+over points on a sphere of the subject's size, with ``J`` the derivative of a pixel by a left perturbation of
 camera_from_world, and let ``A`` (6 C x 6) be the motions of all cameras under a motion of the world. The projection on
 this gauge is ``S = I - A (A^T W A)^-1 A^T W`` (an S-transformation: W. Baarda, 1973; Triggs et al., "Bundle Adjustment:
 A Modern Synthesis", section 9).

@@ -2,7 +2,7 @@
 
 Cameras are treated separately, so shots need not be synchronised. IPPE computes the board's poses for each of several
 focal lengths (T. Collins, A. Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 2014). A bundle adjustment of
-that camera alone (``bundle.py``) completes the estimate. Its covariance shows if the views suffice."""
+that camera alone (``bundle.py``) completes the estimate. The covariance of the lens shows if the views suffice."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -104,9 +104,9 @@ def _lens(
 
 
 def noise_of(misses: Float[np.ndarray, "n 2"]) -> float:
-    """Returns the robust standard deviation (px) of one coordinate of 2D residuals. It is the median length of the
-    residuals divided by 1.1774, the median length for unit variance. The result is at least ``CORNER_SIGMA_LEAST``, and
-    1 if there are no residuals."""
+    """Returns the robust standard deviation (px) of one coordinate of 2D residuals. The estimate is the median length
+    of the residuals divided by 1.1774, the median length for unit variance. The result is at least
+    ``CORNER_SIGMA_LEAST``, and 1 if there are no residuals."""
     if not len(misses):
         return 1.0
     return max(float(np.median(np.linalg.norm(misses, axis=1))) / 1.1774, CORNER_SIGMA_LEAST)

@@ -93,7 +93,7 @@ class LinearisedAspectPrior:
 
 
 def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
-    """Returns wide priors of the intrinsics that suit any lens. They depend only on the image sizes (px)."""
+    """Returns wide priors of the intrinsics that suit any lens. The priors depend only on the image sizes (px)."""
     mean, sigma = [], []
     for width, height in sizes:
         long = max(width, height)

@@ -4,7 +4,8 @@ Each view gives camera_from_board with two ambiguities: the image of a plane all
 may be turned (``Board.turns``). The relative pose of two cameras must be the same in every shot. So each candidate for
 the relative pose is tested on all shared shots, and the candidate that fits most shots is chosen. A maximum spanning
 tree joins the pairs of cameras. The program refuses a tie between two candidates, cameras without common shots, and a
-camera whose views agree with no other camera. Such a camera has mirrored pictures or misnamed shots."""
+camera whose views agree with no other camera. A camera that agrees with no other has mirrored pictures or misnamed
+shots."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -162,8 +163,8 @@ def _disagreement(
 def _squares_apart(
     corners_world: Float[np.ndarray, "*k n 3"], put: Float[np.ndarray, "*j n 3"], board: Board
 ) -> Float[np.ndarray, "*b"]:
-    """Returns the image distance between two sets of corners, in sides of a square's image. It is large where ``put``
-    lies behind the camera."""
+    """Returns the image distance between two sets of corners, in sides of a square's image. The distance is large if
+    ``put`` lies behind the camera."""
     depth = corners_world[..., 2:]
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = np.linalg.norm(corners_world[..., :2] / depth - put[..., :2] / put[..., 2:], axis=-1) * depth[..., 0]

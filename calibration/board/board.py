@@ -1,9 +1,10 @@
 """Describes the calibration board, prints it, computes its corners, and simulates its picture in a camera.
 
-The board frame is right-handed and matches OpenCV's. Its origin is the outer corner of the first square. The x axis
-runs along a row of squares, y down a column, and z *into* the board (away from the viewer). The first square is black.
-It is white if the board is ``inverted``, or if a ChArUco board with an even number of rows is ``legacy``, as OpenCV
-before 4.6 and calib.io draw it. The term corner means an inner corner; corners are numbered row by row.
+The board frame is right-handed and matches OpenCV's. The frame's origin is the outer corner of the first square. The x
+axis runs along a row of squares, y down a column, and z *into* the board (away from the viewer). The first square is
+black. The first square is white if the board is ``inverted``. It is also white if a ChArUco board with an even number
+of rows is ``legacy``, as drawn by OpenCV before 4.6 and calib.io. The term corner means an inner corner; corners are
+numbered row by row.
 """
 
 import tomllib

@@ -4,7 +4,7 @@ board is not found, the markers show which board is in the pictures.
 A ChArUco board's markers are numbered row by row over its white squares. The description of the board may be wrong in
 several ways. OpenCV before 4.6 and calib.io begin a board of an even number of rows with a white square. The second
 board of a pair begins with another marker number. The user may have miscounted squares, mismeasured the marker's side,
-or named the wrong dictionary. Each of these faults implies another layout of the markers. The layout to which a
+or named the wrong dictionary. Each wrong description implies another layout of the markers. The layout to which a
 homography maps the markers' centres reveals the fault.
 """
 
@@ -176,8 +176,8 @@ def _with_measured_pattern(
 
 
 def _refuse_markers(pictures: dict[str, dict[str, Path]]) -> None:
-    """Raises WrongBoard if the pictures show markers though the board is described as a checkerboard. Otherwise part of
-    a ChArUco board may be detected as a checkerboard, and its markers mistaken for blur."""
+    """Raises WrongBoard if the pictures show markers though the board is described as a checkerboard. Part of a ChArUco
+    board may be detected as a checkerboard, and the markers mistaken for blur."""
     dictionary = other_dictionary(_sample(pictures, TRIED)[:TRIED], "")
     if dictionary is not None:
         raise WrongBoard([compose("board-has-markers", dictionary=dictionary)])

@@ -104,7 +104,7 @@ def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
 
 
 def check_frame(rig: Rig, board: Board) -> Check:
-    """Checks that the cameras see an area large enough for a head. It is not if ``square_mm`` is in another unit."""
+    """Checks that the cameras see an area large enough for a head. A wrong unit of ``square_mm`` fails this check."""
     frame = frame_mm(rig)
     advice = compose("advice-square-unit", square_mm=board.square_mm)
     return Check("frame", frame >= FRAME_LEAST_MM, compose("frame-shown", frame_mm=frame), advice)

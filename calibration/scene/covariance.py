@@ -98,11 +98,11 @@ def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
 
 
 def lens_misfit(structure: Structure, noise_px: float) -> float:
-    """Computes how much better the points would fit if each camera had its own lens. The result is about 1 if one lens
+    """Computes how much better the points would fit if each camera had its own lens. The ratio is about 1 if one lens
     fits all cameras, and larger if the lenses differ.
 
-    The method is a score test (Rao 1948): the decrease of chi-squared in one Gauss-Newton step, divided by the number
-    of added parameters. A wrong lens hardly increases the residuals, because the poses compensate for it.
+    The ratio is that of a score test (Rao 1948): the decrease of chi-squared in one Gauss-Newton step, divided by the
+    number of added parameters. A wrong lens hardly increases the residuals, because the poses compensate for it.
     """
     if not structure.one_lens or len(structure.rig) < 2:
         return 1.0

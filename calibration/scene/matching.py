@@ -1,9 +1,9 @@
 """Matches SIFT keypoints between photographs that show the same points of the scene, with pycolmap on the CPU.
 
-Shots of one rig share its cameras but not the scene, because heads move between shots. So pictures are matched only
-within each shot. The keypoints of all shots of a camera are then merged into one image, so that structure from motion
-gives one pose for the camera. All steps run in one thread with one seed. With more threads, the order of RANSAC's
-random draws, and so the result, would depend on the scheduler.
+Shots of one rig share its cameras but not the scene, because heads move between shots. Pictures are therefore matched
+only within each shot. The keypoints of all shots of a camera are then merged into one image, so that structure from
+motion gives one pose for the camera. All steps run in one thread with one seed. With more threads, the order of
+RANSAC's random draws, and so the result, would depend on the scheduler.
 """
 
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ SIDE_MOST_PX = 2400  # features are found in pictures no larger; they are placed
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """Holds COLMAP databases of the matches between photographs. Each camera has one image in a database.
+    """Holds COLMAP databases of the matches between photographs. A database has one image for each camera.
 
     Attributes:
         databases: the first has one lens for all images if these have one size; the last has a lens for each image,

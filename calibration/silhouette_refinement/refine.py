@@ -157,8 +157,8 @@ def refine(
     """Refines camera poses, and with ``focal`` also focal lengths, from the silhouettes of all captures.
 
     In a cross-validation with at most ``FOLDS`` folds, each capture is compared with cameras refined by other captures.
-    The result is kept if the captures then agree better. With ``heads``, the rims of fitted heads are also used once
-    the tangencies have converged. Raises TooFewCaptures."""
+    The refined rig is kept if the captures agree better with the refined cameras. With ``heads``, the rims of fitted
+    heads are also used once the tangencies have converged. Raises TooFewCaptures."""
     if len(captures) < 2:
         raise TooFewCaptures(len(captures))
     folds = min(FOLDS, len(captures))

@@ -7,9 +7,10 @@ planes is
 
     delta = |b| b . (d1 x d2) / (|b x d1| |b x d2|)
 
-The residual is this angle divided by the change of angle per pixel in both images together. It is the distance (px) by
-which each of two equally noisy contours would have to move. At a tangent point the contour runs along the plane, so to
-first order the tangent pixels do not move along it when a camera moves. With x' = R(w) x + v in camera 1's frame,
+The residual is the angle delta divided by the change of angle per pixel in both images together. The residual is the
+distance (px) by which each of two equally noisy contours would have to move. At a tangent point the contour runs along
+the plane, so to first order the tangent pixels do not move along it when a camera moves. With x' = R(w) x + v in camera
+1's frame,
 
     d delta ~ w . (R1 (d2 x b)) x R1 d1 + v . R1 (d1 x d2)         and likewise, signs swapped, for camera 2.
 

@@ -142,8 +142,8 @@ def board_shot(session: RigSession) -> Shot:
 
 
 def take_plates(config: RigConfig, make_driver: MakeDriver = driver_for) -> Plates:
-    """Takes new clean plates (pictures of the empty studio) and uses them from now on. If it raises ShotFailed, the old
-    plates stay in use."""
+    """Takes new clean plates (pictures of the empty studio) and uses them from now on. If the function raises
+    ShotFailed, the old plates stay in use."""
     with RigSession(config, make_driver) as session:
         session.warm_up()
         return session.take_plates()

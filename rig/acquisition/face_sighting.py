@@ -38,7 +38,7 @@ class FaceSighting:
 
 def face_remarks(sighting: FaceSighting | None, faults: Iterable[Fault]) -> tuple[Message, ...]:
     """Returns remarks on the cameras that do not show the face, and on the face's direction. Cameras with a fault in
-    ``EXPLAINING`` get no remark. If the whole rig has such a fault, returns no remarks."""
+    ``EXPLAINING`` get no remark. If a fault in ``EXPLAINING`` concerns the whole rig, returns no remarks."""
     explained = {fault.camera for fault in faults if fault.code in EXPLAINING}
     if sighting is None or None in explained:
         return ()

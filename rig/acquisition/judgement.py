@@ -124,14 +124,14 @@ def _view_faults(
 
 
 def _whose_view(name: str, image: ImageRgb, registration: Registration, plates: Plates) -> str | None:
-    """Returns another camera whose clean plate fits the picture far better than that of ``name``, or None."""
+    """Returns a camera whose clean plate fits the picture far better than the plate of ``name``, or None."""
     others = {other: register(image, plate).found for other, plate in plates.first.items() if other != name}
     best = max(others, key=lambda other: others[other], default=None)
     return best if best is not None and others[best] >= max(FOUND_LEAST, 2 * registration.found) else None
 
 
 class PlatesRefused(ShotFailed):
-    """Reports that new clean plates show a person. They are stored as ``version``; the old plates stay in use."""
+    """Reports that new clean plates show a person. The old plates stay in use; ``version`` stores the new ones."""
 
     def __init__(self, faults: Sequence[Fault], version: str) -> None:
         super().__init__(faults)
@@ -154,7 +154,7 @@ def plate_faults(taken: Mapping[str, Sequence[ImageRgb]], live: Collection[str],
 
 def occupied(taken: Mapping[str, Sequence[ImageRgb]], before: Plates) -> list[Fault]:
     """Returns a fault for each camera whose new plate differs from the plate in use in a region of a head's size.
-    Returns no fault if less than the fraction ``SEEN_SHARE`` of all cameras differ so."""
+    Returns no fault if the plates of less than the fraction ``SEEN_SHARE`` of all cameras differ."""
     compared = [name for name in taken if name in before and taken[name][0].shape == before.first[name].shape]
     positions = {name: find_subject(taken[name][0], before.first[name]) for name in compared}
     faults = [

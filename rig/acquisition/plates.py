@@ -144,7 +144,7 @@ def plates_versions(folder: Path) -> list[PlatesVersion]:
 
 
 def _version_of(folder: Path) -> PlatesVersion:
-    """Reads a version's description from plates.json. If this fails, uses the folder's modification time."""
+    """Reads a version's description from plates.json. Without it, uses the folder's modification time."""
     try:
         document = json.loads((folder / "plates.json").read_text(encoding="utf-8"))
         taken = str(document["taken"])

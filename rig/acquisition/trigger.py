@@ -164,10 +164,10 @@ class TriggerBox:
             raise WrongDevice(self.port, f"STATUS {fields}") from error
 
     def synchronise(self, rounds: int = 5) -> BoxClock:
-        """Compares the box's clock with time.monotonic and returns the best of ``rounds`` comparisons.
+        """Compares the box's clock with time.monotonic ``rounds`` times. Returns the most precise comparison.
 
         By Cristian's method (Distributed Computing 3, 1989), the box read its clock at some time during a round trip.
-        So the shortest round trip gives the narrowest bound; half its duration is the uncertainty.
+        The shortest round trip gives the narrowest bound; half its duration is the uncertainty.
         """
         best: BoxClock | None = None
         for _ in range(rounds):

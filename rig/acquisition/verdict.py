@@ -98,8 +98,8 @@ def without_consequences(faults: Iterable[Fault]) -> list[Fault]:
 
 
 def verdict_of(faults: Iterable[Fault], cameras: Collection[str]) -> Verdict:
-    """Returns the verdict on a capture. It is ``good`` without faults, and ``poor`` if the whole rig has a fault or too
-    few ``cameras`` are free of faults. Otherwise it is ``usable``."""
+    """Returns the verdict on a capture. The verdict is ``good`` without faults, and ``poor`` if the whole rig has a
+    fault or too few ``cameras`` are free of faults. Otherwise the verdict is ``usable``."""
     named = {fault.camera for fault in faults}
     if not named:
         return "good"

@@ -1,7 +1,7 @@
 """Runs each camera in a thread that opens it, grabs frames continuously, and decodes requested frames.
 
-A driver may block forever inside a vendor's library. So every camera has its own thread, and every wait has a deadline.
-If a daemon thread does not end, the program reports this and continues without it.
+A driver may block forever inside a vendor's library. Therefore every camera has a separate thread, and every wait has a
+deadline. If a daemon thread does not end, the program reports this and continues without it.
 """
 
 import contextlib

@@ -5,7 +5,7 @@ projection in ``shaders/camera.glsl`` maps v = 0 to y = -1. OpenGL returns the l
 has row 0 at the top. Anticlockwise triangles become clockwise by this projection, so the context treats clockwise
 triangles as front faces.
 
-OpenGL has pixel centres at half-integer window coordinates, and this project at integers. So the shader adds 1/2.
+OpenGL has pixel centres at half-integer window coordinates, and this project at integers, so the shader adds 1/2.
 """
 
 import contextlib

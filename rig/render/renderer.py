@@ -284,8 +284,8 @@ class SilhouetteSet:
 def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
     """Returns whether a mesh is closed, so that its front faces alone form the whole silhouette.
 
-    A ray enters a closed surface as often as it leaves the surface. So every pixel that a back face covers is also
-    covered by a front face.
+    A ray enters a closed surface as often as it leaves the surface. Every pixel that a back face covers is therefore
+    also covered by a front face.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     base = int(edges.max(initial=0)) + 1

@@ -2,9 +2,9 @@
 
 A camera in Blender (https://docs.blender.org/api/current/bpy.types.Camera.html) has no distortion. With ``sensor_fit``
 HORIZONTAL its focal length in pixels is ``lens * width / sensor_width``. ``shift_x`` and ``shift_y`` move the frame to
-the right and up, as fractions of the width. Its x axis points right, y up and z backwards; lengths are in metres. Only
-undistorted photographs fit as backgrounds. A custom property of each camera holds the displacement of the picture's
-corners by the lens."""
+the right and up, as fractions of the width. Blender's camera axes are x right, y up and z backwards; lengths are in
+metres. Only undistorted photographs fit as backgrounds. A custom property of each camera holds the displacement of the
+picture's corners by the lens."""
 
 import json
 from pathlib import Path

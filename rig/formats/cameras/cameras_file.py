@@ -1,8 +1,8 @@
 """Reads and writes rigs in the file formats of other programs.
 
 The module reads and writes COLMAP (text and binary), caliscope's ``camera_array.toml``, aniposelib's TOML, Metashape's
-XML, RealityCapture's XMP and CSV, nerfstudio's ``transforms.json`` and OpenCV's YAML. It also writes a script for
-Blender. Every reader converts its file to an ``eigenhead-cameras/1`` document, and ``rig_from_document`` checks the
+XML, RealityCapture's XMP and CSV, nerfstudio's ``transforms.json`` and OpenCV's YAML. The module also writes a script
+for Blender. Every reader converts its file to an ``eigenhead-cameras/1`` document, and ``rig_from_document`` checks the
 documents of all formats alike. The module of each format cites a description of the file's layout.
 
 In this project and OpenCV the centre of the top-left pixel is (0, 0); in COLMAP, Metashape, RealityCapture and

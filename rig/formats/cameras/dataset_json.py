@@ -1,10 +1,10 @@
 """Writes the JSON files of data sets of views for training by nerfstudio and GaussianAvatars.
 
-Both programs read ``transforms.json`` with the axes and pixel centres of ``rig.formats.cameras.transforms_json``.
-GaussianAvatars (https://github.com/ShenhanQian/GaussianAvatars, dataset_readers) reads one file for each of training,
-validation and test. It assumes square pixels and a central principal point, and needs only the field of view
-``camera_angle_x`` and numbers of cameras and moments (as in https://github.com/ShenhanQian/VHAP). Lengths are in metres
-in the capture's world frame.
+Both nerfstudio and GaussianAvatars read ``transforms.json`` with the axes and pixel centres of
+``rig.formats.cameras.transforms_json``. GaussianAvatars (https://github.com/ShenhanQian/GaussianAvatars,
+dataset_readers) reads one file for each of training, validation and test. GaussianAvatars assumes square pixels and a
+central principal point, and needs only the field of view ``camera_angle_x`` and numbers of cameras and moments (as in
+https://github.com/ShenhanQian/VHAP). Lengths are in metres in the capture's world frame.
 """
 
 import json

@@ -5,7 +5,7 @@ name and kind are checked before the member is written, and bytes are counted wh
 refused, the folder stays empty. Every fault names a member of the archive.
 
 A member's name is decoded as UTF-8 if its bytes are valid UTF-8, because macOS writes UTF-8 without setting the zip
-flag for it. Otherwise it is decoded as code page 437, the default of the zip format. Folders that enclose the capture,
+flag for it. Other names are decoded as code page 437, the default of the zip format. Folders that enclose the capture,
 and files that file managers add, are not written, so their names are checked less strictly.
 
 Known attacks are described at https://www.bamsoftware.com/hacks/zipbomb (overlapping members), CVE-2007-4559 (traversal

@@ -198,7 +198,7 @@ def capture_root(folder: Path) -> Path:
 def check_folders(folder: Path, rig: Rig) -> None:
     """Raises InputError for folders with names similar to those of the format, such as "backgrounds".
 
-    If such a folder were ignored, clean plates or all pictures would be missing."""
+    If a misnamed folder were ignored, clean plates or all pictures would be missing."""
     kinds = ("images", *BESIDE_PICTURES)
     folders = [path.name for path in sorted(folder.iterdir()) if path.is_dir()]
     others = {name.casefold(): name for name in folders if not {name, name.lower()} & {*kinds, *rig.names}}

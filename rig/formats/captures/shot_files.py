@@ -1,10 +1,10 @@
 """Finds each camera's picture, mask and clean plates in a capture folder.
 
 A file with the name of a camera belongs to that camera. If a camera has no such file, a similar name is accepted if it
-fits only one camera (``rig.formats.pictures.picture_names``). Otherwise the camera body's serial number in the file
-decides. The number is EXIF's BodySerialNumber (CIPA DC-008, tag 0xA431), for Canon's CR3 in its box CMT2, or DNG's
-CameraSerialNumber (0xC62F). Files may also lie in a folder with the camera's name, and all folders in one enclosing
-folder."""
+fits only one camera (``rig.formats.pictures.picture_names``). If no name matches, the camera body's serial number in
+the file decides. The number is EXIF's BodySerialNumber (CIPA DC-008, tag 0xA431), for Canon's CR3 in its box CMT2, or
+DNG's CameraSerialNumber (0xC62F). Files may also lie in a folder with the camera's name, and all folders in one
+enclosing folder."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence

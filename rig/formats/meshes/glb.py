@@ -1,10 +1,10 @@
 """Writes binary glTF files with meshes, vertex colours or textures, morph targets, and nodes at the pivots of parts.
 The library trimesh is not used, because its output differs between versions.
 
-If a scene has pivots, the top node is ``neck``, at the joint of skull and spine. Its child nodes are the parts that
-turn with the neck, and a node for every other pivot (``jaw``, ``eye_right``, ``eye_left``). A part with the name of a
-pivot is the mesh of the pivot's node. Morph targets are sparse, because an expression moves only a part of the face.
-Their names are in ``extras.targetNames``, where three.js and Blender read them.
+If a scene has pivots, the top node is ``neck``, at the joint of skull and spine. The child nodes of ``neck`` are the
+parts that turn with it, and a node for every other pivot (``jaw``, ``eye_right``, ``eye_left``). A part with the name
+of a pivot is the mesh of the pivot's node. Morph targets are sparse, because an expression moves only a part of the
+face. Their names are in ``extras.targetNames``, where three.js and Blender read them.
 """
 
 import json

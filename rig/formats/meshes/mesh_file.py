@@ -1,7 +1,7 @@
 """Reads meshes of other programs through the library trimesh: PLY, OBJ, GLB and, on request, STL.
 
-trimesh ignores glTF's normalised integers, sparse accessors and compressions without an error. A GLB file that uses one
-of these features is refused, and the message names the feature
+trimesh ignores glTF's normalised integers, sparse accessors and compressions without an error. A GLB file with such
+integers, accessors or compression is refused, and the message names the feature
 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, sections 3.6.2, 3.12).
 """
 

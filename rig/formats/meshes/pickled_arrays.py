@@ -1,8 +1,8 @@
 """Reads arrays from untrusted files: npz files within size limits, and pickles without running code.
 
-Loading a pickle normally imports and calls the classes and functions that it names. This module imports none of them.
-Objects of NumPy, SciPy and chumpy are replaced by harmless stand-in classes that decode plain numbers. A pickle with
-any other name is refused. Pickles of Python 2 are also read.
+Loading a pickle normally imports and calls the classes and functions that it names. This module does not import
+anything that a pickle names. Objects of NumPy, SciPy and chumpy are replaced by harmless stand-in classes that decode
+plain numbers. A pickle with any other name is refused. Pickles of Python 2 are also read.
 """
 
 import io

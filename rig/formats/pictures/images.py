@@ -99,7 +99,7 @@ def read_image(path: Path) -> ImageRgb:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Returns width and height (px) from the header. It does not decode the file, because a small file may claim a huge
+    """Returns width and height (px) from the header. The file is not decoded, because a small file may claim a huge
     size. Raises InputError without a valid header."""
     with _faults_of(path.name):
         return _header_size(path.read_bytes(), path.suffix.lower())[0]

@@ -8,8 +8,8 @@ mask is not mistaken for a subject. Files with other content, such as labels, de
 The subject is white by this project's convention, but black in programs that mark the pixels to ignore. Two criteria
 decide which value is the subject. The background covers all borders of a picture but one, which shows the subject's
 shoulders. The subject covers the middle. A mask is inverted if both criteria say that the subject is black. The
-criteria disagree for a close-up that fills the frame and for a subject beside the middle. Such masks are treated as
-most other masks of the capture.
+criteria disagree for a close-up that fills the frame and for a subject beside the middle. Such undecided masks are
+treated as most other masks of the capture.
 """
 
 from collections.abc import Mapping

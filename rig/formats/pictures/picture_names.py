@@ -128,8 +128,8 @@ def _equal(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
 
 
 def _alike_about(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Matches files whose names have the same words before and after each camera's words. Among several choices of
-    these words, uses the one that fits most cameras."""
+    """Matches files whose names have the same words before and after each camera's words. Uses the words before and
+    after that fit most cameras."""
     fitting: dict[tuple[Words, Words], dict[str, list[str]]] = {}
     for name, words in strays.items():
         for camera, known in cameras.items():

@@ -1,8 +1,8 @@
 """Determines the bit depth of picture files, and detects raw sensor mosaics.
 
-Machine vision software writes 10 or 12 bits into 16-bit files. Without scaling, such pictures are nearly black. Such
-software also writes the sensor's colour filter mosaic as a grey picture, in which a quarter of the pixels is red and a
-quarter blue.
+Machine vision software writes 10 or 12 bits into 16-bit files. Without scaling, such pictures are nearly black. Machine
+vision software also writes the sensor's colour filter mosaic as a grey picture, in which a quarter of the pixels is red
+and a quarter blue.
 
 The module also fills the empty rims of pictures if their clean plates (pictures of the empty studio) have no rims, and
 the reverse. Undistortion leaves an empty rim that is transparent, black or white. In a comparison with a plate without

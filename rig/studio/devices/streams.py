@@ -1,8 +1,8 @@
 """Serves the cameras of the simulated studio as motion-JPEG streams on one HTTP port (on loopback by default).
 
-A stream behaves like a network camera with a trigger input. Its live view at ``fps`` pauses while the trigger box is
-armed. When the trigger input rises, the stream sends one frame at once and then continues the live view. A ``Film``
-holds a camera's pictures, which differ in their noise: some for the live view, others for triggered frames.
+A stream behaves like a network camera with a trigger input. The camera's live view at ``fps`` pauses while the trigger
+box is armed. When the trigger input rises, the stream sends one frame at once and then continues the live view. A
+``Film`` holds a camera's pictures, which differ in their noise: some for the live view, others for triggered frames.
 
 Only the server's event loop changes the state; other threads pass it functions to call (``call_soon_threadsafe``).
 """

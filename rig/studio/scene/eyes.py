@@ -1,8 +1,8 @@
 """Creates a simulated subject's eyeballs, directed by a gaze, with white, limbus, iris, pupil and a reflecting cornea.
 
-An adult's eyeball has a radius of 12 mm. Its cornea has a radius of 7.8 mm, and meets the ball at the limbus of radius
-5.85 mm (visible iris diameter 11.7 mm; Ruefer et al. 2005). At the limbus, the colour changes gradually over some
-tenths of a millimetre. If the mesh of a head closes the eyes with skin, the skin is cut open between the lids.
+An adult's eyeball has a radius of 12 mm. The cornea has a radius of 7.8 mm, and meets the eyeball at the limbus of
+radius 5.85 mm (visible iris diameter 11.7 mm; Ruefer et al. 2005). At the limbus, the colour changes gradually over
+some tenths of a millimetre. If the mesh of a head closes the eyes with skin, the skin is cut open between the lids.
 """
 
 from collections.abc import Mapping

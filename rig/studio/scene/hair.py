@@ -1,8 +1,8 @@
 """Creates hair as meshes: an uneven shell over the scalp, and strands that roughen its outline.
 
-The shell has a vertex in each direction of a grid around the middle of the skull. Its radius is the radius of the head
-plus the thickness of the hair. Beyond the hairline the shell lies below the skin. Further shapes are a sheet that hangs
-down around the neck, a bun on the crown, a full beard, and curls, which are winding ridges on the surface.
+The shell has a vertex in each direction of a grid around the middle of the skull. The shell's radius is the radius of
+the head plus the thickness of the hair. Beyond the hairline the shell lies below the skin. Further shapes are a sheet
+that hangs down around the neck, a bun on the crown, a full beard, and curls, which are winding ridges on the surface.
 """
 
 from dataclasses import dataclass
@@ -239,7 +239,7 @@ def grow_beard(head: Mesh, body: Anatomy, style: HairStyle, rng: np.random.Gener
 
 
 def beard_share(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
-    """Returns the density (0 to 1) of a beard at each vertex. It covers jaw, chin and upper lip up to the ears."""
+    """Returns the density (0 to 1) of a beard at each vertex. Beards grow on jaw, chin and upper lip."""
     marks, (x, y, z) = body.landmarks, vertices.T
     mouth, ears = marks["stomion"], body.ears
     across = (x - mouth[0]) / body.half_breadth

@@ -42,8 +42,8 @@ def skin_paint(
 
 
 def oily_zones(vertices: Vertices, body: Anatomy) -> Float[np.ndarray, " v"]:
-    """Returns the oiliness (0 to 1) of the skin at each vertex. It is highest on forehead, nose, cheeks and chin, and
-    constant if landmarks are unknown."""
+    """Returns the oiliness (0 to 1) of the skin at each vertex. The skin is oiliest on forehead, nose, cheeks and chin.
+    Without landmarks, the oiliness is constant."""
     marks = body.landmarks
     if not marks:
         return np.full(len(vertices), DRY)

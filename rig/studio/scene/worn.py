@@ -225,7 +225,7 @@ def shirt(
 def _rings(
     vertices: Float[np.ndarray, "v 3"], collar_y: float, axis: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "r c 3"]:
-    """Returns the rings of a shirt's vertices (mm) from the collar down. Each encloses the neck and the ring above."""
+    """Returns the rings of a shirt's vertices (mm) from the collar down. Each ring encloses the ring above."""
     angle = np.arange(CLOTH_COLUMNS) * 2 * np.pi / CLOTH_COLUMNS
     across, ahead = np.sin(angle), np.cos(angle)
     rings, reach = [], np.zeros(CLOTH_COLUMNS)

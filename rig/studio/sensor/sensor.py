@@ -68,7 +68,7 @@ def expose(light: Float[np.ndarray, "h w 3"], sensor: Sensor, rng: np.random.Gen
 
 
 def through_mosaic(light: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Simulates a Bayer sensor with red at the first pixel. Each pixel keeps one channel; OpenCV interpolates the other
+    """Simulates a Bayer sensor with red at the first pixel. A pixel measures one channel; OpenCV interpolates the other
     channels along edges. Returns float32."""
     codes = np.rint(65535.0 * np.clip(light, 0.0, 1.0)).astype(np.uint16)
     bayer = codes[:, :, 1].copy()
