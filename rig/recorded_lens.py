@@ -35,7 +35,7 @@ class RecordedLens:
     skew: float = 0.0
 
     def distorted(self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 2"]:
-        """Converts pixels of the undistorted picture to the recorded picture. ``matrix`` is the camera matrix."""
+        """Converts pixels of the undistorted picture to pixels of the file. ``matrix`` is the camera matrix."""
         import cv2  # here and below: 0.1 s that most starts do without
 
         rays = np.ones((len(pixels), 3))
@@ -51,7 +51,7 @@ class RecordedLens:
     def undistorted(
         self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]
     ) -> Float[np.ndarray, "n 2"]:
-        """Converts pixels of the recorded picture to the undistorted picture. ``matrix`` is the camera matrix."""
+        """Converts pixels of the file to pixels of the undistorted picture. ``matrix`` is the camera matrix."""
         import cv2
 
         straight = pixels - np.outer(_rows(pixels, matrix), [self.skew * matrix[0, 0], 0.0])
@@ -69,7 +69,7 @@ class RecordedLens:
         """Returns the picture that a pinhole with camera matrix ``matrix`` would have taken. ``smooth`` interpolates;
         masks with hard edges need ``smooth=False``.
 
-        Pixels outside the recorded picture become black."""
+        Pixels outside the picture in the file become black."""
         import cv2
 
         across, down = _maps(self, (picture.shape[1], picture.shape[0]), tuple(matrix.ravel().tolist()))

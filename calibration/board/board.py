@@ -2,9 +2,9 @@
 
 The board frame is right-handed and matches OpenCV's. The frame's origin is the outer corner of the first square. The x
 axis runs along a row of squares, y down a column, and z *into* the board (away from the viewer). The first square is
-black. The first square is white if the board is ``inverted``. It is also white if a ChArUco board with an even number
-of rows is ``legacy``, as drawn by OpenCV before 4.6 and calib.io. The term corner means an inner corner; corners are
-numbered row by row.
+normally black. The first square of an ``inverted`` board is white. The first square is also white if a ChArUco board
+with an even number of rows is ``legacy``, as drawn by OpenCV before 4.6 and calib.io. The term corner means an inner
+corner; corners are numbered row by row.
 """
 
 import tomllib
@@ -232,7 +232,7 @@ def _paper(width: float, height: float) -> tuple[float, float]:
 
 
 def _rectangles(board: Board) -> list[tuple[float, float, float, float, bool]]:
-    """Returns x, y, width, height (mm) and whether it is white for each rectangle of the print, in drawing order."""
+    """Returns x, y, width and height (mm) of each printed rectangle, and whether it is white, in drawing order."""
     side = board.square_mm
     paint = board.inverted  # white squares on black paper, or black on white
     squares = [

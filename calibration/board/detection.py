@@ -347,8 +347,8 @@ def _explain_charuco(grey: np.ndarray, board: Board) -> Message | None:
 
 
 def explain_markers(pictures: Sequence[Markers], board: Board) -> Message | None:
-    """Explains from the markers in pictures how the visible board differs from ``board``. Returns None if it does
-    not."""
+    """Explains from the markers in pictures how the visible board differs from ``board``. Returns None if both
+    agree."""
     layout = find_layout(pictures, board)
     if layout is None:
         if any(map(is_april_grid, pictures)):

@@ -92,7 +92,7 @@ class SceneCalibration:
 
 
 def judge_scene(calibration: SceneCalibration) -> Verdict:
-    """Judges a calibration by its worst camera. If the scale is assumed or a view excluded, it is at best usable."""
+    """Judges a calibration by its worst camera, and at best as usable with an assumed scale or an excluded view."""
     sigma = dict(zip(calibration.rig.names, calibration.uncertainty.pose_sigma_px, strict=True))
     poor = [name for name, px in sigma.items() if px > POSE_POOR_PX]
     loose = [name for name, px in sigma.items() if POSE_GOOD_PX < px <= POSE_POOR_PX]

@@ -1,8 +1,9 @@
 """Computes the scale of a scene, whose unit of length is arbitrary, from a known length or from the mean size of heads.
 
-The file ``scale.json`` states a known length. Without it, the face in the photographs is assumed to have a mean adult's
-size. If no two views show a face, the scene points near the cameras' optical axes are assumed to be a head of the head
-model's mean size. Hair, the neck and furniture make this second assumption less accurate. Reports mark assumed scales.
+The file ``scale.json`` states a known length. Without a known length, the face in the photographs is assumed to have a
+mean adult's size. If no two views show a face, the scene points near the cameras' optical axes are assumed to be a head
+of the head model's mean size. Hair, the neck and furniture then make the scale less accurate. Reports mark assumed
+scales.
 
 A known length also converts cameras from another program, whose unit is unknown, to millimetres. If the cameras agree
 with the length within its uncertainty, they are not changed, because they may come from a more precise board.

@@ -131,7 +131,7 @@ def _whose_view(name: str, image: ImageRgb, registration: Registration, plates: 
 
 
 class PlatesRefused(ShotFailed):
-    """Reports that new clean plates show a person. The old plates stay in use; ``version`` stores the new ones."""
+    """Reports that new plates show a person. The old plates stay in use; the new plates are stored as ``version``."""
 
     def __init__(self, faults: Sequence[Fault], version: str) -> None:
         super().__init__(faults)

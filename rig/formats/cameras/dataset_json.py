@@ -45,7 +45,7 @@ LAYOUTS: dict[DatasetFormat, DatasetLayout] = {
 
 
 def picture_names(rig: Rig, form: DatasetFormat) -> dict[str, str]:
-    """Returns, by camera, the file name of its picture, which its mask shares."""
+    """Returns, by camera, the common file name of the camera's picture and mask."""
     if form == "nerfstudio":
         return {name: f"{name}.png" for name in rig.names}
     return {name: f"{MOMENT:05}_{index:02}.png" for index, name in enumerate(rig.names)}

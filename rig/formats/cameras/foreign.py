@@ -1,7 +1,7 @@
-"""Provides functions that all readers of other programs' camera files use. These functions parse damaged files, name
+"""Provides functions that all readers of other programs' camera files use. These functions report damaged files, name
 cameras, convert lenses and poses, and collect faults. The module also recognises camera files that no reader supports.
-If a capture has no readable cameras, the program estimates the cameras from the photographs, and a message names such
-unread files."""
+If a capture has no readable cameras, the program estimates the cameras from the photographs, and a message names the
+unread camera files."""
 
 import csv
 import re

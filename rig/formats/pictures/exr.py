@@ -1,6 +1,7 @@
 """Writes OpenEXR pictures of linear light in half precision, with lossless compression (ZIP, 16 rows in a block).
 
-The format is described at https://openexr.com/en/latest/OpenEXRFileLayout.html. No library of this project writes it.
+The format is described at https://openexr.com/en/latest/OpenEXRFileLayout.html. No library of this project writes
+OpenEXR.
 """
 
 import struct

@@ -156,7 +156,7 @@ def cut_out_alpha(path: Path) -> Plane | None:
 
     Returns None if the file has no alpha channel, is too large or damaged, or if the opaque part cannot be a subject. A
     subject is in the middle, and at least the fraction ``CUT_AWAY_LEAST`` of the picture around it is transparent.
-    Rounded corners and empty rims of undistorted pictures are smaller."""
+    Rounded corners and empty rims of undistorted pictures are smaller than this fraction."""
     data, suffix = path.read_bytes(), path.suffix.lower()
     if data.startswith(PNG):
         if len(data) <= PNG_COLOUR_TYPE or data[PNG_COLOUR_TYPE] not in PNG_WITH_ALPHA:

@@ -229,7 +229,7 @@ def subject_convention(
 def inverted_masks(
     masks: Mapping[str, Bool[np.ndarray, "_ _"]], middles_px: Mapping[str, Float[np.ndarray, " 2"]]
 ) -> list[str]:
-    """Returns the names of the masks whose subject is black. An undecided mask counts as most other masks do.
+    """Returns the names of the masks whose subject is black. An undecided mask is interpreted as most other masks are.
 
     Args:
         masks: by camera, True where they are white.

@@ -64,7 +64,7 @@ def entry(folder: Path, name: str) -> Path:
 
 
 def has_raw_beside(path: Path) -> bool:
-    """Returns whether the RAW file of the same picture is in the same folder. If so, the RAW file is read instead."""
+    """Returns whether the RAW file of a picture lies in the same folder, so that the RAW file is read instead."""
     if path.suffix.lower() not in IMAGE_SUFFIXES or path.suffix.lower() in RAW_SUFFIXES:
         return False
     return any(path.with_suffix(cased).is_file() for end in RAW_SUFFIXES for cased in (end, end.upper()))
