@@ -83,13 +83,13 @@ class CameraFeed:
             )
 
     def wait_opened(self, deadline_s: float) -> bool:
-        """Waits until the camera is open. Returns whether it is, and returns at once if opening failed."""
+        """Waits until the camera is open or opening has failed. Returns whether the camera is open."""
         with self._changed:
             self._changed.wait_for(lambda: self._opened or self._error is not None, _left(deadline_s))
             return self._opened
 
     def wait_frames(self, count: int, deadline_s: float) -> bool:
-        """Waits until the camera has delivered ``count`` frames since it was opened. Returns whether it has."""
+        """Waits until the camera has delivered ``count`` frames since it was opened. Returns False at the deadline."""
         with self._changed:
             self._changed.wait_for(lambda: self._count >= count, _left(deadline_s))
             return self._count >= count

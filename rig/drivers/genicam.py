@@ -2,7 +2,7 @@
 
 In rig.toml, ``identity`` is the serial number, or the device's id or MAC address as `arv-tool-0.8` lists them. With
 ``trigger = "external"`` the camera waits for a signal on its input Line1, with ``"software"`` for a command. With
-``"free"`` it takes ``fps`` pictures a second.
+``"free"`` the camera takes ``fps`` pictures a second.
 
 The module calls the library through ctypes, because PyGObject would have to be compiled in every virtual environment.
 The functions' signatures are from https://aravisproject.github.io/aravis/aravis-stable/.
@@ -137,7 +137,7 @@ class Aravis:
 
 @cache
 def library() -> Aravis:
-    """Loads the library at the first call. Raises OSError if libaravis is not installed."""
+    """Returns the library, which the first call loads. Raises OSError if libaravis is not installed."""
     return Aravis()
 
 
@@ -198,7 +198,7 @@ class GenicamDriver:
         raise GrabTimeout(self._camera, timeout_s)
 
     def retrieve(self) -> ImageRgb:
-        """Decodes the frame of the last ``grab``. Raises CameraLost if there is none, and DriverError for an unknown
+        """Decodes the frame of the last ``grab``. Raises CameraLost without a frame, and DriverError for an unknown
         pixel format."""
         if self._buffer is None:
             raise CameraLost(self._camera, compose("no-frame-grabbed"))

@@ -277,7 +277,7 @@ class VideoCaptureDriver(FreeDriver):
         self._capture = capture
 
     def configure(self) -> tuple[Message, ...]:
-        """Applies the settings of rig.toml. Returns one message for each setting that the device changed by more than 5
+        """Applies the settings of rig.toml. Returns one message for each setting that the device changed by over 5
         %."""
         capture = self._opened()
         unmet = [

@@ -4,9 +4,9 @@
 The module also draws a model's silhouettes, and computes their boundary-weighted XOR with the input silhouettes
 (section 4.3, eqs. 4 and 5). One instanced draw call draws the silhouettes of all cameras to one shared texture. The sum
 of ``w |S - Sm|`` is computed in two steps. The GPU adds the pixels of each block of 8 x 8 in single precision, in a
-fixed order. The CPU adds the blocks' sums in double precision. So the relative error of a cost is below 64 * 2^-24 =
-4e-6, equal masks cost exactly 0, and the same input always gives the same cost. Blocks that the model cannot cover get
-the cost of an empty model.
+fixed order. The CPU adds the blocks' sums in double precision. Therefore the relative error of a cost is below 64 *
+2^-24 = 4e-6, equal masks cost exactly 0, and the same input always gives the same cost. Blocks that the model cannot
+cover get the cost of an empty model.
 
 On two cores with Mesa's llvmpipe, eleven views of 512 x 384 pixels and 4,900 triangles take 8 ms to draw and 2 ms to
 add. Atomic additions, a compute shader and mipmaps were not faster.
@@ -128,7 +128,7 @@ class _Surface:
 
 
 class SilhouetteSet:
-    """Draws silhouettes of one mesh many times, while only its vertices change. Close it after use."""
+    """Draws silhouettes of one mesh many times, while only its vertices change. Callers must close it."""
 
     def __init__(self, context: GlContext, rig: Rig, faces: Int[np.ndarray, "f 3"]) -> None:
         """Prepares cameras and triangles. Silhouettes are drawn at the image size of ``rig``."""
@@ -194,7 +194,7 @@ class SilhouetteSet:
                 self._empty_sums.append(sums[:, :, 0])
 
     def xor_costs(self, vertices_world: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " k"]:
-        """Returns the cost ``sum w |S - Sm|`` of each camera, in the order of the rig. Needs ``set_inputs``."""
+        """Returns the cost ``sum w |S - Sm|`` of each camera, in the order of the rig. Call ``set_inputs`` first."""
         if not self._empty_sums:
             raise InputError("xor_costs", [compose("no-input-silhouettes")])
         costs = np.zeros(len(self.rig))
@@ -293,7 +293,7 @@ def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
 
 
 def check_images(rig: Rig, images: Mapping[str, np.ndarray], kind: str) -> None:
-    """Raises InputError for a missing image or one that is not of the camera's size. ``kind`` names the images."""
+    """Raises InputError unless each camera has an image of its size. ``kind`` names the images in messages."""
     faults = []
     for camera in rig:
         wanted = (camera.intrinsics.height, camera.intrinsics.width)

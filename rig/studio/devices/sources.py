@@ -32,7 +32,7 @@ class SceneImages:
     """Takes pictures of a static scene with or without the subject. Every picture has different noise. Any thread may
     call it.
 
-    In pictures with the subject, the light differs from that in the empty studio by the drift in the scene's preset.
+    The light differs between pictures with and without the subject by the drift in the scene's preset.
     """
 
     def __init__(self, scene: Scene, *, seated: bool, seed: int = 0) -> None:

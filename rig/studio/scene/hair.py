@@ -46,8 +46,8 @@ HAIRLINE_OVER_EARS = np.array([(-200, -55), (-40, -52), (-10, -38), (22, -34), (
 
 @dataclass(frozen=True, slots=True)
 class HairStyle:
-    """Describes a hair style. ``fringe_mm`` is the distance by which the hairline reaches down over the forehead. The
-    value 0 means no curls, no hanging hair, or no bun."""
+    """Describes a hair style. ``fringe_mm`` is the distance by which the hairline reaches down over the forehead.
+    Curls, hanging hair and bun are absent if their size is 0."""
 
     thickness_mm: float = 14.0
     over_ears: bool = False
