@@ -15,8 +15,8 @@ is no point of the subject. Extrema are paired by their angles, so the cameras m
 ``GATE_PX``.
 
 The rims of a head fitted to one capture give normal equations for the head's shape, the head's pose and the cameras
-(``pipeline.contour_fit.contour``). The Schur complement eliminates shape and pose, so that their uncertainty is taken
-into account. The remaining equations for the cameras are added over all captures."""
+(the paper's section 4.4, ``pipeline.contour_fit.contour``). The Schur complement eliminates shape and pose, so that
+their uncertainty is taken into account. The remaining equations for the cameras are added over all captures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
