@@ -55,7 +55,7 @@ _SHOT_BOUNDS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraConfig:
-    """Holds one table [[cameras]] of rig.toml. The program does not change omitted settings of the camera."""
+    """Holds one table [[cameras]] of rig.toml. The program keeps omitted settings of the camera."""
 
     name: str  # as in cameras.json
     driver: DriverName
@@ -80,8 +80,8 @@ class CameraConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TriggerConfig:
-    """Holds the table [trigger] of rig.toml for the box that releases all cameras. ``port`` is a path in
-    /dev/serial/by-id, or a link made by a udev rule."""
+    """Holds the table [trigger] of rig.toml, for the box that releases all cameras. ``port`` is a path in
+    /dev/serial/by-id or a udev link."""
 
     port: str  # serial port of the box
     baud: int = 115200  # bits a second on the port
@@ -91,7 +91,7 @@ class TriggerConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightsConfig:
-    """Holds the table [lights] of rig.toml: the light outputs of the trigger box that are on during a shot."""
+    """Holds the table [lights] of rig.toml: light outputs of the trigger box that are on during a shot."""
 
     outputs: tuple[int, ...] = ()  # numbers on the box
     settle_s: float = 0.3  # halogen and LED drivers reach their level well within it
@@ -100,7 +100,7 @@ class LightsConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShotConfig:
-    """Holds the table [shot] of rig.toml: waiting times, and the limits that decide whether a shot has a fault."""
+    """Holds the table [shot] of rig.toml: waiting times, and limits that decide whether a shot is faulty."""
 
     timeout_s: float = 2.0  # from the trigger until a camera's frame must be there
     open_timeout_s: float = 10.0  # until a camera must be open
