@@ -1,1 +1,1 @@
-"""Calibrates a rig from pictures of a board, refines it by silhouettes, and checks it."""
+"""Estimates a rig's cameras from pictures of a board or a scene, refines them by silhouettes, and checks them."""

@@ -60,15 +60,13 @@ def calibrate(
     workers: int = 2,
     report: Progress = discard_progress,
 ) -> Calibration:
-    """Calibrates the cameras of ``IMAGES/<camera>/<shot>.<ext>``. Pictures with the same shot name must be
-    simultaneous.
+    """Calibrates cameras from pictures ``IMAGES/<camera>/<shot>.<ext>``. Pictures of one shot name are simultaneous.
 
-    ``images``: the folder IMAGES. ``board``: the calibration board. ``front``: the camera that the subject faces; None
-    takes the middle one. ``previous``: the rig's last calibration, against which names, layout, scale and lenses are
-    checked. ``cache``: folder for detections, by the pictures' content. ``workers``: processes that search the
-    pictures. ``report``: progress.
+    ``images`` is the folder IMAGES. ``front`` is the camera that the subject faces; None selects the middle camera.
+    ``previous`` is the rig's last calibration, with which names, layout, scale and lenses are compared. The folder
+    ``cache`` stores detected corners by the pictures' content. ``workers`` is the number of processes.
 
-    Raises InputError for damaged pictures, and WrongBoard, PoseGraphError or CalibrationRefused, with a remedy.
+    Raises InputError for damaged pictures, and WrongBoard, PoseGraphError or CalibrationRefused with a remedy.
     """
     detections = detect_folder(images, board, cache=cache, workers=workers, report=report)
     calibration = calibrate_detections(detections, front=front, previous=previous, report=report)
@@ -83,7 +81,7 @@ def calibrate_detections(
     previous: Rig | None = None,
     report: Progress = discard_progress,
 ) -> Calibration:
-    """Calibrates from detected corners, as ``calibrate`` does from pictures. It reads no file."""
+    """Calibrates cameras from detected corners, without reading a file."""
     detected = detections.corner_count
     report("lenses", 0.0)
     detections, dropped = drop_blurred(detections)
@@ -135,7 +133,7 @@ def _refuse_blind_cameras(detections: Detections, dropped: Sequence[Dropped]) ->
 
 
 def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], report: Progress) -> _Fit:
-    """Repeats the bundle adjustment until no observation contradicts it."""
+    """Repeats the bundle adjustment without contradictory views until no view contradicts the result."""
     names, noise = graph.names, np.array([lenses[name].noise_px for name in graph.names])
     weak = weak_prior([detections.sizes[name] for name in names])
     dropped = list(_explain(graph.strays, graph, graph.state(lenses), detections, float(np.median(noise))))
@@ -178,7 +176,7 @@ def _finish(
     dropped: tuple[Dropped, ...],
     report: Progress,
 ) -> _Fit:
-    """Removes single corners, fits with Huber's cost, and adds time offsets if they reduce the residuals."""
+    """Removes outlying corners, adjusts with Huber's loss, and adds time offsets if they reduce the residuals."""
     names = graph.names
     contradicting = _contradicting_cameras(names, views, dropped)
     if contradicting:
@@ -223,7 +221,7 @@ def _finish(
 
 
 def _take_shots(state: BundleState, shots: Sequence[str], used: set[str]) -> tuple[BundleState, tuple[str, ...]]:
-    """Returns the state of the ``used`` shots alone, and their names in order."""
+    """Returns the state without shots other than ``used``, and the names of these shots in order."""
     at = [index for index, shot in enumerate(shots) if shot in used]
     boards = state.board_rotations[at], state.board_translations[at]
     state = replace(state, board_rotations=boards[0], board_translations=boards[1], velocities=state.velocities[at])
@@ -231,8 +229,8 @@ def _take_shots(state: BundleState, shots: Sequence[str], used: set[str]) -> tup
 
 
 def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped: Sequence[Dropped]) -> list[Message]:
-    """Returns a reason for each camera that has no view left, or more contradictory views than valid ones. (A mirrored
-    camera can agree with the others in any single shot.)"""
+    """Returns a message for each camera with more excluded views than valid views. A mirrored camera may have this
+    fault, because it can agree with other cameras in any single shot."""
     left, lost = Counter(view.camera for view in views), Counter(drop.camera for drop in dropped)
     return [
         compose("views-contradict", camera=name, count=lost[name], all=lost[name] + left[name])
@@ -244,10 +242,9 @@ def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped:
 def _prior(
     weak: LensPrior, names: Sequence[str], lenses: dict[str, Lens], noise: Float[np.ndarray, " c"], sigma: np.ndarray
 ) -> LensPrior:
-    """Returns the prior on each camera's lens: ``weak`` combined with the estimate from that camera's own views. If
-    views have errors as a whole (their moments differ), the joint fit overestimates the noise of corners, and would
-    bend the lenses to explain the rest. The prior's weight is the fraction of the noise that the corners of one
-    view share."""
+    """Returns the prior of each camera's lens: ``weak`` combined with the estimate from that camera's views alone. If
+    cameras were not simultaneous, all corners of a view share an error, which the joint fit would explain by wrong
+    lenses. The weight of the separate estimate is the fraction of the noise that the corners of one view share."""
     share = 1.0 - noise**2 / sigma**2
     mean = np.stack([lenses[name].intrinsics.values() for name in names])
     information = np.stack([np.linalg.inv(lenses[name].covariance) for name in names])
@@ -330,11 +327,11 @@ def _covariances(
     fit: _Fit, rig: Rig
 ) -> tuple[Float[np.ndarray, "p p"], dict[str, Float[np.ndarray, " 9"]], Float[np.ndarray, " c"]]:
     """Returns the poses' joint covariance in the subject's gauge, standard deviations of the intrinsics, and the effect
-    of both in pixels at the subject. The covariance of the poses includes the uncertainty of the lenses
-    (``effective_pose``), because a fit treats the intrinsics as exact.
+    of both on the subject's image (px). The covariance of the poses includes the uncertainty of the lenses
+    (``effective_pose``), because a later fit treats the intrinsics as exact.
 
-    Corners of one view share an error if moments differ or the board bends. So the covariance for independent corners
-    is multiplied by a factor: the scatter of the views' means, relative to that expected from independent corners."""
+    Corners of one view share an error if cameras were not simultaneous or the board bends. The covariance for
+    independent corners is therefore multiplied by the factor ``_design_effect``."""
     full = fit.solution.covariance() * _design_effect(fit)
     cameras = len(fit.names)
     block = full[: cameras * PER_CAMERA, : cameras * PER_CAMERA].reshape(cameras, PER_CAMERA, cameras, PER_CAMERA)
@@ -348,7 +345,7 @@ def _covariances(
 
 
 def _design_effect(fit: _Fit) -> float:
-    """Returns the variance of the views' mean residuals divided by that for independent corners, at least 1."""
+    """Returns the variance of the views' mean residuals divided by its value for independent corners, at least 1."""
     misses = residuals(fit.solution.state, fit.seen)
     counts = np.bincount(fit.seen.view_of, minlength=len(fit.seen.camera))
     filled = counts > 0
@@ -359,7 +356,7 @@ def _design_effect(fit: _Fit) -> float:
 
 
 def _misses(fit: _Fit) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Returns, for each view, the numbers, pixels and residuals of its used corners."""
+    """Returns the numbers, pixels and residuals (px) of the used corners of each view."""
     every = residuals(fit.solution.state, fit.seen)
     table, first = {}, 0
     for index, view in enumerate(fit.views):

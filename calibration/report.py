@@ -63,7 +63,7 @@ def _checks(calibration: Calibration) -> str:
 
 
 def listed(title: str, lines: Iterable[Message | str]) -> str:
-    """Returns an HTML list with a heading; empty if there are no lines."""
+    """Returns an HTML list with a heading, or an empty text without lines."""
     items = "".join(f"<li>{escape(str(line))}</li>" for line in lines)
     return f"<h2>{title}</h2><ul>{items}</ul>" if items else ""
 
@@ -99,7 +99,7 @@ def _offsets(calibration: Calibration) -> str:
 
 
 def _parameter_table(calibration: Calibration) -> str:
-    """Tabulates parameters and standard deviations: lens, then pose (left perturbation; subject's gauge)."""
+    """Returns an HTML table of each camera's lens and pose with standard deviations (in the subject's gauge)."""
     head = ("camera", *INTRINSICS, "turn x y z, mrad", "shift x y z, mm")
     rows = []
     for camera in calibration.rig:
@@ -118,7 +118,7 @@ def _parameter_table(calibration: Calibration) -> str:
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Returns an HTML table. Cells of ``rows`` are already markup."""
+    """Returns an HTML table. The cells of ``rows`` are HTML and are not escaped."""
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><tr>{top}</tr>{body}</table>"

@@ -1,4 +1,4 @@
-"""Defines the result of a calibration: the rig with its covariances, and the figures and checks behind it."""
+"""Defines the result of a calibration: the rig with its covariances, residuals and checks."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ CELLS = (4, 3)  # of a picture, across and down
 
 
 class CalibrationRefused(EigenheadError):
-    """Reports that the pictures were readable but determine no usable rig. ``calibration`` is there for the report."""
+    """Reports that the pictures were readable but determine no usable rig. The report page shows ``calibration``."""
 
     def __init__(self, reasons: Iterable[Message | str], calibration: "Calibration | None" = None) -> None:
         self.reasons = tuple(message_of(reason) for reason in reasons)
@@ -33,13 +33,13 @@ class CalibrationRefused(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Calibration:
-    """Holds a calibrated rig with its evidence. Covariances are in the gauge of ``calibration.adjustment.gauge``.
+    """Holds a calibrated rig. Covariances are in the gauge of ``calibration.adjustment.gauge``.
 
     Attributes:
         rig: the cameras, each with the covariance of its pose.
-        pose_sigma_px: the size of that covariance at the subject, by camera; the lenses' uncertainty is part of it.
+        pose_sigma_px: the effect of that covariance on each camera's image of the subject, uncertain lenses included.
         intrinsics_sigma: standard deviations of fx fy cx cy k1 k2 p1 p2 k3, by camera.
-        misses: for each camera and shot, the used corners' numbers, pixels, and projected less detected pixels.
+        misses: numbers, pixels and residuals (projected minus detected, px) of the used corners of each view.
     """
 
     rig: Rig
@@ -58,9 +58,9 @@ class Calibration:
     warnings: tuple[Message, ...]
 
     def figures(self) -> dict[str, Any]:
-        """Returns the numbers of ``calibrate --json``. ``sync_px`` is the part of the corners' noise that all cameras
-        share, a sign that they were not simultaneous. Of each camera: reprojection errors in the joint solution and by
-        its own lens alone (RMS, px), and the share of the picture with corners, among others."""
+        """Returns the numbers that ``calibrate --json`` prints. ``sync_px`` is the corner noise that all cameras share;
+        a large value suggests that they were not simultaneous. Each camera has its reprojection error (RMS, px) in the
+        joint solution and in its separate calibration, among others."""
         everything = np.concatenate([miss for _, _, miss in self.misses.values()])
         cameras = {}
         for camera in self.rig:
@@ -84,7 +84,7 @@ class Calibration:
         }
 
     def _covered(self, camera: Camera) -> float:
-        """Returns the fraction of the picture's cells with at least one corner."""
+        """Returns the fraction of cells in a grid over the picture that contain a corner."""
         size = (camera.intrinsics.width, camera.intrinsics.height)
         pixels = np.concatenate(
             [observed for (name, _), (_, observed, _) in self.misses.items() if name == camera.name]
@@ -93,7 +93,7 @@ class Calibration:
         return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
 
     def verdict(self) -> Verdict:
-        """Judges whether the calibration is usable, and what it lacks."""
+        """Returns the verdict on the calibration: good, usable or poor, with possible improvements."""
         cameras = self.figures()["cameras"]
         evidence = {
             name: CameraEvidence(c["views"], c["focal_share"], c["pose_sigma_px"], c["covered"])
@@ -102,8 +102,8 @@ class Calibration:
         return judge(evidence, self.checks)
 
     def document(self) -> dict[str, Any]:
-        """Returns ``calibration.json``: everything but the residuals, as JSON types. ``passed`` of a check is null if
-        there was nothing to check against; ``camera`` of a view that was left out is null for a whole shot."""
+        """Returns the content of ``calibration.json``: everything but the residuals. ``passed`` is null for a check
+        that lacked data; ``camera`` is null for a shot that was excluded as a whole."""
         names = self.rig.names
         offsets = None
         if self.offsets is not None:

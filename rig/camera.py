@@ -1,7 +1,8 @@
-"""Models a calibrated camera: a pinhole with Brown-Conrady distortion, and its pose.
+"""Models a calibrated camera: a pose and a pinhole projection with Brown-Conrady distortion.
 
-``x = X / Z`` in the camera frame is distorted to ``x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + tangential`` (OpenCV's
-order k1 k2 p1 p2 k3), and ``u = fx x_d + cx``. Pixel (0, 0) is the centre of the top-left pixel."""
+A point (X, Y, Z) in the camera frame has ``x = X / Z``, distorted to ``x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) +
+tangential``, and the pixel ``u = fx x_d + cx``. Coefficients have OpenCV's order k1 k2 p1 p2 k3. Pixel (0, 0) is the
+centre of the top-left pixel."""
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -18,8 +19,7 @@ Points = Float[np.ndarray, "n 3"]
 
 @lru_cache(maxsize=1024)  # needed at every projection; the roots of a cubic cost more than projecting a point
 def _turning_radius(k1: float, k2: float, k3: float) -> float:
-    """Returns the radius at which the radial model ``r (1 + k1 r^2 + k2 r^4 + k3 r^6)`` stops growing; infinity if it
-    never does."""
+    """Returns the radius at which the radial model ``r (1 + k1 r^2 + k2 r^4 + k3 r^6)`` stops growing, or infinity."""
     cubic = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     squares = cubic.real[(np.abs(cubic.imag) < 1e-12) & (cubic.real > 0)]
     return float(np.sqrt(squares.min())) if len(squares) else np.inf
@@ -27,7 +27,7 @@ def _turning_radius(k1: float, k2: float, k3: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Distortion:
-    """Holds Brown-Conrady coefficients. https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html"""
+    """Holds Brown-Conrady coefficients, as defined at https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -37,16 +37,16 @@ class Distortion:
 
     @property
     def is_zero(self) -> bool:
-        """Tells whether all coefficients are 0."""
+        """Returns whether all coefficients are 0."""
         return not (self.k1 or self.k2 or self.p1 or self.p2 or self.k3)
 
     def opencv(self) -> Float[np.ndarray, " 5"]:
-        """Returns k1 k2 p1 p2 k3, OpenCV's order."""
+        """Returns k1 k2 p1 p2 k3, in OpenCV's order."""
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
     def max_valid_radius(self) -> float:
-        """Returns the radius (of ``X / Z``) up to which distortion is one to one; beyond it the radial model maps
-        points back inwards."""
+        """Returns the radius, in units of ``X / Z``, up to which the distortion is one-to-one. Beyond the radius, the
+        model maps points back inwards."""
         return _turning_radius(self.k1, self.k2, self.k3)
 
     def apply(self, normalised: Pixels) -> Pixels:
@@ -54,8 +54,8 @@ class Distortion:
         return np.ascontiguousarray(_distorted(normalised.T, self.opencv()).T)
 
     def remove(self, distorted: Pixels) -> Pixels:
-        """Inverts ``apply`` by Newton's method. Returns NaN where no point inside the valid radius maps to the given
-        one."""
+        """Removes the distortion by Newton's method. Returns NaN where no point inside the valid radius is a
+        solution."""
         if self.is_zero:
             return distorted.copy()
         limit = self.max_valid_radius()
@@ -75,8 +75,7 @@ class Distortion:
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """Holds the image size (px) and the projection of one camera: focal lengths and principal point (px), and
-    distortion."""
+    """Holds the image size, focal lengths and principal point of one camera (px), and its distortion."""
 
     width: int
     height: int
@@ -87,7 +86,7 @@ class Intrinsics:
     distortion: Distortion = field(default_factory=Distortion)
 
     def values(self) -> Float[np.ndarray, " 9"]:
-        """Returns fx fy cx cy k1 k2 p1 p2 k3, the argument of ``lens_image``."""
+        """Returns fx fy cx cy (px) k1 k2 p1 p2 k3."""
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion.opencv()])
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -95,12 +94,11 @@ class Intrinsics:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def scaled(self, factor: float) -> "Intrinsics":
-        """Returns the intrinsics for an image scaled by ``factor``: ``u' = (u + 1/2) factor - 1/2``, since pixel
-        centres shift."""
+        """Returns the intrinsics for an image scaled by ``factor``. Pixel u becomes ``(u + 1/2) factor - 1/2``."""
         return self.at_size(round(self.width * factor), round(self.height * factor))
 
     def at_size(self, width: int, height: int) -> "Intrinsics":
-        """Returns the intrinsics for the same image with another number of pixels."""
+        """Returns the intrinsics for the same image resampled to another size (px)."""
         sx, sy = width / self.width, height / self.height
         cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
         return Intrinsics(width, height, self.fx * sx, self.fy * sy, cx, cy, self.distortion)
@@ -110,9 +108,9 @@ class Intrinsics:
 class Camera:
     """Describes a calibrated camera.
 
-    ``covariance`` is that of a left perturbation of ``camera_from_world``: 6 x 6, rotation (rad) then translation (mm).
-    ``recorded`` is the lens of the picture files, if ``intrinsics`` is the pinhole to which they are undistorted.
-    ``serial`` is the serial number of the camera body, from the picture files."""
+    ``covariance`` (6 x 6) is that of a left perturbation of ``camera_from_world``: rotation (rad), then translation
+    (mm). If the reader undistorts the picture files, ``recorded`` is the lens of the files and ``intrinsics`` a
+    pinhole. ``serial`` is the serial number of the camera body, from the picture files."""
 
     name: str
     intrinsics: Intrinsics
@@ -128,18 +126,17 @@ class Camera:
 
     @property
     def axis_world(self) -> Float[np.ndarray, " 3"]:
-        """Returns the unit vector of the camera's viewing direction."""
+        """Returns the unit vector along the optical axis, in the world frame."""
         return self.camera_from_world.rotation[2]
 
     def moved(self, step: Float[np.ndarray, " 6"]) -> "Camera":
-        """Returns the camera after a left perturbation of its pose by a rotation vector (rad) and a translation (mm),
-        in the camera's frame."""
+        """Returns the camera after a left perturbation of its pose: a rotation vector (rad) and a translation (mm) in
+        the camera frame."""
         motion = RigidTransform(rotation_from_vector(step[:3]), step[3:])
         return replace(self, camera_from_world=motion @ self.camera_from_world)
 
     def project(self, points_world: Points) -> Pixels:
-        """Projects world points (mm) to pixels. Returns NaN behind the camera and beyond the distortion's valid
-        radius."""
+        """Projects world points (mm) to pixels. Returns NaN behind the camera and outside the valid radius."""
         return self._image(self.camera_from_world.apply(points_world))
 
     def project_with_jacobian(self, points_world: Points) -> tuple[Pixels, Float[np.ndarray, "n 2 3"]]:
@@ -173,14 +170,14 @@ class Camera:
 def lens_image(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Pixels:
     """Projects points in a camera's frame (mm) to pixels.
 
-    ``lens`` is fx fy cx cy (px) k1 k2 p1 p2 k3, one for all points or one for each. The caller must make sure that the
-    points lie in front of the camera and inside the distortion's valid radius."""
+    ``lens`` is fx fy cx cy (px) k1 k2 p1 p2 k3, for all points or for each point. The points must lie in front of the
+    camera and inside the distortion's valid radius."""
     distorted = np.ascontiguousarray(_distorted(points[:, :2].T / points[:, 2], lens[..., 4:]).T)
     return distorted * lens[..., :2] + lens[..., 2:4]
 
 
 def lens_slopes(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Float[np.ndarray, "n 2 3"]:
-    """Returns the derivatives of ``lens_image`` by the point (px / mm)."""
+    """Returns the derivatives of each pixel of ``lens_image`` by its point (px / mm)."""
     normalised, z = points[:, :2] / points[:, 2:], points[:, 2, None]
     slopes = np.ascontiguousarray(_distortion_slopes(normalised.T, lens[..., 4:])[[0, 1, 1, 2]].T).reshape(-1, 2, 2)
     slopes = lens[..., :2, None] * slopes
@@ -191,7 +188,7 @@ def lens_slopes(points: Points, lens: Float[np.ndarray, "*n 9"]) -> Float[np.nda
 def lens_jacobians(
     points: Points, lens: Float[np.ndarray, "*n 9"]
 ) -> tuple[Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 9"]]:
-    """Returns the derivatives of ``lens_image`` by the point (px / mm) and by the nine values of the lens."""
+    """Returns the derivatives of each pixel of ``lens_image`` by its point (px / mm) and by the nine lens values."""
     normalised, focal = points[:, :2] / points[:, 2:], lens[..., :2, None]
     x, y = normalised.T
     r2 = x * x + y * y
@@ -205,7 +202,7 @@ def lens_jacobians(
 
 
 def _distorted(normalised: Float[np.ndarray, "2 n"], lens: Float[np.ndarray, "*n 5"]) -> Float[np.ndarray, "2 n"]:
-    """Distorts normalised coordinates by the module's equation."""
+    """Distorts normalised coordinates ``X / Z, Y / Z`` by the equation of the module's docstring."""
     (x, y), (k1, k2, p1, p2, k3) = normalised, lens.T
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -216,7 +213,7 @@ def _distorted(normalised: Float[np.ndarray, "2 n"], lens: Float[np.ndarray, "*n
 def _distortion_slopes(
     normalised: Float[np.ndarray, "2 n"], lens: Float[np.ndarray, "*n 5"]
 ) -> Float[np.ndarray, "3 n"]:
-    """Returns the derivative of ``_distorted`` by the normalised coordinates, a symmetric matrix: xx, xy and yy."""
+    """Returns the entries xx, xy and yy of the symmetric matrix of derivatives of ``_distorted`` by the coordinates."""
     (x, y), (k1, k2, p1, p2, k3) = normalised, lens.T
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))

@@ -1,4 +1,4 @@
-"""Defines a capture: one synchronised shot of every camera, in memory."""
+"""Defines a capture: the pictures of one synchronised shot of all cameras, in memory."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -23,12 +23,13 @@ Features = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """Holds the pictures of one shot, and the data read with them.
+    """Holds the pictures of one shot, and the data that were read with the pictures.
 
-    ``images`` are the photographs by camera (RGB), ``backgrounds`` the clean plates, ``masks`` ready-made masks (True =
-    subject). ``soft_masks`` hold the subject's share of each pixel, 0 to 255, for masks with soft edges. ``features``
-    are feature points (px) by landmark and camera. ``digests`` are the sha256 of all files read, ``remarks`` the
-    warnings of the reader. ``texture_sets`` are further photographs by the same cameras, by set and camera."""
+    ``images`` holds the photographs (RGB) by camera, ``backgrounds`` the pictures of the empty studio, and ``masks``
+    the masks from files (True = subject). ``soft_masks`` holds masks with soft edges: the subject's share of each
+    pixel, 0 to 255. ``features`` holds feature points (px) by landmark and camera. ``digests`` holds the SHA-256 of
+    each file, and ``remarks`` the warnings from reading. ``texture_sets`` holds further photographs of the same
+    cameras, by set and camera."""
 
     images: Mapping[str, ImageRgb]
     backgrounds: Mapping[str, tuple[ImageRgb, ...]] = field(default_factory=dict)
@@ -48,7 +49,7 @@ def reassign_images(
     points: Mapping[str, str] = MappingProxyType({}),
     masks: Mapping[str, str] | None = None,
 ) -> Capture:
-    """Returns the capture with some of its images, masks, clean plates and points assigned to other cameras.
+    """Returns the capture with some images, masks, clean plates and feature points assigned to other cameras.
 
     Args:
         pictures: for a camera, the name under which its image is stored now; its pictures in texture sets follow, and
@@ -76,7 +77,7 @@ def reassign_images(
 
 
 def turn_masks(capture: Capture, ways: Mapping[str, tuple[slice, slice]]) -> Capture:
-    """Returns the capture with some masks flipped or turned: ``ways``, by camera, are slices of rows and columns."""
+    """Returns the capture with some masks mirrored or turned by the slices ``ways`` (rows, columns) by camera."""
 
     def turned(masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {n: np.ascontiguousarray(of[ways[n]]) if n in ways else of for n, of in masks.items()}
@@ -85,7 +86,7 @@ def turn_masks(capture: Capture, ways: Mapping[str, tuple[slice, slice]]) -> Cap
 
 
 def _renamed(digests: Mapping[str, str], sources: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
-    """Returns the digests under the files' correct names."""
+    """Returns the files' digests under the names of the reassigned cameras."""
     renamed = {}
     for file, digest in digests.items():
         path = PurePosixPath(file)

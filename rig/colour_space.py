@@ -1,4 +1,4 @@
-"""Converts between sRGB and linear light (IEC 61966-2-1), and reads colours from text."""
+"""Converts colours between sRGB and linear light (IEC 61966-2-1), and reads colours from text."""
 
 import re
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ COLOUR_NAMES = tuple(NAMED)
 
 
 def srgb_from_text(text: str) -> tuple[float, float, float] | None:
-    """Returns the sRGB values (0 to 1) of #rrggbb or of a name in ``COLOUR_NAMES``; None for anything else."""
+    """Returns the sRGB values (0 to 1) of a colour, ``#rrggbb`` or a name in ``COLOUR_NAMES``; otherwise None."""
     code = NAMED.get(text.strip().lower(), text.strip())
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", code):
         return None
@@ -27,11 +27,11 @@ def srgb_from_text(text: str) -> tuple[float, float, float] | None:
 
 
 def linear_from_srgb(encoded: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Converts sRGB values to linear ones, both 0 to 1 (IEC 61966-2-1)."""
+    """Converts sRGB values (0 to 1) to linear values (0 to 1) by IEC 61966-2-1."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def srgb_from_linear(linear: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Converts linear values to sRGB, both 0 to 1; values outside are clipped (IEC 61966-2-1)."""
+    """Converts linear values to sRGB values (0 to 1) by IEC 61966-2-1. Clips linear values to 0 to 1 first."""
     linear = np.clip(linear, 0.0, 1.0)
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)

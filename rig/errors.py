@@ -1,4 +1,4 @@
-"""Defines the base classes of all exceptions. Every message says what is wrong and what to do."""
+"""Defines the base classes of all exceptions. Every exception's message states the fault and a remedy."""
 
 from collections.abc import Iterable
 
@@ -6,7 +6,7 @@ from rig.messages.message import Message, compose, message_of
 
 
 class EigenheadError(Exception):
-    """Is the base class of all errors that this project raises. ``message`` can be shown to an operator."""
+    """Is the base class of all errors that the program raises. ``message`` can be shown to an operator."""
 
     def __init__(self, message: Message | str) -> None:
         self.message = message_of(message)
@@ -14,15 +14,14 @@ class EigenheadError(Exception):
 
 
 class Cancelled(EigenheadError):
-    """Ends work that its owner has cancelled. The function that receives progress raises it."""
+    """Ends a computation that a user has cancelled. The callback that receives its progress raises the exception."""
 
     def __init__(self) -> None:
         super().__init__(compose("cancelled"))
 
 
 class InputError(EigenheadError):
-    """Refuses input that cannot be used. ``subject`` names the input; ``faults`` lists every fault found, not only the
-    first."""
+    """Reports unusable input. ``subject`` names the input, and ``faults`` lists all its faults."""
 
     def __init__(self, subject: str, faults: Iterable[Message | str]) -> None:
         self.subject = subject
@@ -30,14 +29,14 @@ class InputError(EigenheadError):
         super().__init__(compose("input-refused", subject=subject, faults=self.faults))
 
     def located(self, where: str | None = None) -> list[Message]:
-        """Returns the faults, each preceded by ``where`` or, without it, by the error's subject."""
+        """Returns the faults, each preceded by ``where`` or, if that is None, by the error's subject."""
         return [compose("located", where=where or self.subject, fault=fault) for fault in self.faults]
 
 
 class WrongVariable(InputError):
-    """Refuses an environment variable that cannot be used. It is a fault of the machine, not of any capture."""
+    """Reports an unusable environment variable. The machine's set-up is wrong, not the user's input."""
 
 
 def how_to_install(extra: str) -> Message:
-    """Returns the command that installs an optional part of the project, for a checkout or an installed wheel."""
+    """Returns the command that installs an optional part of the program, in a checkout or beside an installed wheel."""
     return compose("install-extra", extra=extra)

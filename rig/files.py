@@ -1,5 +1,5 @@
-"""Writes files so that neither a reader nor a crash leaves or sees a half-written one; computes digests of files and
-documents; names this machine's folder for data that can be recomputed (compiled loops, arrays of models, durations)."""
+"""Writes files atomically, computes digests of files and documents, and names the cache folder. The cache folder holds
+data that can be recomputed, such as machine code and arrays of head models."""
 
 import hashlib
 import json
@@ -13,11 +13,11 @@ CACHE = "EIGENHEAD_CACHE"
 
 
 def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, parents: bool = True) -> None:
-    """Writes ``data`` under a temporary name beside ``path``, syncs it, and renames it. ``mode`` are the file's
-    permissions.
+    """Writes ``data`` to a temporary file beside ``path``, syncs it to disk, and renames it to ``path``. ``mode`` holds
+    the file's permissions.
 
-    Makes the folder if it is missing. With ``parents`` false it raises FileNotFoundError instead, so that a late write
-    does not recreate a removed folder."""
+    Creates missing folders. If ``parents`` is False, raises FileNotFoundError for a missing folder instead, so that a
+    late write does not recreate a removed folder."""
     if parents:
         path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
@@ -34,13 +34,13 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, parents: boo
 
 
 def unfinished(folder: Path, name: str = "*") -> Iterator[Path]:
-    """Yields the temporary files in ``folder`` from writes to ``name``: writes in progress, and writes interrupted by a
-    kill or a power failure. ``*`` stands for any text, as in ``Path.glob``."""
+    """Yields the temporary files in ``folder`` from writes to ``name`` that are in progress or were interrupted, for
+    example by a power failure. In ``name``, ``*`` matches any text, as in ``Path.glob``."""
     return folder.glob(f".{name}.*.part")
 
 
 def document_sha256(document: Mapping[str, Any]) -> str:
-    """Computes the sha256 of a document's canonical JSON. Results refer to their settings and inputs by it."""
+    """Computes the SHA-256 of a document's canonical JSON. Results store such digests of their settings."""
     return hashlib.sha256(json.dumps(document, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
@@ -51,8 +51,7 @@ def sha256_of(path: Path) -> str:
 
 
 def cache_folder() -> Path:
-    """Returns EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead. The folder may not exist
-    yet."""
+    """Returns the folder named by EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead."""
     configured = os.environ.get(CACHE)
     if configured:
         return Path(configured)

@@ -1,4 +1,4 @@
-"""Defines rigid motions and similarities between frames, named ``b_from_a``, and functions on rotations."""
+"""Defines rigid transforms and similarities between frames, and functions on rotations, rays and parabolas."""
 
 from dataclasses import dataclass
 from typing import TypeVar
@@ -18,7 +18,7 @@ class RigidTransform:
 
     @classmethod
     def identity(cls) -> "RigidTransform":
-        """Returns the transform that changes nothing."""
+        """Returns the identity transform."""
         return cls(np.eye(3), np.zeros(3))
 
     def __matmul__(self, other: "RigidTransform") -> "RigidTransform":
@@ -37,7 +37,7 @@ class RigidTransform:
 class Similarity:
     """Maps coordinates in frame a to frame b: ``x_b = scale * rotation @ x_a + translation`` (mm).
 
-    The paper writes it ``T(x) = s (R x + t')``, with t = s t'."""
+    The paper writes the similarity as ``T(x) = s (R x + t')``, with t = s t'."""
 
     scale: float
     rotation: Float[np.ndarray, "3 3"]
@@ -45,12 +45,12 @@ class Similarity:
 
     @classmethod
     def identity(cls) -> "Similarity":
-        """Returns the similarity that changes nothing."""
+        """Returns the identity similarity."""
         return cls(1.0, np.eye(3), np.zeros(3))
 
     @classmethod
     def from_rigid(cls, transform: RigidTransform) -> "Similarity":
-        """Returns the similarity of scale 1."""
+        """Returns ``transform`` as a similarity of scale 1."""
         return cls(1.0, transform.rotation, transform.translation)
 
     def __matmul__(self, other: "Similarity | RigidTransform") -> "Similarity":
@@ -78,7 +78,7 @@ def cross_matrix(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3
 
 
 def rotation_from_vector(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
-    """Computes the rotation by ``|vector|`` radians about the axis ``vector`` (Rodrigues' formula)."""
+    """Returns the matrix of a rotation about the axis ``vector`` by ``|vector|`` radians (Rodrigues' formula)."""
     angle = np.sqrt((vector * vector).sum(axis=-1))[..., None, None]
     skew = cross_matrix(vector)
     # Below 1e-4 rad the series keeps full precision where sin(a)/a and (1-cos a)/a^2 lose digits.
@@ -89,7 +89,7 @@ def rotation_from_vector(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray
 
 
 def vector_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
-    """Inverts ``rotation_from_vector``: returns axis times angle (rad), with the angle in [0, pi]."""
+    """Returns the axis of a rotation matrix, multiplied by its angle (rad) in [0, pi]."""
     # Through the unit quaternion (x, y, z, w): the largest of its four squared entries is at least 1/4, so that the
     # division below is safe at every angle, pi included.
     r = rotation
@@ -118,9 +118,9 @@ def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
 def rigid_fit(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
 ) -> RigidTransform:
-    """Estimates target_from_source by weighted least squares (Kabsch 1976); weights are equal by default.
+    """Estimates target_from_source by weighted least squares (Kabsch 1976). The default weights are equal.
 
-    It is the motion T that minimises ``sum_j w_j |target_j - T(source_j)|^2``, and never a reflection."""
+    The result is the rigid transform T, without reflection, that minimises ``sum_j w_j |target_j - T(source_j)|^2``."""
     share = np.full(len(source), 1.0 / len(source)) if weights is None else weights / weights.sum()
     source_mean, target_mean = share @ source, share @ target
     rotation = nearest_rotation(((source - source_mean) * share[:, None]).T @ (target - target_mean)).T
@@ -133,7 +133,7 @@ def nearest_to_rays(
     weights: Float[np.ndarray, "v ..."] | None = None,
     ridge: float = 1e-9,
 ) -> Float[np.ndarray, "... 3"]:
-    """Returns the points with the least weighted sum of squared distances to their rays, one from each centre.
+    """Returns each point (mm) with the least weighted sum of squared distances to its rays, one ray from each centre.
 
     Args:
         centres: where the rays begin (mm).
@@ -150,9 +150,8 @@ def ray_equations(
     rays: Float[np.ndarray, "v ... 3"],
     weights: Float[np.ndarray, "v ..."] | None = None,
 ) -> tuple[Float[np.ndarray, "... 3 3"], Float[np.ndarray, "... 3"]]:
-    """Returns matrix and right side of the equations of the points nearest to rays, as ``nearest_to_rays`` solves
-    them. The smallest eigenvalue of the matrix is the sum of squared sines between the rays and their mean
-    direction."""
+    """Returns the matrix and right side of the linear equations that ``nearest_to_rays`` solves. The smallest
+    eigenvalue of the matrix is the sum of squared sines of the angles between the rays and their mean direction."""
     weights = np.ones(rays.shape[:-1]) if weights is None else weights
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
     matrix = np.einsum("v...,v...ij->...ij", weights, across)
@@ -162,8 +161,8 @@ def ray_equations(
 def look_at(
     centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]
 ) -> RigidTransform:
-    """Computes camera_from_world of a camera at ``centre`` (mm) that looks at ``target`` (mm). The direction ``up``
-    points to the top of its image."""
+    """Computes camera_from_world of a camera at ``centre`` (mm) whose optical axis passes through ``target`` (mm). The
+    direction ``up`` points to the top of its image."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
@@ -172,12 +171,13 @@ def look_at(
 
 
 def second_difference(before: Values, middle: Values, after: Values) -> Values:
-    """Returns the second derivative of the parabola, per step squared; it is negative at a peak."""
+    """Returns the second derivative of the parabola through three equidistant values, per step squared."""
     return before - 2.0 * middle + after
 
 
 def vertex_offset(before: Values, after: Values, curvature: Values) -> Values:
-    """Returns the distance of the parabola's vertex from the middle value, in steps towards ``after``.
+    """Returns the position of the vertex of the parabola through three equidistant values, in steps from the middle
+    value towards ``after``.
 
     Args:
         before: the value one step before the middle one.

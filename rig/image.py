@@ -1,4 +1,4 @@
-"""Defines the type of pictures in memory, and distinguishes grey pictures from coloured ones."""
+"""Defines the array type of pictures in memory, and distinguishes grey pictures from colour pictures."""
 
 from collections.abc import Sequence
 
@@ -13,14 +13,14 @@ SPARSE = (slice(None, None, 16), slice(None, None, 16))  # tested first: most co
 
 
 def is_grey(image: UInt8[np.ndarray, "_ _ 3"]) -> bool:
-    """Tells whether red, green and blue are equal in every pixel."""
+    """Returns whether red, green and blue are equal in every pixel."""
     return all(bool((part == part[..., :1]).all()) for part in (image[SPARSE], image))
 
 
 def plates_for(
     image: UInt8[np.ndarray, "_ _ 3"], plates: Sequence[UInt8[np.ndarray, "_ _ 3"]]
 ) -> tuple[UInt8[np.ndarray, "_ _ 3"], ...]:
-    """Returns the clean plates to compare a picture with: converted to grey if the picture is grey."""
+    """Returns the clean plates (pictures of the empty studio), in grey if ``image`` is grey, for comparison with it."""
     if not plates or not is_grey(image):
         return tuple(plates)
     return tuple(plate if is_grey(plate) else _in_grey(plate) for plate in plates)

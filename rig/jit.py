@@ -1,19 +1,19 @@
-"""Caches compiled loops under a hash of their content, for later processes on this machine.
+"""Compiles Python functions with Numba, and caches the machine code under a hash of its sources for later processes.
 
-``njit`` here is Numba's, with another cache for compiled code. Numba's own cache (an index for each function, next to
-the sources) starts empty in every checkout. It misses changes to a called loop in another file, loses or mixes entries
-when two processes write one index, and breaks a job if the disk is full or a file is damaged. Here each compiled
-function is one file in ``cache_folder()/kernels``, written atomically. Its name is the sha256 of everything it depends
-on: the byte code and constants of the function and of all that it calls, the types of its arguments, the processor, and
-the versions of Python, Numba and LLVM.
+The function ``njit`` of this module replaces the cache of Numba's ``njit``. Numba's cache is an index for each function
+beside the source file, and starts empty in every checkout. Numba's cache ignores changes to a called function in
+another file. It loses or mixes entries when two processes write one index, and a full disk or a damaged file makes a
+job fail. In this module's cache, each compiled function is one file in ``cache_folder()/kernels``, written atomically.
+The file's name is the SHA-256 of all that the machine code depends on: byte code and constants of the function and its
+callees, argument types, the processor, and the versions of Python, Numba and LLVM.
 
-Code is compiled for a common subset of all x86-64 processors since 2013 (``PORTABLE_CPU``), so that one machine's code
-runs on the next: in a container, from a wheel, from a CI's cache. Code for the specific processor was no faster: with
+Code is compiled for the instructions that all x86-64 processors since 2013 have (``PORTABLE_CPU``). Thus a container, a
+wheel or a CI's cache can carry machine code to other machines. Code for one specific processor was not faster: with
 AVX-512 a job took as many CPU seconds.
 
-Numba has no public interface for this. The internal parts used are: ``Dispatcher._cache`` (an object with
+Numba has no public interface for another cache. This module uses Numba's internal ``Dispatcher._cache`` (an object with
 ``load_overload`` and ``save_overload``), ``CompileResult._reduce`` and ``_rebuild``, ``serialize.dumps``, the option
-``_nrt``, the flag ``noalias``.
+``_nrt`` and the flag ``noalias``.
 """
 
 import hashlib
@@ -51,8 +51,8 @@ log = logging.getLogger("eigenhead")
 
 
 def _choose_processor() -> None:
-    """Sets the portable processor that loops are compiled for, before anything is compiled. Does nothing if
-    NUMBA_CPU_NAME is set or this processor lacks a feature."""
+    """Makes Numba compile for ``PORTABLE_CPU``. Does nothing if NUMBA_CPU_NAME is set or this processor lacks a feature
+    of ``PORTABLE_CPU``."""
     options: Any = config
     try:
         host: dict[str, bool] = dict(llvmlite.binding.get_host_cpu_features())
@@ -70,7 +70,7 @@ _target_options.noalias = TargetOptions.Mapping("noalias")  # a flag of Numba's 
 def njit(
     *, cache: bool = True, allocates: bool = True, overlaps: bool = True, **options: Any
 ) -> Callable[[Callable[..., Any]], Any]:
-    """Compiles a function like ``numba.njit``, and stores the machine code in ``cache_folder()`` for later processes.
+    """Compiles a function as ``numba.njit`` does, and stores the machine code in ``cache_folder()``.
 
     Args:
         cache: whether to keep it.
@@ -97,8 +97,7 @@ def njit(
 
 
 class KeptFunction:
-    """Stores and finds the machine code of one function on disk. It replaces Numba's own cache object and has the same
-    methods."""
+    """Reads and writes the machine code of one function on disk. Numba uses the object as its cache."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher
@@ -106,11 +105,11 @@ class KeptFunction:
 
     @property
     def cache_path(self) -> str:
-        """Returns the folder for new files."""
+        """Returns the folder in which new machine code is stored."""
         return str(cache_folder() / "kernels")
 
     def file(self, signature: Any) -> Path:
-        """Returns the path of the file for the function compiled for these argument types, whether it exists or not."""
+        """Returns the path of the file, existing or not, for the machine code of the argument types ``signature``."""
         if not self._digest:  # late: a function may call one that its module defines further down
             self._digest = function_digest(self._dispatcher)
         key = f"{self._digest} {signature!r} {machine()}"
@@ -119,7 +118,7 @@ class KeptFunction:
         return Path(self.cache_path) / f"{name}-{hashlib.sha256(key.encode()).hexdigest()}"
 
     def is_kept(self, signature: Any) -> bool:
-        """Tells whether a file for these argument types exists."""
+        """Returns whether machine code for the argument types ``signature`` is stored."""
         file = self.file(signature)
         try:
             return (CARRIED / file.name).is_file() or file.is_file()
@@ -127,7 +126,7 @@ class KeptFunction:
             return False
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Returns the compiled function from its file, or None if there is none or it is damaged."""
+        """Returns the compiled function from its file, or None if the file is missing or damaged."""
         rtsys.initialize(target_context)  # not its refresh(), which loads what only a compiler needs: 0.4 s
         file = self.file(signature)
         for path in (CARRIED / file.name, file):
@@ -140,7 +139,7 @@ class KeptFunction:
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Writes a compiled function to its file. If that fails, logs it once for each process and continues."""
+        """Writes a compiled function to its file. Logs the first failure of a process and continues."""
         if any(not lifted.can_cache for lifted in result.lifted) or result.library.has_dynamic_globals:
             return
         data = serialize.dumps(result._reduce())
@@ -150,8 +149,8 @@ class KeptFunction:
             say_not_kept(error)
 
     def flush(self) -> None:
-        """Does nothing; Numba requires it. Files of older code are never found, since their names contain a digest of
-        the code."""
+        """Does nothing, but Numba requires this method. Files of older code need no removal, because file names contain
+        a digest of the code."""
 
 
 @cache
@@ -160,7 +159,7 @@ def _warned() -> set[str]:
 
 
 def say_not_kept(error: OSError) -> None:
-    """Logs, once for each process, that the cache folder cannot be written and why."""
+    """Logs, once in each process, why the cache folder cannot be written."""
     folder = str(cache_folder())
     if folder not in _warned():
         _warned().add(folder)
@@ -174,8 +173,7 @@ def say_not_kept(error: OSError) -> None:
 
 @cache
 def machine() -> str:
-    """Returns a text with everything that machine code depends on besides its source: versions of Python, Numba and
-    LLVM, compiler options, and the processor's features."""
+    """Returns a text with the versions of Python, Numba and LLVM, compiler options and processor features."""
     options: Any = config
     target: Any = cpu_target.target_context
     versions = (numba.__version__, llvmlite.__version__, sys.implementation.cache_tag)
@@ -192,8 +190,7 @@ def function_digest(dispatcher: Dispatcher) -> str:
 
 
 def code_size(dispatcher: Dispatcher) -> int:
-    """Returns the size (bytes) of all code that the compiled function depends on; compile time is roughly proportional
-    to it."""
+    """Returns the size (bytes) of all code that the function depends on, roughly proportional to its compile time."""
     return sum(map(len, _function_parts(dispatcher, set())))
 
 
@@ -232,7 +229,7 @@ def _code_parts(code: CodeType) -> Iterator[bytes]:
 
 
 def _value_parts(value: Any, names: list[str], visited: set[int]) -> Iterator[bytes]:
-    """Yields what a compiled function uses of a global name: the bytes of a value, or the parts of another function."""
+    """Yields a global value, or the code and the values of a function, that a compiled function uses, as bytes."""
     if isinstance(value, Dispatcher):
         yield from _function_parts(value, visited)
     elif isinstance(value, ModuleType):

@@ -8,8 +8,8 @@ from jaxtyping import Float, Int, UInt8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Holds vertices (mm) and triangles, whose corners are counter-clockwise seen from outside. ``colours`` are the
-    sRGB colours of the vertices."""
+    """Holds vertices (mm) and triangles, whose corners are counter-clockwise seen from outside. ``colours`` holds the
+    sRGB colour of each vertex."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -21,7 +21,7 @@ class Mesh:
 
 
 def face_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
-    """Computes face normals. The length of each is twice the area of its face."""
+    """Computes face normals. The length of each normal is twice the area of its face."""
     a, b, c = (vertices[faces[:, i]].T for i in range(3))
     (x, y, z), (u, v, w) = b - a, c - a
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
@@ -36,7 +36,7 @@ def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
 
 
 def boundary_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    """Finds the directed edges that belong to one face only: the border of an open mesh."""
+    """Returns the directed edges that belong to only one face, which form the border of an open mesh."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     low, high = edges.min(axis=1).astype(np.int64), edges.max(axis=1)
     # Both ends are packed into one number: sorting rows takes thirty times as long.
@@ -47,8 +47,8 @@ def boundary_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
 def edges_of(
     faces: Int[np.ndarray, "F 3"],
 ) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "F 3"], Int[np.ndarray, " E"]]:
-    """Returns the mesh's edges (sorted pairs of vertices), the index of the edge opposite each corner of each triangle,
-    and the number of triangles at each edge."""
+    """Returns the mesh's edges as sorted pairs of vertices, and the number of triangles at each edge. Also returns, for
+    each corner of each triangle, the index of the opposite edge."""
     directed = np.concatenate([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]]).astype(np.int64)
     low, high = directed.min(1), directed.max(1)
     base = int(faces.max()) + 1

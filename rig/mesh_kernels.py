@@ -1,4 +1,4 @@
-"""Compiled loops of ``rig.mesh``."""
+"""Computes vertex normals in a compiled loop."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Checks a rig before any picture is read. Reports every fault, each with its remedy."""
+"""Checks the cameras of a rig before any picture is read. Reports all faults with remedies."""
 
 from dataclasses import replace
 
@@ -34,10 +34,9 @@ CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras whose picture co
 
 
 def rig_faults(rig: Rig, *, any_unit: bool = False) -> list[Message]:
-    """Returns the faults of a rig that are visible from its cameras alone: impossible lenses, poses in another
-    convention or unit, and cameras at one place.
+    """Returns faults of the cameras: impossible lenses, poses in another convention or unit, coinciding cameras.
 
-    ``any_unit`` skips the check of the unit, because a known length (scale.json) will define it."""
+    ``any_unit`` skips the check of the unit, if a known length from ``scale.json`` will define the unit."""
     of_all = _principal_point_faults(rig)
     if of_all:  # other faults would only follow from this one
         return of_all
@@ -65,11 +64,12 @@ def _lens_fault(camera: Camera) -> Message | None:
 
 
 def _principal_point_faults(rig: Rig) -> list[Message]:
-    """Returns a fault if the intrinsics belong to pictures of another size, are fractions of the size, or lack
-    principal points.
+    """Returns a fault if the intrinsics belong to pictures of another size, are fractions of the picture's size, or
+    lack principal points.
 
-    For pictures of another size all principal points are off the middle by the same factor, horizontally and
-    vertically. A crop shifts them by a number of pixels instead, and a shifted lens in one direction."""
+    If the intrinsics belong to another size, all principal points differ from the middle by the same factor,
+    horizontally and vertically. A crop instead shifts principal points by some number of pixels, and a shift lens moves
+    them in only one direction."""
     sizes = np.array([(camera.intrinsics.width, camera.intrinsics.height) for camera in rig], float)
     points = np.array([(camera.intrinsics.cx, camera.intrinsics.cy) for camera in rig])
     focal = np.array([(camera.intrinsics.fx, camera.intrinsics.fy) for camera in rig])
@@ -88,11 +88,11 @@ def _principal_point_faults(rig: Rig) -> list[Message]:
 
 
 def _through_lens(camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Returns ``X / Z, Y / Z`` without and with the lens, for a grid over the middle of the picture; NaN where no ray
-    meets a pixel.
+    """Returns normalised coordinates ``X / Z, Y / Z`` without and with distortion, on a grid over the middle of the
+    picture. The coordinates are NaN at pixels without a ray.
 
-    For a recorded lens the grid covers the pinhole's picture. A fisheye's pixels outside the grid are never used, so
-    its model need not be valid there."""
+    If the picture files are undistorted on reading, the grid covers the undistorted picture. Pixels of a fisheye
+    outside this grid are never used, so the lens model need not be valid there."""
     k = camera.intrinsics
     edge = 0.5 * (1.0 - MIDDLE)
     sides = zip((k.width, k.height), GRID, strict=True)
@@ -133,8 +133,8 @@ def _spread_faults(rig: Rig) -> list[Message]:
 
 
 def _unit_fault(frame: float) -> Message:
-    """Returns a fault that names the unit in which a head would fit into the pictures. If two units fit, both are
-    named, because only the file's author knows."""
+    """Returns a fault that names the unit of the poses in which a head would fit into the pictures. If two units are
+    possible, the fault names both."""
     fitting = [unit for unit in UNITS if FRAME_LEAST_MM <= frame * unit <= UNIT_FRAME_MOST_MM]
     usual = sorted(fitting, key=lambda unit: abs(np.log(frame * unit / FRAME_USUAL_MM)))
     if len(usual) < 2:
@@ -152,7 +152,7 @@ def _unit_fault(frame: float) -> Message:
 
 
 def frame_mm(rig: Rig) -> float:
-    """Returns the length (mm) that the longer side of a picture covers at the point nearest to all optical axes: the
+    """Returns the length (mm) that the longer side of a picture covers at the point nearest to all optical axes, as the
     median over the cameras."""
     sides = []
     for camera in rig:
@@ -162,8 +162,7 @@ def frame_mm(rig: Rig) -> float:
 
 
 def _convention_fault(rig: Rig) -> Message | None:
-    """Returns a fault if the cameras point at no common point, but would if their poses were read in another
-    convention."""
+    """Returns a fault if the cameras would point at one point only if their poses had another convention."""
     if _share_looking_at_one_point(rig) > DIVERGING_MOST:
         return None
     fitting = [
@@ -181,8 +180,7 @@ def _convention_fault(rig: Rig) -> Message | None:
 
 
 def alternative_conventions(rig: Rig) -> list[tuple[Message, Rig, Message]]:
-    """Reads the poses in other conventions. Returns, for each, a description of the poses' meaning, the rig, and the
-    remedy."""
+    """Returns, for each other convention of poses, its description, the rig read by it, and the remedy."""
     return [
         (other, Rig(tuple(replace(c, camera_from_world=read(c.camera_from_world)) for c in rig)), remedy)
         for other, (read, remedy) in _CONVENTIONS.items()
@@ -201,7 +199,7 @@ def _share_looking_at_one_point(rig: Rig) -> float:
 
 
 def _of_shifted_quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Returns the rotation whose quaternion x, y, z, w was read as w, x, y, z."""
+    """Returns the correct rotation if ``rotation`` comes from a quaternion x, y, z, w that was read as w, x, y, z."""
     vector = vector_from_rotation(rotation)
     half = float(np.linalg.norm(vector)) / 2.0
     x, y, z, w = np.cos(half), *(vector / 2.0 * np.sinc(half / np.pi))

@@ -8,4 +8,4 @@ Progress = Callable[[str, float], None]
 
 
 def discard_progress(stage: str, fraction: float) -> None:
-    """Does nothing. Use it for work that nobody watches."""
+    """Ignores a progress report, for callers that do not show progress."""

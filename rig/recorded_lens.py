@@ -1,12 +1,14 @@
-"""Models lenses that Brown-Conrady cannot represent; their pictures are undistorted when they are read.
+"""Models lenses that Brown-Conrady distortion cannot represent, and undistorts their pictures on reading.
 
-A camera with such a lens is a pinhole everywhere in the program (``Camera.intrinsics`` has no distortion); its
-``recorded`` is the lens of the picture files. Both have the same focal lengths, principal point and size, so the
-resolution in the middle of the picture stays the same. Pixels of a fisheye outside the pinhole's frame are dropped.
+The rest of the program treats a camera with one of these lenses as a pinhole: ``Camera.intrinsics`` has no distortion,
+and ``Camera.recorded`` is the lens of the picture files. The pinhole and the lens have the same focal lengths,
+principal point and size, so that the resolution in the middle of the picture does not change. Pixels of a fisheye
+outside the pinhole's picture are dropped.
 
-Kannala-Brandt: ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`` with ``theta`` the angle to
-the axis (https://docs.opencv.org/4.x/db/d58/group__calib3d__fisheye.html). Rational: OpenCV's eight coefficients k1 k2
-p1 p2 k3 k4 k5 k6, with a quotient as radial factor (https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html)."""
+The Kannala-Brandt model is ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`` with ``theta``
+the angle to the axis (https://docs.opencv.org/4.x/db/d58/group__calib3d__fisheye.html). The rational model has OpenCV's
+eight coefficients k1 k2 p1 p2 k3 k4 k5 k6 and a quotient as radial factor
+(https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html)."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -25,15 +27,15 @@ ROUNDS, EXACT = 100, 1e-12  # iterations and tolerance of the inverse of either 
 
 @dataclass(frozen=True, slots=True)
 class RecordedLens:
-    """Holds a lens model, its coefficients in the order of ``COEFFICIENTS[model]``, and the skew of its pixels: entry
-    (0, 1) of the camera matrix, in focal lengths fx. The pinhole has no skew."""
+    """Holds a lens model and its coefficients in the order of ``COEFFICIENTS[model]``. ``skew`` is entry (0, 1) of the
+    camera matrix, divided by fx."""
 
     model: LensModel
     coefficients: tuple[float, ...]
     skew: float = 0.0
 
     def distorted(self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 2"]:
-        """Converts the pinhole's ``pixels`` to the recorded picture. ``matrix`` is the camera matrix of both."""
+        """Converts pixels of the undistorted picture to pixels of the file. ``matrix`` is the camera matrix."""
         import cv2  # here and below: 0.1 s that most starts do without
 
         rays = np.ones((len(pixels), 3))
@@ -49,8 +51,7 @@ class RecordedLens:
     def undistorted(
         self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]
     ) -> Float[np.ndarray, "n 2"]:
-        """Converts the recorded picture's ``pixels`` to the pinhole's picture. ``matrix`` is the camera matrix of
-        both."""
+        """Converts pixels of the file to pixels of the undistorted picture. ``matrix`` is the camera matrix."""
         import cv2
 
         straight = pixels - np.outer(_rows(pixels, matrix), [self.skew * matrix[0, 0], 0.0])
@@ -66,9 +67,9 @@ class RecordedLens:
         self, picture: Shaped[np.ndarray, "h w ..."], matrix: Float[np.ndarray, "3 3"], *, smooth: bool = True
     ) -> Shaped[np.ndarray, "h w ..."]:
         """Returns the picture that a pinhole with camera matrix ``matrix`` would have taken. ``smooth`` interpolates;
-        masks with hard edges need False.
+        masks with hard edges need ``smooth=False``.
 
-        Pixels outside the recorded picture are black, in a photograph and in its clean plate alike."""
+        Pixels outside the picture in the file become black."""
         import cv2
 
         across, down = _maps(self, (picture.shape[1], picture.shape[0]), tuple(matrix.ravel().tolist()))
@@ -77,7 +78,7 @@ class RecordedLens:
 
 
 def _rows(pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " n"]:
-    """Returns ``Y / Z`` of pixels; a skew shifts them sideways in proportion to it."""
+    """Returns the normalised coordinate ``Y / Z`` of each pixel."""
     return (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1]
 
 

@@ -13,7 +13,7 @@ from rig.messages.message import compose
 
 
 class UnknownCamera(EigenheadError, KeyError):
-    """Refuses a name that no camera of the rig has. It is a KeyError too."""
+    """Reports a name that no camera of the rig has. The class is also a KeyError."""
 
     def __init__(self, name: str, names: tuple[str, ...]) -> None:
         known = compose("rig-cameras", cameras=names) if names else compose("rig-empty")
@@ -25,8 +25,8 @@ class UnknownCamera(EigenheadError, KeyError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rig:
-    """Holds the cameras, in the order of their file. ``scale_sigma`` is the relative standard deviation of all lengths,
-    if they were estimated from photographs: such an error is common to all cameras."""
+    """Holds cameras in the order of their file. ``scale_sigma`` is the relative standard deviation of all lengths of
+    the rig, if its scale was estimated from photographs."""
 
     cameras: tuple[Camera, ...]
     scale_sigma: float = 0.0
@@ -38,7 +38,7 @@ class Rig:
         return iter(self.cameras)
 
     def __getitem__(self, name: str) -> Camera:
-        """Returns the camera with that name. Raises UnknownCamera if there is none."""
+        """Returns the camera with the given name. Raises UnknownCamera if no camera has it."""
         for camera in self.cameras:
             if camera.name == name:
                 return camera
@@ -53,36 +53,35 @@ class Rig:
         return tuple(camera.name for camera in self.cameras)
 
     def subset(self, names: Iterable[str]) -> "Rig":
-        """Returns the rig of the named cameras only, in the rig's order."""
+        """Returns a rig of only the cameras ``names``, in the order of the rig."""
         retained = set(names)
         return replace(self, cameras=tuple(camera for camera in self.cameras if camera.name in retained))
 
     def with_intrinsics(self, change: Callable[[Intrinsics], Intrinsics]) -> "Rig":
-        """Returns the rig with each camera's intrinsics as ``change`` returns them."""
+        """Returns the rig with each camera's intrinsics replaced by the result of ``change``."""
         return replace(self, cameras=tuple(replace(c, intrinsics=change(c.intrinsics)) for c in self.cameras))
 
     def scaled(self, factor: float) -> "Rig":
-        """Returns the rig for images scaled by ``factor``."""
+        """Returns the rig with intrinsics for images scaled by ``factor``."""
         cameras = (replace(camera, intrinsics=camera.intrinsics.scaled(factor)) for camera in self.cameras)
         return replace(self, cameras=tuple(cameras))
 
     def centre_world(self) -> Float[np.ndarray, " 3"]:
-        """Returns the point (mm) nearest to all optical axes by least squares; the subject should be near it."""
+        """Returns the point (mm) nearest to all optical axes by least squares, where the subject should be."""
         centres = np.stack([camera.centre_world for camera in self.cameras])
         return nearest_to_rays(centres, np.stack([camera.axis_world for camera in self.cameras]))
 
     def front_camera(self) -> str:
-        """Returns the name of the camera in the middle of the rig, whose direction is nearest to the mean of all
-        directions."""
+        """Returns the name of the middle camera, whose direction is nearest to the mean of all directions."""
         directions = np.stack([camera.centre_world for camera in self.cameras]) - self.centre_world()
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         return self.cameras[int(np.argmax(directions @ directions.mean(axis=0)))].name
 
 
 def spread_views(rig: Rig, count: int) -> list[str]:
-    """Returns the names of at most ``count`` cameras that stand well apart: first the front one, then repeatedly the
-    one whose direction from the subject is farthest from all chosen (Gonzalez, *Clustering to minimize the maximum
-    intercluster distance*, 1985)."""
+    """Returns the names of at most ``count`` cameras with widely different views. The front camera comes first. Each
+    further camera is the one whose direction from the subject is farthest from all chosen cameras (Gonzalez,
+    *Clustering to minimize the maximum intercluster distance*, 1985)."""
     away = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     chosen = [rig.names.index(rig.front_camera())]

@@ -1,4 +1,4 @@
-"""Decodes, checks and escapes text from outside before it is stored or sent, and suggests words for mistyped ones."""
+"""Decodes, checks and escapes text from users and files, and suggests corrections of mistyped words."""
 
 import codecs
 import difflib
@@ -14,7 +14,7 @@ MARKS = (  # longest first, since one begins with another
 
 
 def is_encodable(text: str) -> bool:
-    """Tells whether a text can be written as UTF-8. JSON's escapes can state half of a surrogate pair, which cannot."""
+    """Returns whether a text can be written as UTF-8. Half of a surrogate pair, which JSON can contain, cannot."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -23,12 +23,12 @@ def is_encodable(text: str) -> bool:
 
 
 def printable(text: str) -> str:
-    """Returns the text with characters that UTF-8 cannot encode escaped, so that a message can quote it."""
+    """Escapes characters that UTF-8 cannot encode, so that a message can quote the text."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 def suggest(word: str, known: Iterable[str], *, most: int = 1, min_likeness: float = 0.6) -> list[str]:
-    """Returns the known words that may have been meant by a mistyped one, the most similar first.
+    """Returns the words of ``known`` that are similar to the mistyped ``word``, the most similar first.
 
     Args:
         word: the word as it was written.
@@ -41,7 +41,7 @@ def suggest(word: str, known: Iterable[str], *, most: int = 1, min_likeness: flo
 
 
 def as_utf8(data: bytes) -> bytes:
-    """Returns a text without its byte order mark, converted to UTF-8 if the mark means UTF-16 or UTF-32."""
+    """Removes the byte order mark of a text, and converts UTF-16 and UTF-32 to UTF-8."""
     for mark, encoding in MARKS:
         if data.startswith(mark):
             return data.removeprefix(mark).decode(encoding).encode()

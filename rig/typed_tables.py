@@ -1,4 +1,4 @@
-"""Reads tables of decoded JSON or TOML into frozen dataclasses, and names every unknown key and wrong value."""
+"""Converts tables of decoded JSON or TOML to dataclasses, and reports every unknown key and wrong value."""
 
 import dataclasses
 import math
@@ -15,8 +15,7 @@ T = TypeVar("T")
 
 
 def read_table(kind: type[T], document: Mapping[str, Any], subject: str) -> T:
-    """Returns a table of settings (the dataclass ``kind``) from decoded JSON or TOML. Raises InputError that names
-    every fault, and ``subject``."""
+    """Converts decoded JSON or TOML to the dataclass ``kind``. Raises an InputError that names every fault."""
     faults: list[Message] = []
     found = read_fields(kind, document, "", faults)
     if faults:
@@ -25,8 +24,8 @@ def read_table(kind: type[T], document: Mapping[str, Any], subject: str) -> T:
 
 
 def read_fields(kind: type[T], document: Any, where: str, faults: list[Message]) -> T:
-    """Returns the dataclass ``kind`` from decoded JSON or TOML. A missing or wrong key gets its default, or an ellipsis
-    if it has none. Faults are added to ``faults``. ``where`` precedes the keys' names in the faults."""
+    """Converts decoded JSON or TOML to the dataclass ``kind``. A missing or wrong value becomes the field's default, or
+    an ellipsis without a default. Faults are added to ``faults``, with ``where`` before the name of the key."""
     if not isinstance(document, Mapping):
         faults.append(compose("setting-no-object", where=where.rstrip(".") or "settings"))
         return typing.cast(T, ...)
@@ -50,7 +49,7 @@ def read_fields(kind: type[T], document: Any, where: str, faults: list[Message])
 
 
 def _sections_with(key: str, hints: Mapping[str, Any]) -> list[str]:
-    """Returns ``section.key`` for each subtable that has the key."""
+    """Returns ``section.key`` for each subtable that has a field named ``key``."""
     tables = {name: dataclasses.fields(hint) for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
     return [f"{name}.{key}" for name, fields in tables.items() if key in (field.name for field in fields)]
 
@@ -80,7 +79,7 @@ def _value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:
 
 
 def _number(value: Any) -> float | None:
-    """Returns a finite number, else None; a JSON integer may exceed the range of float."""
+    """Returns a finite number as a float, or None for any other value and for integers beyond the range of float."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         return None
     try:
@@ -96,7 +95,7 @@ def _item(where: str, value: Any, index: int) -> str:
 
 
 def _shown(value: Any) -> Message | str:
-    """Returns the text of a wrong value. Python does not print numbers of thousands of digits."""
+    """Returns a wrong value as text. Python does not print integers of thousands of digits."""
     try:
         return f"{value!r:.80}"
     except (ValueError, RecursionError):

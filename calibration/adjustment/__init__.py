@@ -1,4 +1,4 @@
-"""Estimates cameras from corners of a board: lenses, pose graph, bundle adjustment and its gauge, time offsets, world
-frame.
+"""Estimates lenses, camera poses and time offsets from the detected corners of a calibration board.
 
-In: detected corners (px) by camera and shot. Out: a rig (mm) with covariances. Method: Triggs et al. (2000)."""
+The input is corners (px) by camera and shot. The output is a rig (mm) with covariances, from a bundle adjustment
+(Triggs et al., 2000)."""

@@ -1,11 +1,11 @@
-"""Adjusts all parameters together, robustly: intrinsics with distortion, camera poses, board poses.
+"""Adjusts intrinsics with distortion, camera poses and board poses together, with a robust loss.
 
-It uses the project's Levenberg-Marquardt on blocks of the normal equations (``CornerTerm``). Eleven cameras and thirty
-shots have 339 unknowns. A dense Cholesky factor solves these in ten milliseconds, so sparse methods would gain nothing
-(tests/laboratory/notes/calibration.md compares the times with scipy's and Ceres's).
+Levenberg-Marquardt minimises the cost; ``CornerTerm`` adds each view's block to the normal equations. Eleven cameras
+and thirty shots have 339 unknowns. A dense Cholesky factor solves them in ten milliseconds, so a sparse solver would
+gain nothing (tests/laboratory/notes/calibration.md compares the times with those of scipy and Ceres).
 
-Cost: ``sum rho(|r|^2 / sigma_c^2) + priors``. rho is Cauchy's during the search for outliers and Huber's at the end;
-sigma_c is each camera's own noise."""
+The cost is ``sum rho(|r|^2 / sigma_c^2) + priors``. The loss rho is Cauchy's during the search for outliers and Huber's
+at the end; sigma_c is the corner noise of camera c."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -35,8 +35,8 @@ from rig.geometry import cross_matrix
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CornerTerm:
-    """Computes the cost of all corners as a function of the state. ``sigma_px`` is the noise of a corner's coordinate
-    in each camera."""
+    """Computes the cost of all corners as a function of the state. ``sigma_px`` is each camera's standard deviation of
+    a corner's coordinate."""
 
     seen: Observations
     sigma_px: Float[np.ndarray, " c"]
@@ -75,8 +75,8 @@ class LinearisedCornerTerm:
             equations.gradient[at] += product[:-1, -1]
 
     def by_view(self) -> Float[np.ndarray, "n 2 22"]:
-        """Returns the derivatives of each corner by the 22 parameters of its view: camera (15), board (6), time offset
-        (1)."""
+        """Returns the derivatives of each corner's pixel by the 22 parameters of its view, in the order of
+        ``places``."""
         state, observed = self.state, self.term.seen
         world, inside, camera = corner_positions(state, observed)
         behind = inside[:, 2] < DEPTH_LEAST_MM
@@ -92,7 +92,7 @@ class LinearisedCornerTerm:
         return rows
 
     def jacobian(self, size: int) -> Float[np.ndarray, "n 2 q"]:
-        """Returns each corner's derivatives by all ``size`` parameters, mostly zeros; for tests and other solvers."""
+        """Returns the dense Jacobian of all corners by all ``size`` parameters, which tests and other solvers use."""
         observed, rows = self.term.seen, self.by_view()
         whole = np.zeros((*rows.shape[:2], size))
         for view, at in enumerate(places(observed, len(self.state.intrinsics), size)):
@@ -102,8 +102,7 @@ class LinearisedCornerTerm:
 
 
 def places(observed: Observations, cameras: int, size: int) -> Int[np.ndarray, "v 22"]:
-    """Returns, for each view, the indices of its 22 parameters: those of its camera, its board, and its camera's time
-    offset."""
+    """Returns, for each view, the indices of its 22 parameters: camera (15), board (6) and time offset (1)."""
     of_camera = observed.camera[:, None] * PER_CAMERA + np.arange(PER_CAMERA)
     board = cameras * PER_CAMERA + observed.shot[:, None] * PER_SHOT + np.arange(PER_SHOT)
     return np.concatenate([of_camera, board, size - cameras + observed.camera[:, None]], axis=1)
@@ -128,8 +127,7 @@ class Free:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleSolution:
-    """Holds the final state of the adjustment, and the normal matrix there (over the adjusted parameters, which
-    ``free`` marks)."""
+    """Holds the final state of the adjustment, and the normal matrix of the parameters that ``free`` marks."""
 
     state: BundleState
     normal: Float[np.ndarray, "p p"]  # of the free parameters, at the solution, residuals in sigmas
@@ -142,8 +140,8 @@ class BundleSolution:
         return self.evidence.cost
 
     def covariance(self) -> Float[np.ndarray, "q q"]:
-        """Returns the covariance of all parameters: first the cameras (intrinsics, pose), then boards, then time
-        offsets. It is zero for fixed parameters."""
+        """Returns the covariance of all parameters in the order cameras (intrinsics, pose), boards, time offsets. Rows
+        and columns of fixed parameters are zero."""
         full = np.zeros((len(self.free), len(self.free)))
         # Scaled to a unit diagonal first: parameters span from 1e-4 (distortion) to 1e3 (mm).
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self.normal), 1e-12))
@@ -159,12 +157,11 @@ class BundleSolution:
 def corner_sigma(
     state: BundleState, observed: Observations, lens_noise: Float[np.ndarray, " c"]
 ) -> tuple[Float[np.ndarray, " c"], float]:
-    """Estimates the noise (px) of each camera's corners in the joint solution, and the part of it that is common to all
-    cameras.
+    """Returns the noise (px) of each camera's corners in the joint solution, and the noise that all cameras share.
 
-    The noise of each camera alone is known from ``lens_noise``. Residuals of the joint solution are larger if cameras
-    were not exactly simultaneous, or if the board bends. That excess is one variance for all cameras; with one for
-    each, the fit could declare one camera noisy and follow the others exactly."""
+    ``lens_noise`` is the corner noise in each camera's separate calibration. Residuals of the joint solution are larger
+    than this noise if cameras were not exactly simultaneous, or if the board bends. The excess is one variance for all
+    cameras. With a variance for each camera, the fit could declare one camera noisy and fit the others exactly."""
     squares = (residuals(state, observed) ** 2).sum(axis=1)
     typical = float(np.median(squares)) / 1.1774**2
     shared = max(0.0, typical - float(np.median(lens_noise[observed.camera[observed.view_of]] ** 2)))
@@ -184,10 +181,10 @@ def adjust(
 ) -> BundleSolution:
     """Minimises the cost of the bundle adjustment, starting from ``state``.
 
-    ``state``: start of the search. ``observed``: the corners of all views. ``prior``: prior of the intrinsics.
-    ``sigma``: noise of a corner's coordinate by camera, px. ``free``: which parameters change; by default all but the
-    time offsets. ``loss``: robust loss of |r|^2 / sigma^2; least squares by default. ``steps``: largest number of
-    steps. ``tick``: called before every step; an exception that it raises ends the adjustment.
+    ``observed`` holds the corners of all views, and ``prior`` the prior of the intrinsics. ``sigma`` is each camera's
+    noise of a corner's coordinate, px. ``free`` selects the parameters that change: by default all but the time
+    offsets. ``loss`` is the robust loss of |r|^2 / sigma^2; the default is least squares. ``steps`` is the largest
+    number of steps. ``tick`` is called before every step; an exception raised by ``tick`` ends the adjustment.
     """
     problem = bundle_problem(state, CornerTerm(observed, sigma, loss or LeastSquares()), prior, free or Free())
     limits = Limits(steps=steps, tolerance=TOLERANCE, tries=6, first_damping=1e-4)
@@ -197,7 +194,7 @@ def adjust(
 
 
 def bundle_problem(state: BundleState, corners: CornerTerm, prior: LensPrior, free: Free) -> Problem[BundleState]:
-    """Builds the complete problem: corners, priors of the lenses, square pixels, and which parameters change."""
+    """Builds the least-squares problem from the corner term, the lens priors and the prior of square pixels."""
     mask = free_mask(state, free)
     return Problem((corners, prior, AspectTerm()), len(mask), moved_state, mask)
 

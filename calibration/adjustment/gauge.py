@@ -1,15 +1,15 @@
-"""Computes errors of cameras without the part that no image can determine: the arbitrary choice of the world frame.
+"""Computes errors of cameras that do not depend on the arbitrary choice of the world frame, which no image determines.
 
-A rig that moves as a whole stays the same rig. So two calibrations are compared, and covariances stated, in the gauge
+Moving all cameras together changes no image. Calibrations are therefore compared in the gauge (choice of world frame)
 in which the images of the subject's region move least. Let ``W`` (6 C x 6 C, block-diagonal) be the sum of ``J^T J``
 over points on a sphere of the subject's size, with ``J`` the derivative of a pixel by a left perturbation of
-camera_from_world, and let ``A`` (6 C x 6) be the motions of all cameras under a motion of the world. Then the
-projection is ``S = I - A (A^T W A)^-1 A^T W`` (an S-transformation: W. Baarda, 1973; Triggs et al., "Bundle Adjustment:
+camera_from_world, and let ``A`` (6 C x 6) be the motions of all cameras under a motion of the world. The projection on
+this gauge is ``S = I - A (A^T W A)^-1 A^T W`` (an S-transformation: W. Baarda, 1973; Triggs et al., "Bundle Adjustment:
 A Modern Synthesis", section 9).
 
-The world frame of a calibrated rig has x to the subject's left, y up, z towards the front camera. Up is the direction
-perpendicular to the cameras' image rows: a camera that is not rolled has a horizontal x axis at any elevation. The
-origin is the point nearest to all optical axes."""
+The world frame of a calibrated rig has x to the subject's left, y up, and z towards the front camera. The up direction
+is perpendicular to the image rows of all cameras, because a camera without roll has a horizontal x axis. The origin is
+the point nearest to all optical axes."""
 
 from dataclasses import dataclass, replace
 
@@ -28,7 +28,7 @@ SUBJECT_RADIUS_MM = 110.0  # of a sphere as large as a head
 
 
 def subject_points(rig: Rig, radius_mm: float = SUBJECT_RADIUS_MM, count: int = 60) -> Float[np.ndarray, "n 3"]:
-    """Returns points (mm) spread evenly over a sphere around the point that the cameras see (a Fibonacci lattice)."""
+    """Returns points (mm) of a Fibonacci lattice on a sphere around the point nearest to all optical axes."""
     index = np.arange(count) + 0.5
     height, angle = 1 - 2 * index / count, np.pi * (1 + np.sqrt(5)) * index
     ring = np.sqrt(1 - height**2)
@@ -36,7 +36,7 @@ def subject_points(rig: Rig, radius_mm: float = SUBJECT_RADIUS_MM, count: int = 
 
 
 def pose_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 6"]:
-    """Returns the derivative of the points' pixels by a left perturbation of camera_from_world (px per rad and mm)."""
+    """Returns the derivative of the points' pixels by a left perturbation of camera_from_world (px/rad, px/mm)."""
     _, by_world = camera.project_with_jacobian(points_world)
     by_camera = by_world @ camera.camera_from_world.rotation.T
     points = camera.camera_from_world.apply(points_world)
@@ -44,8 +44,8 @@ def pose_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Flo
 
 
 def image_metric(rig: Rig, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c 6 6"]:
-    """Returns, for each camera, the matrix Q with which p^T Q p is the mean squared image motion (px^2) of
-    ``points_world`` under the pose perturbation p."""
+    """Returns a matrix Q for each camera. For a pose perturbation p, ``p^T Q p`` is the mean squared image motion
+    (px^2) of ``points_world``."""
     metrics = []
     for camera in rig:
         jacobian = pose_jacobian(camera, points_world)
@@ -55,8 +55,8 @@ def image_metric(rig: Rig, points_world: Float[np.ndarray, "n 3"]) -> Float[np.n
 
 
 def world_motions(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p g"]:
-    """Returns the left perturbations of all cameras (rows) that correspond to a rotation, a translation and, with
-    ``scale``, a scaling of the world (columns)."""
+    """Returns the left perturbations of all camera poses (rows) under each rotation and translation of the world
+    (columns). ``scale`` adds a column for a scaling of the world."""
     columns = []
     for camera in rig:
         rotation, translation = camera.camera_from_world.rotation, camera.camera_from_world.translation
@@ -71,7 +71,7 @@ def world_motions(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p g"]:
 
 
 def gauge_projection(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p p"]:
-    """Returns the projection S, defined in the module's docstring. With ``scale`` the world's scale is free too."""
+    """Returns the projection S of the module's docstring. With ``scale``, S also removes errors of scale."""
     weights = _block_diagonal(image_metric(rig, subject_points(rig)))
     motions = world_motions(rig, scale=scale)
     normal = motions.T @ weights @ motions
@@ -86,8 +86,8 @@ def _block_diagonal(blocks: Float[np.ndarray, "c 6 6"]) -> Float[np.ndarray, "p 
 
 
 def align_world(rig: Rig, reference: Rig, *, scale: bool = False) -> Rig:
-    """Returns ``rig`` with its world moved (and scaled, with ``scale``) so that its images of the subject's region are
-    as near as possible to those of ``reference``.
+    """Moves the world frame of ``rig`` so that its images of the subject's region are as near as possible to the images
+    in ``reference``. With ``scale``, the world is also scaled.
 
     The distances in the images are minimised, starting from the mean motion between the cameras' frames."""
     points = subject_points(reference)
@@ -100,7 +100,7 @@ def align_world(rig: Rig, reference: Rig, *, scale: bool = False) -> Rig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ImageTerm:
-    """Computes the distances (px) of the rig's images of the points from ``target``; 0 outside a lens's valid area."""
+    """Computes the distances (px) of the points' images from ``target``, or 0 outside a lens's valid area."""
 
     points: Float[np.ndarray, "n 3"]
     target: Float[np.ndarray, "m 2"]
@@ -115,8 +115,7 @@ class _ImageTerm:
 
 
 def _shifted(rig: Rig, step: np.ndarray) -> Rig:
-    """Returns the rig with poses ``camera_from_world @ motion``; a seventh entry of ``step`` scales the
-    translations."""
+    """Returns the rig with its world moved by ``step``; a seventh entry of ``step`` scales the translations."""
     motion = RigidTransform(rotation_from_vector(step[:3]), step[3:6])
     cameras = []
     for camera in rig:
@@ -128,8 +127,7 @@ def _shifted(rig: Rig, step: np.ndarray) -> Rig:
 
 
 def _brought_together(rig: Rig, reference: Rig) -> Rig:
-    """Returns the rig with its world moved by the mean of the motions that take its cameras' frames to those of
-    ``reference``."""
+    """Moves the rig's world by the mean of the motions from its cameras' frames to those in ``reference``."""
     moves = [camera.camera_from_world.inverse() @ reference[camera.name].camera_from_world for camera in rig]
     rotation = nearest_rotation(np.sum([move.rotation for move in moves], axis=0))
     here = np.mean([camera.centre_world for camera in rig], axis=0)
@@ -139,11 +137,11 @@ def _brought_together(rig: Rig, reference: Rig) -> Rig:
 
 
 def image_distance(rig: Rig, reference: Rig, *, scale: bool = False) -> Float[np.ndarray, " c"]:
-    """Computes, for each camera, the RMS distance (px) between the images of the subject's region in ``rig`` and in
-    ``reference``, with aligned worlds.
+    """Computes, for each camera, the RMS distance (px) between images of the subject's region in ``rig`` and in
+    ``reference``, after aligning their worlds.
 
-    It measures a calibration error by its effect on a fit to silhouettes. Each rig projects with its own lenses, so
-    errors of principal point and rotation that cancel do not count."""
+    The distance measures a calibration error by its effect on a fit to silhouettes. Each rig projects with its own
+    lenses, so an error of the principal point that a rotation compensates does not count."""
     points = subject_points(reference)
     aligned = align_world(rig, reference, scale=scale)
     misses = [camera.project(points) - reference[camera.name].project(points) for camera in aligned]
@@ -156,11 +154,11 @@ def intrinsics_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) 
 
 
 def effective_pose(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "6 15"]:
-    """Returns the matrix that converts an error of the intrinsics (first nine) and pose of a camera to the pose
-    perturbation with the most similar effect on the subject's image.
+    """Returns the matrix that converts an error of a camera's nine intrinsics and pose to the pose perturbation with
+    the most similar effect on the subject's image.
 
-    Whoever treats the intrinsics as exact must allow the pose that error: a principal point that is 10 px off, for
-    example, acts almost like a rotation."""
+    A fit that treats the intrinsics as exact must allow for this error in the pose. A principal point that is 10 px
+    off, for example, acts almost like a rotation."""
     by_pose = pose_jacobian(camera, points_world).reshape(-1, 6)
     by_lens = intrinsics_jacobian(camera, points_world).reshape(-1, 9)
     good = np.isfinite(by_pose).all(axis=1) & np.isfinite(by_lens).all(axis=1)
@@ -169,9 +167,9 @@ def effective_pose(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Fl
 
 
 def image_sigma(rig: Rig, covariance: Float[np.ndarray, "c 15 c 15"]) -> Float[np.ndarray, " c"]:
-    """Computes, for each camera, the standard deviation (px, 2D) of its image of the subject's region, with aligned
-    worlds, under the joint covariance of all intrinsics (first nine) and poses. It estimates ``image_distance(rig, true
-    rig)``."""
+    """Computes, for each camera, the standard deviation (px, 2D) of its image of the subject's region, after aligning
+    worlds. ``covariance`` is the joint covariance of each camera's nine intrinsics and pose. The result estimates
+    ``image_distance(rig, true_rig)``."""
     points, count = subject_points(rig), len(rig)
     by_pose = [pose_jacobian(camera, points).reshape(-1, 6) for camera in rig]
     by_lens = [intrinsics_jacobian(camera, points).reshape(-1, 9) for camera in rig]
@@ -189,7 +187,7 @@ def image_sigma(rig: Rig, covariance: Float[np.ndarray, "c 15 c 15"]) -> Float[n
 
 
 def up_direction(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """Returns the upward unit vector, in the rig's present frame."""
+    """Returns the upward unit vector, in the rig's current world frame."""
     rights = np.stack([camera.camera_from_world.rotation[0] for camera in rig])
     ups = -np.stack([camera.camera_from_world.rotation[1] for camera in rig])
     values, vectors = np.linalg.eigh(rights.T @ rights)
@@ -201,11 +199,10 @@ def up_direction(rig: Rig) -> Float[np.ndarray, " 3"]:
 
 
 def in_world_frame(rig: Rig, front: str | None = None) -> Rig:
-    """Returns the same rig in the project's world frame. ``front`` names the front camera; by default it is the middle
-    one.
+    """Returns the same rig in the world frame of the module's docstring. ``front`` names the front camera; the default
+    is the middle camera.
 
-    Covariances are those of left perturbations and do not change. Raises InputError if ``front`` is no camera of the
-    rig."""
+    The covariances, of left perturbations, do not change. Raises InputError if the rig has no camera ``front``."""
     if front is not None and front not in rig:
         raise InputError("front camera", [compose("front-of-other-rig", front=f"{front!r}", cameras=rig.names)])
     origin, up = rig.centre_world(), up_direction(rig)

@@ -1,9 +1,8 @@
-"""Estimates each camera's lens from its own views of the board, as the bundle's start and as a check.
+"""Estimates each camera's lens from that camera's views of the board. The bundle adjustment starts from these lenses.
 
-Cameras are treated separately, so shots need not be synchronised. The focal length starts from a scan of candidates;
-for each the board's pose follows by IPPE (T. Collins, A. Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV
-2014). The bundle of ``bundle.py`` over the one camera completes the estimate, and its covariance tells whether the
-views suffice."""
+Cameras are treated separately, so shots need not be synchronised. IPPE computes the board's poses for each of several
+focal lengths (T. Collins, A. Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 2014). A bundle adjustment of
+that camera alone (``bundle.py``) completes the estimate. The covariance of the lens shows if the views suffice."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,8 +29,8 @@ CORNER_SIGMA_LEAST = 0.02  # px; no detector is better, and a perfect fit must n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lens:
-    """Holds one camera's lens, estimated from that camera alone. ``covariance`` is that of fx fy cx cy (px) k1 k2 p1 p2
-    k3; ``poses`` are the board's poses by shot."""
+    """Holds one camera's lens, estimated from that camera alone. ``covariance`` is the covariance of fx fy cx cy (px)
+    k1 k2 p1 p2 k3; ``poses`` holds the board's pose in each shot."""
 
     camera: str
     intrinsics: Intrinsics
@@ -49,7 +48,7 @@ class Lens:
 
     @property
     def weakness(self) -> Message | None:
-        """Returns a message on why the views do not determine the lens well; None if they do."""
+        """Returns a message that explains why the views do not determine the lens well; None if they do."""
         if self.views < VIEWS_LEAST:
             return compose("lens-views-too-few", camera=self.camera, views=self.views, needed=VIEWS_LEAST)
         share = self.sigma[0] / self.intrinsics.fx
@@ -69,7 +68,7 @@ def estimate_lenses(detections: Detections) -> dict[str, Lens]:
 
 
 def estimate_lens(views: Sequence[View], size: tuple[int, int], board: Board) -> Lens:
-    """Estimates the lens of one camera, and the board's poses, from one or more views."""
+    """Estimates the lens of one camera, and the board's poses, from its views. ``size`` is width and height, px."""
     shots = [view.shot for view in views]
     observed = observations(views, [views[0].camera], shots, board)
     state = _start(views, size, board)
@@ -105,16 +104,17 @@ def _lens(
 
 
 def noise_of(misses: Float[np.ndarray, "n 2"]) -> float:
-    """Returns the robust standard deviation (px) of one coordinate: the median length of the residuals over 1.1774,
-    that of a 2D Gaussian of unit variance. At least ``CORNER_SIGMA_LEAST``; 1 without residuals."""
+    """Returns the robust standard deviation (px) of one coordinate of 2D residuals. The estimate is the median length
+    of the residuals divided by 1.1774, the median length for unit variance. The result is at least
+    ``CORNER_SIGMA_LEAST``, and 1 if there are no residuals."""
     if not len(misses):
         return 1.0
     return max(float(np.median(np.linalg.norm(misses, axis=1))) / 1.1774, CORNER_SIGMA_LEAST)
 
 
 def _start(views: Sequence[View], size: tuple[int, int], board: Board) -> BundleState:
-    """Returns a first state: the best-fitting focal length of several, the principal point in the middle, no
-    distortion, and board poses by IPPE."""
+    """Returns the initial state: the best-fitting of several focal lengths, a central principal point, no distortion,
+    and board poses by IPPE."""
     width, height = size
     best: tuple[float, Intrinsics, list[RigidTransform]] | None = None
     for share in SCAN:
@@ -139,8 +139,8 @@ def _start(views: Sequence[View], size: tuple[int, int], board: Board) -> Bundle
 
 
 def board_poses_of(detection: Found, intrinsics: Intrinsics, board: Board) -> list[tuple[RigidTransform, float]]:
-    """Returns the possible poses camera_from_board of one view, each with its RMS error (px), best first. The image of
-    a plane has up to two."""
+    """Returns the possible poses camera_from_board of one view with their RMS errors (px), best first. The image of a
+    plane allows up to two poses."""
     points = board.corners()[detection.ids]
     count, turns, shifts, errors = cv2.solvePnPGeneric(
         points, detection.corners, intrinsics.matrix(), intrinsics.distortion.opencv(), flags=cv2.SOLVEPNP_IPPE

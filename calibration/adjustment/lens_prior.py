@@ -1,6 +1,6 @@
-"""Defines Gaussian priors of the intrinsics: knowledge about lenses that is independent of the corners.
+"""Defines Gaussian priors of the intrinsics, from knowledge about lenses that does not come from the corners.
 
-The default priors are weak; they only constrain parameters that the views do not determine."""
+The default priors are weak: they only influence parameters that the views hardly determine."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,25 +19,25 @@ LENS_PRIOR = {"k1": 0.5, "k2": 0.5, "p1": 0.01, "p2": 0.01, "k3": 0.5}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensPrior:
-    """Holds Gaussian priors of the intrinsics: mean and information (inverse covariance) for each camera."""
+    """Holds the mean and the information (inverse covariance) of each camera's intrinsics."""
 
     mean: Float[np.ndarray, "c 9"]
     information: Float[np.ndarray, "c 9 9"]
 
     def combine(self, mean: Float[np.ndarray, "c 9"], information: Float[np.ndarray, "c 9 9"]) -> "LensPrior":
-        """Returns the product of this prior with an independent second one."""
+        """Returns the product of this prior with a second, independent Gaussian prior."""
         total = self.information + information
         pull = np.einsum("cij,cj->ci", self.information, self.mean) + np.einsum("cij,cj->ci", information, mean)
         return LensPrior(np.linalg.solve(total, pull[:, :, None])[:, :, 0], total)
 
     def at(self, state: BundleState) -> "LinearisedLensPrior":
-        """Returns the prior at a state."""
+        """Evaluates the prior at a state of the bundle adjustment."""
         return LinearisedLensPrior(self, state.intrinsics - self.mean)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedLensPrior:
-    """Holds the prior and the difference ``away`` of the present intrinsics from its mean."""
+    """Holds the prior and the difference ``away`` of the state's intrinsics from the prior's mean."""
 
     prior: LensPrior
     away: Float[np.ndarray, "c 9"]
@@ -56,7 +56,7 @@ class LinearisedLensPrior:
 
 
 class AspectTerm:
-    """Computes the residual ``2 (fx - fy) / (fx + fy) / ASPECT_PRIOR`` of each camera: pixels are nearly square."""
+    """Computes the residual ``2 (fx - fy) / (fx + fy) / ASPECT_PRIOR``, a prior that pixels are nearly square."""
 
     def at(self, state: BundleState) -> "LinearisedAspectPrior":
         """Returns the term at a state."""
@@ -93,7 +93,7 @@ class LinearisedAspectPrior:
 
 
 def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
-    """Returns wide priors that hold for any lens; they depend on the image sizes alone."""
+    """Returns wide priors of the intrinsics that suit any lens. The priors depend only on the image sizes (px)."""
     mean, sigma = [], []
     for width, height in sizes:
         long = max(width, height)

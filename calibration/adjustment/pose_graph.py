@@ -1,10 +1,11 @@
-"""Estimates the poses of cameras and boards (the pose graph), as a start for the bundle adjustment.
+"""Estimates the poses of all cameras and boards (the pose graph), from which the bundle adjustment starts.
 
 Each view gives camera_from_board with two ambiguities: the image of a plane allows two poses (IPPE), and a checkerboard
-may be turned (``Board.turns``). Two cameras that share shots resolve both, since their relative pose must be the same
-in every shot: each shot's candidates are tested on all other shots, and the one with the most support wins. Pairs are
-joined by a maximum spanning tree. Remaining ambiguities are refused: a tie between turns, cameras without common shots,
-and a camera whose views agree with no other camera's (its pictures are mirrored, or its shots are misnamed)."""
+may be turned (``Board.turns``). The relative pose of two cameras must be the same in every shot. So each candidate for
+the relative pose is tested on all shared shots, and the candidate that fits most shots is chosen. A maximum spanning
+tree joins the pairs of cameras. The program refuses a tie between two candidates, cameras without common shots, and a
+camera whose views agree with no other camera. A camera that agrees with no other has mirrored pictures or misnamed
+shots."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -31,8 +32,7 @@ SAME_DEG = 15.0  # candidates whose rotations differ by less are one hypothesis
 
 
 class PoseGraphError(EigenheadError):
-    """Reports that the views do not determine the relative poses of the cameras. ``reasons`` are messages that name the
-    cameras."""
+    """Reports that the views do not determine the cameras' relative poses. ``reasons`` name the cameras."""
 
     def __init__(self, reasons: Iterable[Message]) -> None:
         self.reasons = tuple(reasons)
@@ -41,8 +41,8 @@ class PoseGraphError(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Holds the possible camera_from_board of one view: each pose combined with each turn of the board. ``turns`` are
-    indices into ``Board.turns()``."""
+    """Holds the possible poses camera_from_board of one view: each pose from IPPE combined with each turn of the board.
+    ``turns`` are indices into ``Board.turns()``."""
 
     poses: tuple[RigidTransform, ...]
     turns: tuple[int, ...]
@@ -52,8 +52,8 @@ class Candidates:
 class Edge:
     """Holds the relative pose of two cameras with common shots.
 
-    ``a_from_b`` is the best candidate, ``support`` the number of the ``shared`` shots in which it is correct;
-    ``ambiguous`` tells that another pose has equal support."""
+    ``a_from_b`` is the candidate pose that fits most of the ``shared`` common shots, and ``support`` counts the shots
+    that it fits. ``ambiguous`` is True if another pose fits as many shots."""
 
     a: str
     b: str
@@ -64,14 +64,14 @@ class Edge:
 
     @property
     def consistent(self) -> bool:
-        """Tells whether the relative pose is correct in at least half of the shared shots."""
+        """Returns whether the relative pose fits at least half of the shared shots."""
         return self.support >= max(1, self.shared / 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Graph:
-    """Holds all cameras and boards in the frame of ``names[0]``. The boards' turns are already applied to ``views``;
-    ``strays`` are views that fit in no turn."""
+    """Holds the poses of all cameras and boards in the frame of the camera ``names[0]``. The corners of ``views`` are
+    reordered by the turn of their board; ``strays`` are views that fit in no turn."""
 
     names: tuple[str, ...]
     shots: tuple[str, ...]
@@ -81,7 +81,7 @@ class Graph:
     strays: tuple[View, ...]
 
     def state(self, lenses: dict[str, Lens]) -> BundleState:
-        """Returns the graph as a bundle adjustment's start, with the intrinsics of ``lenses`` and no time offsets."""
+        """Returns the initial state of the bundle adjustment, with the intrinsics of ``lenses`` and no time offsets."""
         return BundleState(
             np.stack([lenses[name].intrinsics.values() for name in self.names]),
             np.stack([self.cameras[name].rotation for name in self.names]),
@@ -150,8 +150,7 @@ def _disagreement(
     of_b: Sequence[Sequence[RigidTransform]],
     board: Board,
 ) -> Float[np.ndarray, " s"]:
-    """Returns, for each shot, the smallest distance (squares) between the board in camera a's view and in camera b's,
-    in the frame of a."""
+    """Returns, for each shot, the smallest image distance (in squares) of board poses seen by cameras a and b."""
     corners = _outline(board)
     values = []
     for poses_a, poses_b in zip(of_a, of_b, strict=True):
@@ -164,8 +163,8 @@ def _disagreement(
 def _squares_apart(
     corners_world: Float[np.ndarray, "*k n 3"], put: Float[np.ndarray, "*j n 3"], board: Board
 ) -> Float[np.ndarray, "*b"]:
-    """Returns the distance in the image, in sides of a square of that view; large where ``put`` is behind the
-    camera."""
+    """Returns the image distance between two sets of corners, in sides of a square's image. The distance is large if
+    ``put`` lies behind the camera."""
     depth = corners_world[..., 2:]
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = np.linalg.norm(corners_world[..., :2] / depth - put[..., :2] / put[..., 2:], axis=-1) * depth[..., 0]
@@ -184,8 +183,8 @@ def _angle_deg(first: Float[np.ndarray, "3 3"], second: Float[np.ndarray, "3 3"]
 
 
 def _span(names: Sequence[str], edges: Sequence[Edge]) -> dict[str, RigidTransform]:
-    """Returns camera_from_world of all cameras that a maximum spanning tree reaches from ``names[0]`` (Prim's
-    algorithm); the frame of ``names[0]`` is the world."""
+    """Returns camera_from_world of all cameras that a maximum spanning tree (Prim's algorithm) reaches from the camera
+    ``names[0]``, whose frame is the world."""
     placed = {names[0]: RigidTransform.identity()}
     while True:
         border = [edge for edge in edges if (edge.a in placed) != (edge.b in placed)]
@@ -201,7 +200,7 @@ def _span(names: Sequence[str], edges: Sequence[Edge]) -> dict[str, RigidTransfo
 def _place_boards(
     views: Sequence[View], cameras: dict[str, RigidTransform], options: dict[tuple[str, str], Candidates], board: Board
 ) -> tuple[dict[str, RigidTransform], list[View], list[View]]:
-    """Returns world_from_board by shot, the views with the fitting turn applied, and the views that fit in no turn."""
+    """Returns world_from_board by shot, the views reordered by the board's turn, and the views that fit in no turn."""
     boards: dict[str, RigidTransform] = {}
     retained, strays = [], []
     corners, turns = _outline(board), board.turns()
@@ -227,7 +226,8 @@ def _fits(
     corners: np.ndarray,
     board: Board,
 ) -> list[tuple[float, int]]:
-    """Returns, for each view, the distance (squares) of the board at this pose in its best turn, and that turn."""
+    """Returns, for each view, the image distance (in squares) of the board at ``world_from_board`` in its best turn,
+    and the index of this turn."""
     table = []
     for view in views:
         option = options[view.camera, view.shot]
@@ -252,7 +252,7 @@ def _reasons(
     edges: Sequence[Edge],
     options: dict[tuple[str, str], Candidates],
 ) -> list[Message]:
-    """Returns one message for each group of cameras that is not connected with the largest."""
+    """Returns one message for each group of cameras that is not connected to the largest group."""
     good = [edge for edge in edges if edge.consistent and not edge.ambiguous]
     groups: list[set[str]] = []
     for name in names:
@@ -304,8 +304,7 @@ def _fits_when_mirrored(
 
 
 def _mirror(detection: Found, board: Board, width: int) -> Found:
-    """Returns the detection in the picture mirrored left to right, with its corners ordered according to the board's
-    colours."""
+    """Returns the corners as they would be detected in the mirrored picture; ``width`` is its width, px."""
     columns, rows = board.grid
     index = np.arange(board.corner_count).reshape(rows, columns)
     # A mirrored row starts with the same colour where the number of columns of squares is odd; else turn the rows over.

@@ -1,6 +1,6 @@
-"""Defines the unknowns of a bundle adjustment (the state) and its observations, and projects the corners of a state.
+"""Defines the unknowns of a bundle adjustment (the state) and its observations, and projects the board's corners.
 
-Poses are perturbed from the left, as in ``Camera.covariance``."""
+A perturbation multiplies a pose from the left, as in ``Camera.covariance``."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ DEPTH_LEAST_MM = 1e-3
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
     """Holds the detected corners of all views, sorted by view. ``camera`` and ``shot`` are each view's indices into the
-    state; ``starts`` are the first corner of each view, and the end."""
+    state. View v has the corners from ``starts[v]`` to ``starts[v + 1]``."""
 
     camera: Int[np.ndarray, " v"]
     shot: Int[np.ndarray, " v"]
@@ -32,11 +32,11 @@ class Observations:
 
     @property
     def view_of(self) -> Int[np.ndarray, " n"]:
-        """Returns the index of the view of each corner."""
+        """Returns, for each corner, the index of its view."""
         return np.repeat(np.arange(len(self.camera)), np.diff(self.starts))
 
     def subset(self, retained: Bool[np.ndarray, " n"]) -> "Observations":
-        """Returns only the corners marked in ``retained``. All views stay, possibly without corners."""
+        """Returns the corners that ``retained`` marks. All views remain, possibly without corners."""
         counts = np.bincount(self.view_of[retained], minlength=len(self.camera))
         starts = np.concatenate([[0], np.cumsum(counts)])
         return replace(self, starts=starts, points=self.points[retained], pixels=self.pixels[retained])
@@ -44,10 +44,10 @@ class Observations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleState:
-    """Holds the estimated parameters: intrinsics (fx fy cx cy k1 k2 p1 p2 k3), camera_from_world, world_from_board
-    (mm).
+    """Holds the estimated intrinsics (fx fy cx cy k1 k2 p1 p2 k3), camera_from_world and world_from_board (mm).
 
-    ``offsets`` are time offsets of each camera, in shots; ``velocities`` the motion of the board per shot (rad, mm)."""
+    ``offsets`` is the time offset of each camera, in intervals between shots. ``velocities`` is the motion of the board
+    from one shot to the next (rad, mm)."""
 
     intrinsics: Float[np.ndarray, "c 9"]
     camera_rotations: Float[np.ndarray, "c 3 3"]
@@ -63,7 +63,7 @@ class BundleState:
 
 
 def observations(views: Sequence[View], cameras: Sequence[str], shots: Sequence[str], board: Board) -> Observations:
-    """Collects the corners of all views: pixels, and positions on the board (mm)."""
+    """Collects the pixels of all views' corners and their positions on the board (mm)."""
     corners = board.corners()
     counts = [len(view.found.ids) for view in views]
     return Observations(
@@ -76,19 +76,18 @@ def observations(views: Sequence[View], cameras: Sequence[str], shots: Sequence[
 
 
 def intrinsics_of(values: Float[np.ndarray, " 9"], size: tuple[int, int]) -> Intrinsics:
-    """Builds intrinsics from ``fx fy cx cy k1 k2 p1 p2 k3``, the order of a bundle's unknowns; ``size`` is width and
-    height, px."""
+    """Builds intrinsics from the values ``fx fy cx cy k1 k2 p1 p2 k3``; ``size`` is width and height, px."""
     fx, fy, cx, cy, *lens = (float(value) for value in values)
     return Intrinsics(*size, fx, fy, cx, cy, Distortion(*lens))
 
 
 def camera_of(state: BundleState, index: int, name: str, size: tuple[int, int]) -> Camera:
-    """Returns the camera at ``index`` of a state, camera_from_world in mm."""
+    """Returns the camera at ``index`` of a state, with its pose in mm; ``size`` is width and height, px."""
     return Camera(name, intrinsics_of(state.intrinsics[index], size), state.camera_pose(index))
 
 
 def moved_state(state: BundleState, step: Float[np.ndarray, " q"]) -> BundleState:
-    """Returns the state after a step ``step`` of all parameters: cameras (intrinsics, pose), boards, time offsets."""
+    """Returns the state after adding ``step`` to all parameters: cameras (intrinsics, pose), boards, time offsets."""
     cameras, shots = len(state.intrinsics), len(state.board_rotations)
     per_camera = step[: cameras * PER_CAMERA].reshape(cameras, PER_CAMERA)
     per_shot = step[cameras * PER_CAMERA : cameras * PER_CAMERA + shots * PER_SHOT].reshape(shots, PER_SHOT)
@@ -110,7 +109,7 @@ def _motions(steps: Float[np.ndarray, "n 6"]) -> tuple[Float[np.ndarray, "n 3 3"
 
 
 def orthonormal(state: BundleState) -> BundleState:
-    """Returns the state with rotations made orthonormal again, after the rounding errors of many steps."""
+    """Makes all rotations of the state orthonormal again, which rounding errors of many steps spoil."""
     return replace(
         state,
         camera_rotations=np.stack([nearest_rotation(r) for r in state.camera_rotations]),
@@ -121,7 +120,7 @@ def orthonormal(state: BundleState) -> BundleState:
 def corner_positions(
     state: BundleState, observed: Observations
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """Returns all corners in the world frame and in their camera's frame (mm), and the camera index of each."""
+    """Returns all corners in the world frame and in their camera's frame (mm), and each corner's camera index."""
     camera, shot = observed.camera[observed.view_of], observed.shot[observed.view_of]
     world = np.einsum("nij,nj->ni", state.board_rotations[shot], observed.points) + state.board_translations[shot]
     if state.offsets.any():
@@ -133,7 +132,7 @@ def corner_positions(
 
 
 def residuals(state: BundleState, observed: Observations) -> Float[np.ndarray, "n 2"]:
-    """Returns projected minus detected pixels; ``BEHIND_PX`` for corners behind their camera."""
+    """Returns projected minus detected pixels of each corner. Corners behind their camera get ``BEHIND_PX``."""
     _, inside, camera = corner_positions(state, observed)
     behind = inside[:, 2] < DEPTH_LEAST_MM
     inside[behind] = (0.0, 0.0, 1.0)
@@ -143,5 +142,5 @@ def residuals(state: BundleState, observed: Observations) -> Float[np.ndarray, "
 
 
 def rms(misses: Float[np.ndarray, "n 2"]) -> float:
-    """Returns the root mean square length of residuals (px); 0 if there are none."""
+    """Returns the root mean square length of 2D residuals (px), or 0 without residuals."""
     return float(np.sqrt((misses**2).sum(axis=1).mean())) if len(misses) else 0.0

@@ -1,8 +1,8 @@
-"""Estimates whether the cameras were synchronous: a time offset for each, from how residuals follow the board's motion.
+"""Estimates a time offset of each camera from the dependence of its residuals on the board's motion.
 
 The board's velocity in a shot is the central difference of its poses in the shots before and after. So offsets are in
-units of the time between shots; they are meaningful only if the shots are frames of one recording. They are estimated
-jointly with all other parameters; the first camera's offset is zero."""
+units of the time between shots, and they are meaningful only if the shots are frames of one recording. The offsets are
+estimated jointly with all other parameters; the first camera's offset is zero."""
 
 from dataclasses import dataclass, replace
 
@@ -17,8 +17,8 @@ from rig.geometry import RigidTransform, vector_from_rotation
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeOffsets:
-    """Holds offsets and standard deviations of each camera (in shots), and the RMS of the residuals (px, 2D) without
-    and with them."""
+    """Holds each camera's time offset and its standard deviation (in intervals between shots). Also holds the RMS of
+    the residuals (px, 2D) without and with offsets."""
 
     offsets: Float[np.ndarray, " c"]
     sigma: Float[np.ndarray, " c"]
@@ -27,8 +27,8 @@ class TimeOffsets:
 
 
 def board_velocities(state: BundleState) -> Float[np.ndarray, "s 6"]:
-    """Returns the board's motion per shot, a left perturbation of world_from_board (rad, mm); one-sided differences at
-    the ends."""
+    """Returns the board's motion per shot as a left perturbation of world_from_board (rad, mm). The first and last shot
+    use one-sided differences."""
     poses = [RigidTransform(r, t) for r, t in zip(state.board_rotations, state.board_translations, strict=True)]
     velocities = np.zeros((len(poses), 6))
     for i in range(len(poses)):
@@ -46,7 +46,7 @@ def board_velocities(state: BundleState) -> Float[np.ndarray, "s 6"]:
 def estimate_offsets(
     state: BundleState, observed: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"]
 ) -> TimeOffsets:
-    """Estimates the offsets by solving the bundle again with them, starting from its solution ``state``."""
+    """Estimates the time offsets by a second bundle adjustment, which starts from the solution ``state``."""
     before = rms(residuals(state, observed))
     state = replace(state, velocities=board_velocities(state))
     first = adjust(state, observed, prior, sigma, free=Free(offsets=True), loss=HUBER).state

@@ -1,10 +1,10 @@
-"""Describes the calibration board: its print, the positions of its corners, and its picture in a camera.
+"""Describes the calibration board, prints it, computes its corners, and simulates its picture in a camera.
 
-Board frame: origin at the outer corner of the first square, x along a row of squares, y down its columns, z *into* the
-board (away from the viewer), so that a camera in front of the board sees x to the right when y points down. The frame
-is right-handed and matches OpenCV's. The first square is black (white if ``inverted``, or if a ChArUco board with an
-even number of rows is ``legacy``, as OpenCV before 4.6 and calib.io draw it). Corners are the inner ones, numbered row
-by row.
+The board frame is right-handed and matches OpenCV's. The frame's origin is the outer corner of the first square. The x
+axis runs along a row of squares, y down a column, and z *into* the board (away from the viewer). The first square is
+normally black. The first square of an ``inverted`` board is white. The first square is also white if a ChArUco board
+with an even number of rows is ``legacy``, as drawn by OpenCV before 4.6 and calib.io. The term corner means an inner
+corner; corners are numbered row by row.
 """
 
 import tomllib
@@ -45,8 +45,7 @@ FAN_DEG = 150.0  # azimuths that a simulated board faces in turn
 @dataclass(frozen=True, slots=True)
 class Board:
     """Describes a calibration board; ``columns`` and ``rows`` count squares. ``measured_width_mm`` and
-    ``measured_height_mm`` are the outer size of the printed pattern as measured by ruler or caliper, against which the
-    scale is checked."""
+    ``measured_height_mm`` are the outer size of the printed pattern, measured with a ruler, to check the scale."""
 
     kind: Kind
     columns: int
@@ -76,18 +75,18 @@ class Board:
         return self.columns * self.rows // 2
 
     def corners(self) -> Float[np.ndarray, "n 3"]:
-        """Returns the inner corners in the board frame, mm, row by row."""
+        """Returns the positions of the inner corners (mm) in the board frame, row by row."""
         x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
         return self.square_mm * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
     def centre(self) -> Float[np.ndarray, " 3"]:
-        """Returns the middle of the board, in the board frame, mm."""
+        """Returns the middle of the board (mm) in the board frame."""
         return 0.5 * self.square_mm * np.array([self.columns, self.rows, 0.0])
 
     def turns(self) -> list[Int[np.ndarray, " _"]]:
-        """Returns the orders of the corners that no picture can distinguish: for each rotation of the board that leaves
-        its colours unchanged, ``order[i]`` is the corner that then appears at corner i. A ChArUco board has only one
-        order, because its markers differ."""
+        """Returns an order of the corners for each rotation of the board that leaves its colours unchanged. After the
+        rotation, corner ``order[i]`` appears at the position of corner i. A ChArUco board has only one order, because
+        its markers differ."""
         index = np.arange(self.corner_count).reshape(self.rows - 1, self.columns - 1)
         if self.kind == "charuco":
             return [index.ravel()]
@@ -102,20 +101,20 @@ class Board:
 
     @property
     def is_chiral(self) -> bool:
-        """Tells whether a picture of the pattern differs from every picture of its mirror image; only such a board
-        reveals a mirrored camera. A checkerboard that is square or has an odd side equals its mirror image."""
+        """Returns whether the pattern differs from its mirror image, so that pictures of the board reveal a mirrored
+        camera. A checkerboard that is square or has an odd side equals its mirror image."""
         if self.kind == "charuco":
             return True
         return self.columns % 2 == 0 and self.rows % 2 == 0 and self.columns != self.rows
 
     def squares(self) -> Bool[np.ndarray, "rows columns"]:
-        """Tells for each square whether it is black."""
+        """Returns True for each black square."""
         row, column = np.indices((self.rows, self.columns))
         white_first = self.kind == "charuco" and self.legacy and self.rows % 2 == 0
         return ((row + column) % 2 == 0) ^ self.inverted ^ white_first
 
     def opencv(self) -> cv2.aruco.CharucoBoard:
-        """Returns the board as an object of OpenCV. For ChArUco boards only."""
+        """Returns a ChArUco board as an object of OpenCV."""
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         size = (self.columns, self.rows)
         numbers = np.arange(self.marker_count) + self.first_marker
@@ -125,7 +124,7 @@ class Board:
 
 
 def read_board(path: Path) -> Board:
-    """Reads a board from a ``board.toml`` file. Raises InputError that names every fault."""
+    """Reads a board from a ``board.toml`` file. Raises an InputError that names every fault."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
@@ -134,7 +133,7 @@ def read_board(path: Path) -> Board:
 
 
 def board_from_document(document: Mapping[str, Any], subject: str = "board.toml") -> Board:
-    """Returns the board described by a decoded ``board.toml``. Raises InputError that names every fault."""
+    """Returns the board that a decoded ``board.toml`` describes. Raises an InputError that names every fault."""
     known = set(Board.__dataclass_fields__)
     strange = [key for key in document if key not in known]
     faults = [compose("board-key-unknown", key=f"{key!r}", known=sorted(known)) for key in strange]
@@ -202,7 +201,7 @@ def _side(board: Board, key: str) -> int:
 
 
 def write_board_pdf(board: Board, path: Path) -> tuple[float, float]:
-    """Writes the board as a PDF at true scale, with a ruler, on the smallest paper that fits; returns its size (mm)."""
+    """Writes the board and a ruler to a PDF at true scale. Returns the size (mm) of the smallest paper that fits."""
     width, height = board.columns * board.square_mm, board.rows * board.square_mm
     page = _paper(width, height)
     pdf = FPDF(unit="mm", format=page)
@@ -233,7 +232,7 @@ def _paper(width: float, height: float) -> tuple[float, float]:
 
 
 def _rectangles(board: Board) -> list[tuple[float, float, float, float, bool]]:
-    """Returns x, y, width, height (mm) of each rectangle and whether it is white, in the order of drawing."""
+    """Returns x, y, width and height (mm) of each printed rectangle, and whether it is white, in drawing order."""
     side = board.square_mm
     paint = board.inverted  # white squares on black paper, or black on white
     squares = [
@@ -261,7 +260,7 @@ def _marker(board: Board, number: int, x: float, y: float) -> list[tuple[float, 
 
 
 def _runs(cells: Bool[np.ndarray, "n n"]) -> list[tuple[int, int, int]]:
-    """Returns (line, first, one past the last) for every run of True."""
+    """Returns (row, first column, one past the last column) for every run of True cells."""
     padded = np.pad(cells, ((0, 0), (1, 1))).astype(np.int8)
     steps = np.diff(padded, axis=1)
     starts, ends = np.argwhere(steps == 1), np.argwhere(steps == -1)
@@ -290,8 +289,8 @@ def _draw_foot(pdf: FPDF, board: Board, page: tuple[float, float]) -> None:
 
 
 def board_poses(board: Board, count: int, rng: np.random.Generator) -> list[RigidTransform]:
-    """Draws world_from_board (mm) of a board that a person turns from one side of the rig to the other, tilted and
-    rolled, around the world's origin."""
+    """Draws random poses world_from_board (mm) near the world's origin, as if a person turned the board from one side
+    of the rig to the other."""
     poses = []
     for azimuth in np.radians(FAN_DEG * ((np.arange(count) + 0.5) / count - 0.5)):
         # The board's z points away from the viewer: for a viewer on +z of the world, x right is world x, y down is -y.
@@ -305,8 +304,8 @@ def board_poses(board: Board, count: int, rng: np.random.Generator) -> list[Rigi
 def photograph_board(
     board: Board, world_from_board: RigidTransform, camera: Camera, rng: np.random.Generator, *, blur_px: float = 0.6
 ) -> UInt8[np.ndarray, "h w"]:
-    """Simulates a picture of the board before a plain wall, with noise. A camera behind the board sees white paper.
-    OpenCV draws the pattern, so that the program's own drawing is not used to test itself."""
+    """Simulates a noisy picture of the board before a plain wall. A camera behind the board sees white paper. OpenCV
+    draws the pattern, because a test of ``write_board_pdf`` needs an independent drawing."""
     from scipy.interpolate import RectBivariateSpline
 
     k, side = camera.intrinsics, 2  # samples of a pixel's side
@@ -327,7 +326,7 @@ def photograph_board(
 
 
 def _sheet(board: Board) -> UInt8[np.ndarray, "h w"]:
-    """Draws the printed sheet, with a square of paper around the pattern."""
+    """Draws the printed sheet, with a margin as wide as a square around the pattern."""
     size = (board.columns * SHEET_PX, board.rows * SHEET_PX)
     if board.kind == "charuco":
         sheet = board.opencv().generateImage(size)

@@ -1,11 +1,11 @@
-"""Finds the corners of a board in one grey picture: their numbers, and their positions to a fraction of a pixel.
+"""Finds the numbers and sub-pixel positions of a board's corners in one grey picture.
 
-Checkerboards: ``findChessboardCornersSB`` (A. Duda, U. Frese, "Accurate Detection and Localization of Checkerboard
-Corners for Calibration", BMVC 2018), first plain, then exhaustive; if it finds nothing, the classic detector with
-``cornerSubPix``. ChArUco: ``CharucoDetector``. Every result is checked. The corners must be the image of a flat grid
-seen from its front. A checkerboard must have the described size, and its corners are ordered by handedness and colour.
-The pose graph, which compares cameras, decides between rotations that colours cannot distinguish (``Board.turns``).
-CALIB_CB_LARGER would detect a larger board but, on real pictures, adds rows that do not exist.
+OpenCV's ``findChessboardCornersSB`` finds checkerboards (A. Duda, U. Frese, "Accurate Detection and Localization of
+Checkerboard Corners for Calibration", BMVC 2018). If its exhaustive search also fails, the older detector and
+``cornerSubPix`` are used. ``CharucoDetector`` finds ChArUco boards. The detected corners must be the image of a flat
+grid seen from its front. A checkerboard must have the described size; its corners are ordered so that the grid is
+right-handed and agrees with the colours. If a rotation leaves the colours unchanged (``Board.turns``), the pose graph
+chooses the order later. The option CALIB_CB_LARGER is not used: on real pictures it adds rows that do not exist.
 """
 
 from dataclasses import dataclass
@@ -27,8 +27,8 @@ SB = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """Holds the board's corners in one picture: their numbers ``ids`` and pixels. ``rise_px`` measures the blur: the
-    width (px) of an edge from 10 to 90 % of its height."""
+    """Holds the numbers ``ids`` and the pixels of the board's corners in one picture. ``rise_px`` measures the blur as
+    the width (px) of an edge from 10 to 90 % of its contrast."""
 
     ids: Int[np.ndarray, " n"]
     corners: Float[np.ndarray, "n 2"]
@@ -36,8 +36,7 @@ class Found:
 
 
 def detect(grey: UInt8[np.ndarray, "h w"], board: Board) -> Found | None:
-    """Finds the board in one grey picture. Returns its corners to a fraction of a pixel, in the board's order; None if
-    the board is not found."""
+    """Returns the sub-pixel corners of the board in one grey picture, in the board's order, or None."""
     picture = 255 - grey if board.inverted else grey
     corners = (_charuco if board.kind == "charuco" else _checkerboard)(picture, board)
     if corners is None or len(corners[0]) < CORNERS_LEAST or not is_flat_grid(board, *corners):
@@ -46,7 +45,7 @@ def detect(grey: UInt8[np.ndarray, "h w"], board: Board) -> Found | None:
 
 
 def is_flat_grid(board: Board, ids: Int[np.ndarray, " n"], corners: Float[np.ndarray, "n 2"]) -> bool:
-    """Tells whether ``corners`` are, up to a lens's distortion, the image of the board's grid seen from its front."""
+    """Returns whether ``corners`` (px) are, up to lens distortion, the image of the board's front."""
     flat = board.corners()[ids, :2] / board.square_mm
     if np.linalg.matrix_rank(flat - flat.mean(axis=0)) < 2:
         return False
@@ -58,9 +57,8 @@ def is_flat_grid(board: Board, ids: Int[np.ndarray, " n"], corners: Float[np.nda
 
 
 def rise(grey: UInt8[np.ndarray, "h w"], board: Board, found: Corners) -> float:
-    """Computes the width (px) of the board's edges, from 10 to 90 % of their height, in the blurrier of the board's two
-    directions. It is infinite if no edge rises within the available space (half a square, or the border around a
-    marker)."""
+    """Computes the width (px) of the board's edges, from 10 to 90 % of their contrast, in the blurrier of the board's
+    two directions. Returns infinity if every edge is wider than the half square or the marker's border beside it."""
     ids, corners = found
     flat = board.corners()[ids, :2] / board.square_mm
     homography = _homography(flat, corners)
@@ -76,7 +74,7 @@ def rise(grey: UInt8[np.ndarray, "h w"], board: Board, found: Corners) -> float:
 
 
 def _edge_width(grey: np.ndarray, homography: np.ndarray, middles: np.ndarray, reach: np.ndarray) -> float:
-    """Returns the median width of edges through ``middles`` (board, in squares), sampled ``reach`` either way."""
+    """Returns the median width of edges through ``middles`` (board frame, in squares), sampled up to ``reach``."""
     steps, along = np.linspace(-1.0, 1.0, 61), 0.1 * (reach[::-1] > 0)
     # Three lines beside each other, averaged: noise must not pass for blur.
     points = middles[:, None, None] + np.array([-1, 0, 1])[:, None, None] * along + steps[:, None] * reach
@@ -112,8 +110,8 @@ def _checkerboard(grey: np.ndarray, board: Board) -> Corners | None:
 
 
 def in_board_order(grey: np.ndarray, corners: np.ndarray, board: Board) -> Float[np.ndarray, "rows columns 2"]:
-    """Returns the corners (px) as a grid of the board's rows and columns, turned so that it is right-handed and agrees
-    with the board's colours."""
+    """Returns the corners (px) as a grid of rows and columns, turned so that the grid is right-handed and agrees with
+    the board's colours."""
     columns, rows = board.grid
     grid = corners.reshape(rows, columns, 2)
     across, down = (grid[:, -1] - grid[:, 0]).mean(axis=0), (grid[-1] - grid[0]).mean(axis=0)
@@ -127,7 +125,7 @@ def in_board_order(grey: np.ndarray, corners: np.ndarray, board: Board) -> Float
 
 
 def _contrast(grey: np.ndarray, grid: Float[np.ndarray, "rows columns 2"]) -> float:
-    """Returns the mean grey of the board's white squares minus that of the black ones."""
+    """Returns the mean grey value of the board's white squares minus the mean of its black squares."""
     middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     row, column = np.indices(middles.shape[:2])
     black = (row + column) % 2 == 0  # the square between the first four inner corners is (1, 1): black
@@ -136,8 +134,7 @@ def _contrast(grey: np.ndarray, grid: Float[np.ndarray, "rows columns 2"]) -> fl
 
 
 def pattern_continues(grey: np.ndarray, grid: Float[np.ndarray, "rows columns 2"]) -> bool:
-    """Tells whether squares also alternate outside the board's outline, so that the corners found are part of a larger
-    board."""
+    """Returns whether the squares continue outside the grid, so that the corners belong to a larger board."""
     inside = abs(_contrast(grey, grid))
     rows, columns = grid.shape[:2]
     flat = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
@@ -169,15 +166,14 @@ def _sector_based(grey: np.ndarray, board: Board, flags: int = SB) -> np.ndarray
 
 
 def classic_corners(grey: np.ndarray, board: Board) -> np.ndarray | None:
-    """Returns the corners (px, row by row) that OpenCV's detector with adaptive threshold finds; None unless it finds
-    the whole board."""
+    """Returns the corners (px, row by row) from OpenCV's adaptive threshold detector, or None if any is missing."""
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     ok, corners = cv2.findChessboardCorners(grey, board.grid, flags=flags)
     return _refine(grey, corners.reshape(-1, 2), 0.35, board) if ok else None
 
 
 def _refine(grey: np.ndarray, corners: np.ndarray, share: float, board: Board) -> np.ndarray:
-    """Calls ``cornerSubPix`` with a window of ``share`` of a square's side in the image."""
+    """Refines corners (px) with ``cornerSubPix``; the window is ``share`` of a square's side in the image."""
     spread = np.sqrt(abs(np.linalg.det(np.cov(corners.T))))  # of a uniform grid: (n sides)^2 / 12 in each direction
     side = np.sqrt(12.0 * spread / board.corner_count)
     window = int(np.clip(share * side, 2, 15))

@@ -1,11 +1,11 @@
-"""Finds the board in many pictures, in parallel, and caches the results by the pictures' content. ``corners`` examines
-one picture. If the described board is not found, its markers tell which board is in the pictures.
+"""Finds the board in many pictures, in parallel, and caches the results by the pictures' content. If the described
+board is not found, the markers show which board is in the pictures.
 
-A ChArUco board's markers are numbered row by row over its white squares. The description may be wrong in several ways.
-OpenCV before 4.6 and calib.io begin an even number of rows with a white square; the second board of a pair begins with
-another number; squares may be miscounted, the marker's side mismeasured, or the dictionary wrong. In each case a
-homography maps the markers' centres to another layout, which reveals the cause. A marker's side is measured in units of
-the squares.
+A ChArUco board's markers are numbered row by row over its white squares. The description of the board may be wrong in
+several ways. OpenCV before 4.6 and calib.io begin a board of an even number of rows with a white square. The second
+board of a pair begins with another marker number. The user may have miscounted squares, mismeasured the marker's side,
+or named the wrong dictionary. Each wrong description implies another layout of the markers. The layout to which a
+homography maps the markers' centres reveals the fault.
 """
 
 import contextlib
@@ -45,7 +45,7 @@ RATIO_OFF = 0.05  # of the square, between the told and the measured side of mar
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Holds one camera's corners of the board in one shot."""
+    """Holds the corners of the board that one camera saw in one shot."""
 
     camera: str
     shot: str
@@ -61,21 +61,21 @@ class PictureNote:
     reason: Message
 
     def message(self) -> Message:
-        """Returns the note as a message that names the picture and the reason."""
+        """Returns a message that names the picture and the reason."""
         return compose("located", where=f"{self.camera}/{self.picture}", fault=self.reason)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
-    """Holds the detections of the board in all pictures.
+    """Holds the board's corners in all pictures.
 
     Attributes:
-        board: as it is, perhaps corrected.
+        board: the board, corrected if the markers contradict its description.
         sizes: width and height of each camera's pictures, px.
-        shots: their names.
+        shots: names of the shots.
         views: the corners that each camera saw in each shot.
-        notes: for cameras that never see the board, what their pictures show instead.
-        remarks: how the board differs from its description.
+        notes: reasons why some cameras never see the board.
+        remarks: differences between the board and its description.
     """
 
     board: Board
@@ -92,14 +92,14 @@ class Detections:
 
 
 class WrongBoard(EigenheadError):
-    """Reports that the pictures show a board other than the described one."""
+    """Reports that the pictures show a board that differs from its description."""
 
     def __init__(self, reasons: Iterable[Message]) -> None:
         super().__init__(compose("wrong-board", notes=tuple(reasons)))
 
 
 def reasons_of(notes: Iterable[PictureNote]) -> list[Message]:
-    """Returns each reason once, with its pictures."""
+    """Returns one message for each reason, which lists the pictures."""
     pictures: dict[Message, list[str]] = {}
     for note in notes:
         pictures.setdefault(note.reason, []).append(f"{note.camera}/{note.picture}")
@@ -123,11 +123,11 @@ def detect_folder(
     together: bool = True,
     report: Progress = discard_progress,
 ) -> Detections:
-    """Finds the board in every picture of ``folder``. A ChArUco board is also found if its first square is white, or if
-    its markers begin at a number other than described.
+    """Finds the board in every picture of ``folder``. A ChArUco board is also found if the description has a wrong
+    colour of the first square or a wrong first marker number.
 
-    ``cache`` is a folder for results by the pictures' SHA-256; ``together``: cameras must share shots. Raises
-    InputError for damaged input, and WrongBoard if no picture shows the board and some show another.
+    The folder ``cache`` stores results by the pictures' SHA-256. ``together`` requires cameras to share shots. Raises
+    InputError for damaged input, and WrongBoard if pictures show only another board.
     """
     pictures = list_pictures(folder, together=together)
     detections = _detect_pictures(folder, pictures, board, cache, workers, report)
@@ -150,8 +150,8 @@ def _with_measured_pattern(
     workers: int,
     report: Progress,
 ) -> Detections:
-    """Returns the board with its pattern read from its markers, if it is not found as described. Raises WrongBoard if
-    its markers are not as wide as described, because their edges would then seem blurred."""
+    """If the board is not found as described, reads its layout from its markers and detects again. Raises WrongBoard if
+    the markers' side differs from the description, because the edges would then seem blurred."""
     board = detections.board
     found_share = len(detections.views) / sum(map(len, pictures.values()))
     greys = _sample(pictures, MEASURED)
@@ -176,15 +176,15 @@ def _with_measured_pattern(
 
 
 def _refuse_markers(pictures: dict[str, dict[str, Path]]) -> None:
-    """Raises WrongBoard where pictures that should show a checkerboard show markers. Some squares of a ChArUco board
-    pass for a checkerboard, and the markers' edges for blur."""
+    """Raises WrongBoard if the pictures show markers though the board is described as a checkerboard. Part of a ChArUco
+    board may be detected as a checkerboard, and the markers mistaken for blur."""
     dictionary = other_dictionary(_sample(pictures, TRIED)[:TRIED], "")
     if dictionary is not None:
         raise WrongBoard([compose("board-has-markers", dictionary=dictionary)])
 
 
 def _sample(pictures: dict[str, dict[str, Path]], count: int) -> list[UInt8[np.ndarray, "_ _"]]:
-    """Returns about ``count`` pictures, in grey, from all cameras and shots."""
+    """Returns about ``count`` grey pictures, spread over all cameras and shots."""
     paths = [path for shots in pictures.values() for path in shots.values()]
     every = paths[:: max(1, len(paths) // count)]
     return [grey for path in every if (grey := _decode(path.read_bytes())) is not None]
@@ -235,7 +235,7 @@ def _detect_pictures(
 
 
 def _detect_file(path: Path, board: Board, cache: Path | None) -> tuple[tuple[int, int], Found | None] | Message:
-    """Returns the picture's size and its detection, or the file's fault."""
+    """Returns the picture's width and height (px) and its corners, or a message about the file's fault."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -277,7 +277,7 @@ def _from_cache(path: Path) -> Found | None:
 def _explain_missing(
     pictures: dict[str, dict[str, Path]], sizes: dict[str, tuple[int, int]], views: list[View], board: Board
 ) -> list[PictureNote]:
-    """Returns notes on cameras that never see the board: what their pictures show instead, if it is recognised."""
+    """Returns the reasons, where recognised, why some cameras never see the board."""
     notes = []
     cameras_with_board = {view.camera for view in views}
     for camera in (camera for camera in sizes if camera not in cameras_with_board):
@@ -330,7 +330,7 @@ def _explain_checkerboard(grey: np.ndarray, board: Board) -> Message | None:
 
 
 def _explain_charuco(grey: np.ndarray, board: Board) -> Message | None:
-    """Explains, from a picture's markers, why the board was not found."""
+    """Explains from the markers in a picture why the board was not found."""
     markers = find_markers(grey, board.dictionary)
     mirrored = find_markers(np.ascontiguousarray(grey[:, ::-1]), board.dictionary)
     if len(mirrored) > len(markers) + 2:
@@ -347,8 +347,8 @@ def _explain_charuco(grey: np.ndarray, board: Board) -> Message | None:
 
 
 def explain_markers(pictures: Sequence[Markers], board: Board) -> Message | None:
-    """Explains how the board in the pictures differs from ``board``, according to their markers; None if it does not
-    differ."""
+    """Explains from the markers in pictures how the visible board differs from ``board``. Returns None if both
+    agree."""
     layout = find_layout(pictures, board)
     if layout is None:
         if any(map(is_april_grid, pictures)):
@@ -366,9 +366,9 @@ def explain_markers(pictures: Sequence[Markers], board: Board) -> Message | None
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Describes how markers are laid out: squares in a row, number of the first marker, and whether the first square is
-    white (``legacy``). ``ratio`` is the measured side of a marker divided by that of a square, ``markers`` the count
-    up to the last that fits: a picture's background may pass for any."""
+    """Describes the layout of markers: squares in a row, number of the first marker, and whether the first square is
+    white (``legacy``). ``ratio`` is the measured side of a marker divided by a square's side. ``markers`` counts the
+    markers up to the last one that fits the layout, because false markers may be detected in the background."""
 
     columns: int
     first_marker: int
@@ -378,8 +378,7 @@ class Layout:
 
 
 def find_markers(grey: UInt8[np.ndarray, "h w"], dictionary: str) -> dict[int, Float[np.ndarray, "4 2"]]:
-    """Returns the corners (px) of the markers in a grey picture, by the marker's number. A number that occurs twice is
-    left out."""
+    """Returns the corners (px) of the markers in a grey picture by marker number, without numbers that occur twice."""
     return _detected(grey, cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)))
 
 
@@ -391,8 +390,8 @@ def _detected(grey: np.ndarray, dictionary: cv2.aruco.Dictionary) -> dict[int, F
 
 
 def find_layout(pictures: Sequence[Markers], board: Board) -> Layout | None:
-    """Finds the layout that explains the markers in most pictures, preferring one with as many columns as ``board``;
-    None if there is none."""
+    """Finds the layout that explains the markers in most pictures, preferably with as many columns as ``board``.
+    Returns None if no layout fits."""
     shown = [markers for markers in pictures if len(markers) >= MARKERS_LEAST]
     if not shown:
         return None
@@ -407,8 +406,8 @@ def find_layout(pictures: Sequence[Markers], board: Board) -> Layout | None:
 
 
 def _first_markers(shown: Sequence[Markers], board: Board | None) -> list[int]:
-    """Returns possible numbers of the first marker: 0 or the board's own if possible. Otherwise it is the least
-    observed one, or a lower one if the board has more markers than were observed."""
+    """Returns possible numbers of the board's first marker: 0, the number in the description, the least observed
+    number, or a lower number if the board has more markers than were observed."""
     least, most = min(min(markers) for markers in shown), max(max(markers) for markers in shown)
     if board is None:
         return [0] if least == 0 else [0, least]
@@ -436,7 +435,7 @@ def _explaining(shown: Sequence[Markers], columns: int, first: int, *, legacy: b
 
 
 def _layout_corners(columns: int, *, legacy: bool) -> Float[np.ndarray, "m 4 2"]:
-    """Returns the markers' corners in squares, with markers as wide as a square, for as many rows as any board has."""
+    """Returns the markers' corners (in squares) of the longest possible board, with markers as wide as a square."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
     rows = min(60, 2 * (len(dictionary.bytesList) // columns))
     board = cv2.aruco.CharucoBoard((columns, rows), 1.0, 0.999, dictionary)
@@ -445,8 +444,7 @@ def _layout_corners(columns: int, *, legacy: bool) -> Float[np.ndarray, "m 4 2"]
 
 
 def _fit(flat: Float[np.ndarray, "m 4 2"], observed: Float[np.ndarray, "m 4 2"]) -> tuple[float, float]:
-    """Returns the RMS distance (squares) of the markers' centres from their layout, and a marker's measured side
-    (squares)."""
+    """Returns the RMS distance (squares) of the markers' centres from their layout, and a marker's side (squares)."""
     homography, _ = cv2.findHomography(observed.mean(axis=1), flat.mean(axis=1), 0)
     if homography is None or np.linalg.det(homography) <= 0:
         return np.inf, 0.0
@@ -458,8 +456,7 @@ def _fit(flat: Float[np.ndarray, "m 4 2"], observed: Float[np.ndarray, "m 4 2"])
 
 
 def other_dictionary(greys: Iterable[UInt8[np.ndarray, "h w"]], dictionary: str) -> str | None:
-    """Finds another of OpenCV's dictionaries that fits a picture's markers, the smallest of these; None if there is
-    none."""
+    """Returns the smallest other dictionary of OpenCV that fits a picture's markers, or None."""
     sizes = {
         name: len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
         for name in dir(cv2.aruco)
@@ -475,7 +472,7 @@ def other_dictionary(greys: Iterable[UInt8[np.ndarray, "h w"]], dictionary: str)
 
 
 def is_april_grid(markers: Markers) -> bool:
-    """Tells whether there is a marker in every cell of a grid, numbered row by row, as on Kalibr's AprilGrid."""
+    """Returns whether the markers fill every cell of a grid, numbered row by row, as on Kalibr's AprilGrid."""
     if len(markers) < MARKERS_LEAST:
         return False
     numbers = np.array(sorted(markers))
@@ -494,8 +491,8 @@ def is_april_grid(markers: Markers) -> bool:
 
 
 def board_of(layout: Layout, board: Board) -> Board | None:
-    """Returns ``board`` with the first marker number and the first square's colour from ``layout``; None if the layout
-    has another number of squares or another size of markers."""
+    """Returns ``board`` with the first marker number and the first square's colour of ``layout``. Returns None if
+    ``layout`` has another number of squares or another size of markers."""
     if layout.columns != board.columns or abs(layout.ratio - board.marker_ratio) > RATIO_OFF:
         return None
     return replace(board, legacy=layout.legacy, first_marker=layout.first_marker)

@@ -1,7 +1,7 @@
 """Lists the board pictures of a folder by camera and shot: ``IMAGES/<camera>/<shot>.<ext>``.
 
-Many programs instead make a folder for each shot, with a file for each camera in it. The names reveal that or, if they
-do not, the pictures: a camera that does not move sees the same room in every shot.
+Many programs instead make a folder for each shot, with a file for each camera. The names of files usually reveal such a
+structure. Otherwise the pictures reveal it, because a fixed camera sees the same room in every shot.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,8 +30,8 @@ _Thing = TypeVar("_Thing")
 
 
 def list_pictures(folder: Path, *, together: bool = True) -> dict[str, dict[str, Path]]:
-    """Returns the pictures of a folder as {camera: {shot: path}}. ``together``: cameras must share shots. Raises
-    InputError that names every fault."""
+    """Returns the pictures of a folder as {camera: {shot: path}}. ``together`` requires cameras to share shots. Raises
+    an InputError that names every fault."""
     if not folder.is_dir():
         raise InputError(str(folder), [compose("no-picture-folder")])
     faults, filed = list[Message](), dict[str, dict[str, Path]]()
@@ -53,7 +53,7 @@ def list_pictures(folder: Path, *, together: bool = True) -> dict[str, dict[str,
 
 
 def _named_apart(cameras: Filed) -> list[Message]:
-    """Returns a fault if no two cameras have a shot of the same name, as when each camera numbers its own files."""
+    """Returns a fault if no two cameras have a shot of the same name, for example where cameras number files."""
     shots = [shot for files in cameras.values() for shot in files]
     if len(cameras) < 2 or len(set(shots)) < len(shots):
         return []
@@ -62,7 +62,7 @@ def _named_apart(cameras: Filed) -> list[Message]:
 
 
 def filed_by_shot(pictures: Filed) -> bool:
-    """Tells whether the pictures from ``list_pictures`` lie in folders of shots instead of cameras."""
+    """Returns whether the pictures from ``list_pictures`` lie in folders of shots instead of folders of cameras."""
     return any(path.parent.name != camera for camera, shots in pictures.items() for path in shots.values())
 
 
@@ -75,7 +75,7 @@ def _turned(filed: Filed) -> dict[str, dict[str, Path]]:
 
 
 def _are_shots(filed: Filed) -> bool:
-    """Tells whether folders are shots and the files in them cameras."""
+    """Returns whether each folder is a shot and each file in it a camera."""
     shared = set.intersection(*(set(files) for files in filed.values())) if filed else set()
     if len(filed) < 2 or len(shared) < 2:
         return False
@@ -92,7 +92,7 @@ def _names_camera(name: str) -> bool:
 
 
 def _difference(filed: Filed) -> float:
-    """Returns the median difference (levels) between the pictures of a group; infinite if their sizes differ."""
+    """Returns the median difference (grey levels) between a group's pictures, or infinity if their sizes differ."""
     differences = []
     for files in _spread([*filed.values()]):
         pictures = [picture for path in _spread([*files.values()]) if (picture := _small(path)) is not None]
@@ -102,7 +102,7 @@ def _difference(filed: Filed) -> float:
 
 
 def _spread(things: Sequence[_Thing]) -> list[_Thing]:
-    """Returns a few elements of ``things``, at even steps from first to last."""
+    """Returns a few elements at even steps from first to last."""
     return [things[k] for k in np.unique(np.linspace(0, len(things) - 1, COMPARED).round().astype(int))]
 
 

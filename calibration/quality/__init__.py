@@ -1,1 +1,1 @@
-"""Judges a calibration: finds wrong corners, and writes the operator's messages."""
+"""Finds wrong corners of a calibration, checks the result, and explains both to the operator."""

@@ -1,8 +1,7 @@
-"""Checks properties that a low reprojection error does not imply. A calibration that fails a check is refused, with a
-remedy. Shots may pass every check and still determine too little: the verdict states what a calibration lacks.
+"""Checks properties of a calibration that a low reprojection error does not imply. A calibration that fails a check is
+refused with a remedy. The verdict on a calibration also lists what it lacks, even if all checks pass.
 
-The verdict's limits were chosen on simulated sessions of 4 to 30 shots (``tests.support.board_sessions``); no command
-prints them.
+The limits of the verdict were chosen on simulated sessions of 4 to 30 shots (``tests.support.board_sessions``).
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,8 +37,8 @@ LOOSE_PX = 2.0  # a camera whose pose is looser than this, seen at the subject, 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Holds the result of one check. ``passed`` is None if there was nothing to check against; ``advice`` is the remedy
-    for a failure."""
+    """Holds the result of one check. ``passed`` is None if the data for the check were missing; ``advice`` is the
+    remedy for a failure."""
 
     name: str
     passed: bool | None
@@ -48,8 +47,7 @@ class Check:
 
 
 def check_cheirality(state: BundleState, observed: Observations, board: Board) -> Check:
-    """Checks that every corner lies in front of its camera, that every board shows its front, and that all rotations
-    are proper."""
+    """Checks that corners lie in front of cameras, that boards show their front, and that no pose is a reflection."""
     camera, shot = observed.camera[observed.view_of], observed.shot[observed.view_of]
     world = np.einsum("nij,nj->ni", state.board_rotations[shot], observed.points) + state.board_translations[shot]
     points = np.einsum("nij,nj->ni", state.camera_rotations[camera], world) + state.camera_translations[camera]
@@ -67,7 +65,7 @@ def check_cheirality(state: BundleState, observed: Observations, board: Board) -
 def check_held_out(
     state: BundleState, observed: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"], free: Free
 ) -> Check:
-    """Checks that cameras estimated without every fifth shot fit the boards of those shots as well as the others."""
+    """Checks that cameras estimated without every fifth shot also fit the omitted shots."""
     several = np.flatnonzero(np.bincount(observed.shot, minlength=len(state.board_rotations)) >= 2)
     held = several[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
     if len(held) < 2 or len(several) - len(held) < 4:
@@ -87,8 +85,8 @@ def check_held_out(
 
 
 def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
-    """Checks the size of the squares against the measured size of the print, and the print's ratio of height to width
-    against the cameras' measurement."""
+    """Compares the squares' size with the user's measurement of the print, and the squares' ratio of height to width
+    with the cameras' measurement."""
     pairs = [("width", board.measured_width_mm, board.columns), ("height", board.measured_height_mm, board.rows)]
     ratios = {name: value / (count * board.square_mm) for name, value, count in pairs if value is not None}
     off = [
@@ -106,15 +104,14 @@ def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
 
 
 def check_frame(rig: Rig, board: Board) -> Check:
-    """Checks that the visible area at the cameras' common point is large enough for a head; it is far too small if
-    ``square_mm`` is in another unit."""
+    """Checks that the cameras see an area large enough for a head. A wrong unit of ``square_mm`` fails this check."""
     frame = frame_mm(rig)
     advice = compose("advice-square-unit", square_mm=board.square_mm)
     return Check("frame", frame >= FRAME_LEAST_MM, compose("frame-shown", frame_mm=frame), advice)
 
 
 def check_determined(rig: Rig, pose_sigma_px: Float[np.ndarray, " c"]) -> Check:
-    """Checks that the uncertainty of every camera's pose, in its image of the subject, is below ``LOOSE_PX`` pixels."""
+    """Checks that the uncertainty of each camera's pose moves the subject's image by less than ``LOOSE_PX`` pixels."""
     loose = [name for name, value in zip(rig.names, pose_sigma_px, strict=True) if not value < LOOSE_PX]
     worst = int(np.argmax(pose_sigma_px))
     detail = compose("poses-determined", px=pose_sigma_px.max(), camera=rig.names[worst])
@@ -123,7 +120,7 @@ def check_determined(rig: Rig, pose_sigma_px: Float[np.ndarray, " c"]) -> Check:
 
 
 def check_against_previous(rig: Rig, previous: Rig | None) -> list[Check]:
-    """Compares layout, scale and lenses with the previous calibration, for the cameras that both have."""
+    """Compares the layout, scale and lenses of the cameras that are also in the previous calibration."""
     names = [name for name in rig.names if previous is not None and name in previous]
     if previous is None or len(names) < 3:
         return [
@@ -166,8 +163,8 @@ def _check_layout(now: Rig, then: Rig) -> Check:
 
 
 def _assignment(now: Rig, then: Rig) -> tuple[list[int], float, float]:
-    """Returns, for each camera, the earlier camera at its position, the mean distance (mm) of this assignment, and that
-    of the assignment by names."""
+    """Returns, for each camera, the camera of the previous rig at the same position. Also returns the mean distance
+    (mm) of this assignment and of the assignment by names."""
     here, there = (np.stack([camera.centre_world for camera in rig]) for rig in (now, then))
     best: tuple[list[int], float] | None = None
     for camera, other in ((c, o) for c in now for o in then):
@@ -184,7 +181,7 @@ def _assignment(now: Rig, then: Rig) -> tuple[list[int], float, float]:
 
 
 def _misfit_mm(here: Float[np.ndarray, "c 3"], there: Float[np.ndarray, "c 3"], mirrored: bool) -> float:
-    """Returns the RMS distance (mm) after the best rigid motion; with ``mirrored`` after a reflection too."""
+    """Returns the RMS distance (mm) after the best rigid motion; ``mirrored`` adds a reflection."""
     points = here * (-1.0, 1.0, 1.0) if mirrored else here
     return float(np.sqrt(((rigid_fit(points, there).apply(points) - there) ** 2).sum(axis=1).mean()))
 
@@ -210,8 +207,8 @@ def _check_lenses(now: Rig, then: Rig) -> Check:
 def measure_aspect(
     state: BundleState, observed: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"], free: Free
 ) -> tuple[float, float]:
-    """Measures the height of the board's squares over their width, and its standard deviation: the minimum of a
-    parabola through the costs of three solutions with the board stretched."""
+    """Measures the ratio of height to width of the board's squares, and its standard deviation. The ratio is the
+    minimum of a parabola through the costs of three solutions with stretched boards."""
     step = 0.003
     costs = []
     for stretch in (-step, 0.0, step):
@@ -225,14 +222,14 @@ def measure_aspect(
 
 
 def failed(checks: Sequence[Check]) -> list[Check]:
-    """Returns the checks that failed, without those that could not be judged."""
+    """Returns the failed checks, without checks that could not be judged."""
     return [check for check in checks if check.passed is False]
 
 
 @dataclass(frozen=True, slots=True)
 class CameraEvidence:
-    """Holds how well one camera is calibrated. ``focal_share`` is the relative standard deviation of its focal length;
-    ``covered`` is the share of twelve equal parts of the picture in which corners were seen."""
+    """Holds how well one camera is calibrated. ``focal_share`` is the relative standard deviation of the focal length.
+    The picture is divided into twelve equal parts; ``covered`` is the fraction of parts with corners."""
 
     views: int
     focal_share: float
@@ -242,15 +239,14 @@ class CameraEvidence:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Holds the verdict on a calibration: good, usable or poor. ``missing`` lists possible improvements, the most
-    urgent first; empty if it is good."""
+    """Holds the verdict on a calibration: good, usable or poor. ``missing`` lists improvements, most urgent first."""
 
     word: Word
     missing: tuple[Message, ...]
 
 
 def judge(cameras: Mapping[str, CameraEvidence], checks: Sequence[Check]) -> Verdict:
-    """Judges a calibration by its weakest camera, and by whether there were held-out shots to check."""
+    """Judges a calibration by its worst camera, and by whether held-out shots were available for a check."""
     severe, mild = [], []
 
     def of(test: str, least: float, most: float) -> list[str]:

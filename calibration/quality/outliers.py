@@ -1,5 +1,4 @@
-"""Finds views and shots that contradict the rest of the rig, and why. Each of them is reported; none is silently given
-less weight."""
+"""Finds views and shots that contradict the rest of the rig, and explains why. Every excluded view is reported."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,14 +24,14 @@ MATCH_RATIO = 3.0  # an explanation must bring a view this much closer than it w
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """Holds an excluded view and the reason; ``camera`` None means the whole shot."""
+    """Holds an excluded view and the reason. If ``camera`` is None, the whole shot is excluded."""
 
     shot: str
     camera: str | None
     reason: Message
 
     def message(self) -> Message:
-        """Returns shot, camera and reason as one message."""
+        """Returns a message with the shot, the camera and the reason."""
         if self.camera is None:
             return compose("dropped-shot", shot=self.shot, reason=self.reason)
         return compose("dropped-view", shot=self.shot, camera=self.camera, reason=self.reason)
@@ -42,8 +41,8 @@ class Dropped:
 
 
 def drop_blurred(detections: Detections) -> tuple[Detections, list[Dropped]]:
-    """Returns the detections without views whose edges are too blurred to locate corners, and these views with the
-    reason."""
+    """Removes views whose edges are too blurred to locate corners. Returns the other detections, and the removed views
+    with the reason."""
     retained, dropped = [], []
     for view in detections.views:
         side = square_side_px(view, detections.board)
@@ -57,7 +56,7 @@ def drop_blurred(detections: Detections) -> tuple[Detections, list[Dropped]]:
 
 
 def square_side_px(view: View, board: Board) -> float:
-    """Returns the median side (px) of the board's squares in a view; 0 without two neighbouring corners."""
+    """Returns the median side (px) of the board's squares in a view, or 0 if no two corners are neighbours."""
     columns = board.grid[0]
     corner_of = dict(zip(view.found.ids.tolist(), view.found.corners, strict=True))
     sides = [
@@ -70,8 +69,8 @@ def square_side_px(view: View, board: Board) -> float:
 
 
 def drop_misread(detections: Detections, lenses: dict[str, Lens]) -> tuple[Detections, list[Dropped]]:
-    """Returns the detections without views that no pose of a flat board fits with the camera's lens, and these views
-    with the reason."""
+    """Removes views in which no pose of a flat board fits the corners. Returns the other detections, and the removed
+    views with the reason."""
     retained, dropped = [], []
     for view in detections.views:
         lens = lenses[view.camera]
@@ -93,8 +92,8 @@ def view_rms(state: BundleState, observed: Observations) -> Float[np.ndarray, " 
 
 
 def bad_views(state: BundleState, observed: Observations) -> np.ndarray:
-    """Tells which views the joint solution does not fit. A robust solution may fit one camera of a shot at the others'
-    expense; ``explain_shot`` finds the fault of such a shot."""
+    """Returns a mask of the views that the joint solution does not fit. The camera at fault may be another one of the
+    same shot, which ``explain_shot`` decides."""
     rms = view_rms(state, observed)
     return rms > max(VIEW_RATIO * float(np.median(rms)), VIEW_LEAST_PX)
 
@@ -110,7 +109,7 @@ def explain_shot(
     boards: dict[str, RigidTransform],
     noise_px: float,
 ) -> list[Dropped]:
-    """Decides which views of a shot to exclude, and why; the ``bad`` views contradict the rig."""
+    """Decides which views of a shot to exclude, and why. The joint solution does not fit the views ``bad``."""
     cameras = {
         name: Camera(name, intrinsics_of(state.intrinsics[i], detections.sizes[name]), state.camera_pose(i))
         for i, name in enumerate(names)
@@ -130,8 +129,7 @@ def explain_shot(
 def _why(
     view: View, cameras: dict[str, Camera], detections: Detections, boards: dict[str, RigidTransform], noise_px: float
 ) -> Message:
-    """Returns why a view contradicts the rig: its picture belongs to another camera or another shot, or the cause is
-    unknown."""
+    """Explains why a view contradicts the rig, for example because its picture belongs to another camera or shot."""
     limit = max(10 * noise_px, 3.0)
     for name, camera in cameras.items():
         alike = name != view.camera and detections.sizes[name] == detections.sizes[view.camera]
@@ -144,7 +142,7 @@ def _why(
 
 
 def miss(view: View, camera: Camera, world_from_board: RigidTransform, board: Board) -> float:
-    """Returns the RMS distance (px) between a view's corners and their projections, for the best turn of the board."""
+    """Returns the RMS distance (px) between a view's corners and their projections, in the best turn of the board."""
     values = []
     for turn in board.turns():
         points = world_from_board.apply(board.corners()[turn[view.found.ids]])
@@ -156,8 +154,8 @@ def miss(view: View, camera: Camera, world_from_board: RigidTransform, board: Bo
 def board_scale(
     views: Sequence[View], cameras: dict[str, Camera], board: Board, start: RigidTransform
 ) -> tuple[float, float] | None:
-    """Estimates the size of a shot's board relative to the described one, and the RMS error (px) at that size. Returns
-    None if too few cameras or corners determine it."""
+    """Estimates the board's size in a shot relative to its description, and the RMS error (px) at that size. Returns
+    None with too few cameras or corners."""
     if len({view.camera for view in views}) < 2:
         return None
     triples = [(cameras[v.camera], board.corners()[v.found.ids], v.found.corners) for v in views]
@@ -177,8 +175,8 @@ def board_scale(
 def _triangulated(
     triples: Sequence[tuple[Camera, np.ndarray, np.ndarray]], ids: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, Float[np.ndarray, "n 3"]] | None:
-    """Triangulates the corners that two or more cameras see. Returns their numbers and positions, or None if there are
-    too few."""
+    """Returns the numbers and triangulated positions of the corners that two or more cameras see, or None if too
+    few."""
     counts = np.bincount(np.concatenate(ids))
     wanted = np.flatnonzero(counts >= 2)
     if len(wanted) < 4:

@@ -1,1 +1,1 @@
-"""Calibrates cameras from photographs of a scene alone, without board or clean plates."""
+"""Calibrates cameras from photographs of a scene, without a calibration board."""

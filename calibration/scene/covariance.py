@@ -1,13 +1,12 @@
-"""Computes how uncertain the cameras are, given the points: the inverse of the reduced camera system of the bundle
-adjustment.
+"""Computes the covariance of the cameras by inverting the bundle adjustment's reduced camera system.
 
-With U, V and W the blocks of the normal equations of cameras, of points, and between both, eliminating the points
-leaves ``S = U - W V^-1 W^T`` (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 1999, section 6.1). It is
+The normal equations have a block U of the cameras, V of the points, and W between both. Eliminating the points leaves
+``S = U - W V^-1 W^T`` (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 1999, section 6.1). The matrix S is
 singular along the seven motions of the world (rotation, translation, scale). The covariance is therefore stated in the
-subject's gauge of ``calibration.adjustment.gauge``, where these motions are no error of a camera. Lens parameters that
-were not estimated get an assumed standard deviation, which is propagated ("consider" covariance: Tapley et al.,
-Statistical Orbit Determination, 2004, 6.3). With few views that is the principal point (the picture's middle); with a
-lens for each camera it is also the distortion.
+gauge of ``calibration.adjustment.gauge``, in which these motions are no error of a camera. Lens parameters that were
+not estimated get an assumed standard deviation, which is propagated ("consider" covariance: Tapley et al., Statistical
+Orbit Determination, 2004, 6.3). With few views the principal point is not estimated. If each camera has its own lens,
+distortion is not estimated either.
 """
 
 from dataclasses import dataclass, replace
@@ -40,7 +39,7 @@ OUTLIER_SIGMAS = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """Holds the uncertainty of the cameras of a solved structure.
+    """Holds the uncertainty of the cameras that structure from motion solved for.
 
     Attributes:
         blocks: covariance of each camera's pose as a left perturbation (rad, mm), the lens's uncertainty included.
@@ -58,7 +57,7 @@ class Uncertainty:
 
 
 def uncertainty(structure: Structure) -> Uncertainty:
-    """Computes the covariances of the cameras of a solved structure, whose lengths must be in millimetres."""
+    """Computes the covariances of the structure's cameras. Lengths of the structure must be in millimetres."""
     rig = structure.rig
     noise = max(NOISE_LEAST_PX, 1.4826 * float(np.median(np.abs(structure.residuals()))))
     places = camera_places(structure)
@@ -91,8 +90,7 @@ def uncertainty(structure: Structure) -> Uncertainty:
 
 
 def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
-    """Returns, for each camera, the positions of its parameters (f k1 k2 cx cy, then the six of its pose) among all
-    unknowns."""
+    """Returns, for each camera, the indices of f k1 k2 cx cy and of its six pose parameters among all unknowns."""
     count = len(structure.rig)
     lenses = np.zeros(count, int) if structure.one_lens else np.arange(count)
     lens = LENS * lenses[:, None] + np.arange(LENS)
@@ -100,11 +98,11 @@ def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
 
 
 def lens_misfit(structure: Structure, noise_px: float) -> float:
-    """Tests how much better the points would be explained if each camera had its own lens: about 1 if one lens fits
-    all, more if the lenses differ.
+    """Computes how much better the points would fit if each camera had its own lens. The ratio is about 1 if one lens
+    fits all cameras, and larger if the lenses differ.
 
-    It is a score test (Rao 1948): the decrease of chi-squared in one Gauss-Newton step, divided by the number of added
-    parameters. The residuals themselves hardly show a wrong lens, because the poses compensate for it.
+    The ratio is that of a score test (Rao 1948): the decrease of chi-squared in one Gauss-Newton step, divided by the
+    number of added parameters. A wrong lens hardly increases the residuals, because the poses compensate for it.
     """
     if not structure.one_lens or len(structure.rig) < 2:
         return 1.0
@@ -124,8 +122,8 @@ def lens_misfit(structure: Structure, noise_px: float) -> float:
 def reduced_camera_system(
     structure: Structure, noise_px: float
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-    """Returns the matrix ``S`` of the module's docstring, for keypoints with noise ``noise_px`` along each axis, and
-    half the gradient of chi-squared by the same unknowns. Outliers are left out."""
+    """Returns the matrix ``S`` of the module's docstring, for keypoints with noise ``noise_px`` along each axis. Also
+    returns half the gradient of chi-squared by the cameras' parameters. Outliers are left out."""
     places = camera_places(structure)
     size, count = int(places.max()) + 1, len(structure.points)
     u, v = np.zeros((size, size)), np.zeros((count, 3, 3))
@@ -158,7 +156,7 @@ def reduced_camera_system(
 
 
 def _inverse(matrix: Float[np.ndarray, "p p"], motions: Float[np.ndarray, "p 7"]) -> Float[np.ndarray, "p p"]:
-    """Returns the inverse of the reduced system with its null space, ``motions``, held fixed."""
+    """Returns the inverse of the reduced camera system, restricted so that ``motions``, its null space, are zero."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     held = np.linalg.qr(motions / scale[:, None])[0]
     inverse = np.linalg.inv(matrix * np.outer(scale, scale) + held @ held.T) - held @ held.T
@@ -168,7 +166,7 @@ def _inverse(matrix: Float[np.ndarray, "p p"], motions: Float[np.ndarray, "p 7"]
 def _per_camera(
     covariance: Float[np.ndarray, "p p"], places: Int[np.ndarray, "c 11"]
 ) -> Float[np.ndarray, "c 15 c 15"]:
-    """Returns the covariance by each camera's nine lens values and pose."""
+    """Returns the covariance rearranged by camera: nine lens values, then six values of the pose."""
     count = len(places)
     expand = np.zeros((count, 15, len(covariance)))
     for index in range(count):

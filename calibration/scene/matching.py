@@ -1,9 +1,9 @@
-"""Finds the keypoints of two photographs that show the same point of the scene: SIFT on the CPU, by pycolmap.
+"""Matches SIFT keypoints between photographs that show the same points of the scene, with pycolmap on the CPU.
 
-Shots of one rig share its cameras but not the scene, because heads move between shots. So pictures are matched only
-within each shot. The keypoints of all shots of a camera are then merged into a single image. The data thus state that
-the cameras do not move, and the solver needs no constraint. Everything runs in one thread with one seed; with more
-threads, the order of RANSAC's draws, and so the result, would depend on the scheduler.
+Shots of one rig share its cameras but not the scene, because heads move between shots. Pictures are therefore matched
+only within each shot. The keypoints of all shots of a camera are then merged into one image, so that structure from
+motion gives one pose for the camera. All steps run in one thread with one seed. With more threads, the order of
+RANSAC's random draws, and so the result, would depend on the scheduler.
 """
 
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ SIDE_MOST_PX = 2400  # features are found in pictures no larger; they are placed
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """Holds the matches between photographs, in COLMAP databases with one image for each camera.
+    """Holds COLMAP databases of the matches between photographs. A database has one image for each camera.
 
     Attributes:
         databases: the first has one lens for all images if these have one size; the last has a lens for each image,
@@ -60,7 +60,7 @@ def match_photographs(photographs: Photographs, scratch: Path, *, one_lens: bool
             one picture and all have one size.
         report: progress.
 
-    Raises InputError that names every picture that cannot be used.
+    Raises an InputError that names every unusable picture.
     """
     sizes = _write_grey(photographs, scratch / "pictures")
     if one_lens is None:
@@ -81,7 +81,7 @@ def match_photographs(photographs: Photographs, scratch: Path, *, one_lens: bool
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Silences COLMAP's log in the block; hardly any of its lines are for users."""
+    """Switches off COLMAP's log within the ``with`` block, because users do not need it."""
     import pycolmap
 
     before = pycolmap.logging.minloglevel
@@ -93,7 +93,7 @@ def quiet() -> Iterator[None]:
 
 
 def _write_grey(photographs: Photographs, folder: Path) -> dict[str, tuple[int, int]]:
-    """Writes pictures as this project decodes them, not as COLMAP would; returns width and height."""
+    """Decodes pictures and writes them in grey, because COLMAP would decode differently. Returns sizes (px)."""
 
     def one(job: tuple[str, str, Path]) -> tuple[tuple[int, int], Message | None]:
         camera, shot, path = job
@@ -170,12 +170,12 @@ def _pairs_file(path: Path, pairs: Iterator[tuple[str, str]]) -> Path:
 
 
 def _first(photographs: Photographs) -> list[str]:
-    """Returns the picture that represents each camera among COLMAP's images."""
+    """Returns the name of the picture that represents each camera in COLMAP's database."""
     return [f"{camera}/{next(iter(shots))}.png" for camera, shots in photographs.files.items()]
 
 
 def _merge(photographs: Photographs, scratch: Path, name: str, *, one_lens: bool) -> Path:
-    """Merges all shots of a camera to one image: keypoints in sequence, matches renumbered and verified."""
+    """Merges the keypoints of all shots of a camera into one image, then renumbers and verifies the matches."""
     import pycolmap
 
     options = pycolmap.ImageReaderOptions()

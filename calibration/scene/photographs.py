@@ -1,7 +1,8 @@
 """Lists the photographs of a folder by camera and shot.
 
-``PHOTOS/<camera>.<ext>``, or ``PHOTOS/<camera>/<shot>.<ext>``, where equal shot names mean the same moment; both also
-inside ``PHOTOS/images/``. A camera's name becomes that of its file in a capture, so it must be a valid one.
+Files are named ``PHOTOS/<camera>.<ext>`` or ``PHOTOS/<camera>/<shot>.<ext>``, and may lie in ``PHOTOS/images/``.
+Pictures with the same shot name were taken at the same moment. A camera's name must be valid as a file name in a
+capture.
 """
 
 from collections.abc import Mapping
@@ -26,7 +27,7 @@ ONE_SHOT = "shot"  # the name of the only one, where every camera has one pictur
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photographs:
-    """Holds the files of photographs by camera, then by shot, both sorted by name."""
+    """Holds the files of photographs by camera and shot, sorted by name."""
 
     files: Mapping[str, Mapping[str, Path]]
 
@@ -42,7 +43,7 @@ class Photographs:
 
 
 def find_photographs(folder: Path) -> Photographs:
-    """Lists the photographs in ``folder`` by camera and shot. Raises InputError that names every fault."""
+    """Lists the photographs in ``folder`` by camera and shot. Raises an InputError that names every fault."""
     if not folder.is_dir():
         raise InputError(folder.name, [compose("no-folder-of-photographs")])
     root = capture_root(folder)
@@ -70,8 +71,8 @@ def find_photographs(folder: Path) -> Photographs:
 
 
 def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bool[np.ndarray, "_ _"]]:
-    """Reads the masks (True = subject) in the folder masks/ of a single shot's photographs, by camera. Raises
-    InputError for a mask that is damaged or of another size than its photograph."""
+    """Reads the masks (True = subject) of a single shot from the folder masks/, by camera. Raises InputError if a mask
+    is damaged or differs from its photograph in size."""
     root = capture_root(folder)
     if photographs.shots != (ONE_SHOT,) or not entry(root, "masks").is_dir():
         return {}

@@ -1,5 +1,5 @@
 """Defines the result of a calibration from a scene: the rig with its covariances, its scale, and excluded views. Also
-gives the verdict on it, with the same limits as for a board, and writes its report, one self-contained HTML page."""
+judges the calibration with the limits of a board calibration, and writes its report as one HTML page."""
 
 from dataclasses import dataclass
 from html import escape
@@ -18,7 +18,7 @@ from rig.rig import Rig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneCalibration:
-    """Holds a rig that was calibrated from photographs of a scene (mm, world frame, with covariances).
+    """Holds a rig calibrated from photographs of a scene, in the world frame (mm).
 
     Attributes:
         rig: the cameras.
@@ -44,12 +44,12 @@ class SceneCalibration:
     refinement: Message | None = None
 
     def absences(self) -> list[Message]:
-        """Returns a message for every view that could not be joined to the others, with the reason."""
+        """Returns a message for every camera that structure from motion left out, with the reason."""
         return [compose("located", where=name, fault=why) for name, why in self.left_out.items()]
 
     def figures(self) -> dict[str, Any]:
-        """Returns the numbers that ``calibrate --from scene --json`` prints. ``used_share`` is the share of matched
-        keypoints in the solution; ``points`` of a camera are those of its keypoints (``features``) in it."""
+        """Returns the numbers that ``calibrate --from scene --json`` prints. ``used_share`` is the fraction of matched
+        keypoints that the solution uses. ``points`` is the number of a camera's keypoints that the solution uses."""
         misses = self.structure.residuals()
         cameras = {}
         for index, camera in enumerate(self.rig):
@@ -72,7 +72,7 @@ class SceneCalibration:
         }
 
     def document(self) -> dict[str, Any]:
-        """Returns a scene's ``calibration.json``, without points and residuals."""
+        """Returns the content of ``calibration.json``, without points and residuals."""
         return {
             "figures": self.figures(),
             "front": self.front,
@@ -92,8 +92,7 @@ class SceneCalibration:
 
 
 def judge_scene(calibration: SceneCalibration) -> Verdict:
-    """Judges a calibration by its weakest camera. With an assumed scale, or a view that did not join, the verdict is
-    usable at best."""
+    """Judges a calibration by its worst camera, and at best as usable with an assumed scale or an excluded view."""
     sigma = dict(zip(calibration.rig.names, calibration.uncertainty.pose_sigma_px, strict=True))
     poor = [name for name, px in sigma.items() if px > POSE_POOR_PX]
     loose = [name for name, px in sigma.items() if POSE_GOOD_PX < px <= POSE_POOR_PX]
@@ -110,7 +109,7 @@ def _loose(names: list[str], pixels: float) -> Message:
 
 
 def scene_page(calibration: SceneCalibration) -> str:
-    """Returns the report of a calibration as the text of an HTML page."""
+    """Returns the report of a calibration as HTML."""
     figures, scale = calibration.figures(), calibration.scale
     mark = "bad" if scale.assumed else "good"
     total = len(calibration.rig) + len(calibration.left_out)

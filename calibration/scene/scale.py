@@ -1,13 +1,12 @@
-"""Determines the unit of a scene in millimetres: from a known length in it, otherwise from the usual size of heads.
+"""Computes the scale of a scene, whose unit of length is arbitrary, from a known length or from the mean size of heads.
 
-In: a structure in any unit. Out: the factor, its relative standard deviation and its source. The known lengths are
-those of ``scale.json``. Without one, the face in the photographs is assumed to have a mean adult's size. If no two
-views show a face, the points around the cameras' common point are assumed to be a head, as far from their middle as the
-model's mean head is from its own. Hair, a neck and the table distort that. Both assumptions are marked as such wherever
-they are shown.
+The file ``scale.json`` states a known length. Without a known length, the face in the photographs is assumed to have a
+mean adult's size. If no two views show a face, the scene points near the cameras' optical axes are assumed to be a head
+of the head model's mean size. Hair, the neck and furniture then make the scale less accurate. Reports mark assumed
+scales.
 
-A known length also converts the cameras of another program, whose unit is unknown, to millimetres. Cameras that agree
-with the length within its uncertainty are not changed, because a calibration board is more precise.
+A known length also converts cameras from another program, whose unit is unknown, to millimetres. If the cameras agree
+with the length within its uncertainty, they are not changed, because they may come from a more precise board.
 """
 
 from collections.abc import Iterable, Mapping
@@ -48,7 +47,7 @@ POINTS_LEAST = 30
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Holds the scale of a structure.
+    """Holds the factor that converts a structure's lengths to millimetres.
 
     Attributes:
         factor: millimetres in its unit of length.
@@ -64,15 +63,15 @@ class Scale:
 
     @property
     def assumed(self) -> bool:
-        """Tells whether the scale is assumed because the photographs show no known length."""
+        """Returns whether the scale is assumed because no length is known."""
         return self.source in ASSUMED
 
 
 def find_scale(
     structure: Structure, known: KnownLength | None, photographs: Photographs, head: Float[np.ndarray, "v 3"]
 ) -> Scale:
-    """Computes the scale of a structure from a ``known`` length or, if that is None, from the size of a mean face, or
-    of a mean head (``head``: its vertices, mm). Raises InputError if the photographs do not show the known length."""
+    """Computes the scale of a structure from the length ``known``. If ``known`` is None, uses the mean size of a face,
+    or of a head with the vertices ``head`` (mm). Raises InputError if the photographs do not show the known length."""
     if isinstance(known, PointDistance):
         return scale_from_points(structure.rig, known)
     if isinstance(known, CameraDistance):
@@ -83,8 +82,8 @@ def find_scale(
 
 
 def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
-    """Computes the scale from the known distance between two cameras' centres. From outside, the position of a lens's
-    entrance pupil is known only to a few millimetres. Raises InputError if one of the cameras was left out."""
+    """Computes the scale from the known distance between two cameras' centres. A user can locate the centre inside a
+    lens only to a few millimetres. Raises InputError if the rig lacks one of the two cameras."""
     lost = [name for name in known.cameras if name not in rig]
     if lost:
         raise InputError("scale.json", [compose("scale-camera-lost", camera=name) for name in lost])
@@ -97,7 +96,7 @@ def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
 
 
 def scale_from_points(rig: Rig, known: PointDistance) -> Scale:
-    """Computes the scale from the known distance between two points, each picked in two views or more. Raises
+    """Computes the scale from the known distance between two points that a user picked in two or more views. Raises
     InputError if a point cannot be triangulated."""
     ends, faults = [], []
     for name, views in (("first", known.first), ("second", known.second)):
@@ -128,14 +127,14 @@ Tags = Mapping[tuple[str, int], Mapping[str, Float[np.ndarray, "4 2"]]]
 
 
 def find_tags(photographs: Photographs, known: TagSize) -> Tags:
-    """Finds a dictionary's tags in all photographs. Returns their corners (px) by (shot, number), then by camera."""
+    """Finds square tags in all photographs. Returns their corners (px) by shot and tag number, then by camera."""
     files = ((camera, shot, path) for camera, shots in photographs.files.items() for shot, path in shots.items())
     decoded = ((camera, shot, decode_image_file(path, path.name, "grey")[0]) for camera, shot, path in files)
     return _tags_of(((camera, shot, grey) for camera, shot, grey in decoded if grey is not None), known)
 
 
 def _tags_of(pictures: Iterable[tuple[str, str, UInt8[np.ndarray, "h w"]]], known: TagSize) -> Tags:
-    """Finds tags in grey pictures of (camera, shot)."""
+    """Finds tags in grey pictures, each listed after its camera and shot."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
     dictionary = cv2.aruco.getPredefinedDictionary(dictionaries()[known.dictionary])
@@ -147,7 +146,7 @@ def _tags_of(pictures: Iterable[tuple[str, str, UInt8[np.ndarray, "h w"]]], know
 
 
 def _tags_in(grey: UInt8[np.ndarray, "h w"], detector: cv2.aruco.ArucoDetector) -> dict[int, Float[np.ndarray, "4 2"]]:
-    """Returns the corners of each tag by its number, without numbers that occur twice."""
+    """Returns the corners (px) of each tag by its number, without numbers that occur twice."""
     corners, ids, _ = detector.detectMarkers(grey)
     numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]
     return {
@@ -158,8 +157,8 @@ def _tags_in(grey: UInt8[np.ndarray, "h w"], detector: cv2.aruco.ArucoDetector) 
 
 
 def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
-    """Computes the scale from the known side of tags: the median over all tags in two or more views. Raises InputError
-    if there is none."""
+    """Computes the scale from the known side of tags, as the median over all tags that two or more views show. Raises
+    InputError if there is no such tag."""
     markers = []
     for number, views in tags.items():
         joined = {camera: corners for camera, corners in views.items() if camera in rig}
@@ -187,8 +186,8 @@ def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
 
 
 def scale_from_face(rig: Rig, photographs: Photographs) -> Scale | None:
-    """Assumes the scale at which the face in the first shot has a mean adult's size. Returns None if no two of the
-    photographs agree on a face."""
+    """Computes the scale at which the face in the first shot has a mean adult's size. Returns None if fewer than two
+    photographs agree on the face."""
     images, small = {}, work_rig(rig, WORK_PIXELS)
     for camera in rig:
         path = next(iter(photographs.files[camera.name].values()))
@@ -204,8 +203,8 @@ def scale_from_face(rig: Rig, photographs: Photographs) -> Scale | None:
 
 
 def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Scale:
-    """Assumes the scale at which the points around the subject are as far from their middle (median) as the vertices of
-    a mean head ``head`` (mm) are from theirs."""
+    """Computes the scale at which the scene points around the subject have the same median distance from their middle
+    as the vertices ``head`` (mm) of a mean head."""
     points = _looked_at(structure)
     ratio = _median_radius(head) / _median_radius(points)
     provenance = compose("scale-by-head")
@@ -213,7 +212,7 @@ def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Sca
 
 
 def _looked_at(structure: Structure) -> Float[np.ndarray, "p 3"]:
-    """Returns points in the largest sphere around the cameras' common point that all but a few cameras see whole."""
+    """Returns the points in a sphere around the point nearest to all optical axes that most cameras see whole."""
     centre, radii = structure.rig.centre_world(), []
     for camera in structure.rig:
         k = camera.intrinsics
@@ -231,8 +230,8 @@ def _median_radius(points: Float[np.ndarray, "p 3"]) -> float:
 
 
 def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> tuple[Rig, list[Message]]:
-    """Scales a rig so that a known length is right (mm). Returns the rig and a message about the change. If the rig
-    agrees with the length within the length's uncertainty, it is returned unchanged, without a message.
+    """Scales a rig so that a known length is correct (mm). Returns the rig and a message about the change. If the rig
+    agrees with the length within its uncertainty, returns the unchanged rig and no message.
 
     Args:
         capture: pictures as ``rig`` took them.
@@ -251,7 +250,7 @@ def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) 
 
 
 def times(rig: Rig, factor: float) -> Rig:
-    """Returns the rig with all its lengths multiplied by ``factor`` and its covariances scaled accordingly."""
+    """Multiplies all lengths of the rig by ``factor``, and scales its covariances accordingly."""
     grows = np.diag([1.0, 1.0, 1.0, factor, factor, factor])
     return replace(
         rig,
@@ -284,6 +283,6 @@ def _scale(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> Scale:
 
 
 def _undistorted(full: Rig, name: str, pixel: np.ndarray) -> np.ndarray:
-    """Returns the position of a file's pixel in the picture as it is read."""
+    """Converts a pixel of the original file to the undistorted picture that the program works on."""
     lens = full[name].recorded
     return pixel if lens is None else lens.undistorted(pixel[None], full[name].intrinsics.matrix())[0]

@@ -1,11 +1,11 @@
-"""Calibrates a rig from photographs of a scene: matches, structure from motion, scale, world frame, covariances.
+"""Calibrates a rig from photographs of a scene by structure from motion, and finds its scale and world frame.
 
-In: one photograph for each camera, or a folder of shots for each, of a scene with enough detail to be matched: a head
-with skin and hair seen by cameras 10 to 25 degrees apart, a table with things on it, a room. Leaves: the rig.
+The input is one photograph, or a folder of shots, for each camera. The scene must have enough detail for matching, such
+as a room, a table with objects, or a head seen by cameras 10 to 25 degrees apart.
 
-If a single capture has masks, its silhouettes refine the cameras. No second capture can be held out, so pairs of
-cameras are. Every view is in pairs on both sides, so held-out pairs judge poses that they did not influence. A fault of
-a view's mask, however, is judged by the same mask.
+If a single shot has masks, its silhouettes refine the camera poses. A check on held-out pairs of cameras decides
+whether the refined poses are kept. Each view also takes part in pairs that are not held out, so this check does not
+reveal a faulty mask.
 """
 
 import tempfile
@@ -53,8 +53,8 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # abou
 
 
 def in_guessed_frame(rig: Rig, front: str | None) -> Rig:
-    """Returns the rig in a guessed world frame: the choice of ``in_world_frame`` with all cameras upright. Cameras on
-    their side or upside down are turned only for the guess."""
+    """Returns the rig in the world frame that ``in_world_frame`` chooses if all cameras are upright. Cameras on their
+    side or upside down are turned upright only for this choice."""
     turns = [np.linalg.matrix_power(QUARTER, int(count)) for count in quarter_turns(rig)]
     upright = Rig(
         tuple(
@@ -84,8 +84,8 @@ def calibrate_scene(
     one_lens: bool | None = None,
     report: Progress = discard_progress,
 ) -> SceneCalibration:
-    """Calibrates the cameras of the photographs ``PHOTOS/<camera>.<ext>`` or ``PHOTOS/<camera>/<shot>.<ext>``. The same
-    photographs give the same rig on the same machine.
+    """Calibrates the cameras that took the photographs ``PHOTOS/<camera>.<ext>`` or ``PHOTOS/<camera>/<shot>.<ext>``.
+    On one machine, the same photographs always give the same rig.
 
     Args:
         folder: the folder PHOTOS.
@@ -95,8 +95,8 @@ def calibrate_scene(
             one picture and all have one size.
         report: progress.
 
-    Raises InputError that names every fault of the photographs and of ``scale.json``; also CalibrationRefused with the
-    views that could not be joined, the reasons, and what to add.
+    Raises an InputError that names every fault of the photographs and of ``scale.json``. Raises CalibrationRefused if
+    too few views could be joined, with reasons and remedies.
     """
     photographs = find_photographs(folder)
     names = photographs.names
@@ -118,8 +118,8 @@ def calibrate_scene(
 
 
 def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, dict[str, Message]]:
-    """Returns the structure and, by name, the reasons why views are left out of it. Raises CalibrationRefused if too
-    few views could be joined."""
+    """Returns the structure, and the reason for each camera that it lacks. Raises CalibrationRefused if the structure
+    has too few cameras."""
     names = list(matches.sizes)
     joined = structure.rig.names if structure is not None else ()
     left_out = {name: why_not(name, matches, joined) for name in names if name not in joined}
@@ -133,8 +133,8 @@ def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, di
 def placed(
     structure: Structure, scale: Scale, matches: Matches, left_out: dict[str, Message], front: str | None
 ) -> SceneCalibration:
-    """Returns the calibration of a structure, in millimetres and in the world frame, with covariances and warnings.
-    Raises CalibrationRefused if the view ``front`` is left out."""
+    """Converts a structure to millimetres and the world frame. Returns the calibration with covariances. Raises
+    CalibrationRefused if the structure lacks the camera ``front``."""
     if front in left_out:
         raise CalibrationRefused([compose("front-left-out", camera=str(front), why=left_out[str(front)])])
     here = transformed(structure, structure.rig, scale.factor)
@@ -168,8 +168,8 @@ def placed(
 
 
 def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.ndarray, "_ _"]]) -> SceneCalibration:
-    """Refines the poses of a calibration so that the subject's silhouettes agree. The new poses are accepted if
-    held-out pairs of views agree better. Returns the calibration unchanged if there are too few masks."""
+    """Refines the camera poses by the subject's silhouettes. The refined poses are accepted if held-out pairs of views
+    agree better. Returns the unchanged calibration if there are too few masks."""
     rig = calibration.rig
     known = [name for name in rig.names if name in masks]
     if len(known) < VIEWS_LEAST:
@@ -181,8 +181,8 @@ def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.
 
 
 def transformed(structure: Structure, moved: Rig, factor: float) -> Structure:
-    """Returns the structure with its lengths multiplied by ``factor``, in the frame in which its cameras have the poses
-    of ``moved``."""
+    """Multiplies the structure's lengths by ``factor`` and transforms it to the frame in which its cameras have the
+    poses of ``moved``."""
     before, after = structure.rig.cameras[0].camera_from_world, moved.cameras[0].camera_from_world
     new_from_old = after.inverse() @ before
     cameras = tuple(
@@ -193,9 +193,9 @@ def transformed(structure: Structure, moved: Rig, factor: float) -> Structure:
 
 
 def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> tuple[Rig, Message] | None:
-    """Refines extrinsics with the silhouettes of one capture. Returns the refined rig if held-out pairs of cameras, a
-    fifth of them at a time, agree better, otherwise ``rig``; and the reason. Returns None if fewer than ``VIEWS_LEAST``
-    views have a usable silhouette."""
+    """Refines camera poses with the silhouettes of one capture. Returns the refined rig if held-out pairs of cameras
+    agree better (five-fold cross-validation), otherwise ``rig``, with the reason. Returns None if fewer than
+    ``VIEWS_LEAST`` views have a usable silhouette."""
     usable = [name for name in rig.names if name in capture and capture[name].quality.usable]
     if len(usable) < VIEWS_LEAST:
         return None
@@ -220,6 +220,7 @@ def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> tuple[Rig, Messag
 
 
 def _pairs(names: list[str], fold: int, *, inside: bool) -> Pairs:
-    """Returns a test whether a pair of cameras is in a fold (``inside``) or not. Each side has pairs of all cameras."""
+    """Returns a function that tests whether a pair of cameras is in a fold (``inside``) or outside it. Every camera has
+    pairs in the fold and outside it."""
     index_of = {name: index for index, name in enumerate(names)}
     return lambda pair: (sum(index_of[name] for name in pair) % FOLDS == fold) == inside

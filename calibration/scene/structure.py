@@ -1,9 +1,9 @@
-"""Solves for cameras and points from matches: COLMAP's incremental structure from motion, which starts from the best
-pair and adds one view after another.
+"""Estimates cameras and points from matches by COLMAP's incremental structure from motion, which starts from the best
+pair of views and adds the others one by one.
 
-Source: J. L. Schoenberger, J.-M. Frahm, Structure-from-Motion Revisited, CVPR 2016, in pycolmap. The unit of length and
-the frame are arbitrary and chosen afterwards. COLMAP's centre of the top-left pixel is (0.5, 0.5), this project's (0,
-0): principal points and keypoints are shifted on reading.
+The method is that of J. L. Schoenberger, J.-M. Frahm, Structure-from-Motion Revisited, CVPR 2016. The resulting unit of
+length and frame are arbitrary. The centre of the top-left pixel is (0.5, 0.5) in COLMAP and (0, 0) in this project, so
+principal points and keypoints are shifted.
 """
 
 from collections.abc import Collection
@@ -33,10 +33,10 @@ TRACK_LEAST = 3  # a point in two views only tells nothing about the third; and 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Structure:
-    """Holds cameras and points solved from matches, in an arbitrary frame and unit.
+    """Holds the cameras and points from structure from motion, in an arbitrary frame and unit.
 
-    Observation i is the pixel ``pixels[i]`` of the point ``point_of[i]`` in the camera ``camera_of[i]``. ``one_lens``
-    says that all cameras have the same intrinsics.
+    Observation i is the pixel ``pixels[i]`` of the point ``point_of[i]`` in the camera ``camera_of[i]``. If
+    ``one_lens`` is True, all cameras have the same intrinsics.
     """
 
     rig: Rig
@@ -48,13 +48,13 @@ class Structure:
 
     @property
     def estimated(self) -> int:
-        """Returns how many of the lens parameters f, k1, k2, cx, cy (in this order) were estimated."""
+        """Returns how many lens parameters, in the order f, k1, k2, cx, cy, were estimated."""
         if not self.one_lens:
             return 1
         return 5 if len(self.rig) >= CENTRE_VIEWS else 3
 
     def residuals(self) -> Float[np.ndarray, "n 2"]:
-        """Returns projected minus observed pixel of each observation."""
+        """Returns the projected minus the observed pixel of each observation."""
         projected = np.empty_like(self.pixels)
         for index, camera in enumerate(self.rig):
             of_camera = self.camera_of == index
@@ -63,12 +63,12 @@ class Structure:
 
 
 def solve_structure(matches: Matches, scratch: Path, *, report: Progress) -> Structure | None:
-    """Solves for the largest set of cameras that can be joined, with their points. Returns None if no pair of views can
-    start it.
+    """Estimates the cameras and points of the largest connected set of views. Returns None if no pair of views is
+    suitable as a start.
 
-    If each camera has its own lens, the solution starts from the one lens that explains all views best, and keeps its
-    distortion: in a view of a head, focal length and distance cannot be separated, and 300 points cannot separate
-    distortion from noise.
+    If each camera has its own lens, the estimate starts from the single lens that fits all views best. The distortion
+    of this lens is kept, because the 300 points of a view cannot separate distortion from noise. A good start is needed
+    because one view of a head cannot separate focal length from distance.
     """
     import pycolmap
 
@@ -90,7 +90,7 @@ def solve_structure(matches: Matches, scratch: Path, *, report: Progress) -> Str
 
 
 def _start_lenses(path: Path, lens: Float[np.ndarray, " 5"] | None) -> None:
-    """Sets the initial lens of every camera of a database, without its principal point; None means COLMAP's guess."""
+    """Sets the initial focal length and distortion of every camera in a database. None keeps COLMAP's guess."""
     import pycolmap
 
     if lens is None:
@@ -105,7 +105,8 @@ def _start_lenses(path: Path, lens: Float[np.ndarray, " 5"] | None) -> None:
 
 
 def _pipeline_options() -> "pycolmap.IncrementalPipelineOptions":
-    """Returns options that keep lenses undistorted while views join: three views' k1 and k2 would exclude a fourth."""
+    """Returns options that do not estimate distortion while views are added. Distortion fitted to three views would
+    exclude a fourth view."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -121,7 +122,7 @@ def _pipeline_options() -> "pycolmap.IncrementalPipelineOptions":
 
 
 def _adjust(model: "pycolmap.Reconstruction", *, one_lens: bool, principal_point: bool) -> None:
-    """Does the last bundle adjustment with a robust loss, because a wrong match may be within COLMAP's four pixels."""
+    """Runs a final bundle adjustment with a robust loss, because COLMAP accepts wrong matches below four pixels."""
     import pycolmap
 
     options = pycolmap.BundleAdjustmentOptions()

@@ -1,3 +1,3 @@
-"""Refines cameras with the outlines of the photographed heads (Ramanathan, Steinbach and Girod 2000).
+"""Refines cameras with the silhouettes of the photographed heads (Ramanathan, Steinbach and Girod 2000).
 
-In: silhouettes of captures and a calibrated rig. Out: a refined rig, accepted only if independent data confirm it."""
+The inputs are a calibrated rig and silhouettes. The refined rig is kept only if held-out captures agree better."""

@@ -1,27 +1,22 @@
-"""Refines extrinsics with silhouettes of any subject: epipolar tangency over several captures, without a model of the
-subject.
+"""Refines camera poses with silhouettes of any subject, by epipolar tangency over several captures.
 
-The residual and its derivative by the cameras are in ``tangency_term``. Each step of Levenberg-Marquardt searches the
-tangencies anew: the first step uses the outer ones of ``pipeline.multiview.tangency``, which cannot be confused, the
-later steps all frontier points. With a head model, the rims of fitted heads are added at the end. The calibration's
-covariance is the prior; the gauge is that of ``calibration.adjustment.gauge``. Silhouettes do not determine a rig's
-scale, so the board's stays.
+``tangency_term`` computes the residual and its derivatives by the cameras. Each Levenberg-Marquardt step searches the
+tangencies again. The first step uses only the outer tangencies of ``pipeline.multiview.tangency``, whose assignment is
+unambiguous. Later steps use all frontier points. With a head model, the rims of fitted heads are added at the end. The
+covariance of the board calibration is the prior. Silhouettes do not determine a rig's scale, so the scale does not
+change.
 
-Frontier points are points where an epipolar plane touches the subject, seen on the silhouettes of two cameras. Consider
-the angle of a contour's rays about the line through both camera centres. At a local extremum of the angle the epipolar
-plane touches the subject. Unless that point is hidden, the other contour has an extremum at the same angle.
-``pipeline.multiview.tangency`` uses the two outermost extrema of a pair; a head with hair and shoulders has several
-more. Only convex extrema count: where two parts of an outline cross (a T-junction), the contour has a concave corner
-that is no point of the subject. Extrema are paired by their angles, so the cameras must already be accurate to about
+A frontier point is a point where an epipolar plane touches the subject. Consider the angle of a contour's rays about
+the line through two camera centres. At a local extremum of the angle the epipolar plane touches the subject. Unless the
+touching point is hidden, the other camera's contour has an extremum at the same angle. ``pipeline.multiview.tangency``
+uses only the smallest and the largest angle of two cameras; a head with hair and shoulders has several more extrema.
+Concave extrema are ignored: where two parts of an outline cross (a T-junction), the contour has a concave corner that
+is no point of the subject. Extrema are paired by their angles, so the cameras must already be accurate to about
 ``GATE_PX``.
 
-The rims of a head fitted to one capture give equations for the cameras alone. The contour solver's normal equations
-(section 4.4, ``pipeline.contour_fit.contour``) over (shape, pose, cameras) are reduced to the cameras by the Schur
-complement, which accounts for the uncertainty of the head's shape. The equations of several captures are added: each
-has its own head, and all share the cameras.
-
-In: silhouettes of several captures, and the rig. Out: the rig, refined if held-out captures agree.
-"""
+The rims of a head fitted to one capture give normal equations for the head's shape, the head's pose and the cameras
+(the paper's section 4.4, ``pipeline.contour_fit.contour``). The Schur complement eliminates shape and pose, so that
+their uncertainty is taken into account. The remaining equations for the cameras are added over all captures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -91,7 +86,7 @@ HELD_PX = 0.01  # prior that keeps cameras fixed in the fit: a tenth of the erro
 
 
 class TooFewCaptures(EigenheadError):
-    """Reports too few captures to refine the cameras and also check the result."""
+    """Reports that there are too few captures to refine the cameras and to check the result."""
 
     def __init__(self, captures: int) -> None:
         super().__init__(compose("refinement-too-few-captures", count=captures))
@@ -99,8 +94,7 @@ class TooFewCaptures(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heads:
-    """Holds a model for the heads of all captures, and the start pose for the fit of each capture's head
-    (``world_from_head``)."""
+    """Holds a head model, and for each capture the pose ``world_from_head`` from which the fit of its head starts."""
 
     model: HeadModel
     starts: Sequence[Similarity]
@@ -113,13 +107,13 @@ class Heads:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """Holds tangency residuals (px), each with its two cameras."""
+    """Holds the residuals (px) of tangencies, each with the names of its two cameras."""
 
     cameras: tuple[tuple[str, str], ...]
     px: Float[np.ndarray, " n"]
 
     def of(self, camera: str) -> Float[np.ndarray, " k"]:
-        """Returns the residuals of all tangencies of a camera."""
+        """Returns the residuals (px) of all tangencies of one camera."""
         return self.px[[camera in pair for pair in self.cameras]]
 
 
@@ -130,15 +124,14 @@ class Refinement:
     Attributes:
         rig: ``proposed`` if the refinement is ``kept``, otherwise the start.
         proposed: the refined rig.
-        before: residuals of all captures at the start.
+        before: residuals of all captures in the rig before the refinement.
         after: residuals of each capture with cameras refined by the other captures alone.
         before_px: robust RMS of ``before``.
         after_px: robust RMS of ``after``.
-        noise_px: the noise that both assume.
+        noise_px: the noise assumed for ``before_px`` and ``after_px``.
         kept: whether the held-out captures agree better.
-        reason: why it was kept or not.
-        change_px: for each camera, the RMS motion (2D) of the image of the subject's region from the start to
-            ``proposed``, after the worlds are aligned.
+        reason: why the refined rig was kept or not.
+        change_px: for each camera, the RMS motion (2D) of its image of the subject's region by the refinement.
     """
 
     rig: Rig
@@ -161,11 +154,11 @@ def refine(
     heads: Heads | None = None,
     report: Progress = discard_progress,
 ) -> Refinement:
-    """Refines extrinsics, and with ``focal`` also focal lengths, from all captures.
+    """Refines camera poses, and with ``focal`` also focal lengths, from the silhouettes of all captures.
 
-    The result is kept if each capture, held out in its turn (several at a time if there are more than ``FOLDS``),
-    agrees better with cameras refined by the others. ``heads`` is a model whose rims are used as well, once
-    the tangencies have converged. Raises TooFewCaptures."""
+    In a cross-validation with at most ``FOLDS`` folds, each capture is compared with cameras refined by other captures.
+    The refined rig is kept if the captures agree better with the refined cameras. With ``heads``, the rims of fitted
+    heads are also used once the tangencies have converged. Raises TooFewCaptures."""
     if len(captures) < 2:
         raise TooFewCaptures(len(captures))
     folds = min(FOLDS, len(captures))
@@ -214,7 +207,7 @@ def _joined(parts: Sequence[Residuals]) -> Residuals:
 def residuals(captures: Sequence[Mapping[str, Silhouette]], rig: Rig, pairs: Pairs | None = None) -> Residuals:
     """Returns the residuals of all captures' outer tangencies, or of those between the given ``pairs`` of cameras.
 
-    Outer tangencies are the same for every rig, so residuals of two rigs can be compared."""
+    Every rig has the same outer tangencies, so residuals of two rigs can be compared."""
     found = [_tangencies(capture, rig, pairs, outer=True) for capture in captures]
     misses = [tangency_residuals(PackedTangencies.of(tangencies, rig), rig) for tangencies in found]
     return Residuals(tuple(t.cameras for tangencies in found for t in tangencies), np.concatenate(misses))
@@ -252,11 +245,11 @@ def minimise_tangencies(
     heads: Heads | None,
     pairs: Pairs | None = None,
 ) -> Rig:
-    """Returns the cameras that minimise the tangency cost over all captures, with the start as prior; with ``heads``
-    the cost of the heads' rims is added at the end.
+    """Returns the cameras that minimise the tangency cost over all captures, with ``start`` as the prior. With
+    ``heads``, the cost of the heads' rims is added at the end.
 
-    Only tangencies of ``pairs`` of cameras count if these are given. The covariances of the result are those of the
-    last step, in the subject's gauge (``calibration.adjustment.gauge``)."""
+    ``pairs`` restricts the tangencies to certain pairs of cameras. The last step gives the covariances of the result,
+    in the subject's gauge (``calibration.adjustment.gauge``)."""
     here = _Refining(captures, start, focal, pairs)
     correction = here.prior.centre
     solution = None
@@ -281,7 +274,7 @@ def minimise_tangencies(
 
 
 class _Refining:
-    """Holds everything that stays constant while the tangencies of a refinement are searched anew in each step."""
+    """Holds the data of a refinement that do not change between its steps."""
 
     def __init__(
         self, captures: Sequence[Mapping[str, Silhouette]], start: Rig, focal: bool, pairs: Pairs | None
@@ -297,18 +290,19 @@ class _Refining:
     def step(
         self, correction: Float[np.ndarray, " p"], terms: tuple[Term[Float[np.ndarray, " p"]], ...]
     ) -> Solution[Float[np.ndarray, " p"]]:
-        """Takes one step on ``terms`` and the prior."""
+        """Takes one Levenberg-Marquardt step on the cost of ``terms`` and the prior."""
         return minimise(Problem((*terms, self.prior), len(correction), np.add), correction, ONE_STEP)
 
     def tangency_term(self, correction: Float[np.ndarray, " p"], *, outer: bool) -> TangencyTerm:
-        """Returns the cost of all captures' tangencies in the corrected cameras, with their robust noise."""
+        """Finds the tangencies of all captures in the corrected cameras. Returns their cost, with robustly estimated
+        noise."""
         rig = self.rig(correction)
         tangencies = [t for capture in self.captures for t in _tangencies(capture, rig, self.pairs, outer=outer)]
         packed = PackedTangencies.of(tangencies, rig)
         return TangencyTerm(packed, self.start, self.focal, noise_of(tangency_residuals(packed, rig)))
 
     def rim_terms(self, correction: Float[np.ndarray, " p"], heads: Heads) -> list[Quadratic]:
-        """Returns the cost of each capture's rims as a quadratic function of the cameras."""
+        """Returns each capture's rim cost as a quadratic function of the corrections of all cameras."""
         rig, poses = self.rig(correction), _pose_places(self.start, focal=self.focal)
         terms = []
         for capture, start in zip(self.captures, heads.starts, strict=True):
@@ -337,7 +331,7 @@ def _pose_places(rig: Rig, *, focal: bool) -> Int[np.ndarray, " q"]:
 
 
 def _prior(rig: Rig, *, focal: bool) -> Float[np.ndarray, "p p"]:
-    """Returns the prior information of the cameras: their covariances, and that of the focal length's logarithm."""
+    """Returns the prior information matrix of all camera poses and, with ``focal``, logarithms of focal lengths."""
     centre = rig.centre_world()[None]
     blocks = []
     for camera in rig:
@@ -350,13 +344,13 @@ def _prior(rig: Rig, *, focal: bool) -> Float[np.ndarray, "p p"]:
 
 
 def gauge_free(information: Float[np.ndarray, "p p"], projection: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Removes the choice of the world frame from a prior. Returns the information matrix of N(0, information^-1)
-    restricted to the range of ``projection``, plus a term that holds motions of the world at zero, because no image
-    determines them.
+    """Removes from a prior the information on the choice of the world frame, which no image determines. Returns the
+    information matrix of N(0, information^-1) restricted to the range of ``projection``, plus a term that holds motions
+    of the world at zero.
 
     With S the projection, I - S = A B of rank 6, and M the information, the minimum of (x - A t)^T M (x - A t) over all
-    motions t of the world is x^T (M - M A (A^T M A)^-1 A^T M) x. A motion of the whole rig then has no cost, as for the
-    tangencies. The term ``(I - S)^T M (I - S)`` fixes the frame without any visible effect.
+    motions t of the world is x^T (M - M A (A^T M A)^-1 A^T M) x. Neither this minimum nor the tangency cost changes if
+    the whole rig moves. The term ``(I - S)^T M (I - S)`` fixes the world frame without an effect on any image.
     """
     world = np.eye(len(projection)) - projection
     motions = scipy.linalg.orth(world, rcond=1e-9)
@@ -367,7 +361,7 @@ def gauge_free(information: Float[np.ndarray, "p p"], projection: Float[np.ndarr
 
 
 def _projection(rig: Rig, *, focal: bool) -> Float[np.ndarray, "p p"]:
-    """Returns the projection that removes the world's own motion from a step."""
+    """Returns the projection that removes a motion of the whole rig from a step."""
     poses = _pose_places(rig, focal=focal)
     matrix = np.eye(per_camera(focal=focal) * len(rig))
     matrix[np.ix_(poses, poses)] = gauge_projection(rig)
@@ -376,8 +370,8 @@ def _projection(rig: Rig, *, focal: bool) -> Float[np.ndarray, "p p"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contour:
-    """Holds the longest closed outline of a silhouette, in order: sub-pixel positions, unit rays in the world frame,
-    and which pixels are ``whole`` (not at the picture's border)."""
+    """Holds the longest closed outline of a silhouette: ordered sub-pixel positions and unit rays in the world frame.
+    ``whole`` marks pixels away from the picture's border."""
 
     camera: Camera
     mask: Bool[np.ndarray, "h w"]
@@ -387,7 +381,7 @@ class Contour:
 
     @classmethod
     def of(cls, camera: Camera, silhouette: Silhouette) -> "Contour":
-        """Extracts the outline of a silhouette, smoothed by ``SMOOTH_PX``."""
+        """Extracts the longest outline of a silhouette, smoothed by ``SMOOTH_PX``."""
         outlines, _ = cv2.findContours(silhouette.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         chain = max(outlines, key=len).reshape(-1, 2).astype(float)
         pixels = gaussian_filter1d(on_contour(chain, silhouette.distance), SMOOTH_PX, axis=0, mode="wrap")
@@ -399,8 +393,8 @@ class Contour:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Extremes:
-    """Holds the local extrema of the angle along one contour: angle (rad), +1 for maxima and -1 for minima, pixel, and
-    the angle's change per pixel."""
+    """Holds the local extrema of the epipolar plane's angle along one contour: angle (rad), kind (+1 maximum, -1
+    minimum), pixel, and the angle's change per pixel."""
 
     angle: Float[np.ndarray, " e"]
     side: Float[np.ndarray, " e"]
@@ -409,8 +403,8 @@ class _Extremes:
 
 
 def find_frontier(silhouettes: Mapping[str, Silhouette], rig: Rig) -> list[Tangency]:
-    """Returns the frontier points of every pair of cameras that both contours show without ambiguity. ``rig`` must
-    contain only cameras with a usable silhouette."""
+    """Returns the unambiguous frontier points of every pair of cameras. Every camera of ``rig`` must have a usable
+    silhouette."""
     contours = [Contour.of(camera, silhouettes[camera.name]) for camera in rig]
     return [point for one, two in combinations(contours, 2) for point in _pair(one, two)]
 
@@ -457,9 +451,10 @@ def _extremes(contour: Contour, angle: Float[np.ndarray, " n"], u: np.ndarray, v
 def rim_equations(
     silhouettes: Mapping[str, Silhouette], rig: Rig, heads: Heads, start: Similarity
 ) -> tuple[Float[np.ndarray, "c6 c6"], Float[np.ndarray, " c6"]]:
-    """Returns normal matrix and gradient of the rims' cost over the left perturbations (rad, mm) of all cameras.
+    """Returns the normal matrix and gradient of one capture's rim cost over the left pose perturbations (rad, mm) of
+    all cameras.
 
-    They are zero for cameras without a usable silhouette. Raises ValueError if no silhouette is usable."""
+    Entries of cameras without a usable silhouette are zero. Raises ValueError if no silhouette is usable."""
     bare = Rig(tuple(replace(camera, covariance=None) for camera in rig))  # the caller adds the prior
     solved = solve_contour(heads.model, start, silhouettes, bare, replace(heads.settings, calibration_px=HELD_PX))
     problem = replace(solved.problem, camera_information=np.zeros_like(solved.problem.camera_information))

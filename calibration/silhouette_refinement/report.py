@@ -19,7 +19,7 @@ BINS, HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT = 24, 420.0, 160.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinementRun:
-    """Holds a refinement together with its starting rig, the names of its captures, and warnings."""
+    """Holds a refinement with the rig before it, the names of its captures, and warnings."""
 
     refinement: Refinement
     start: Rig
@@ -27,7 +27,7 @@ class RefinementRun:
     warnings: tuple[Message, ...] = ()
 
     def document(self) -> dict[str, Any]:
-        """Returns what ``refine --json`` prints: residuals are robust RMS, px."""
+        """Returns the document that ``refine --json`` prints. Residuals are robust RMS values (px)."""
         refinement = self.refinement
         return {
             "kept": refinement.kept,
@@ -91,7 +91,7 @@ def refinement_page(run: RefinementRun) -> str:
 
 
 def _camera(run: RefinementRun, name: str) -> dict[str, float]:
-    """Returns the residuals of a camera's tangencies before and after, and how far it was moved."""
+    """Returns a camera's tangency residuals before and after the refinement (px), and the change of its pose."""
     refinement, start, end = run.refinement, run.start[name], run.refinement.proposed[name]
     motion = end.camera_from_world @ start.camera_from_world.inverse()
     after = refinement.after.of(name)

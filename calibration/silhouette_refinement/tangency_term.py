@@ -1,18 +1,20 @@
 """Computes the residual of a frontier point in two cameras, and its derivatives by both cameras.
 
 A plane through two camera centres that touches the subject touches both silhouettes, at the images of one frontier
-point (Ramanathan, Steinbach and Girod 2000; Wong and Cipolla 2001). Each camera defines such a plane. With centres c,
-rays d at the two tangent pixels and base b = c2 - c1, the angle between the two planes is
+point (Ramanathan, Steinbach and Girod 2000; Wong and Cipolla 2001). Each silhouette's tangent pixel gives one plane
+through both centres. With centres c, rays d at the two tangent pixels and base b = c2 - c1, the angle between the two
+planes is
 
     delta = |b| b . (d1 x d2) / (|b x d1| |b x d2|)
 
-Divided by the change of angle per pixel in both images together, it is the residual: the distance in pixels by which
-each contour would have to move if both were equally noisy. At a tangent point the contour runs along the plane, so to
-first order the tangent pixels stay where they are when a camera moves. With x' = R(w) x + v in camera 1's frame,
+The residual is the angle delta divided by the change of angle per pixel in both images together. The residual is the
+distance (px) by which each of two equally noisy contours would have to move. At a tangent point the contour runs along
+the plane, so to first order the tangent pixels do not move along it when a camera moves. With x' = R(w) x + v in camera
+1's frame,
 
     d delta ~ w . (R1 (d2 x b)) x R1 d1 + v . R1 (d1 x d2)         and likewise, signs swapped, for camera 2.
 
-A focal length (its logarithm) rotates the rays; its derivative is taken by central differences.
+Central differences give the derivative by the logarithm of a focal length, which rotates the rays.
 """
 
 from collections.abc import Sequence
@@ -33,8 +35,8 @@ ZOOM_STEP = 1e-4  # difference of a focal length's logarithm for its derivative
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedTangencies:
-    """Holds n tangencies of a rig as arrays: indices of both cameras, tangent pixels, and ``steepness``, the change of
-    angle per pixel of both contours together (rad / px)."""
+    """Holds n tangencies of a rig as arrays. ``steepness`` is the change of angle per pixel of both contours together
+    (rad / px)."""
 
     cameras: Int[np.ndarray, "n 2"]
     pixels: Float[np.ndarray, "n 2 2"]
@@ -55,8 +57,8 @@ class PackedTangencies:
 class TangencyTerm:
     """Computes Geman and McClure's cost of tangency residuals as a function of the corrections of all cameras.
 
-    A correction lists, camera by camera, a left perturbation of the pose in ``start`` (rad, mm) and, with ``focal``,
-    the change of the focal length's logarithm."""
+    A correction holds, for each camera, a left perturbation of its pose in ``start`` (rad, mm). With ``focal``, it also
+    holds the change of the focal length's logarithm."""
 
     seen: PackedTangencies
     start: Rig
@@ -75,13 +77,12 @@ class TangencyTerm:
 
 
 def per_camera(*, focal: bool) -> int:
-    """Returns the number of unknowns of a camera: 6 of its pose, and 1 with ``focal``."""
+    """Returns the number of unknowns of a camera: 6 for its pose, and with ``focal`` 1 more."""
     return 7 if focal else 6
 
 
 def corrected(rig: Rig, correction: Float[np.ndarray, " p"], *, focal: bool) -> Rig:
-    """Returns the rig with the pose, and with ``focal`` the focal length, of every camera changed by its part of the
-    correction."""
+    """Applies a correction to the pose of every camera and, with ``focal``, to its focal length."""
     cameras = []
     for camera, step in zip(rig, correction.reshape(len(rig), -1), strict=True):
         moved = camera.moved(step[:6])
@@ -104,7 +105,7 @@ def tangency_residuals(packed: PackedTangencies, rig: Rig) -> Float[np.ndarray, 
 
 def tangency_jacobian(packed: PackedTangencies, rig: Rig, *, focal: bool) -> Float[np.ndarray, "n p"]:
     """Returns the derivatives of the residuals by the corrections of all cameras (px per rad, mm and unit of the
-    logarithm). The factor from angles to pixels is taken as constant."""
+    logarithm). The factor that converts angles to pixels is treated as constant."""
     size, count = per_camera(focal=focal), len(packed.cameras)
     base, rays = _bases(packed, rig), _rays(packed, rig)
     gain = _gain(packed, base, rays)[:, None]
@@ -143,6 +144,6 @@ def _rays(packed: PackedTangencies, rig: Rig) -> Float[np.ndarray, "n 2 3"]:
 def _gain(
     packed: PackedTangencies, base: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 2 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns the factor from the triple product to pixels, with both contours equally noisy."""
+    """Returns the factor that converts the triple product ``b . (d1 x d2)`` to pixels."""
     planes = [np.linalg.norm(np.cross(base, rays[:, side]), axis=1) for side in (0, 1)]
     return np.linalg.norm(base, axis=1) / (planes[0] * planes[1] * packed.steepness)

@@ -1,4 +1,3 @@
-"""Takes shots with a real rig: triggers it, collects simultaneous pictures, stores clean plates, and judges the
-pictures.
+"""Takes shots with a camera rig: triggers the cameras, collects their simultaneous pictures, and judges these.
 
-In: rig.toml and its devices. Out: capture folders with sync certificates, or named faults."""
+The input is rig.toml and the devices that it lists. The output is capture folders, or faults with remedies."""

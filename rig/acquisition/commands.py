@@ -1,6 +1,6 @@
-"""Implements an operator's commands: `eigenhead rig check`, `preview`, `capture`, and taking clean plates.
+"""Implements the commands `eigenhead rig check`, `preview`, `capture`, `board` and `plates`.
 
-Each function is one command: it opens a session, does its work, and closes the session. It prints nothing."""
+The function of a command opens the cameras, does its work, and closes the cameras. It prints nothing."""
 
 import itertools
 import json
@@ -37,7 +37,7 @@ COLUMNS = ("camera", "found", "resolution", "fps", "exposure", "sharpness", "syn
 
 
 class NoCalibration(EigenheadError):
-    """Reports a rig without calibration: a capture folder needs cameras.json, so none can be written."""
+    """Reports a rig without calibration. No capture folder can be written, because it must contain cameras.json."""
 
     def __init__(self) -> None:
         super().__init__(compose("rig-without-calibration"))
@@ -45,20 +45,19 @@ class NoCalibration(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class RigCheck:
-    """Holds the result of a check: ``rows`` has a row of texts for each camera, in the order of ``COLUMNS``; ``faults``
-    lists every fault."""
+    """Holds the result of `eigenhead rig check`: a row of texts (``COLUMNS``) for each camera, and all faults."""
 
     rows: tuple[tuple[str, ...], ...]
     faults: tuple[Fault, ...]
 
     @property
     def healthy(self) -> bool:
-        """Tells whether a capture would succeed now."""
+        """Returns whether a capture would succeed now."""
         return not any(fault.is_error for fault in self.faults)
 
 
 def check(config: RigConfig, make_driver: MakeDriver = driver_for) -> RigCheck:
-    """Opens all devices of a rig and takes a test shot, which is not stored (`eigenhead rig check`)."""
+    """Opens all devices of a rig and takes a test shot, which is not stored."""
     with RigSession(config, make_driver) as session:
         session.warm_up()
         shot = session.shoot()
@@ -66,8 +65,8 @@ def check(config: RigConfig, make_driver: MakeDriver = driver_for) -> RigCheck:
 
 
 def preview(config: RigConfig, out: Path, make_driver: MakeDriver = driver_for) -> tuple[Fault, ...]:
-    """Writes a contact sheet of every camera to ``out``, a .jpg or .png file (`eigenhead rig preview`). Returns the
-    faults of the shot."""
+    """Takes a shot and writes one picture with small pictures of all cameras to ``out``, a .jpg or .png file. Returns
+    the faults of the shot."""
     with RigSession(config, make_driver) as session:
         session.warm_up()
         shot = session.shoot()
@@ -78,11 +77,10 @@ def preview(config: RigConfig, out: Path, make_driver: MakeDriver = driver_for) 
 def capture(
     config: RigConfig, out: Path, make_driver: MakeDriver = driver_for, *, report: Progress = discard_progress
 ) -> Shot:
-    """Takes one shot and writes it as the capture folder ``out`` (`eigenhead rig capture`). ``report`` is called with
-    "warm up", "shot" and "done".
+    """Takes one shot and writes it as the capture folder ``out``. Reports the stages "warm up", "shot" and "done".
 
-    Raises ShotFailed, and writes nothing, if the shot is no complete capture; NoCalibration; and InputError if ``out``
-    exists and is not empty. Warnings are in the shot that is returned and in the folder's shot.json.
+    Writes nothing and raises ShotFailed if the shot has an error. Raises NoCalibration for a rig without calibration,
+    and InputError if ``out`` is not empty. The returned shot and the file shot.json contain the warnings.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(str(out), [compose("folder-exists")])
@@ -96,7 +94,7 @@ def capture(
 
 
 def capture_with(session: RigSession, out: Path) -> Shot:
-    """Takes one shot with a session that is open and warm, and writes it as the capture folder ``out``. Raises
+    """Takes one shot with an open session whose cameras are warmed up, and writes the capture folder ``out``. Raises
     ShotFailed and NoCalibration."""
     if session.rig is None:
         raise NoCalibration
@@ -110,12 +108,11 @@ def capture_with(session: RigSession, out: Path) -> Shot:
 def board_shots(
     config: RigConfig, out: Path, count: int, make_driver: MakeDriver = driver_for, *, pause_s: float = 4.0
 ) -> Iterator[tuple[str, tuple[str, ...], tuple[Fault, ...]]]:
-    """Takes ``count`` shots of a calibration board and writes ``out/<camera>/<shot>.png``, for `eigenhead calibrate`
-    (`eigenhead rig board`).
+    """Takes ``count`` shots of a calibration board and writes ``out/<camera>/<shot>.png`` for `eigenhead calibrate`.
 
-    Yields for each shot its name, the cameras whose pictures were written, and the faults. Waits ``pause_s`` before
-    each shot, so that the board can be moved. Names of shots already in ``out`` are not used again. Raises ShotFailed
-    where no camera delivers.
+    Yields each shot's name, the cameras whose pictures were written, and the faults. Waits ``pause_s`` before each
+    shot, so that the board can be moved. Never overwrites earlier shots in ``out``. Raises ShotFailed if no camera
+    delivers a picture.
     """
     taken = {path.stem for path in out.glob("*/*.png")}
     names = (name for name in map("shot{:03}".format, itertools.count()) if name not in taken)
@@ -130,11 +127,10 @@ def board_shots(
 
 
 def board_shot(session: RigSession) -> Shot:
-    """Takes one shot of a calibration board with a session that is open and warm. Needs neither calibration nor clean
-    plates.
+    """Takes one shot of a calibration board with an open session. The rig needs neither calibration nor clean plates.
 
-    Returns the pictures of the cameras that deliver, and the faults, except those that the board causes by covering the
-    background. Raises ShotFailed if no camera delivers.
+    Returns the pictures that cameras delivered, and the faults. Faults that the board causes by hiding the background
+    are left out. Raises ShotFailed if no camera delivers a picture.
     """
     shot = session.shoot()
     faults = tuple(fault for fault in shot.faults if fault.code not in HIDDEN_BY_BOARD)
@@ -146,16 +142,16 @@ def board_shot(session: RigSession) -> Shot:
 
 
 def take_plates(config: RigConfig, make_driver: MakeDriver = driver_for) -> Plates:
-    """Takes new clean plates of the empty studio and starts to use them. Raises ShotFailed; then the old plates stay in
-    use."""
+    """Takes new clean plates (pictures of the empty studio) and uses them from now on. If the function raises
+    ShotFailed, the old plates stay in use."""
     with RigSession(config, make_driver) as session:
         session.warm_up()
         return session.take_plates()
 
 
 def write_shot(out: Path, shot: Shot, plates: Plates, rig: Rig) -> None:
-    """Writes a shot as a capture folder with clean plates and certificate (shot.json). The folder appears only when it
-    is complete."""
+    """Writes a shot as a capture folder with clean plates and the timing of the shot (shot.json). The folder appears
+    only when it is complete."""
     out.parent.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:
@@ -174,7 +170,7 @@ def write_shot(out: Path, shot: Shot, plates: Plates, rig: Rig) -> None:
 def contact_sheet(
     names: tuple[str, ...], images: Mapping[str, ImageRgb], faults: tuple[Fault, ...], tile_width: int = 320
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Returns one picture (RGB) of all cameras, each with its name and the codes of its faults."""
+    """Returns one picture (RGB) that shows the pictures of all cameras, with the cameras' names and codes of faults."""
     tile_height = tile_width * 3 // 4
     columns = math.ceil(math.sqrt(len(names)))
     rows = math.ceil(len(names) / columns)

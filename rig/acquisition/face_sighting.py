@@ -1,7 +1,7 @@
 """Turns detections of the subject's face in a shot into remarks for the operator.
 
-``pipeline.faces`` finds the face and makes the ``FaceSighting``. Remarks are no faults: a head can be reconstructed
-with the face turned away, or from a statue in which no network finds a face."""
+``pipeline.faces`` finds the face and creates the ``FaceSighting``. Remarks are no faults: a head can be reconstructed
+if the face is turned away, or if the face detector fails, for example on a statue."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ EXPLAINING = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class FaceSighting:
-    """Holds which pictures show the subject's face, and the direction of the face.
+    """Holds the cameras that see the subject's face, and the direction of the face.
 
-    ``searched``: number of pictures searched; ``missing``: cameras in front of the face whose pictures do not show it;
-    ``left_deg`` and ``up_deg``: angles of the face to the subject's left and up, seen from the camera ``front``. Both
-    are None without a face, or if the cameras stand all around and none is the front. ``remarks``: further
-    observations, such as closed eyes.
+    ``searched`` is the number of searched pictures. ``missing`` lists the cameras in front of the face whose pictures
+    do not show the face. ``left_deg`` and ``up_deg`` are the angles of the face to the subject's left and up, relative
+    to the camera ``front``. Both angles are None without a face, and if cameras all around the subject leave the front
+    undefined. ``remarks`` holds further observations, such as closed eyes.
     """
 
     searched: int
@@ -37,8 +37,8 @@ class FaceSighting:
 
 
 def face_remarks(sighting: FaceSighting | None, faults: Iterable[Fault]) -> tuple[Message, ...]:
-    """Returns remarks on which cameras do not show the face, and on its direction. Cameras with a fault in
-    ``EXPLAINING`` are left out; there are no remarks if the whole rig has one."""
+    """Returns remarks on the cameras that do not show the face, and on the face's direction. Cameras with a fault in
+    ``EXPLAINING`` get no remark. If a fault in ``EXPLAINING`` concerns the whole rig, returns no remarks."""
     explained = {fault.camera for fault in faults if fault.code in EXPLAINING}
     if sighting is None or None in explained:
         return ()
@@ -54,7 +54,7 @@ def face_remarks(sighting: FaceSighting | None, faults: Iterable[Fault]) -> tupl
 
 
 def _ways(sighting: FaceSighting) -> list[Message]:
-    """Returns the direction of the face if it is turned by more than ``TURNED_DEG``: left or right, then up or down."""
+    """Returns the directions (left or right, up or down) in which the face is turned by more than ``TURNED_DEG``."""
     left, up = sighting.left_deg or 0.0, sighting.up_deg or 0.0
     ways = []
     if abs(left) > TURNED_DEG:

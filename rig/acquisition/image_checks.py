@@ -1,12 +1,11 @@
-"""Measures whether a picture is fit for use: exposure, sharpness, noise, and motion of the background since its clean
-plate.
+"""Measures exposure, sharpness and noise of a picture, and the motion of its background relative to a clean plate.
 
-All are pure functions of images. Brightness is in the image's values (0 to 255), lengths in pixels.
+Brightness is in the image's values (0 to 255), lengths are in pixels. A clean plate is a picture of the empty studio.
 
-Finding the subject takes a few hundredths of a second, so that the operator can shoot again: a picture is compared with
-its clean plate at a small size, where noise averages out. The result is for framing and for drawing an outline;
-reconstruction segments anew (pipeline.segmentation). Its intersection over union with the true silhouettes is 0.978 to
-0.987 on two rendered captures of eleven cameras.
+``find_subject`` compares a picture with its clean plate at a small size, where noise averages out. This takes a few
+hundredths of a second, so that the operator can shoot again while the subject is present. The outline shows whether the
+subject is in the frame; reconstruction segments more precisely (``pipeline.segmentation``). The outline's intersection
+over union with the true silhouettes is 0.978 to 0.987 on two rendered captures of eleven cameras.
 """
 
 import itertools
@@ -46,7 +45,7 @@ _SCALE_MOST = 0.03  # a camera 1.2 m away would have to be moved 36 mm along its
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """Holds the mean value of a picture (0 to 255) and the fraction of clipped pixels (every channel 255)."""
+    """Holds the mean value of a picture (0 to 255) and the fraction of clipped pixels (all channels 255)."""
 
     mean: float
     clipped_share: float
@@ -56,10 +55,10 @@ class Exposure:
 class Registration:
     """Holds how well the background of a picture agrees with a clean plate.
 
-    ``patches``: number of textured patches of the plate; ``found``: fraction of them found in the picture, all moved by
-    one similarity; ``moved_px``: largest motion of an image corner by this similarity, 0 if none was found;
-    ``moved_sd_px``: its standard deviation; ``in_place``: fraction of patches that look alike at their old position
-    (also true for a plain wall, where no patch can be located).
+    ``patches`` is the number of textured patches of the plate. ``found`` is the fraction of patches found in the
+    picture, all moved by one similarity. ``moved_px`` is the largest motion of an image corner by this similarity, or 0
+    without one. ``moved_sd_px`` is the standard deviation of ``moved_px``. ``in_place`` is the fraction of patches
+    whose old position looks the same in the picture, for example on a plain wall, where patches cannot be located.
     """
 
     patches: int
@@ -70,31 +69,29 @@ class Registration:
 
     @property
     def conclusive(self) -> bool:
-        """Tells whether the plate has enough texture for ``found`` and ``moved_px`` to mean anything."""
+        """Returns whether the plate has enough texture for ``found`` and ``moved_px`` to be meaningful."""
         return self.patches >= _PATCHES_LEAST
 
 
 def exposure(image: ImageRgb) -> Exposure:
-    """Measures the mean value of a picture and the share of clipped pixels."""
+    """Measures the mean value of a picture and the fraction of clipped pixels."""
     red, green, blue = cv2.split(image)
     low = cv2.min(cv2.min(red, green), blue)
     return Exposure(sum(cv2.mean(image)[:3]) / 3, np.count_nonzero(low == 255) / low.size)
 
 
 def noise_of(plates: Sequence[ImageRgb]) -> float | None:
-    """Computes the standard deviation of the temporal noise from pictures of one still scene. Returns None for a single
-    picture.
+    """Computes the standard deviation of the temporal noise from pictures of a static scene; None for one picture.
 
-    The differences of successive pictures have the variance 2 sigma^2. It is taken within blocks of 16 px, so that
-    drifting light does not count. The median over the blocks ignores a movement in a corner.
+    The difference of successive pictures has the variance 2 sigma^2. The variance is computed within blocks of 16 px,
+    where drifting light hardly matters. The median over all blocks ignores motion in a few of them.
     """
     variances = [_block_variance(after, before) for before, after in itertools.pairwise(plates)]
     return float(np.sqrt(np.median(variances) / 2)) if variances else None
 
 
 def disturbed(plates: Sequence[ImageRgb], noise: float) -> bool:
-    """Tells whether something moved between clean plates: whether a block of 16 px changed by more than 8 standard
-    deviations."""
+    """Returns whether a block of 16 px changed between clean plates by more than 8 standard deviations."""
     first = cv2.resize(plates[0].astype(np.float32), None, fx=1 / 16, fy=1 / 16, interpolation=cv2.INTER_AREA)
     # A block's mean has 1/16 of the noise. No person changes it by less than 4.
     limit = max(8.0 * noise * np.sqrt(2) / 16, 4.0)
@@ -107,13 +104,13 @@ def disturbed(plates: Sequence[ImageRgb], noise: float) -> bool:
 
 
 def blur_px(image: ImageRgb) -> float | None:
-    """Measures how blurred a picture is: the standard deviation (px) of a Gaussian that would spread a sharp edge as
-    much. Returns None where the picture has no edges.
+    """Measures the blur of a picture as the standard deviation (px) of a Gaussian that would blur a sharp edge as much.
+    Returns None if the picture has no edges.
 
-    A step of height A, blurred with standard deviation s, has the gradient energy A^2 / (2 sqrt(pi) s) across it. Two
-    more blurs of known size, s1 and s2, give energies whose ratio q = sqrt((s^2 + s2^2) / (s^2 + s1^2)) does not depend
-    on A; the equation is solved for s. Only the strongest gradients count, where the steps are. The energy of the
-    noise, measured elsewhere in the picture, is subtracted first.
+    A step of height A, blurred with standard deviation s, has the gradient energy A^2 / (2 sqrt(pi) s) across it.
+    Blurring the picture further, by known s1 and by s2, gives energies whose ratio q = sqrt((s^2 + s2^2) / (s^2 +
+    s1^2)) does not depend on A. The equation is solved for s. Only pixels with the strongest gradients are used,
+    because they lie on steps. The energy of the noise, measured in other pixels, is subtracted first.
     """
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.float32)
     small, large = _gradient_energy(grey, _GAUSS_SMALL_PX), _gradient_energy(grey, _GAUSS_LARGE_PX)
@@ -134,11 +131,11 @@ def blur_px(image: ImageRgb) -> float | None:
 
 
 def register(image: ImageRgb, plate: ImageRgb) -> Registration:
-    """Finds the background of ``plate`` in ``image``, which a subject may partly hide, and returns its motion.
+    """Measures the motion of the background from ``plate`` to ``image``, in which a subject may hide parts of it.
 
-    Textured patches of the plate are searched near their positions by normalised correlation, which brightness and
-    contrast do not change. A patch counts as found if one similarity, common to all patches, explains its motion
-    (RANSAC).
+    Normalised correlation, which does not depend on brightness and contrast, searches textured patches of the plate
+    near their old positions. RANSAC finds the similarity that explains most motions; ``found`` counts the patches that
+    agree with it.
     """
     if image.shape != plate.shape:
         return Registration(_PATCHES_MOST, 0.0, 0.0)
@@ -166,7 +163,7 @@ def register(image: ImageRgb, plate: ImageRgb) -> Registration:
 
 
 def _block_variance(after: ImageRgb, before: ImageRgb) -> float:
-    """Returns the variance of the difference of two pictures: the median over blocks of 16 px and over the channels."""
+    """Returns the median variance of the difference of two pictures over all blocks of 16 px and all channels."""
     size = 16 if min(after.shape[:2]) >= 16 else 1
     height, width = (length // size * size for length in after.shape[:2])
     difference = after[:height, :width].astype(np.float32) - before[:height, :width]
@@ -222,7 +219,7 @@ def _is_alike(here: Grey, there: Grey, point: tuple[int, int]) -> bool:
 
 
 def _peak(values: Float[np.ndarray, " n"], at: int) -> float:
-    """Returns the offset of the peak from the highest value, in samples; 0 at the ends."""
+    """Returns the sub-sample offset of a peak from its highest value, at index ``at``; 0 at the ends of ``values``."""
     if not 0 < at < len(values) - 1:
         return 0.0
     left, middle, right = (float(values[at + step]) for step in (-1, 0, 1))
@@ -241,10 +238,10 @@ def _corner_deviation(
     target: Float[np.ndarray, "n 2"],
     shape: tuple[int, ...],
 ) -> float:
-    """Returns the standard deviation (px) at the image corner where a similarity fitted to points is least accurate.
+    """Returns the largest standard deviation (px), over the image corners, of a similarity fitted to points.
 
-    With x - mean as a complex number, a similarity is a factor and a shift; their variances are sigma^2 over the sum
-    of |x - mean|^2 and over n.
+    In complex numbers, a similarity multiplies ``x - mean`` by a factor and adds a shift. The variance of the factor is
+    sigma^2 over the sum of |x - mean|^2, that of the shift is sigma^2 / n.
     """
     residuals = target - source @ similarity[:, :2].T - similarity[:, 2]
     variance = float((residuals**2).sum()) / (2 * len(source) - 4)  # per coordinate, four parameters
@@ -264,8 +261,8 @@ def _largest_move(similarity: Float[np.ndarray, "2 3"], shape: tuple[int, ...]) 
 class SubjectPlace:
     """Holds the position of the subject in a picture.
 
-    ``outline``: corners of its contour (px of the picture); ``share``: share of the picture's area that it fills;
-    ``cut_off``: edges of the picture that cut off the upper half of the outline (the bottom edge always cuts a bust).
+    ``outline`` holds the corners of its contour (px). ``share`` is the fraction of the picture that it fills.
+    ``cut_off`` lists the picture's edges that touch the outline's upper half; the bottom edge always cuts a bust.
     """
 
     outline: tuple[tuple[float, float], ...]
@@ -274,8 +271,8 @@ class SubjectPlace:
 
 
 def find_subject(image: ImageRgb, plate: ImageRgb) -> SubjectPlace | None:
-    """Finds the subject: the largest part of a picture that differs from the clean plate. Returns None where nothing as
-    large as a head differs."""
+    """Finds the subject as the largest region of a picture that differs from the clean plate. Returns None if no region
+    of a head's size differs."""
     if image.shape != plate.shape:
         return None
     here, there = (np.float32(_reduced(picture)) + 1.0 for picture in (image, plate))
@@ -286,8 +283,7 @@ def find_subject(image: ImageRgb, plate: ImageRgb) -> SubjectPlace | None:
 
 
 def subject_of_mask(mask: Bool[np.ndarray, "h w"]) -> SubjectPlace | None:
-    """Returns the subject's position in a picture with a known mask. Returns None if the mask contains nothing as large
-    as a head."""
+    """Returns the subject's position in a picture with a known mask, or None if it has no region of a head's size."""
     return _place(_reduced(mask.astype(np.uint8)) > 0, mask.shape)
 
 

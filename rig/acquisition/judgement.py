@@ -1,6 +1,5 @@
-"""Judges the pictures of a shot: light, focus, and the cameras' views. All functions are pure functions of pictures,
-clean plates and settings. New clean plates replace the old ones only if they show an empty studio: they are tested
-for motion while they are taken, for light, and by comparison with the plates in use."""
+"""Judges the light, the focus and the cameras' views in the pictures of a shot. Also judges whether new clean plates
+show an empty studio, from their light, from motion between them, and by comparison with the plates in use."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -33,19 +32,19 @@ MOVED_DARK_PX = 3.0  # the same with the lamps off: up to 2.6 px without any mov
 
 
 def plate_level(plate: ImageRgb | None) -> float:
-    """Returns the mean value (0 to 255) that a picture should have, from its clean plate."""
+    """Returns the mean value (0 to 255) of a clean plate, which a picture by the same camera should also have."""
     return LEVEL_WITHOUT_PLATES if plate is None else max(float(plate[::4, ::4].mean()), 1.0)
 
 
 def examine_picture(image: ImageRgb, plate: ImageRgb | None) -> PictureCheck:
-    """Measures the exposure and blur of one picture, and how its background agrees with the clean plate."""
+    """Measures the exposure and blur of one picture, and the agreement of its background with the clean plate."""
     light = exposure(image)
     black = light.mean < BLACK_LEVEL * plate_level(plate)
     return PictureCheck(light, blur_px(image), None if plate is None or black else register(image, plate))
 
 
 def examine(images: Mapping[str, ImageRgb], plates: Plates) -> dict[str, PictureCheck]:
-    """Measures every picture, in parallel. Returns the measurements by camera."""
+    """Measures all pictures in parallel. Returns the measurements by camera."""
     with ThreadPoolExecutor(4) as pool:
         examined = pool.map(lambda name: examine_picture(images[name], plates.first.get(name)), images)
         return dict(zip(images, examined, strict=True))
@@ -54,7 +53,7 @@ def examine(images: Mapping[str, ImageRgb], plates: Plates) -> dict[str, Picture
 def judge(
     images: Mapping[str, ImageRgb], checks: Mapping[str, PictureCheck], plates: Plates, shot: ShotConfig
 ) -> list[Fault]:
-    """Returns the faults that the pictures of a shot show, by measurement and by comparison with the clean plates."""
+    """Returns the faults of a shot's pictures, judged by their measurements and by comparison with clean plates."""
     levels = {name: plate_level(plates.first.get(name)) for name in checks}
     return judge_checks(
         checks, levels, shot, lambda name, registration: _whose_view(name, images[name], registration, plates)
@@ -67,7 +66,7 @@ def judge_checks(
     shot: ShotConfig,
     whose_view: OtherView = lambda name, registration: None,
 ) -> list[Fault]:
-    """Returns the faults that follow from the measurements of pictures.
+    """Returns the faults of pictures, judged by their measurements alone.
 
     Args:
         checks: the measurements by camera.
@@ -92,7 +91,7 @@ def judge_checks(
 def _light_faults(
     checks: Mapping[str, PictureCheck], levels: Mapping[str, float], shot: ShotConfig
 ) -> tuple[list[Fault], dict[str, bool]]:
-    """Returns the faults of the light, and for each camera whether it has enough light for its view to be judged."""
+    """Returns the faults of exposure, and for each camera whether its picture is bright enough to judge the view."""
     ratios = {name: check.exposure.mean / levels[name] for name, check in checks.items() if name in levels}
     common = median(ratios.values()) if len(ratios) >= 3 else 1.0
     faults: list[Fault] = []
@@ -125,16 +124,14 @@ def _view_faults(
 
 
 def _whose_view(name: str, image: ImageRgb, registration: Registration, plates: Plates) -> str | None:
-    """Returns the camera whose clean plate fits the picture far better than its own camera's; None if there is no such
-    camera."""
+    """Returns a camera whose clean plate fits the picture far better than the plate of ``name``, or None."""
     others = {other: register(image, plate).found for other, plate in plates.first.items() if other != name}
     best = max(others, key=lambda other: others[other], default=None)
     return best if best is not None and others[best] >= max(FOUND_LEAST, 2 * registration.found) else None
 
 
 class PlatesRefused(ShotFailed):
-    """Reports that new clean plates show a person. They are stored as the version ``version``; the old plates stay in
-    use."""
+    """Reports that new plates show a person. The old plates stay in use; the new plates are stored as ``version``."""
 
     def __init__(self, faults: Sequence[Fault], version: str) -> None:
         super().__init__(faults)
@@ -142,8 +139,8 @@ class PlatesRefused(ShotFailed):
 
 
 def plate_faults(taken: Mapping[str, Sequence[ImageRgb]], live: Collection[str], shot: ShotConfig) -> list[Fault]:
-    """Returns the faults that pictures of the empty studio show without comparison to other plates. ``live``: cameras
-    with a sensor, as opposed to recorded pictures."""
+    """Returns the faults of new clean plates, without comparison to older plates. ``live`` holds the cameras with a
+    sensor; other cameras replay recorded pictures."""
     faults = []
     for name, images in taken.items():
         if name in live and any(np.array_equal(images[0], other) for other in images[1:2]):
@@ -156,8 +153,8 @@ def plate_faults(taken: Mapping[str, Sequence[ImageRgb]], live: Collection[str],
 
 
 def occupied(taken: Mapping[str, Sequence[ImageRgb]], before: Plates) -> list[Fault]:
-    """Returns a fault for each camera whose new plate differs from the plate in use as if a person sat there. Returns
-    none if fewer than ``SEEN_SHARE`` of the cameras show such a difference."""
+    """Returns a fault for each camera whose new plate differs from the plate in use in a region of a head's size.
+    Returns no fault if the plates of less than the fraction ``SEEN_SHARE`` of all cameras differ."""
     compared = [name for name in taken if name in before and taken[name][0].shape == before.first[name].shape]
     positions = {name: find_subject(taken[name][0], before.first[name]) for name in compared}
     faults = [

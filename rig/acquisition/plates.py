@@ -1,10 +1,10 @@
-"""Stores clean plates: several pictures of the empty studio for each camera, next to rig.toml.
+"""Stores clean plates, which are pictures of the empty studio, for each camera in a folder beside rig.toml.
 
     plates/<camera>/000.png ...     (or plates/<camera>.png: what a capture folder's background/ holds is accepted too)
     plates/plates.json              when they were taken, the noise of each camera
     plates.versions/<version>/...   those that were in use before, and those that were refused
 
-A session needs one plate of each camera in memory; captures get links to the files.
+The program keeps one plate of each camera in memory. A capture folder gets links to the files of all plates.
 """
 
 import json
@@ -32,8 +32,8 @@ UNFINISHED_S = 3600.0  # no version takes so long to write
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plates:
-    """Holds the clean plates by camera: their files, the first of them as an image, and the noise (standard deviation
-    of the values; None for a single plate)."""
+    """Holds the clean plates by camera: files, the first plate as an image, and the noise (standard deviation of the
+    values, 0 to 255). The noise is None for a single plate."""
 
     files: Mapping[str, tuple[Path, ...]]
     first: Mapping[str, ImageRgb]
@@ -48,7 +48,7 @@ NO_PLATES = Plates({}, {}, {}, None)
 
 
 def read_plates(folder: Path, names: tuple[str, ...]) -> Plates:
-    """Reads the clean plates in ``folder``; cameras without any are left out. Raises InputError for a file that is no
+    """Reads the clean plates in ``folder``, for cameras that have any. Raises InputError for a file that is no
     picture."""
     files = {name: paths for name in names if (paths := _files(folder, name))}
     with ThreadPoolExecutor(4) as pool:
@@ -68,8 +68,8 @@ def read_plates(folder: Path, names: tuple[str, ...]) -> Plates:
 
 @dataclass(frozen=True, slots=True)
 class PlatesVersion:
-    """Describes a stored set of clean plates. ``taken``: UTC, ISO 8601; ``refused``: the faults because of which the
-    plates are not in use."""
+    """Describes a stored set of clean plates. ``taken`` is the UTC time in ISO 8601; ``refused`` lists the faults for
+    which the plates were refused."""
 
     id: str
     taken: str
@@ -79,14 +79,13 @@ class PlatesVersion:
 
 
 def write_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]]) -> Plates:
-    """Writes new clean plates and starts to use them. Once they are complete, the old plates in ``folder`` become a
-    version."""
+    """Writes new clean plates to ``folder``. When they are complete, the old plates become a version."""
     return use_plates(folder, keep_plates(folder, images), tuple(images))
 
 
 def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refused: tuple[Message, ...] = ()) -> str:
-    """Writes clean plates as a version that is not in use, and returns the version's id. ``refused``: the faults that
-    prevent their use."""
+    """Writes clean plates as a version that is not in use, and returns the version's id. ``refused`` lists the faults
+    that prevent their use."""
     moment = datetime.now(UTC)
     identity = moment.strftime("%Y%m%dT%H%M%S%fZ")
     _remove_unfinished(folder)
@@ -106,8 +105,7 @@ def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refuse
 
 
 def use_plates(folder: Path, version: str, names: tuple[str, ...]) -> Plates:
-    """Starts to use a stored version of the clean plates; the plates in use become a version. Raises InputError for an
-    unknown version."""
+    """Exchanges the clean plates in use for a stored version. Raises InputError for an unknown version."""
     wanted, stored = (_versions(folder) / version, {entry.id: entry for entry in plates_versions(folder)})
     if version in stored and stored[version].in_use:
         return read_plates(folder, names)
@@ -123,14 +121,14 @@ def use_plates(folder: Path, version: str, names: tuple[str, ...]) -> Plates:
 
 
 def _remove_old(folder: Path) -> None:
-    """Removes all but the newest ``VERSIONS_MOST`` versions; the one in use stays."""
+    """Removes all stored versions but the newest ``VERSIONS_MOST``."""
     for old in plates_versions(folder)[VERSIONS_MOST:]:
         if not old.in_use:
             shutil.rmtree(_versions(folder) / old.id, ignore_errors=True)
 
 
 def _remove_unfinished(folder: Path) -> None:
-    """Removes versions whose writing process ended before they were complete."""
+    """Removes incomplete versions whose writing process has ended."""
     for left in _versions(folder).glob("*.new"):
         if time.time() - left.stat().st_mtime > UNFINISHED_S:
             shutil.rmtree(left, ignore_errors=True)
@@ -146,7 +144,7 @@ def plates_versions(folder: Path) -> list[PlatesVersion]:
 
 
 def _version_of(folder: Path) -> PlatesVersion:
-    """Describes the version in a folder, by plates.json; without a readable one its time is that of the folder."""
+    """Reads a version's description from plates.json. Without it, uses the folder's modification time."""
     try:
         document = json.loads((folder / "plates.json").read_text(encoding="utf-8"))
         taken = str(document["taken"])
@@ -164,7 +162,7 @@ def _versions(folder: Path) -> Path:
 
 
 def link_plates(plates: Plates, background: Path) -> None:
-    """Links the files of clean plates into background/ of a capture, or copies them where links are impossible."""
+    """Links the files of clean plates into the folder ``background`` of a capture, or copies them if it cannot link."""
     for name, files in plates.files.items():
         for i, file in enumerate(files):
             target = (

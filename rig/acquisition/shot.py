@@ -1,7 +1,7 @@
-"""Defines a shot: pictures, a certificate of their simultaneity, and all faults with their codes.
+"""Defines a shot: pictures that all cameras took at one time, the certificate of their timing, and all faults.
 
-This module judges timing by pure functions of frames; rig.acquisition.judgement judges pictures;
-rig.acquisition.session takes the shot."""
+This module judges only timing. ``rig.acquisition.judgement`` judges pictures; ``rig.acquisition.session`` takes
+shots."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ class FaultDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Holds one fault: its code (see ``REMEDIES``), its camera (None: the whole rig), and the measurement."""
+    """Holds one fault: its code (a key of ``REMEDIES``), its camera (None for the whole rig), and the measurement."""
 
     code: str
     camera: str | None
@@ -64,12 +64,12 @@ class Fault:
 
     @property
     def is_error(self) -> bool:
-        """Tells whether the fault makes the capture fail; the others are warnings."""
+        """Returns whether the fault makes the capture fail. A fault that does not is a warning."""
         return self.code not in WARNINGS
 
     @property
     def remedy(self) -> Message:
-        """Returns what an operator should do about the fault."""
+        """Returns a message that says what the operator should do about the fault."""
         return REMEDIES[self.code]
 
     def document(self) -> FaultDocument:
@@ -96,12 +96,12 @@ class Fault:
 
 
 def read_fault(document: Mapping[str, Any]) -> Fault:
-    """Reads a fault from ``Fault.document``, also from an earlier version's, whose detail is a text."""
+    """Reads a fault from the result of ``Fault.document``. Earlier versions stored the detail as a text."""
     return Fault(document["code"], document["camera"], read_message(document.get("detail_message", document["detail"])))
 
 
 class ShotFailed(EigenheadError):
-    """Reports a shot that is not usable as a capture. ``faults`` holds every fault."""
+    """Reports a shot that is not usable as a capture. ``faults`` holds all its faults."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self.faults = tuple(faults)
@@ -110,8 +110,8 @@ class ShotFailed(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class CameraSync:
-    """Holds the timing of one camera in a shot. ``skew_s``: delay of the frame's arrival after its due time, which is
-    the trigger plus output delay and configured latency."""
+    """Holds the timing of one camera in a shot. ``skew_s`` is the delay (s) of the frame's arrival after its due time:
+    the trigger time plus output delay and configured latency."""
 
     camera: str
     status: Status
@@ -130,7 +130,7 @@ class CameraSyncDocument(TypedDict):
 
 
 class SyncDocument(TypedDict):
-    """Holds a certificate as plain values for JSON; times are in milliseconds."""
+    """Holds a ``SyncCertificate`` as plain values for JSON. Times are in milliseconds."""
 
     trigger_utc: str
     fired: bool
@@ -161,8 +161,8 @@ class ShotDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class SyncCertificate:
-    """Holds how simultaneous the pictures of a shot are. ``trigger_s`` is the moment of the release (time.monotonic,
-    s); None if there was none."""
+    """Holds the timing of all pictures of a shot. ``trigger_s`` is the time of the trigger (time.monotonic, s), or None
+    without a trigger."""
 
     trigger_s: float | None
     trigger_utc: str
@@ -172,18 +172,18 @@ class SyncCertificate:
 
     @property
     def spread_s(self) -> float | None:
-        """Returns the time (s) from the earliest to the latest picture of the shot; None if fewer than two arrived."""
+        """Returns the time (s) from the earliest to the latest picture, or None if fewer than two arrived."""
         skews = [camera.skew_s for camera in self.cameras if camera.skew_s is not None]
         return max(skews) - min(skews) if len(skews) > 1 else None
 
     def lines(self) -> list[str]:
-        """Returns one line of text for each camera: its name, status and skew."""
+        """Returns one line of text for each camera, with its name, status and skew."""
         width = max(len(line.camera) for line in self.cameras)
         skews = {line.camera: "" if line.skew_s is None else f"  {line.skew_s * 1000:+.1f} ms" for line in self.cameras}
         return [f"{line.camera:<{width}}  {line.status}{skews[line.camera]}" for line in self.cameras]
 
     def document(self) -> SyncDocument:
-        """Returns the certificate as plain values for JSON; times are in milliseconds."""
+        """Returns the certificate as plain values for JSON. Times are in milliseconds."""
         return {
             "trigger_utc": self.trigger_utc,
             "fired": self.trigger_s is not None,
@@ -204,7 +204,7 @@ class SyncCertificate:
 
 @dataclass(frozen=True, slots=True)
 class PictureCheck:
-    """Holds the measurements of one picture. ``registration`` is None without a clean plate and for a black picture."""
+    """Holds the measurements of one picture. ``registration`` is None for a black picture or without a clean plate."""
 
     exposure: Exposure
     blur_px: float | None
@@ -224,7 +224,7 @@ class PictureCheck:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
-    """Holds the result of one release of the rig: pictures, certificate of their timing, measurements and faults."""
+    """Holds the result of one shot: pictures, the certificate of their timing, measurements and faults."""
 
     images: Mapping[str, ImageRgb]
     certificate: SyncCertificate
@@ -233,11 +233,11 @@ class Shot:
 
     @property
     def complete(self) -> bool:
-        """Tells whether the shot can be reconstructed: all its faults are warnings."""
+        """Returns whether the shot can be reconstructed, because all its faults are only warnings."""
         return not any(fault.is_error for fault in self.faults)
 
     def document(self) -> ShotDocument:
-        """Returns the content of the capture folder's shot.json."""
+        """Returns the content of the file shot.json in a capture folder."""
         return {
             "format": "eigenhead-shot/1",
             "sync": self.certificate.document(),
@@ -248,10 +248,10 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Holds when the frame of one camera was due (time.monotonic, s) and the period of the camera's live view (s).
+    """Holds the time (time.monotonic, s) at which one camera's frame was due, and the period of its live view (s).
 
-    ``triggered``: an output of the box releases the frame; otherwise the next frame to arrive counts. ``recorded``: the
-    picture comes from a recording and has no time of today.
+    If ``triggered``, an output of the trigger box starts the exposure; otherwise the next frame to arrive is used. If
+    ``recorded``, the picture comes from a recording, so its time is meaningless.
     """
 
     due_s: float
@@ -269,8 +269,8 @@ def certify(
     uncertainty_s: float,
     skew_most_s: float,
 ) -> tuple[SyncCertificate, list[Fault]]:
-    """Returns the certificate of a shot and its timing faults: "late-trigger", "late" and "dropped". ``frames`` and
-    ``timings`` are by camera."""
+    """Returns the certificate of a shot, and its timing faults "late-trigger", "late" and "dropped". The keys of
+    ``frames`` and ``timings`` are cameras."""
     skews = {name: frame.time_s - timings[name].due_s for name, frame in frames.items() if frame is not None}
     if trigger_s is None:
         skews = {}

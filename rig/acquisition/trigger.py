@@ -1,9 +1,10 @@
-"""Drives the trigger box over pyserial by its line protocol (docs/rig.md).
+"""Controls the trigger box, which releases all cameras at once, by a serial protocol of text lines (docs/rig.md).
 
-A request is ``@SS BODY*CCCC\\n`` and its reply ``#SS BODY*CCCC\\n``: SS is a sequence number (two hex digits), CCCC the
-CRC-16/CCITT-FALSE of ``SS BODY``. A start character resynchronises a receiver at any moment, so noise between lines has
-no effect. A damaged line is ignored; the client repeats it under its sequence number, and the box repeats its reply
-from memory without acting twice. Requests and replies start with different characters, so an echo is no reply.
+A request is ``@SS BODY*CCCC\\n`` and its reply ``#SS BODY*CCCC\\n``. SS is a sequence number (two hex digits) and CCCC
+the CRC-16/CCITT-FALSE of ``SS BODY``. A receiver starts a new line at each start character, so noise between lines has
+no effect. The box ignores a damaged request, and the host sends the request again with the same sequence number. If the
+box has already executed a request of this number, it only repeats its reply. Requests and replies start with different
+characters, so that an echo is not mistaken for a reply.
 """
 
 import string
@@ -21,25 +22,25 @@ BUSY_S = 1.5  # longest release: delay and pulse take up to 0.5 s each, and the 
 
 
 class TriggerError(EigenheadError):
-    """Reports that the trigger box could not do what was requested; all other errors of this module derive from it."""
+    """Reports that the trigger box did not execute a request. All other errors of this module are subclasses."""
 
 
 class TriggerUnplugged(TriggerError):
-    """Reports that the serial port does not exist or went away."""
+    """Reports that the serial port does not exist or was unplugged."""
 
     def __init__(self, port: str, why: str) -> None:
         super().__init__(compose("trigger-unplugged", port=port, reason=why))
 
 
 class TriggerSilent(TriggerError):
-    """Reports that the serial port exists, but nothing answers on it."""
+    """Reports that the serial port exists but no device answers."""
 
     def __init__(self, port: str, body: str, waited_s: float) -> None:
         super().__init__(compose("trigger-silent", port=port, command=body.split()[0], waited_s=waited_s))
 
 
 class WrongDevice(TriggerError):
-    """Reports that the device on the serial port is no trigger box."""
+    """Reports that the device on the serial port is not a trigger box."""
 
     def __init__(self, port: str, said: str) -> None:
         super().__init__(compose("trigger-other-device", port=port, protocol=PROTOCOL, said=f"{said!r}"))
@@ -56,7 +57,7 @@ class TriggerRefused(TriggerError):
 
 @dataclass(frozen=True, slots=True)
 class BoxStatus:
-    """Holds the box's answer to STATUS. ``bad_lines``: number of lines that it ignored as noise."""
+    """Holds the box's answer to STATUS. ``bad_lines`` is the number of damaged lines that the box ignored."""
 
     state: str
     shots: int
@@ -66,7 +67,7 @@ class BoxStatus:
 
 @dataclass(frozen=True, slots=True)
 class BoxClock:
-    """Holds one comparison of clocks: the host's time (time.monotonic, s) at the box's microsecond ``box_us``, and its
+    """Holds one comparison of clocks: the host's time (time.monotonic, s) at the box's time ``box_us``, and its
     uncertainty (s)."""
 
     host_s: float
@@ -74,16 +75,16 @@ class BoxClock:
     uncertainty_s: float
 
     def host_from_box(self, box_us: int) -> float:
-        """Returns the host's time (time.monotonic, s) for a box time within 35 minutes, also across the overflow of the
-        32-bit counter."""
+        """Converts a box time (us) within 35 minutes of ``box_us`` to the host's time (time.monotonic, s). The box's
+        32-bit counter may overflow in between."""
         difference = (box_us - self.box_us + CLOCK_PERIOD_US // 2) % CLOCK_PERIOD_US - CLOCK_PERIOD_US // 2
         return self.host_s + difference * 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Fired:
-    """Holds one release: when the box raised its outputs (time.monotonic, s), the uncertainty of that time, when the
-    host requested it, and the box's count of shots."""
+    """Holds one release of the cameras: when the box raised its outputs and when the host requested it (time.monotonic,
+    s), the uncertainty (s), and the box's count of shots."""
 
     time_s: float
     uncertainty_s: float
@@ -92,11 +93,10 @@ class Fired:
 
 
 class TriggerBox:
-    """Talks to one trigger box. Every method raises TriggerError; when a method returns, the box has acknowledged the
-    request.
+    """Controls one trigger box. A method returns after the box has acknowledged the request, or raises TriggerError.
 
-    ``port`` is a serial port (a /dev/serial/by-id path survives a reboot) or the pty of a simulated box. Opening waits
-    up to ``boot_s``: many boards restart when their port is opened and accept commands only two seconds later.
+    ``port`` is a serial port or the pseudo-terminal of a simulated box. A path in /dev/serial/by-id does not change at
+    a reboot. The constructor waits up to ``boot_s``, because many boards restart when their port is opened.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class TriggerBox:
         self.close()
 
     def close(self) -> None:
-        """Closes the serial port. Safe to call twice and on an unplugged cable."""
+        """Closes the serial port. The call may be repeated, and may follow an unplugged cable."""
         # pyserial's close restores nothing that could fail, but an unplugged descriptor may still raise
         try:
             self._serial.close()
@@ -135,20 +135,20 @@ class TriggerBox:
             return
 
     def set_delay(self, channel: int, delay_us: int) -> None:
-        """Sets how long after the release an output is raised, 0 to 500,000 us."""
+        """Sets the delay (0 to 500,000 us) from the release to the rise of an output."""
         self._command(f"DELAY {channel} {delay_us}")
 
     def set_lights(self, mask: int) -> None:
-        """Switches the light outputs: bit n of ``mask`` is light n."""
+        """Switches the lights on or off: bit n of ``mask`` is the state of light n."""
         self._command(f"LIGHTS {mask:X}")
 
     def arm(self, window_s: float) -> None:
-        """Allows one FIRE within ``window_s``; after that the box disarms itself."""
+        """Allows one call of ``fire`` within ``window_s``. After that time the box disarms itself."""
         self._command(f"ARM {round(window_s * 1000)}")
 
     def fire(self, mask: int, pulse_us: int) -> Fired:
-        """Raises the outputs whose bits are set in ``mask``, each after its delay, for ``pulse_us``. The box must be
-        armed."""
+        """Raises the outputs whose bits are set in ``mask``, each after its delay, for ``pulse_us``. Needs an armed
+        box."""
         clock = self._clock or self.synchronise()
         asked_s = time.monotonic()
         words = self._command(f"FIRE {mask:X} {pulse_us}")
@@ -156,7 +156,7 @@ class TriggerBox:
         return Fired(clock.host_from_box(box_us), clock.uncertainty_s, asked_s, shot)
 
     def status(self) -> BoxStatus:
-        """Returns the box's state (IDLE, ARMED or FIRING), shots since power-up, lights, and lines lost to noise."""
+        """Returns the box's state (IDLE, ARMED or FIRING), shots since power-up, lights, and count of damaged lines."""
         fields = _fields(self._command("STATUS"))
         try:
             return BoxStatus(fields["STATE"], int(fields["SHOTS"]), int(fields["LIGHTS"], 16), int(fields["BAD"]))
@@ -164,10 +164,10 @@ class TriggerBox:
             raise WrongDevice(self.port, f"STATUS {fields}") from error
 
     def synchronise(self, rounds: int = 5) -> BoxClock:
-        """Compares the box's clock with time.monotonic and returns the best of ``rounds`` comparisons.
+        """Compares the box's clock with time.monotonic ``rounds`` times. Returns the most precise comparison.
 
-        Cristian's method (Distributed Computing 3, 1989): the box read its clock during the round trip, so the shortest
-        of several round trips gives the narrowest bound. Half that trip is the uncertainty.
+        By Cristian's method (Distributed Computing 3, 1989), the box read its clock at some time during a round trip.
+        The shortest round trip gives the narrowest bound; half its duration is the uncertainty.
         """
         best: BoxClock | None = None
         for _ in range(rounds):
@@ -187,8 +187,7 @@ class TriggerBox:
             raise WrongDevice(self.port, " ".join(words))
 
     def _command(self, body: str, attempts: int | None = None) -> list[str]:
-        """Sends ``body`` until the box answers, also while the box is busy with a release. Returns the words after
-        OK."""
+        """Repeats ``body`` until the box answers, even while it is busy. Returns the words of the reply after OK."""
         until_s = time.monotonic() + BUSY_S
         while True:
             with self._lock:

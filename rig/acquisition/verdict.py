@@ -1,6 +1,6 @@
-"""Judges whether a capture is worth reconstructing, both for shots (while the subject is still there) and for uploads.
+"""Judges whether a capture is worth reconstructing, for shots while the subject is still present and for uploads.
 
-Cameras are measured one at a time, so a large rig needs the memory of one camera only."""
+Only one camera's picture is in memory at a time."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ SOUND_SHARE = 0.75  # 8 of 11 cameras still surround a head; with fewer, one sid
 
 
 class SubjectDocument(TypedDict):
-    """Holds the subject's position in a picture, as plain values. ``outline``: corners, px."""
+    """Holds the subject's position in a picture, for JSON. ``outline`` lists the contour's corners (px)."""
 
     share: float
     cut_off: list[str]
@@ -33,7 +33,7 @@ class SubjectDocument(TypedDict):
 
 
 class ViewDocument(TypedDict, total=False):
-    """Holds the measurements of one camera's picture; missing measurements are absent."""
+    """Holds the measurements of one camera's picture as plain values for JSON, without missing measurements."""
 
     mean: float
     clipped_share: float
@@ -70,8 +70,8 @@ class ViewCheck:
 def check_view(
     image: ImageRgb, plate: ImageRgb | None, mask: Bool[np.ndarray, "h w"] | None, *, place_only: bool = False
 ) -> ViewCheck:
-    """Measures one camera's picture and finds the subject in it. ``place_only``: only search the subject, because the
-    shot has measured the rest."""
+    """Measures one camera's picture and finds the subject in it. ``place_only`` only searches the subject, if the shot
+    was measured before."""
     if mask is not None and mask.shape == image.shape[:2]:
         position = subject_of_mask(mask)
     else:
@@ -83,23 +83,23 @@ def check_view(
 
 
 def view_faults(views: Mapping[str, ViewCheck], limits: ShotConfig) -> list[Fault]:
-    """Returns the faults of a capture's pictures, from the checks by camera."""
+    """Returns the faults of a capture's pictures from the cameras' measurements."""
     pictures = {name: view.picture for name, view in views.items() if view.picture is not None}
     levels = {name: view.level for name, view in views.items() if view.level is not None}
     return without_consequences([*judge_checks(pictures, levels, limits), *_place_faults(views)])
 
 
 def without_consequences(faults: Iterable[Fault]) -> list[Fault]:
-    """Removes faults that another fault of the same camera explains: with a wrong background, for example, no subject
-    is found."""
+    """Removes faults that another fault of the same camera explains. For example, a wrong background explains that no
+    subject was found."""
     known = [*faults]
     displaced = {fault.camera for fault in known if fault.code in DISPLACED} - {None}
     return [fault for fault in known if not (fault.code in PLACE_FAULTS and fault.camera in displaced)]
 
 
 def verdict_of(faults: Iterable[Fault], cameras: Collection[str]) -> Verdict:
-    """Returns the verdict on a capture: ``good`` without any fault; ``poor`` if the rig as a whole has a fault, or if
-    too few of the ``cameras`` are free of faults; otherwise ``usable``."""
+    """Returns the verdict on a capture. The verdict is ``good`` without faults, and ``poor`` if the whole rig has a
+    fault or too few ``cameras`` are free of faults. Otherwise the verdict is ``usable``."""
     named = {fault.camera for fault in faults}
     if not named:
         return "good"

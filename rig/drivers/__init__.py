@@ -1,2 +1,1 @@
-"""Drives cameras: one module for each kind, behind the interface ``base.Driver``. A vendor's library is imported only
-when its driver is used."""
+"""Controls cameras through the interface ``base.Driver``, with one module for each kind of camera."""

@@ -1,9 +1,9 @@
-"""Defines the interface of camera drivers and their errors, and finds the driver that rig.toml names for a camera. The
-driver's module, and with it any vendor's library, is imported only then.
+"""Defines the interface and the errors of camera drivers, and creates the driver that rig.toml names for a camera. A
+driver's module, with its vendor's library, is imported only if rig.toml names it.
 
-``grab`` waits for the camera's next frame and returns when it arrived; ``retrieve`` decodes that frame. They are two
-calls because most frames of a stream are never used, and decoding them all would make the arrival times late.
-A driver belongs to one thread at a time (``rig.drivers.feed``).
+``grab`` waits for the camera's next frame and returns its time of arrival; ``retrieve`` decodes the frame. The two
+calls are separate because most frames are never used, and decoding every frame would delay the measured times. Only one
+thread at a time may use a driver (``rig.drivers.feed``).
 """
 
 import importlib
@@ -23,8 +23,7 @@ from rig.messages.message import Message, compose
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """Holds when a frame arrived (time.monotonic, s; the earliest moment known to the driver) and the frame's running
-    number."""
+    """Holds the earliest known time of arrival of a frame (time.monotonic, s), and the frame's sequence number."""
 
     time_s: float
     sequence: int
@@ -32,7 +31,7 @@ class Arrival:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """Holds one picture, RGB and upright, with the time of its arrival (time.monotonic, s) and its running number."""
+    """Holds one upright RGB picture with its time of arrival (time.monotonic, s) and its sequence number."""
 
     image: ImageRgb
     time_s: float
@@ -41,14 +40,14 @@ class Frame:
 
 @runtime_checkable
 class Driver(Protocol):
-    """Describes the driver of one camera. Every method but ``close`` may raise DriverError; ``close`` raises nothing
-    and may be called twice."""
+    """Declares the methods of a driver for one camera. Every method but ``close`` may raise DriverError; ``close`` may
+    be called twice."""
 
     live: bool
     """Its pictures come from a sensor, so that two equal ones mean a frozen stream."""
 
     def open(self, timeout_s: float) -> None:
-        """Finds the camera with the identity in rig.toml, and starts it. Raises CameraNotFound."""
+        """Finds and starts the camera with the identity in rig.toml. Raises CameraNotFound."""
         ...
 
     def configure(self) -> tuple[Message, ...]:
@@ -56,28 +55,28 @@ class Driver(Protocol):
         ...
 
     def grab(self, timeout_s: float) -> Arrival:
-        """Waits for the next frame and returns when it arrived. Raises GrabTimeout, after which ``grab`` may be called
-        again, and CameraLost.
+        """Waits for the next frame and returns its time of arrival. Raises GrabTimeout, after which ``grab`` may be
+        called again, and CameraLost.
 
-        It may take a second longer than ``timeout_s`` if the vendor's library has no such timeout.
+        The call may take a second longer than ``timeout_s`` if the vendor's library has no timeout.
         """
         ...
 
     def retrieve(self) -> ImageRgb:
-        """Decodes the frame of the last ``grab`` and returns it as the camera sees it (not rotated)."""
+        """Decodes the frame of the last ``grab`` and returns it without the rotation of rig.toml."""
         ...
 
     def trigger(self) -> None:
-        """Asks the camera for a picture now, if its ``trigger`` in rig.toml is "software". Other cameras ignore it."""
+        """Makes the camera take a picture if its ``trigger`` in rig.toml is "software"; otherwise does nothing."""
         ...
 
     def close(self) -> None:
-        """Releases the camera."""
+        """Stops the camera and frees its resources."""
         ...
 
 
 class DriverError(EigenheadError):
-    """Reports that a camera does not do what it should. The message begins with the camera's name."""
+    """Reports a failure of a camera. The message begins with the camera's name."""
 
     def __init__(self, camera: str, message: Message) -> None:
         self.camera = camera
@@ -92,7 +91,7 @@ class CameraNotFound(DriverError):
 
 
 class CameraLost(DriverError):
-    """Reports that a camera was disconnected, or that what it sends is no picture."""
+    """Reports that a camera was disconnected or sends data that are no picture."""
 
     def __init__(self, camera: CameraConfig, why: Message | str) -> None:
         super().__init__(camera.name, compose("camera-lost", reason=why))
@@ -123,15 +122,14 @@ class _DriverModule(Protocol):
 
 
 def driver_for(camera: CameraConfig, folder: Path) -> Driver:
-    """Returns the driver that rig.toml names for a camera, not yet opened. ``folder`` is the folder of rig.toml. Raises
+    """Creates the driver that rig.toml names for a camera. ``folder`` is the folder of rig.toml. Raises
     DriverMissing."""
     module = cast(_DriverModule, importlib.import_module(f".{camera.driver}", __package__))
     return module.make(camera, folder)
 
 
 class Pace:
-    """Ticks ``fps`` times a second from its creation on. Ticks that nobody waited for are lost, like frames of a
-    camera."""
+    """Ticks ``fps`` times a second. A tick that no call waits for is lost, as are a camera's frames."""
 
     def __init__(self, fps: float) -> None:
         self._period_s = 1.0 / fps
@@ -139,7 +137,7 @@ class Pace:
         self.beat = 0
 
     def wait(self, timeout_s: float) -> bool:
-        """Sleeps until the next tick, or for ``timeout_s``. Tells whether there was a tick."""
+        """Sleeps until the next tick, or for ``timeout_s`` at most. Returns whether a tick came."""
         passed = int((time.monotonic() - self._started_s) / self._period_s)
         due = max(self.beat + 1, passed)
         wait_s = self._started_s + due * self._period_s - time.monotonic()
@@ -152,22 +150,22 @@ class Pace:
 
 
 class FreeDriver:
-    """Sends frames at its own rate, whatever is asked of it."""
+    """Implements ``trigger`` for cameras that always send frames at a fixed rate."""
 
     def trigger(self) -> None:
-        """Does nothing: there is no software trigger."""
+        """Does nothing, because the camera has no software trigger."""
         return
 
 
 class PacedDriver(FreeDriver):
-    """Delivers frames at the camera's rate without a device."""
+    """Implements ``grab`` for drivers without a device, which deliver frames at a fixed rate."""
 
     def __init__(self, camera: CameraConfig) -> None:
         self._camera = camera
         self._pace: Pace | None = None
 
     def grab(self, timeout_s: float) -> Arrival:
-        """Waits for the next frame at the camera's rate. Raises GrabTimeout, CameraLost."""
+        """Waits for the next frame. Raises GrabTimeout and CameraLost."""
         if self._pace is None:
             raise CameraLost(self._camera, compose("camera-not-open"))
         if not self._pace.wait(timeout_s):

@@ -1,7 +1,7 @@
-"""Runs one camera in its own thread: opens it, grabs frames continuously, and passes them on when requested.
+"""Runs each camera in a thread that opens it, grabs frames continuously, and decodes requested frames.
 
-A driver may block forever inside a vendor's library, where nothing can stop it. So every camera has its own thread, and
-every wait has a deadline. A thread that does not end is abandoned: it is a daemon, and its feed reports that.
+A driver may block forever inside a vendor's library. Therefore every camera has a separate thread, and every wait has a
+deadline. If a daemon thread does not end, the program reports this and continues without it.
 """
 
 import contextlib
@@ -24,8 +24,8 @@ _KEPT = 32  # frames that wait to be collected: half a second at 60 a second
 
 @dataclass(frozen=True, slots=True)
 class FeedState:
-    """Holds the state of one camera at a moment. Times are in seconds of time.monotonic. ``unmet`` are the settings
-    that the camera refused."""
+    """Holds the current state of one camera. Times are in seconds of time.monotonic. ``unmet`` lists the settings that
+    the camera refused."""
 
     opened: bool
     last_seen_s: float | None
@@ -35,8 +35,7 @@ class FeedState:
 
 
 class CameraFeed:
-    """Runs one camera's driver in a thread. ``start`` returns at once. Methods that wait take a deadline, in seconds of
-    time.monotonic."""
+    """Runs one camera's driver in a thread. Methods that wait have a deadline, in seconds of time.monotonic."""
 
     def __init__(self, camera: CameraConfig, driver: Driver, open_timeout_s: float) -> None:
         self.camera = camera
@@ -61,11 +60,11 @@ class CameraFeed:
         self._thread.start()
 
     def stop(self) -> None:
-        """Asks the thread to end without waiting for it; ``close`` waits."""
+        """Requests the end of the thread without waiting; ``close`` waits."""
         self._stop.set()
 
     def close(self, deadline_s: float) -> bool:
-        """Ends the thread. Returns False if the driver is blocked, so that its thread had to be abandoned."""
+        """Ends the thread. Returns False if the driver still blocks the thread at the deadline."""
         self.stop()
         if self._thread.ident is not None:
             self._thread.join(max(0.0, deadline_s - time.monotonic()))
@@ -84,27 +83,27 @@ class CameraFeed:
             )
 
     def wait_opened(self, deadline_s: float) -> bool:
-        """Waits until the camera is open and tells whether it is. Returns at once where opening failed."""
+        """Waits until the camera is open or opening has failed. Returns whether the camera is open."""
         with self._changed:
             self._changed.wait_for(lambda: self._opened or self._error is not None, _left(deadline_s))
             return self._opened
 
     def wait_frames(self, count: int, deadline_s: float) -> bool:
-        """Waits until the camera has delivered ``count`` frames since it was opened, and tells whether it has."""
+        """Waits until the camera has delivered ``count`` frames since it was opened. Returns False at the deadline."""
         with self._changed:
             self._changed.wait_for(lambda: self._count >= count, _left(deadline_s))
             return self._count >= count
 
     def want(self, from_s: float) -> None:
-        """Decodes and stores the frames that arrive after ``from_s`` (time.monotonic), until ``collect`` takes one.
-        Earlier frames are dropped."""
+        """Starts to decode and store the frames that arrive after ``from_s`` (time.monotonic, s), until ``collect``
+        takes one."""
         with self._changed:
             self._frames.clear()
             self._wanted_from_s, self._due_s = from_s, None
 
     def due(self, earliest_s: float) -> None:
-        """Declares that the wanted frame is the first one that arrives at ``earliest_s`` (time.monotonic) or later.
-        Later frames are not decoded."""
+        """Requests only the first frame that arrives at ``earliest_s`` (time.monotonic, s) or later. Later frames are
+        not decoded."""
         with self._changed:
             self._due_s = earliest_s
 
@@ -115,8 +114,8 @@ class CameraFeed:
             self._wanted_from_s = self._due_s = None
 
     def collect(self, earliest_s: float, deadline_s: float) -> Frame | None:
-        """Returns the first stored frame that arrived at ``earliest_s`` or later; None if none has arrived by the
-        deadline."""
+        """Returns the first stored frame that arrived at ``earliest_s`` or later, or None if no such frame arrives by
+        the deadline."""
 
         def first() -> Frame | None:
             return next((frame for frame in self._frames if frame.time_s >= earliest_s), None)
@@ -126,7 +125,7 @@ class CameraFeed:
             return first()
 
     def trigger(self) -> None:
-        """Asks a camera with a software trigger for a picture. The camera's thread passes the request on."""
+        """Makes the camera's thread send the software trigger."""
         self._release.set()
 
     def _run(self) -> None:

@@ -1,11 +1,11 @@
-"""Drives GigE Vision and USB3 Vision cameras through Aravis (Debian: libaravis-0.8-0).
+"""Controls GigE Vision and USB3 Vision cameras through the library Aravis (Debian package libaravis-0.8-0).
 
-``identity`` is the serial number, or the device's id or MAC address as `arv-tool-0.8` lists them. With ``trigger =
-"external"`` the camera waits for Line1, with ``"software"`` for a command, with ``"free"`` it runs at ``fps``.
+In rig.toml, ``identity`` is the serial number, or the device's id or MAC address as `arv-tool-0.8` lists them. With
+``trigger = "external"`` the camera waits for a signal on its input Line1, with ``"software"`` for a command. With
+``"free"`` the camera takes ``fps`` pictures a second.
 
-The few functions of libaravis-0.8 that are needed are called through ctypes, typed, with GError as an exception. That
-needs one shared library from the distribution only, while PyGObject would have to be compiled in every virtual
-environment. Source of the signatures: https://aravisproject.github.io/aravis/aravis-stable/
+The module calls the library through ctypes, because PyGObject would have to be compiled in every virtual environment.
+The functions' signatures are from https://aravisproject.github.io/aravis/aravis-stable/.
 """
 
 import contextlib
@@ -47,7 +47,7 @@ PACKET_SOCKET_DISABLED = 1  # ARV_GV_STREAM_OPTION_PACKET_SOCKET_DISABLED
 
 
 class AravisError(Exception):
-    """Reports that Aravis refused a call; the text is Aravis's."""
+    """Reports that a call of Aravis failed, with the message from Aravis."""
 
 
 class _GError(ctypes.Structure):
@@ -95,8 +95,7 @@ _MAY_FAIL: dict[str, tuple[Any, list[Any]]] = {
 
 
 class Aravis:
-    """Wraps the library libaravis. ``call`` runs one of its functions and raises AravisError where that reports a
-    GError."""
+    """Wraps the library libaravis. ``call`` runs one of its functions and converts a GError to AravisError."""
 
     def __init__(self) -> None:
         self._aravis = ctypes.CDLL(LIBRARY)
@@ -112,8 +111,7 @@ class Aravis:
             function.restype, function.argtypes = result, [*arguments, POINTER(POINTER(_GError))]
 
     def call(self, name: str, *arguments: Any) -> Any:
-        """Calls the library's function ``name`` and returns its result; texts are returned as str.
-        Raises AravisError."""
+        """Calls the library's function ``name`` and returns its result, a C string as str. Raises AravisError."""
         function = getattr(self._aravis, name)
         if name in _PLAIN:
             result = function(*arguments)
@@ -127,11 +125,11 @@ class Aravis:
         return result
 
     def release(self, pointer: int) -> None:
-        """Returns a reference to a GObject to the library."""
+        """Releases a reference to a GObject."""
         self._gobject.g_object_unref(pointer)
 
     def pixels(self, buffer: int) -> UInt8[np.ndarray, " n"]:
-        """Returns a copy of the bytes of the image in a buffer."""
+        """Copies the bytes of the image in a buffer."""
         size = c_size_t()
         data = self._aravis.arv_buffer_get_image_data(buffer, byref(size))
         return np.frombuffer(ctypes.string_at(data, size.value), np.uint8)
@@ -139,7 +137,7 @@ class Aravis:
 
 @cache
 def library() -> Aravis:
-    """Returns the library; it is loaded only once. Raises OSError where it is not installed."""
+    """Returns the library, which the first call loads. Raises OSError if libaravis is not installed."""
     return Aravis()
 
 
@@ -152,7 +150,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class GenicamDriver:
-    """Drives one GigE Vision or USB3 Vision camera through Aravis."""
+    """Controls one GigE Vision or USB3 Vision camera through Aravis."""
 
     live = True
 
@@ -177,8 +175,8 @@ class GenicamDriver:
             raise CameraNotFound(self._camera, str(error)) from error
 
     def configure(self) -> tuple[Message, ...]:
-        """Returns one message for each setting that the camera refused. ``open`` has applied them, since picture sizes
-        cannot change once the stream runs."""
+        """Returns one message for each setting that the camera refused. ``open`` has applied the settings, because the
+        picture's size cannot change while the stream runs."""
         return self._unmet  # applied before the acquisition started: sizes cannot change after it
 
     def grab(self, timeout_s: float) -> Arrival:
@@ -200,7 +198,7 @@ class GenicamDriver:
         raise GrabTimeout(self._camera, timeout_s)
 
     def retrieve(self) -> ImageRgb:
-        """Decodes the frame of the last ``grab``. Raises CameraLost if there is none, and DriverError for an unknown
+        """Decodes the frame of the last ``grab``. Raises CameraLost without a frame, and DriverError for an unknown
         pixel format."""
         if self._buffer is None:
             raise CameraLost(self._camera, compose("no-frame-grabbed"))
@@ -210,7 +208,7 @@ class GenicamDriver:
         return self._decode(self._aravis.pixels(self._buffer), width, height, pixel_format)
 
     def trigger(self) -> None:
-        """Sends the command that takes a picture, if rig.toml sets a software trigger. Raises CameraLost."""
+        """Makes the camera take a picture, if rig.toml sets a software trigger. Raises CameraLost."""
         if self._camera.trigger != "software" or self._device is None:
             return
         try:
@@ -298,7 +296,7 @@ class GenicamDriver:
         self._aravis.call("arv_camera_start_acquisition", self._device)
 
     def _stamp_s(self, buffer: int) -> float:
-        """Returns the host's time stamp of the buffer, taken in Aravis's own thread, converted to time.monotonic."""
+        """Returns the time (time.monotonic, s) at which Aravis received the buffer on this host."""
         now_s = time.monotonic()
         age_s = (time.time_ns() - self._aravis.call("arv_buffer_get_system_timestamp", buffer)) * 1e-9
         return now_s - age_s if 0 <= age_s < 1.0 else now_s

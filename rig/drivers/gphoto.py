@@ -1,8 +1,8 @@
-"""Drives DSLRs and other PTP cameras through python-gphoto2 (extra ``gphoto``).
+"""Controls DSLRs and other PTP cameras through python-gphoto2 (optional dependency group ``gphoto``).
 
-``identity`` is the camera's serial number, or a network address ``ptpip:192.168.1.7``. Each picture is a new file on
-the camera, taken at the trigger box's remote cable (``trigger = "external"``) or at a command (``"software"``). Set the
-camera to JPEG; its memory card is not used.
+In rig.toml, ``identity`` is the camera's serial number, or a network address such as ``ptpip:192.168.1.7``. The trigger
+box releases the shutter by a cable (``trigger = "external"``), or the host by a command (``"software"``). The camera
+must be set to JPEG; its memory card is not used.
 """
 
 import importlib
@@ -34,7 +34,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class GphotoDriver:
-    """Drives one DSLR, or another camera with PTP, through libgphoto2."""
+    """Controls one DSLR, or another camera with PTP, through libgphoto2."""
 
     live = True
 
@@ -56,8 +56,8 @@ class GphotoDriver:
             raise CameraNotFound(self._camera, str(error)) from error
 
     def configure(self) -> tuple[Message, ...]:
-        """Applies the settings of rig.toml. Returns one message for each that the camera refused; gain cannot be
-        set."""
+        """Applies the settings of rig.toml. Returns one message for each setting that the camera refused; gain cannot
+        be set."""
         camera = self._camera
         wanted: list[tuple[str, str, Any]] = [("capturetarget", "capturetarget", "Internal RAM")]
         if camera.pixel_format is not None:
@@ -73,8 +73,8 @@ class GphotoDriver:
         return tuple(unmet)
 
     def grab(self, timeout_s: float) -> Arrival:
-        """Waits until the camera adds a picture. Its arrival is the time at which libgphoto2 reports it. Raises
-        GrabTimeout, CameraLost."""
+        """Waits until libgphoto2 reports a new picture, whose time of arrival is the time of the report. Raises
+        GrabTimeout and CameraLost."""
         deadline_s = time.monotonic() + timeout_s
         try:
             while (left_s := deadline_s - time.monotonic()) > 0:
@@ -161,7 +161,8 @@ class GphotoDriver:
         return device
 
     def _set(self, name: str, value: Any) -> bool:
-        """Sets one configuration value; a number is set to the nearest available choice."""
+        """Sets one configuration value, a number to the nearest available choice. Returns whether the camera accepted
+        it."""
         try:
             widget = self._opened().get_single_config(name)
             choices = list(widget.get_choices()) if widget.get_type() == self._gp.GP_WIDGET_RADIO else []
@@ -176,12 +177,12 @@ class GphotoDriver:
 
 
 def _serial_of(camera: CameraConfig) -> str:
-    """Returns the serial number without leading zeros, which cameras report but do not print on their bodies."""
+    """Returns the serial number without leading zeros, because the number printed on the body lacks them."""
     return camera.identity.lstrip("0")
 
 
 def _nearest_choice(value: Any, choices: list[str]) -> str | None:
-    """Returns the choice equal to ``value``; for a number, the nearest one within a third of a stop."""
+    """Returns the choice equal to ``value`` or, for a number, the nearest choice within a third of a stop."""
     if isinstance(value, str):
         return value if value in choices else None
     numbers = [(abs(number / value - 1), choice) for choice in choices if (number := _number(choice)) is not None]
@@ -190,7 +191,8 @@ def _nearest_choice(value: Any, choices: list[str]) -> str | None:
 
 
 def _number(text: str) -> float | None:
-    """Returns a camera's shutter speed or temperature: "1/125", "0.5", "5200"; None for "bulb" and the like."""
+    """Converts a shutter speed or colour temperature such as "1/125", "0.5" or "5200" to a number. Returns None for
+    other texts."""
     numerator, _, denominator = text.strip().rstrip("s").partition("/")
     try:
         return float(numerator) / float(denominator or 1)

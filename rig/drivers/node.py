@@ -1,6 +1,6 @@
-"""Drives cameras of Raspberry Pis with deploy/raspberry_pi/node.py: motion JPEG with settings and a software trigger.
+"""Controls Raspberry Pi cameras that run deploy/raspberry_pi/node.py and send motion JPEG over HTTP.
 
-``identity`` is the node's address, ``http://pi03.local:8080``.
+In rig.toml, ``identity`` is the address of the Raspberry Pi, such as ``http://pi03.local:8080``.
 """
 
 from urllib.parse import urlencode
@@ -15,27 +15,27 @@ _TRIGGER_S = 1.0  # within which a node must take the command
 
 
 def make(camera: CameraConfig, folder: object) -> Driver:
-    """Returns the driver for a node."""
+    """Creates the driver for a Raspberry Pi."""
     return NodeDriver(camera)
 
 
 class NodeDriver(MjpegDriver):
-    """Reads the stream of one node."""
+    """Reads the stream of one Raspberry Pi."""
 
     def address(self) -> str:
-        """Returns the stream's address, with the settings of rig.toml."""
+        """Returns the stream's address, with the settings of rig.toml as query parameters."""
         wanted = {key: getattr(self._camera, key) for key in _SETTINGS if getattr(self._camera, key) is not None}
         return f"{self._root()}/stream?{urlencode(wanted)}"
 
     def configure(self) -> tuple[Message, ...]:
-        """Returns one message for each setting that the node's camera refuses."""
+        """Returns one message for each setting that the camera refused."""
         unmet = self.header("X-Unmet").split(",")
         return tuple(
             compose("setting-refused", setting=key, value=str(getattr(self._camera, key))) for key in unmet if key
         )
 
     def trigger(self) -> None:
-        """Releases a picture, if rig.toml sets a software trigger. Raises CameraLost."""
+        """Makes the camera take a picture, if rig.toml sets a software trigger. Raises CameraLost."""
         if self._camera.trigger != "software":
             return
         try:

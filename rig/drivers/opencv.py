@@ -1,10 +1,11 @@
-"""Drives cameras by OpenCV: UVC and other V4L2 cameras by stable path, RTSP by address, motion JPEG over HTTP.
+"""Controls cameras through OpenCV (UVC and other V4L2 cameras, RTSP), and reads motion JPEG over HTTP.
 
-V4L2 stamps its buffers with CLOCK_MONOTONIC, the same clock as time.monotonic; a plausible stamp is used.
+V4L2 puts a time stamp of CLOCK_MONOTONIC on each buffer. The driver uses plausible stamps, because time.monotonic is
+the same clock.
 
-Motion JPEG is a multipart/x-mixed-replace body (RFC 2046, section 5.1). OpenCV's own reader decodes every frame before
-it reports it. Here a frame's arrival is the time at which the kernel received its header, and a frame is decoded only
-if it is requested.
+A motion JPEG stream is a multipart/x-mixed-replace body (RFC 2046, section 5.1). OpenCV's reader would decode every
+frame before it reports the frame. This module decodes only requested frames. A frame's time of arrival is the time at
+which the kernel received the frame's header.
 """
 
 import base64
@@ -40,7 +41,7 @@ _STREAM_STALE_S = 5.0  # a kernel stamp of a packet further from now than this i
 
 
 class StreamTimeout(Exception):
-    """Reports that nothing arrived in time. Reading may continue."""
+    """Reports that no data arrived in time. Reading may continue."""
 
 
 class StreamBroken(Exception):
@@ -68,12 +69,12 @@ class MjpegStream:
             raise
 
     def close(self) -> None:
-        """Ends the connection. Safe to call twice."""
+        """Ends the connection. The call may be repeated."""
         self._socket.close()
 
     def next_part(self, timeout_s: float) -> tuple[float, bytes]:
-        """Returns when the next part of the stream arrived (time.monotonic, s), and its body. A part that a timeout
-        interrupted is completed by the next call."""
+        """Returns the time of arrival (time.monotonic, s) and the body of the stream's next part. If a timeout
+        interrupts a part, the next call completes it."""
         deadline_s = time.monotonic() + timeout_s
         if self._part is None:
             self._take_until(self._boundary, deadline_s, HEAD_MOST)
@@ -135,7 +136,7 @@ class MjpegStream:
 
 
 def _stamp_s(notes: list[tuple[int, int, bytes]]) -> float:
-    """Returns the kernel's time of arrival on the clock of time.monotonic, or the present time if it gives none."""
+    """Returns the time of arrival (time.monotonic, s) that the kernel reports, or else the current time."""
     now_s = time.monotonic()
     for level, kind, data in notes:
         if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS) and len(data) == _TIMESPEC.size:
@@ -147,7 +148,7 @@ def _stamp_s(notes: list[tuple[int, int, bytes]]) -> float:
 
 
 def connect(url: str, timeout_s: float, method: str = "GET") -> socket.socket:
-    """Sends a request without a body, and returns the connection. Raises OSError."""
+    """Sends an HTTP request without a body, and returns the connection. Raises OSError."""
     parts = urlsplit(url)
     port = parts.port or (443 if parts.scheme == "https" else 80)
     host = parts.hostname or ""
@@ -186,7 +187,7 @@ def _boundary(head: bytes) -> bytes:
 
 
 def make(camera: CameraConfig, folder: Path) -> Driver:
-    """Returns the driver for an address or a device path: MjpegDriver for http, else VideoCaptureDriver."""
+    """Creates an MjpegDriver for an HTTP address, and a VideoCaptureDriver for any other address or device path."""
     return MjpegDriver(camera) if camera.identity.startswith(_ADDRESSES) else VideoCaptureDriver(camera)
 
 
@@ -219,8 +220,8 @@ class MjpegDriver(FreeDriver):
         return found.group(1).strip() if found else ""
 
     def configure(self) -> tuple[Message, ...]:
-        """Returns one message for each setting of exposure, gain or white balance in rig.toml, because none can be set
-        over HTTP."""
+        """Returns one message for each setting of exposure, gain or white balance in rig.toml, because HTTP cannot set
+        them."""
         return tuple(compose("not-set-over-http", setting=key) for key in self._camera.exposure_settings())
 
     def grab(self, timeout_s: float) -> Arrival:
@@ -248,7 +249,8 @@ class MjpegDriver(FreeDriver):
 
 
 class VideoCaptureDriver(FreeDriver):
-    """Reads the sources that cv2.VideoCapture opens: /dev/v4l/by-id/..., /dev/v4l/by-path/..., rtsp://..."""
+    """Reads sources that cv2.VideoCapture can open: paths in /dev/v4l/by-id and /dev/v4l/by-path, and rtsp
+    addresses."""
 
     live = True
 
@@ -275,8 +277,8 @@ class VideoCaptureDriver(FreeDriver):
         self._capture = capture
 
     def configure(self) -> tuple[Message, ...]:
-        """Applies the settings of rig.toml. Returns one message for each that the device refused; a difference up to 5
-        % counts as accepted."""
+        """Applies the settings of rig.toml. Returns one message for each setting that the device changed by over 5
+        %."""
         capture = self._opened()
         unmet = [
             compose("setting-not-taken", setting=key, value=str(wanted), actual=capture.get(prop))
@@ -286,7 +288,7 @@ class VideoCaptureDriver(FreeDriver):
         return tuple(unmet)
 
     def grab(self, timeout_s: float) -> Arrival:
-        """Waits for the next frame, at most about a second whatever ``timeout_s`` is. Raises GrabTimeout,
+        """Waits for the next frame for about a second, regardless of ``timeout_s``. Raises GrabTimeout and
         CameraLost."""
         capture = self._opened()
         started_s = time.monotonic()
@@ -357,7 +359,7 @@ def decode_jpeg(camera: CameraConfig, data: bytes) -> ImageRgb:
 
 
 def _is_taken(prop: int, wanted: float, actual: float) -> bool:
-    """Tells whether a value was set: to a twentieth, because cameras have steps; exactly for a pixel format."""
+    """Returns whether a value was set: a pixel format exactly, another value within 5 %, because cameras have steps."""
     return abs(actual - wanted) <= (0.0 if prop == cv2.CAP_PROP_FOURCC else _NEAR * abs(wanted))
 
 

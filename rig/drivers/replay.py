@@ -1,7 +1,8 @@
-"""Delivers a picture from a recorded capture in place of a camera's, repeatedly at the camera's rate.
+"""Replaces a camera by one picture from a recorded capture, delivered repeatedly at a fixed rate.
 
-``identity`` is the capture's folder, relative to rig.toml, followed by # and the camera's name in the capture if it
-differs. With ``plates = "FOLDER/background"`` in rig.toml, a whole session can run on a recorded shot.
+In rig.toml, ``identity`` is the capture's folder, relative to rig.toml. If the camera has another name in the capture,
+``#`` and that name follow. The setting ``plates = "FOLDER/background"`` adds the recorded clean plates (pictures of the
+empty studio).
 """
 
 from pathlib import Path
@@ -17,12 +18,12 @@ _FPS = 10.0
 
 
 def make(camera: CameraConfig, folder: Path) -> Driver:
-    """Returns the driver for a camera of a recorded capture."""
+    """Creates the driver for a camera of a recorded capture."""
     return ReplayDriver(camera, folder)
 
 
 class ReplayDriver(PacedDriver):
-    """Delivers one recorded picture again and again at a steady rate."""
+    """Delivers one recorded picture repeatedly at a fixed rate."""
 
     live = False
 
@@ -48,7 +49,7 @@ class ReplayDriver(PacedDriver):
         self._pace = Pace(self._camera.fps or _FPS)
 
     def configure(self) -> tuple[Message, ...]:
-        """Returns no message: a recorded picture has no settings."""
+        """Returns no message, because a recorded picture has no settings."""
         return ()
 
     def retrieve(self) -> ImageRgb:
@@ -58,5 +59,5 @@ class ReplayDriver(PacedDriver):
         return self._image
 
     def close(self) -> None:
-        """Drops the recorded picture."""
+        """Frees the recorded picture."""
         self._image = self._pace = None

@@ -1,8 +1,8 @@
-"""Drives a camera of the simulated studio inside this process, without network or trigger box.
+"""Simulates a camera of a studio inside this process, without network or trigger box.
 
-``identity`` is a head's mesh file, relative to rig.toml, followed by # and the name of the studio's camera if it
-differs. The head sits in the default studio, and each camera photographs it at its rate. ``rig.studio.devices.serve``
-simulates cameras as separate devices with a trigger box.
+In rig.toml, ``identity`` is the mesh file of a head, relative to rig.toml. If the studio's camera has another name,
+``#`` and that name follow. The camera renders the head in the default studio at its frame rate.
+``rig.studio.devices.serve`` instead simulates separate network cameras and a trigger box.
 """
 
 import time
@@ -19,14 +19,14 @@ _FPS = 10.0
 
 
 def make(camera: CameraConfig, folder: Path) -> Driver:
-    """Returns the driver for a camera of the simulated studio with the head of a mesh file in it."""
+    """Creates the driver for a camera of a simulated studio that contains the head of a mesh file."""
     file, _, name = camera.identity.partition("#")
     return SimulatedDriver(camera, name or camera.name, mesh_file=folder / file)
 
 
 class SimulatedDriver(PacedDriver):
-    """Photographs an ``ImageSource`` or, if there is none, the simulated studio with the head of ``mesh_file`` in it.
-    The studio is built when the driver is opened."""
+    """Delivers pictures from an ``ImageSource`` or, without one, of a simulated studio with the head of ``mesh_file``.
+    ``open`` builds the studio."""
 
     live = True
 
@@ -39,14 +39,13 @@ class SimulatedDriver(PacedDriver):
         self._source = source
 
     def open(self, timeout_s: float) -> None:
-        """Builds the studio if needed, and starts the camera's rate. Raises CameraNotFound."""
+        """Builds the studio if needed, and starts the sequence of frames. Raises CameraNotFound."""
         if self._source is None:
             self._source = self._build()
         self._pace = Pace(self._camera.fps or _FPS)
 
     def configure(self) -> tuple[Message, ...]:
-        """Returns one message for each setting of exposure, gain or white balance in rig.toml, which a simulated camera
-        lacks."""
+        """Returns one message for each setting of exposure, gain or white balance, which a simulated camera lacks."""
         return tuple(compose("no-setting-of-simulated", setting=key) for key in self._camera.exposure_settings())
 
     def retrieve(self) -> ImageRgb:
@@ -56,7 +55,7 @@ class SimulatedDriver(PacedDriver):
         return self._source(self._view, time.monotonic())
 
     def close(self) -> None:
-        """Stops the camera but keeps the studio."""
+        """Stops the sequence of frames but keeps the studio."""
         self._pace = None
 
     def _build(self) -> ImageSource:

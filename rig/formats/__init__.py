@@ -1,3 +1,3 @@
-"""Reads and writes files of rigs, captures, pictures and meshes, in this project's formats and in other programs'.
+"""Reads and writes files of rigs, captures, pictures and meshes, in this project's formats and those of other programs.
 
-Every reader reports all faults of a file at once; every writer renames a finished file into place."""
+Every reader reports all faults of a file at once. Every writer writes a temporary file first and then renames it."""

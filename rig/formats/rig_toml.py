@@ -1,8 +1,8 @@
 """Reads rig.toml: the cameras, trigger box and lights of a rig, and the limits for a shot.
 
-Every table is a frozen dataclass whose fields are the keys. An unknown key is refused, and the nearest known one is
-suggested. A camera is identified by something that survives a reboot (serial number, /dev/v4l/by-id or by-path,
-address), never by an index, because indices change. deploy/rig.example.toml shows every key."""
+Every table of the file has a frozen dataclass whose fields are the keys. An unknown key is a fault, and the message
+suggests the most similar known key. A camera is identified by its serial number, its address or a path in
+/dev/v4l/by-id or by-path, never by an index, because indices change at a reboot. See deploy/rig.example.toml."""
 
 import dataclasses
 import re
@@ -55,7 +55,7 @@ _SHOT_BOUNDS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraConfig:
-    """Holds one table [[cameras]] of rig.toml. Omitted settings stay as they are in the camera."""
+    """Holds one table [[cameras]] of rig.toml. The program keeps omitted settings of the camera."""
 
     name: str  # as in cameras.json
     driver: DriverName
@@ -74,14 +74,14 @@ class CameraConfig:
     rotation_deg: Literal[0, 90, 180, 270] = 0  # clockwise, of the picture, to stand upright
 
     def exposure_settings(self) -> list[str]:
-        """Returns the names of the settings of exposure, gain and white balance that have a value."""
+        """Returns the names of those settings of exposure, gain and white balance that have a value."""
         return [key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self, key) is not None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TriggerConfig:
-    """Holds the table [trigger] of rig.toml, the trigger box. ``port`` is a path under /dev/serial/by-id, or a link
-    made by a udev rule."""
+    """Holds the table [trigger] of rig.toml, for the box that releases all cameras. ``port`` is a path in
+    /dev/serial/by-id or a udev link."""
 
     port: str  # serial port of the box
     baud: int = 115200  # bits a second on the port
@@ -91,7 +91,7 @@ class TriggerConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightsConfig:
-    """Holds the table [lights] of rig.toml: which light outputs of the trigger box are on during a shot."""
+    """Holds the table [lights] of rig.toml: light outputs of the trigger box that are on during a shot."""
 
     outputs: tuple[int, ...] = ()  # numbers on the box
     settle_s: float = 0.3  # halogen and LED drivers reach their level well within it
@@ -100,7 +100,7 @@ class LightsConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShotConfig:
-    """Holds the table [shot] of rig.toml: waiting times, and limits beyond which a shot has a fault."""
+    """Holds the table [shot] of rig.toml: waiting times, and limits that decide whether a shot is faulty."""
 
     timeout_s: float = 2.0  # from the trigger until a camera's frame must be there
     open_timeout_s: float = 10.0  # until a camera must be open
@@ -116,7 +116,7 @@ class ShotConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigConfig:
-    """Holds a whole rig.toml. ``folder`` is the file's folder, to which relative paths in it refer."""
+    """Holds a whole rig.toml. Relative paths in the file start from ``folder``, the file's folder."""
 
     format: Literal["eigenhead-rig/1"]
     cameras: tuple[CameraConfig, ...]
@@ -131,22 +131,22 @@ class RigConfig:
 
     @property
     def plates_folder(self) -> Path:
-        """Returns the folder of the clean plates."""
+        """Returns the folder of the clean plates (pictures of the empty studio)."""
         return self.folder / self.plates
 
     @property
     def calibration_file(self) -> Path | None:
-        """Returns the calibration that this rig uses; None if it names none."""
+        """Returns the path of the rig's calibration, or None if rig.toml names none."""
         return None if self.calibration is None else self.folder / self.calibration
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Returns camera names in the file's order."""
+        """Returns the cameras' names in the order of the file."""
         return tuple(camera.name for camera in self.cameras)
 
 
 def read_rig_config(path: Path) -> RigConfig:
-    """Reads rig.toml. Raises InputError that names every fault."""
+    """Reads rig.toml. Raises an InputError that names every fault."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
@@ -157,7 +157,7 @@ def read_rig_config(path: Path) -> RigConfig:
 
 
 def rig_config_from_document(document: Mapping[str, Any], folder: Path, subject: str = "rig.toml") -> RigConfig:
-    """Returns a rig from parsed TOML. Raises InputError that names every fault."""
+    """Converts the content of rig.toml to a RigConfig. Raises an InputError that names every fault."""
     faults: list[Message] = []
     config = read_fields(RigConfig, document, "", faults)
     if faults := faults or _rig_faults(config):
@@ -168,10 +168,10 @@ def rig_config_from_document(document: Mapping[str, Any], folder: Path, subject:
 def adjusted(
     config: RigConfig, cameras: Mapping[str, Mapping[str, float | None]], outputs: tuple[int, ...] | None
 ) -> RigConfig:
-    """Returns the rig with other settings of cameras (``exposure_ms``, ``gain_db``, ``white_balance_k``) and other
-    lamps.
+    """Returns the rig's configuration with changed camera settings (``exposure_ms``, ``gain_db``, ``white_balance_k``)
+    and lamps.
 
-    ``outputs`` None keeps the lamps of rig.toml. Raises InputError naming every fault."""
+    If ``outputs`` is None, the lamps of rig.toml are kept. Raises InputError naming every fault."""
     changed = dataclasses.replace(
         config,
         cameras=tuple(dataclasses.replace(camera, **cameras.get(camera.name, {})) for camera in config.cameras),
@@ -240,7 +240,7 @@ def _trigger_faults(trigger: TriggerConfig) -> list[Message]:
 
 
 def _outside(table: object, bounds: Mapping[str, tuple[float, float]], where: str = "") -> list[Message]:
-    """Returns a fault for each value of a table that is outside its bounds."""
+    """Returns a fault for each value of a table that lies outside its bounds."""
     values = {key: getattr(table, key) for key in bounds}
     return [
         compose("value-outside", key=where + key, value=f"{value}", least=f"{bounds[key][0]}", most=f"{bounds[key][1]}")
@@ -250,6 +250,6 @@ def _outside(table: object, bounds: Mapping[str, tuple[float, float]], where: st
 
 
 def _hinted(fault: Message, word: Any, known: Iterable[Any]) -> Message:
-    """Adds to a fault the known word that was probably meant, if a similar one exists."""
+    """Adds to a fault the word of ``known`` that is most similar to ``word``, if any is similar."""
     near = suggest(str(word), map(str, known), min_likeness=0.5)
     return compose("did-you-mean", fault=fault, nearest=f"{near[0]!r}") if near else fault

@@ -1,4 +1,4 @@
-"""Encodes and decodes the trigger box's protocol ``eigenhead-trigger/1``: one message in each line (docs/rig.md)."""
+"""Encodes and decodes text lines of the trigger box's protocol ``eigenhead-trigger/1`` (docs/rig.md)."""
 
 from collections.abc import Iterator
 
@@ -13,7 +13,7 @@ CLOCK_PERIOD_US = 2**32  # the box counts microseconds in 32 bits: it wraps ever
 
 
 def crc16(data: bytes) -> int:
-    """Computes CRC-16/CCITT-FALSE (polynomial 0x1021, start 0xFFFF): crc16(b"123456789") == 0x29B1."""
+    """Computes the checksum CRC-16/CCITT-FALSE, with polynomial 0x1021 and start value 0xFFFF."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte << 8
@@ -24,14 +24,13 @@ def crc16(data: bytes) -> int:
 
 
 def encode_line(start: bytes, sequence: int, body: str) -> bytes:
-    """Returns one line of the protocol. ``body`` is printable ASCII without @ # and *."""
+    """Encodes one line of the protocol. ``body`` must be printable ASCII without @, # and *."""
     payload = f"{sequence:02X} {body}".encode("ascii")
     return start + payload + f"*{crc16(payload):04X}\n".encode("ascii")
 
 
 def decode_payload(line: bytes) -> tuple[int, str] | None:
-    """Returns sequence number and body of a line's content between start character and newline; None if it is
-    damaged."""
+    """Returns the sequence number and body of a line without start character and newline; None if it is damaged."""
     payload, star, digits = line.rpartition(b"*")
     if not star or len(payload) < 4 or payload[2:3] != b" " or not _is_hex(digits, 4) or not _is_hex(payload[:2], 2):
         return None
@@ -41,9 +40,9 @@ def decode_payload(line: bytes) -> tuple[int, str] | None:
 
 
 class LineReader:
-    """Splits a byte stream into valid lines that begin with ``start``, and counts damaged ones.
+    """Splits a byte stream into valid lines that begin with ``start``, and counts damaged lines.
 
-    The last 80 bytes outside lines (noise, or another device's output) are in ``stray``."""
+    ``stray`` holds the last 80 bytes outside lines, such as noise or the output of another device."""
 
     def __init__(self, start: bytes) -> None:
         self._start = start[0]
@@ -52,7 +51,7 @@ class LineReader:
         self.bad_lines = 0
 
     def feed(self, data: bytes) -> Iterator[tuple[int, str]]:
-        """Yields (sequence, body) of each valid line that ``data`` completes."""
+        """Yields the sequence number and body of each valid line that ``data`` completes."""
         for byte in data:
             if byte == self._start:
                 self.bad_lines += self._line is not None

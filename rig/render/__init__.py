@@ -1,1 +1,1 @@
-"""Draws with OpenGL on EGL; no other package uses moderngl."""
+"""Draws images of meshes and runs compute shaders with OpenGL on EGL, through the library moderngl."""

@@ -1,7 +1,7 @@
-"""Runs compute shaders: calculations on arrays on the GPU.
+"""Runs compute shaders, which are programs that compute with arrays on the GPU.
 
-It uses OpenGL 4.3 on EGL, like the silhouettes, so no other driver is needed. Without a GPU, Mesa's software renderer
-runs the same shaders, slower than compiled loops.
+Compute shaders need OpenGL 4.3 on EGL but no further driver. Without a GPU, Mesa's software renderer runs the same
+shaders, but more slowly than compiled loops on the CPU.
 """
 
 import contextlib
@@ -39,8 +39,7 @@ class DeviceArray:
 
 
 class ComputeDevice:
-    """Runs compute shaders in an OpenGL context of its own. Any thread of the process may call it; one runs at a time,
-    others wait.
+    """Runs compute shaders in a separate OpenGL context. Any thread may call the methods, which run in turn.
 
     ``with ComputeDevice.create() as device: ...``. Raises ComputeUnavailable if there is no OpenGL 4.3.
     """
@@ -59,7 +58,7 @@ class ComputeDevice:
 
     @classmethod
     def create(cls) -> "ComputeDevice":
-        """Returns a new device. Raises ComputeUnavailable if there is no OpenGL 4.3."""
+        """Creates a device. Raises ComputeUnavailable without OpenGL 4.3."""
         return cls()
 
     def __enter__(self) -> "ComputeDevice":
@@ -69,13 +68,13 @@ class ComputeDevice:
         self.close()
 
     def close(self) -> None:
-        """Frees the context and its resources."""
+        """Frees the OpenGL context and its resources."""
         with self._lock:
             self._gl.release()
 
     @contextlib.contextmanager
     def uploaded(self, *arrays: np.ndarray) -> Iterator[tuple[DeviceArray, ...]]:
-        """Yields copies of the arrays on the device, which are freed at the end."""
+        """Copies arrays to the device and yields the copies, which are freed at the end of the ``with`` block."""
         with self._current():
             held = tuple(DeviceArray(self._gl.buffer(np.ascontiguousarray(array))) for array in arrays)
         try:
@@ -95,7 +94,7 @@ class ComputeDevice:
         constants: Mapping[str, int],
         uniforms: Uniforms,
     ) -> None:
-        """Runs a shader with ``groups`` groups of invocations across and down.
+        """Runs a compute shader on the device.
 
         Args:
             shader: file of its source; ``#include`` reads files beside it.
@@ -133,7 +132,7 @@ class ComputeDevice:
 
 
 def open_device(name: DeviceName, renderer: str) -> ComputeDevice | None:
-    """Returns the device for computations; None means the CPU.
+    """Opens the device for computations. Returns None if the CPU should compute.
 
     Args:
         name: ``gl`` takes any OpenGL, ``auto`` a GPU if there is one.
@@ -153,5 +152,5 @@ def open_device(name: DeviceName, renderer: str) -> ComputeDevice | None:
 
 
 def is_software(renderer: str) -> bool:
-    """Tells whether a renderer's description names a software renderer."""
+    """Returns whether a description of OpenGL's renderer names a software renderer."""
     return any(word in renderer.lower() for word in SOFTWARE)

@@ -1,13 +1,11 @@
-"""Provides the EGL context and its shader programs, and handles two conventions in which OpenGL differs from this
-project.
+"""Provides the EGL context and its shader programs, and handles two conventions of OpenGL.
 
-Row order: OpenGL counts rows from the bottom. Everything in ``rig.render`` draws image row v into framebuffer row v
-(the projection in ``shaders/camera.glsl`` maps v = 0 to y = -1). Reading back, lowest row first, thus gives row 0 at
-the top; no image is flipped. As a consequence, anticlockwise triangles become clockwise, so the context treats
-clockwise as front.
+OpenGL counts rows from the bottom. All code in ``rig.render`` draws image row v to framebuffer row v, because the
+projection in ``shaders/camera.glsl`` maps v = 0 to y = -1. OpenGL returns the lowest row first, so that a read image
+has row 0 at the top. Anticlockwise triangles become clockwise by this projection, so the context treats clockwise
+triangles as front faces.
 
-Pixel centre: a fragment's centre is at half-integer window coordinates, while pixel (0, 0) of this project is a centre;
-so the shader adds 1/2.
+OpenGL has pixel centres at half-integer window coordinates, and this project at integers, so the shader adds 1/2.
 """
 
 import contextlib
@@ -28,7 +26,7 @@ CLIP_PLANES = range(0x3000, 0x3006)  # GL_CLIP_DISTANCE0 and on, as many as shad
 
 @runtime_checkable
 class Releasable(Protocol):
-    """Describes a GPU resource that must be freed."""
+    """Declares the method of a GPU resource that frees it."""
 
     def release(self) -> None:
         """Frees the resource."""
@@ -39,25 +37,25 @@ Resource = TypeVar("Resource", bound=Releasable)
 
 
 class EglUnavailable(EigenheadError):
-    """Reports that no OpenGL context could be made on this machine."""
+    """Reports that no OpenGL context can be created on this machine."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(compose("no-opengl", reason=reason))
 
 
 class WrongThread(EigenheadError):
-    """Reports that a renderer was used outside the thread or process that made it, or after it was closed."""
+    """Reports the use of a renderer outside the thread or process that created it, or after it was closed."""
 
     def __init__(self, why: Message) -> None:
         super().__init__(compose("renderer-of-other-thread", why=why))
 
 
 class Owned(contextlib.ExitStack):
-    """Frees every GPU resource that was passed through a call of it, in reverse order, at the end of the block.
-    moderngl frees nothing by itself."""
+    """Frees all registered GPU resources, in reverse order, at the end of a ``with`` block, because moderngl does not
+    free resources automatically."""
 
     def __call__(self, resource: Resource) -> Resource:
-        """Returns the resource, which is freed at the end of the block."""
+        """Registers a resource to be freed at the end of the ``with`` block, and returns it."""
         self.callback(resource.release)
         return resource
 
@@ -81,7 +79,7 @@ class GlContext:
 
     @contextlib.contextmanager
     def current(self) -> Iterator[moderngl.Context]:
-        """Makes the context current during the block. Raises WrongThread."""
+        """Makes the context current during a ``with`` block. Raises WrongThread."""
         if self._closed:
             raise WrongThread(compose("renderer-closed"))
         if (os.getpid(), threading.get_ident()) != self._owner:
@@ -93,8 +91,8 @@ class GlContext:
     def drawing(
         self, target: moderngl.Framebuffer, *, clip: bool = True, cull: bool = False, depth: bool = False
     ) -> Iterator[None]:
-        """Draws to ``target`` in the block: ``clip`` limits drawing to tiles and beyond near planes, ``cull`` omits
-        back faces, ``depth`` adds a depth test."""
+        """Makes ``target`` the target of all drawing in a ``with`` block. ``clip`` limits drawing to tiles and to
+        points behind the near planes, ``cull`` omits back faces, and ``depth`` adds a depth test."""
         planes = CLIP_PLANES if clip else ()
         for plane in planes:
             self.gl.enable_direct(plane)
@@ -108,7 +106,7 @@ class GlContext:
             self._rest.use()  # moderngl keeps binding the last target, and fails once that is released
 
     def program(self, vertex: str, fragment: str, geometry: str | None = None) -> moderngl.Program:
-        """Returns the shader program from these files of ``shaders/``; it is compiled once."""
+        """Returns the shader program from files in ``shaders/``. Each program is compiled once."""
         key = (vertex, fragment, geometry or "")
         if key not in self._programs:
             self._programs[key] = self.gl.program(
@@ -120,7 +118,7 @@ class GlContext:
 
     @property
     def largest_texture(self) -> int:
-        """Returns the largest width and height of a texture, px."""
+        """Returns the largest width and height (px) of a texture."""
         return int(self._info["GL_MAX_TEXTURE_SIZE"])
 
     @property
@@ -130,12 +128,12 @@ class GlContext:
 
     @property
     def description(self) -> str:
-        """Returns renderer and version, for example ``llvmpipe (LLVM 15.0.6, 256 bits), 4.5 (Core Profile) Mesa
-        22.3.6``."""
+        """Returns OpenGL's renderer and version, for example ``llvmpipe (LLVM 15.0.6, 256 bits), 4.5 (Core Profile)
+        Mesa 22.3.6``."""
         return f"{self._info['GL_RENDERER']}, {self._info['GL_VERSION']}"
 
     def close(self) -> None:
-        """Frees the programs and the context. May be called twice. Raises WrongThread."""
+        """Frees the programs and the context. The call may be repeated. Raises WrongThread."""
         if not self._closed:
             with self.current():
                 for program in self._programs.values():

@@ -1,11 +1,11 @@
-"""Draws the photographs of the simulated studio: the light from a painted and lit subject to the lens.
+"""Draws the photographs of the simulated studio from the colours and the irradiance of a subject's vertices.
 
-Colour and irradiance come from the caller, for each vertex. Finer structure is a function of the position on the
-subject, evaluated at each pixel (``shaders/grain.glsl``), so that all views agree on every pore. A mild highlight moves
-with the view. Radiance is linear, and a pixel is the mean of several samples.
+Structure finer than the vertices is a function of the position on the subject, so that all views agree on every pore. A
+shader evaluates this function at each pixel (``shaders/grain.glsl``). A weak highlight depends on the view. Radiance is
+linear, and a pixel is the mean of several samples.
 
-llvmpipe computes both sides of every branch: shading brows and lips at each pixel would take 2.5 us a pixel, three
-times the present time.
+The software renderer llvmpipe computes both sides of every branch. Shading brows and lips at each pixel would therefore
+take three times as long (2.5 us for each pixel).
 """
 
 from collections.abc import Sequence
@@ -28,8 +28,8 @@ Vector4 = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Grain:
-    """Describes the fine structure of a surface: cell sizes of its two octaves along the axes of ``Part.places`` (mm),
-    and the weights of their four values."""
+    """Describes the fine structure of a surface by noise with two octaves. Holds the octaves' cell sizes (mm) along the
+    axes of ``Part.places``, and the weights of the four noise values."""
 
     coarse_mm: tuple[float, float, float]
     coarse_weights: Vector4
@@ -41,10 +41,10 @@ class Grain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """Holds a piece of the subject, in the world frame.
+    """Holds a part of the subject, such as skin or hair, in the world frame (mm).
 
-    ``places`` are the coordinates for its fine structure. ``paint`` is linear albedo and the strength of the fine
-    structure. ``irradiance`` is linear RGB, in which white paper is 1.
+    ``places`` holds the coordinates (mm) at which the fine structure is evaluated. ``paint`` holds linear albedo and
+    the strength of the fine structure. ``irradiance`` is linear RGB; a value of 1 makes white paper white.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -60,8 +60,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gallery:
-    """Holds what all parts of a subject share: the noise volume, and the two lamps that cause highlights (world frame,
-    linear RGB)."""
+    """Holds the noise volume for the fine structure, and two lamps that cause highlights (world frame, linear RGB)."""
 
     noise: UInt8[np.ndarray, "64 64 64 4"]
     lamps: Float[np.ndarray, "2 3"]
@@ -71,8 +70,8 @@ class Gallery:
 def draw_photographs(
     context: GlContext, rig: Rig, parts: Sequence[Part], gallery: Gallery, samples: int
 ) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
-    """Draws the parts in each camera: linear RGB multiplied by coverage, and coverage (float32). Cameras are drawn one
-    at a time, because the samples of one take 25 MB."""
+    """Draws the parts in each camera. Returns linear RGB multiplied by coverage, and coverage (float32). Cameras are
+    drawn one at a time, because the samples of one camera take 25 MB."""
     origin = rig.centre_world()
     box = np.concatenate([box_points(part.vertices) for part in parts])
     pictures = {}
@@ -88,7 +87,7 @@ def draw_photographs(
 
 
 def draw_vertex_radiance(context: GlContext, part: Part, gallery: Gallery) -> Float[np.ndarray, "v 3"]:
-    """Returns the linear RGB (float32) of each vertex as in ``draw_photographs``, without highlights."""
+    """Returns the linear RGB (float32) with which ``draw_photographs`` draws each vertex, without highlights."""
     count = len(part.vertices)
     size = (VERTEX_ROW, -(-count // VERTEX_ROW))
     with context.current() as gl, Owned() as owned:

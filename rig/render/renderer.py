@@ -1,14 +1,15 @@
-"""Provides the renderer, which its owner creates, passes on, and closes. It draws depth maps for visibility (section
-4.5: is a vertex occluded in an image?) and for shadows.
+"""Draws meshes in all cameras of a rig. Depth maps show which vertices are occluded in an image (the paper's section
+4.5) or lie in shadow.
 
-It also draws the model's silhouettes in all cameras, and computes their boundary-weighted XOR with the input's (section
-4.3, eqs. 4 and 5). All cameras share one atlas, which a single instanced draw fills. The sum of ``w |S - Sm|`` is taken
-in two steps: the GPU adds blocks of 8 x 8 pixels in single precision, in a fixed order; the blocks' sums are read back
-and added in double precision. So the relative error of a cost is below 64 * 2^-24 = 4e-6, equal masks cost exactly 0,
-and the same input always gives the same number. Blocks that the model cannot reach have the cost of an empty model.
+The module also draws a model's silhouettes, and computes their boundary-weighted XOR with the input silhouettes
+(section 4.3, eqs. 4 and 5). One instanced draw call draws the silhouettes of all cameras to one shared texture. The sum
+of ``w |S - Sm|`` is computed in two steps. The GPU adds the pixels of each block of 8 x 8 in single precision, in a
+fixed order. The CPU adds the blocks' sums in double precision. Therefore the relative error of a cost is below 64 *
+2^-24 = 4e-6, equal masks cost exactly 0, and the same input always gives the same cost. Blocks that the model cannot
+cover get the cost of an empty model.
 
-Measured on two cores with Mesa's llvmpipe, eleven views of 512 x 384 and 4,900 triangles: 8 ms to draw, 2 ms to add.
-Atomic additions (in a varying order), a compute shader over a copied mask, and mipmaps were slower or no better.
+On two cores with Mesa's llvmpipe, eleven views of 512 x 384 pixels and 4,900 triangles take 8 ms to draw and 2 ms to
+add. Atomic additions, a compute shader and mipmaps were not faster.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,7 +44,8 @@ GREY = 190
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Holds one distant light. ``towards`` is the unit direction to it, world frame; None puts it at the camera."""
+    """Holds one distant light. ``towards`` is the unit direction to the light in the world frame, or None for a light
+    at the camera."""
 
     towards: tuple[float, float, float] | None = None
     ambient: float = 0.0
@@ -56,7 +58,7 @@ HEADLIGHT = Light(ambient=0.15)
 def draw_colour(
     context: GlContext, rig: Rig, mesh: Mesh, samples: int, light: Light
 ) -> dict[str, UInt8[np.ndarray, "_ _ 4"]]:
-    """Draws a mesh in each camera: RGB and coverage (alpha). RGB is the colour of the covered part of a pixel, not
+    """Draws a mesh in each camera as RGB and coverage (alpha). RGB is the colour of the covered part of a pixel, not
     mixed with a background."""
     if not len(mesh.faces):
         return {c.name: np.zeros((c.intrinsics.height, c.intrinsics.width, 4), np.uint8) for c in rig}
@@ -87,8 +89,8 @@ def draw_colour(
 def draw_antialiased(
     context: GlContext, draw: moderngl.VertexArray, page: Page, samples: int
 ) -> UInt8[np.ndarray, "h w 4"]:
-    """Draws one page and returns the mean over ``samples`` samples of each pixel. Its colours are multiplied by the
-    coverage (alpha)."""
+    """Draws one texture of ``page`` and returns the mean over ``samples`` samples of each pixel. Colours are multiplied
+    by the coverage (alpha)."""
     gl, size = context.gl, (page.width, page.height)
     with Owned() as owned:
         image = owned(gl.renderbuffer(size, 4, samples=samples))
@@ -112,7 +114,7 @@ def _straight(premultiplied: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Surface:
-    """Holds the GPU resources of one page: the mask to draw into, the weights, and the block sums."""
+    """Holds the GPU resources for one page of camera images: the drawn mask, the weights, and the block sums."""
 
     page: Page
     mask: moderngl.Framebuffer
@@ -126,11 +128,10 @@ class _Surface:
 
 
 class SilhouetteSet:
-    """Prepares cameras and triangles for many evaluations in which only the vertices change. Call ``close`` after use,
-    or use ``with``."""
+    """Draws silhouettes of one mesh many times, while only its vertices change. Callers must close it."""
 
     def __init__(self, context: GlContext, rig: Rig, faces: Int[np.ndarray, "f 3"]) -> None:
-        """``rig`` at the resolution to draw in."""
+        """Prepares cameras and triangles. Silhouettes are drawn at the image size of ``rig``."""
         self.rig = rig
         self._context = context
         self._faces = np.ascontiguousarray(faces, np.int32)
@@ -158,7 +159,7 @@ class SilhouetteSet:
         self._surfaces = []
 
     def masks(self, vertices_world: Float[np.ndarray, "v 3"]) -> dict[str, Bool[np.ndarray, "_ _"]]:
-        """Returns the mask of the mesh in each camera: the pixel centres that it covers."""
+        """Returns the mask of the mesh in each camera. A pixel is True if the mesh covers its centre."""
         silhouettes = {}
         with self._context.current():
             self._draw(vertices_world)
@@ -173,9 +174,9 @@ class SilhouetteSet:
     def set_inputs(
         self, masks: Mapping[str, Bool[np.ndarray, "_ _"]], weights: Mapping[str, Float[np.ndarray, "_ _"]]
     ) -> None:
-        """Uploads the input silhouettes and the weight of each pixel, ``1 / d^2`` of eq. (5); done once for a capture.
+        """Uploads the input silhouettes and each pixel's weight ``1 / d^2`` of eq. (5) to the GPU.
 
-        Raises InputError if a camera of the rig has no mask or weights of its size.
+        Raises InputError if a camera's mask or weights are missing or not of the camera's size.
         """
         check_images(self.rig, masks, "mask")
         check_images(self.rig, weights, "weight")
@@ -193,7 +194,7 @@ class SilhouetteSet:
                 self._empty_sums.append(sums[:, :, 0])
 
     def xor_costs(self, vertices_world: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " k"]:
-        """Returns ``sum w |S - Sm|`` for each camera, in the order of the rig. ``set_inputs`` must have been called."""
+        """Returns the cost ``sum w |S - Sm|`` of each camera, in the order of the rig. Call ``set_inputs`` first."""
         if not self._empty_sums:
             raise InputError("xor_costs", [compose("no-input-silhouettes")])
         costs = np.zeros(len(self.rig))
@@ -211,7 +212,7 @@ class SilhouetteSet:
         return costs
 
     def _draw(self, vertices: Float[np.ndarray, "v 3"]) -> Int[np.ndarray, "k 4"]:
-        """Draws every page's masks; returns the boxes that the model can reach, per camera, in blocks of its tile."""
+        """Draws all masks. Returns, for each camera, the range of blocks that the model may cover."""
         if len(vertices) < self._vertices_needed:
             few = compose("vertices-few", held=len(vertices), wanted=self._vertices_needed)
             raise InputError("vertices", [few])
@@ -231,7 +232,8 @@ class SilhouetteSet:
         return boxes
 
     def _reach(self, vertices: Float[np.ndarray, "v 3"]) -> tuple[Int[np.ndarray, "k 4"], bool]:
-        """Returns the blocks (left, top, right, bottom) that the model may touch, by camera, and if all is in front."""
+        """Returns the range of blocks (left, top, right, bottom) that the model may cover in each camera, and whether
+        the whole model lies in front of all cameras."""
         box = box_points(vertices)
         boxes, all_in_front = [], True
         for camera, limit in zip(self.rig, self._limits, strict=True):
@@ -280,10 +282,10 @@ class SilhouetteSet:
 
 
 def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
-    """Tells whether a mesh is closed: every edge has its counterpart. Its front faces alone then form the whole
-    silhouette.
+    """Returns whether a mesh is closed, so that its front faces alone form the whole silhouette.
 
-    A line enters such a surface as often as it leaves it, so every pixel under a back face is also under a front face.
+    A ray enters a closed surface as often as it leaves the surface. Every pixel that a back face covers is therefore
+    also covered by a front face.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     base = int(edges.max(initial=0)) + 1
@@ -291,8 +293,7 @@ def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
 
 
 def check_images(rig: Rig, images: Mapping[str, np.ndarray], kind: str) -> None:
-    """Raises InputError if the image of a camera is missing or not of the camera's size. ``kind`` names the images in
-    messages."""
+    """Raises InputError unless each camera has an image of its size. ``kind`` names the images in messages."""
     faults = []
     for camera in rig:
         wanted = (camera.intrinsics.height, camera.intrinsics.width)
@@ -321,8 +322,8 @@ def _block_tile(page: Page, position: int) -> tuple[slice, slice]:
 def draw_depth(
     context: GlContext, rig: Rig, vertices_world: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> dict[str, Float[np.ndarray, "_ _"]]:
-    """Draws the depth map of a mesh in each camera: the camera-frame z (mm, float32) at each pixel's centre; inf where
-    there is nothing."""
+    """Returns the depth map of a mesh in each camera: the camera-frame z (mm, float32) at each pixel's centre, or inf
+    where no surface is."""
     if not len(faces):
         return {c.name: np.full((c.intrinsics.height, c.intrinsics.width), np.inf, np.float32) for c in rig}
     origin = rig.centre_world()
@@ -359,11 +360,11 @@ def _draw_page(
 
 
 class Renderer:
-    """Draws meshes in the views of a rig's cameras, lens distortion included. It belongs to one thread of one process.
+    """Draws meshes in the views of a rig's cameras, lens distortion included. Only one thread may use a renderer.
 
     ``with Renderer.create() as renderer: ...``. Raises EglUnavailable if OpenGL cannot start, and WrongThread if it is
-    used in another thread. Meshes are in the world frame, mm; images have row 0 on top. ``scale`` draws the same views
-    at another resolution (0.5: half the width).
+    used in another thread. Meshes are in the world frame (mm). Images have row 0 on top. The parameter ``scale`` of the
+    methods scales the images' width and height.
     """
 
     def __init__(self, context: GlContext) -> None:
@@ -371,7 +372,7 @@ class Renderer:
 
     @classmethod
     def create(cls) -> "Renderer":
-        """Returns a new renderer for this thread. Raises EglUnavailable if OpenGL cannot start."""
+        """Creates a renderer for the current thread. Raises EglUnavailable if OpenGL cannot start."""
         return cls(GlContext())
 
     def __enter__(self) -> "Renderer":
@@ -381,35 +382,34 @@ class Renderer:
         self.close()
 
     def close(self) -> None:
-        """Frees the renderer. Raises WrongThread in another thread."""
+        """Frees the renderer's resources. Raises WrongThread in another thread."""
         self.context.close()
 
     def silhouette_set(self, rig: Rig, faces: Int[np.ndarray, "f 3"], scale: float = 1.0) -> SilhouetteSet:
-        """Prepares many evaluations of one mesh topology in all cameras: its masks, and their weighted XOR with input
-        masks."""
+        """Prepares to draw the silhouettes of one mesh many times, with other vertices each time."""
         return SilhouetteSet(self.context, rig.scaled(scale) if scale != 1.0 else rig, faces)
 
     def depth(
         self, rig: Rig, vertices_world: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], scale: float = 1.0
     ) -> dict[str, Float[np.ndarray, "_ _"]]:
-        """Returns the depth of the nearest surface along the optical axis (z in the camera frame, mm, float32) by
-        camera; inf where there is none."""
+        """Returns the depth map of a mesh in each camera: the camera-frame z (mm, float32) of the nearest surface, or
+        inf where no surface is."""
         return draw_depth(self.context, rig.scaled(scale) if scale != 1.0 else rig, vertices_world, faces)
 
     def colour(
         self, rig: Rig, mesh: Mesh, scale: float = 1.0, *, samples: int = 4, light: Light = UNLIT
     ) -> dict[str, UInt8[np.ndarray, "_ _ 4"]]:
-        """Draws the mesh with its vertex colours (grey if it has none), antialiased. Returns RGB, and coverage as
-        alpha, by camera."""
+        """Draws a mesh with its vertex colours, antialiased; a mesh without colours is grey. Returns RGB, and coverage
+        as alpha, by camera."""
         return draw_colour(self.context, rig.scaled(scale) if scale != 1.0 else rig, mesh, samples, light)
 
     def photograph(
         self, rig: Rig, parts: Sequence[Part], gallery: Gallery, *, samples: int = 4
     ) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
-        """Draws a painted, lit subject. Returns its linear radiance by camera: RGB multiplied by coverage, and coverage
-        (float32)."""
+        """Draws the parts of a simulated subject in each camera. Returns linear RGB multiplied by coverage, and
+        coverage (float32)."""
         return draw_photographs(self.context, rig, parts, gallery, samples)
 
     def vertex_radiance(self, part: Part, gallery: Gallery) -> Float[np.ndarray, "v 3"]:
-        """Returns the linear RGB (float32) of each vertex of a part, as photographed but without highlights."""
+        """Returns the linear RGB (float32) of each vertex of a part in ``photograph``, without highlights."""
         return draw_vertex_radiance(self.context, part, gallery)

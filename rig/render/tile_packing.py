@@ -1,4 +1,4 @@
-"""Packs the images of all cameras into as few textures as OpenGL allows, and the cameras' parameters for shaders."""
+"""Packs the images of all cameras as tiles into few textures (pages), and prepares camera parameters for shaders."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ INSTANCE_NAMES = ("pose_x", "pose_y", "pose_z", "projection", "lens", "lens_more
 
 
 class ImageTooLarge(EigenheadError):
-    """Reports that an image does not fit into the largest texture of the driver."""
+    """Reports that an image is larger than OpenGL's largest texture."""
 
     def __init__(self, name: str, width: int, height: int, limit: int) -> None:
         super().__init__(compose("image-beyond-driver", camera=name, width=width, height=height, most=limit))
@@ -26,7 +26,7 @@ class ImageTooLarge(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Page:
-    """Holds one texture that several cameras share: their indices, and their tiles on it (left, top, width, height)."""
+    """Describes a texture that several cameras share: the cameras' indices and tiles (left, top, width, height, px)."""
 
     width: int
     height: int
@@ -34,14 +34,13 @@ class Page:
     tiles: Int[np.ndarray, "k 4"]
 
     def cut(self, image: np.ndarray, position: int) -> np.ndarray:
-        """Returns the part of a page's image that is the tile at ``position``."""
+        """Returns the tile with index ``position`` from an image of the whole page."""
         left, top, width, height = self.tiles[position]
         return image[top : top + height, left : left + width]
 
 
 def pack(cameras: Sequence[Camera], largest_side: int) -> tuple[Page, ...]:
-    """Packs the cameras' images onto pages: in rows, the tallest first, with a new page when one is full. Raises
-    ImageTooLarge."""
+    """Packs the cameras' images in rows onto pages, the tallest images first. Raises ImageTooLarge."""
     side = min(largest_side, PAGE_PX)
     for camera in cameras:
         k = camera.intrinsics
@@ -77,8 +76,8 @@ def _page(placed: list[tuple[int, tuple[int, int, int, int]]]) -> Page:
 
 
 def lens_limit(camera: Camera) -> float:
-    """Returns the radius of a ray (``X / Z``) beyond which no point appears in the image: twice the radius of the
-    farthest corner."""
+    """Returns the radius, in units of ``X / Z``, beyond which no point is drawn. This limit is twice the radius of the
+    image's farthest corner."""
     k = camera.intrinsics
     corners = np.array([(x, y) for x in (-0.5, k.width - 0.5) for y in (-0.5, k.height - 0.5)])
     radii = np.linalg.norm(camera.undistort(corners), axis=1)
@@ -93,10 +92,11 @@ def instances(
     origin_world: Float[np.ndarray, " 3"],
     depth_ranges: Float[np.ndarray, "n 2"] | None = None,
 ) -> Float[np.ndarray, "k 30"]:
-    """Returns a row of shader inputs for each tile of ``page``. The shader then expects points relative to
-    ``origin_world``.
+    """Returns a row of shader inputs for each tile of ``page``. Vertices for the shader must be relative to
+    ``origin_world`` (mm).
 
-    ``depth_ranges``: nearest and farthest depth of the scene in each camera (mm); None draws without a depth buffer.
+    ``depth_ranges`` holds the nearest and farthest depth (mm) of the scene in each camera. None draws without a depth
+    buffer.
     """
     rows = np.zeros((len(page.cameras), 30), np.float32)
     for row, index, tile in zip(rows, page.cameras, page.tiles, strict=True):
@@ -113,8 +113,8 @@ def instances(
 
 
 def box_points(vertices: Float[np.ndarray, "v 3"], per_edge: int = 9) -> Float[np.ndarray, "p 3"]:
-    """Returns points on the twelve edges of the vertices' bounding box. Seen from outside the box, their outline
-    contains the mesh's outline."""
+    """Returns points on the twelve edges of the vertices' bounding box. In a view from outside the box, the points'
+    outline encloses the mesh."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     steps = np.linspace(0.0, 1.0, per_edge)
     corners = np.array([(a, b) for a in (0.0, 1.0) for b in (0.0, 1.0)])
@@ -123,7 +123,7 @@ def box_points(vertices: Float[np.ndarray, "v 3"], per_edge: int = 9) -> Float[n
 
 
 def depth_range(camera: Camera, box: Float[np.ndarray, "p 3"]) -> tuple[float, float]:
-    """Returns the nearest and the farthest depth (mm) of the points of a bounding box, slightly widened."""
+    """Returns the nearest and the farthest depth (mm) of a bounding box's points in a camera, slightly widened."""
     depth = camera.camera_from_world.apply(box)[:, 2]
     near = max(0.99 * float(depth.min()), NEAR_MM)
     return near, max(1.01 * float(depth.max()), near + 1.0)

@@ -1,1 +1,1 @@
-"""Simulates a studio, which tests and the demo photograph."""
+"""Simulates a photo studio with cameras, whose pictures tests and the demonstration use."""

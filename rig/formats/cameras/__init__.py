@@ -1,4 +1,4 @@
-"""Reads and writes files of cameras: ``cameras.json``, other programs' files, and ``scale.json`` with a known length.
+"""Reads and writes files of cameras: ``cameras.json``, files of other programs, and ``scale.json`` with a known length.
 
-In: a file, or a folder that contains one. Out: a checked ``Rig``, or all faults of the file at once. ``cameras_file``
-chooses the reader by the file's name; ``foreign_keys`` defines the treatment of every key."""
+A reader returns a checked ``Rig``, or reports all faults of a file. ``cameras_file`` chooses the reader by the file's
+name. ``foreign_keys`` defines how readers treat every key of another program's file."""

@@ -1,9 +1,10 @@
-"""Writes a script that puts a rig's cameras into a Blender scene: ``blender --python cameras.py``, or its text editor.
+"""Writes a Python script that adds a rig's cameras to a Blender scene (``blender --python cameras.py``).
 
-Blender's camera (https://docs.blender.org/api/current/bpy.types.Camera.html): with ``sensor_fit`` HORIZONTAL the focal
-length in pixels is ``lens width / sensor_width``; ``shift_x`` and ``shift_y`` move the frame to the right and up, as
-fractions of the width; there is no distortion. Axes: x right, y up, z backwards; lengths in metres. Photographs fit as
-backgrounds only if undistorted; each camera has a note with the displacement of the picture's corners by its lens."""
+A camera in Blender (https://docs.blender.org/api/current/bpy.types.Camera.html) has no distortion. With ``sensor_fit``
+HORIZONTAL its focal length in pixels is ``lens * width / sensor_width``. ``shift_x`` and ``shift_y`` move the frame to
+the right and up, as fractions of the width. Blender's camera axes are x right, y up and z backwards; lengths are in
+metres. Only undistorted photographs fit as backgrounds. A custom property of each camera holds the displacement of the
+picture's corners by the lens."""
 
 import json
 from pathlib import Path

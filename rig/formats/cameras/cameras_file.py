@@ -1,17 +1,18 @@
-"""Reads and writes rigs in other programs' files.
+"""Reads and writes rigs in the file formats of other programs.
 
-It reads and writes COLMAP (text and binary), caliscope's ``camera_array.toml``, aniposelib's TOML, Metashape's XML,
-RealityCapture's XMP and CSV, nerfstudio's ``transforms.json`` and OpenCV's YAML; it only writes Blender's script. Every
-reader converts its file to an ``eigenhead-cameras/1`` document and passes it to ``rig_from_document``, so that all
-formats get the same checks. Each format's module names the description of its layout.
+The module reads and writes COLMAP (text and binary), caliscope's ``camera_array.toml``, aniposelib's TOML, Metashape's
+XML, RealityCapture's XMP and CSV, nerfstudio's ``transforms.json`` and OpenCV's YAML. The module also writes a script
+for Blender. Every reader converts its file to an ``eigenhead-cameras/1`` document, and ``rig_from_document`` checks the
+documents of all formats alike. The module of each format cites a description of the file's layout.
 
-Pixels: in this project and OpenCV the centre of the top-left pixel is (0, 0); in COLMAP, Metashape, RealityCapture and
-nerfstudio it is (0.5, 0.5). Lengths become millimetres: caliscope, Metashape and RealityCapture are in metres; COLMAP's
-scale is free and taken as millimetres; the unit of aniposelib, nerfstudio and OpenCV follows from the size of the rig.
-Gaussian splatting's ``cameras.json`` and NeRSemble's ``camera_params.json`` are also read.
+In this project and OpenCV the centre of the top-left pixel is (0, 0); in COLMAP, Metashape, RealityCapture and
+nerfstudio it is (0.5, 0.5). Readers convert lengths to millimetres. Files of caliscope, Metashape and RealityCapture
+are in metres. COLMAP's arbitrary unit is taken as millimetres. In files of aniposelib, nerfstudio and OpenCV, the
+distances between the cameras determine the unit. Gaussian splatting's ``cameras.json`` and NeRSemble's
+``camera_params.json`` are also read.
 
-Unread keys of ``cameras.json``, such as a misspelt ``covarianse`` or a ``k4`` that the lens model lacks, are no faults,
-because files may carry other programs' keys. A warning tells the author that they have no effect.
+An unread key of ``cameras.json``, such as a misspelt ``covarianse`` or a ``k4`` that the lens model lacks, is no fault,
+because files may contain keys for other programs. A warning says that the key has no effect.
 """
 
 import re
@@ -91,8 +92,8 @@ def _are_of_splatting(entries: list[Any]) -> bool:
 
 
 def no_rig_fault(folder: Path) -> Message:
-    """Returns the fault of a folder without a file of cameras. If the folder contains captures, an archive, or cameras
-    of an unsupported program instead, the fault names them."""
+    """Returns a fault that reports a folder without a file of cameras. The fault names any captures, archives, or files
+    of unsupported programs in the folder."""
     if unread := unread_programs(folder):
         return unread[0]
     archives = [path.name for path in sorted(folder.iterdir()) if path.name.lower().endswith(ARCHIVE_ENDINGS)]
@@ -104,17 +105,17 @@ def no_rig_fault(folder: Path) -> Message:
 
 
 def find_rig_file(folder: Path) -> Path | None:
-    """Returns the file in ``folder`` that holds the rig, for ``read_rig_file``; None if there is none."""
+    """Returns the path of the file in ``folder`` that holds the rig, or None without such a file."""
     return next(rig_files(folder), None)
 
 
 def rig_files(folder: Path) -> Iterator[Path]:
-    """Yields the files in ``folder`` that may hold the rig, at most one for each program. The first is the one to read.
+    """Yields the files in ``folder`` that may hold the rig, at most one for each program, the best one first.
 
-    In this order: ``cameras.json``; a COLMAP model in ``sparse/0``, ``sparse`` or at the top (``cameras.bin`` or
-    ``.txt``); ``camera_array.toml``; any other TOML file with aniposelib's keys; ``transforms.json``; ``intri.yml``;
-    any other YAML file of OpenCV's with a ``K_<camera>``; an XML file of Metashape's; RealityCapture's XMP files,
-    beside the pictures or at the top, or its CSV; a ``cameras.json`` of another name.
+    The order is: ``cameras.json``; a COLMAP model (``cameras.bin`` or ``.txt``) in ``sparse/0``, ``sparse`` or
+    ``folder``; ``camera_array.toml``; another TOML file with aniposelib's keys; ``transforms.json``; ``intri.yml``;
+    another YAML file of OpenCV with a key ``K_<camera>``; an XML file of Metashape; XMP files of RealityCapture beside
+    the pictures or in ``folder``, or its CSV; a file like ``cameras.json`` with another name.
     """
     here = [path for path in sorted(folder.iterdir()) if path.is_file() and not is_junk(path.name)]
     images = entry(folder, "images")
@@ -149,13 +150,12 @@ def rig_files(folder: Path) -> Iterator[Path]:
 
 
 def read_rig_file(path: Path) -> Rig:
-    """Returns the rig in a file of any known format. Raises InputError naming every fault found in it."""
+    """Returns the rig in a file of any known format. Raises InputError naming every fault."""
     return read_cameras(path).rig
 
 
 def read_cameras(path: Path) -> CamerasRead:
-    """Returns the rig in a file of any known format, with its reader's remarks. Raises InputError naming every
-    fault."""
+    """Returns the rig in a file of any known format, with warnings. Raises InputError naming every fault."""
     suffix = path.suffix.lower()
     readers = {
         **{".json": _read_json, ".toml": read_toml, ".xml": read_metashape, ".csv": read_csv},
@@ -173,7 +173,7 @@ def read_cameras(path: Path) -> CamerasRead:
 
 
 def _read_json(path: Path) -> CamerasRead:
-    """Reads the cameras of a JSON file; its content tells which program wrote it."""
+    """Reads the cameras of a JSON file, in the format that its content indicates."""
     document = read_document(path)
     reader = next((read for is_of, read in JSON_READERS if is_of(document)), None)
     if reader is not None:
@@ -195,7 +195,7 @@ def _read_json(path: Path) -> CamerasRead:
 
 
 def _thinned(read: CamerasRead, file: str) -> CamerasRead:
-    """Reduces more than ``CAMERAS_MOST`` cameras to that number; the remaining ones stand well apart."""
+    """Keeps at most ``CAMERAS_MOST`` cameras with widely different views."""
     if len(read.rig) <= CAMERAS_MOST:
         return read
     kept = set(spread_views(read.rig, CAMERAS_MOST))
@@ -208,7 +208,7 @@ def _thinned(read: CamerasRead, file: str) -> CamerasRead:
 
 
 def rig_file_parts(path: Path) -> tuple[Path, ...]:
-    """Returns all files that ``read_rig_file`` reads for ``path``; most formats have one."""
+    """Returns all files that ``read_rig_file`` reads for ``path``, because some formats have several."""
     if path.suffix.lower() == ".xmp":
         return tuple(other for other in sorted(path.parent.iterdir()) if other.suffix.lower() == ".xmp")
     pairs = {"cameras.bin": "images.bin", "cameras.txt": "images.txt", "intri.yml": "extri.yml"}
@@ -217,8 +217,8 @@ def rig_file_parts(path: Path) -> tuple[Path, ...]:
 
 
 def write_rig_file(rig: Rig, path: Path, kind: str) -> None:
-    """Writes a rig in the format ``kind``, one of ``FORMATS``; for ``FOLDER_FORMATS`` the path is a folder. Raises
-    InputError for another kind."""
+    """Writes a rig in the format ``kind``. For a kind in ``FOLDER_FORMATS``, ``path`` is a folder. Raises InputError
+    for a kind that is not in ``FORMATS``."""
     if kind not in WRITERS:
         raise InputError("format", [compose("none-of", value=f"{kind!r}", known=FORMATS)])
     skewed = [camera.name for camera in rig if camera.recorded is not None and camera.recorded.skew]
@@ -228,8 +228,8 @@ def write_rig_file(rig: Rig, path: Path, kind: str) -> None:
 
 
 def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[Message, ...]:
-    """Returns messages for the unread keys of a decoded ``cameras.json``; keys that many cameras share are reported
-    once, with their number."""
+    """Returns messages about the unread keys of a decoded ``cameras.json``. A key of many cameras gets one message,
+    with the number of cameras."""
     counts = Counter(_unread(document))
     faults = []
     for (place, key), times in list(counts.items())[:TOLD_MOST]:
@@ -241,7 +241,7 @@ def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[Messag
 
 
 def _unread(document: Any) -> Iterator[tuple[str, str]]:
-    """Yields the place and name of each unread key."""
+    """Yields the location and name of each unread key."""
     if not isinstance(document, Mapping) or document.get("format") != FORMAT:
         return
     cameras, tables = document.get("cameras"), list[tuple[str, Any]]([("", document)])

@@ -1,4 +1,4 @@
-"""Reads and writes ``cameras.json`` (``eigenhead-cameras/1``), the project's own file for a rig's cameras."""
+"""Reads and writes ``cameras.json`` (``eigenhead-cameras/1``), this project's file format for a rig's cameras."""
 
 import json
 from pathlib import Path
@@ -24,15 +24,15 @@ PIXELS_MOST = 20_000  # a side; larger is a damaged or hostile file, not a camer
 
 
 class PoseDocument(TypedDict):
-    """Describes a pose in JSON: rotation matrix, by rows, and translation (mm)."""
+    """Describes a pose in JSON: the rows of a rotation matrix, and a translation (mm)."""
 
     rotation: list[list[float]]
     translation: list[float]
 
 
 class CameraDocument(TypedDict):
-    """Holds one camera. ``covariance`` is 6 x 6, rotation (rad) then translation (mm); ``serial`` is the body's serial
-    number as EXIF has it."""
+    """Describes one camera in JSON. ``covariance`` (6 x 6) lists rotation (rad), then translation (mm). ``serial`` is
+    the body's serial number from EXIF."""
 
     name: str
     width: int
@@ -45,7 +45,7 @@ class CameraDocument(TypedDict):
 
 
 class CamerasDocument(TypedDict):
-    """Holds the content of ``cameras.json``. ``scale_sigma`` is as in ``Rig``."""
+    """Describes ``cameras.json``. ``scale_sigma`` is the relative standard deviation of all lengths."""
 
     format: str
     unit: str
@@ -54,12 +54,12 @@ class CamerasDocument(TypedDict):
 
 
 def read_rig(path: Path) -> Rig:
-    """Returns the rig in ``cameras.json``. Raises InputError naming every fault in it."""
+    """Returns the rig in ``cameras.json``. Raises InputError naming every fault."""
     return rig_from_document(read_document(path), path.name)
 
 
 def read_document(path: Path) -> Any:
-    """Returns a decoded JSON file. Raises InputError."""
+    """Decodes a JSON file. Raises InputError if that fails."""
     try:
         return json.loads(path.read_bytes())  # UTF-8, 16 or 32, which json recognises by the first bytes
     except OSError as error:
@@ -73,7 +73,7 @@ def read_document(path: Path) -> Any:
 
 
 def write_rig(rig: Rig, path: Path) -> None:
-    """Writes ``cameras.json``, under a temporary name first."""
+    """Writes ``cameras.json`` atomically."""
     write_atomically(path, json.dumps(document_from_rig(rig), indent=1).encode())
 
 
@@ -118,7 +118,7 @@ def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
 
 
 def _unit_fault(unit: Any) -> Message:
-    """Returns the fault of a unit other than millimetres, with the factor to millimetres if it is known."""
+    """Returns a fault that reports a unit other than millimetres, with the unit's factor if the unit is known."""
     written = f"{unit!r:.80}"
     factor = UNITS_MM.get(unit.lower()) if isinstance(unit, str) else None
     if factor is None:
@@ -127,7 +127,7 @@ def _unit_fault(unit: Any) -> Message:
 
 
 def _repeated(names: list[str]) -> list[Message]:
-    """Returns one fault for all names that several cameras have (in a list written twice, all are repeated)."""
+    """Returns one fault that lists all names that several cameras have."""
     repeated = [name for name in sorted(set(names)) if names.count(name) > 1]
     if not repeated:
         return []
@@ -147,7 +147,7 @@ def _shared_serials(cameras: list[Camera]) -> list[Message]:
 
 
 def name_fault(name: Any) -> Message | None:
-    """Tells why ``name`` cannot be a camera's name, which becomes a file name; None if it can."""
+    """Returns a fault if ``name`` cannot be a camera's name, which must be valid as a file name; otherwise None."""
     if not isinstance(name, str) or not 0 < len(name) <= 64:
         return compose("camera-name-length", name=f"{name!r:.80}", most=64)
     if not all(c.isascii() and (c.isalnum() or c in "-_.") for c in name) or name.startswith("."):
@@ -184,8 +184,8 @@ def _lens_document(camera: Camera) -> dict[str, str | float]:
 
 
 def _read_lens(lens: Any, where: str, faults: list[Message]) -> tuple[Distortion, RecordedLens | None]:
-    """Returns the camera's own distortion; or no distortion, and the recorded lens whose distortion is removed from its
-    pictures."""
+    """Returns the camera's Brown-Conrady distortion. For another lens model, returns zero distortion and the lens by
+    which pictures are undistorted on reading."""
     model = lens.get("model", "brown-conrady") if isinstance(lens, dict) else "brown-conrady"
     known: LensModel | None = next((name for name in COEFFICIENTS if name == model), None)
     if known is None and model != "brown-conrady":
@@ -252,7 +252,7 @@ def _is_covariance(matrix: np.ndarray) -> bool:
 
 
 def is_number(value: Any) -> bool:
-    """Tells whether a decoded value is a finite number of plausible size, and not a truth value."""
+    """Returns whether a decoded value is a finite number of plausible size."""
     return isinstance(value, int | float) and not isinstance(value, bool) and bool(abs(value) < 1e12)  # NaN fails too
 
 

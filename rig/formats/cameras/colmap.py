@@ -1,8 +1,8 @@
 """Reads and writes COLMAP models, text and binary (https://colmap.github.io/format.html; parameter order of
 ``src/colmap/sensor/models.h``).
 
-In COLMAP the centre of the top-left pixel is (0.5, 0.5), in this project (0, 0): half a pixel is subtracted on reading
-and added on writing. COLMAP's scale is free and taken as millimetres."""
+The centre of the top-left pixel is (0.5, 0.5) in COLMAP and (0, 0) in this project, so half a pixel is subtracted on
+reading and added on writing. The unit of a COLMAP model is arbitrary and taken as millimetres."""
 
 import math
 import struct
@@ -54,8 +54,8 @@ COLMAP_NAMES = {number: name for name, (number, _) in COLMAP_MODELS.items()}
 
 
 def read_colmap(path: Path) -> CamerasRead:
-    """Returns the rig in the COLMAP model of a ``cameras`` file: each image becomes a camera of this project, named
-    after the image file. Raises InputError naming every fault."""
+    """Returns the rig in the COLMAP model whose ``cameras`` file is ``path``. Each image becomes a camera, named after
+    the image file. Raises InputError naming every fault."""
     folder, suffix = path.parent, path.suffix.lower()
     files = [entry(folder, f"{kind}{suffix}") for kind in ("cameras", "images")]
     subject = "/".join([folder.name, f"cameras{suffix}"]) if folder.name else f"cameras{suffix}"
@@ -77,7 +77,7 @@ def read_colmap(path: Path) -> CamerasRead:
 
 
 def write_colmap(rig: Rig, folder: Path, *, binary: bool = False, suffix: str = ".png") -> None:
-    """Writes ``cameras``, ``images``, ``rigs``, ``frames`` and an empty ``points3D``; images are called
+    """Writes ``cameras``, ``images``, ``rigs``, ``frames`` and an empty ``points3D``. Images are named
     ``<camera><suffix>``."""
     import pycolmap
 
@@ -96,7 +96,7 @@ def write_colmap(rig: Rig, folder: Path, *, binary: bool = False, suffix: str = 
 
 
 class _Records:
-    """Reads little-endian records one after the other. Raises ``struct.error`` if the bytes end too early."""
+    """Reads consecutive little-endian records from bytes. Raises ``struct.error`` if the bytes end too early."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.at = data, 0
@@ -107,8 +107,8 @@ class _Records:
         return values
 
     def count(self, least_bytes: int) -> int:
-        """Reads a number of records, each of at least ``least_bytes`` bytes. Raises Malformed if so many do not fit in
-        the rest of the file, before any memory is allocated for them."""
+        """Reads a count of records, each of at least ``least_bytes`` bytes. Raises Malformed before memory is
+        allocated, if the rest of the file is too short for this count."""
         (count,) = self.take("Q")
         if count * least_bytes > len(self.data) - self.at:
             raise Malformed(compose("records-promised", records=str(count)))
@@ -128,7 +128,7 @@ class _Records:
 
 @dataclass(frozen=True, slots=True)
 class ColmapCamera:
-    """Holds a camera of a COLMAP model; ``values`` are its parameters in the order of that model."""
+    """Holds a camera of a COLMAP model. ``values`` are the parameters in the order of COLMAP's camera model."""
 
     model: str
     width: int
@@ -138,8 +138,7 @@ class ColmapCamera:
 
 @dataclass(frozen=True, slots=True)
 class ColmapImage:
-    """Holds an image of a COLMAP model: quaternion and translation of camera_from_world, and the number of its
-    camera."""
+    """Holds an image of a COLMAP model: quaternion and translation of camera_from_world, and the camera's number."""
 
     pose: list[float]
     camera: int
@@ -190,7 +189,8 @@ def _text_cameras(data: bytes) -> dict[int, ColmapCamera]:
 
 
 def _text_images(data: bytes) -> list[ColmapImage]:
-    """Reads images: one line each, followed by a line with its points, which hand-written files often lack."""
+    """Reads the images of a text model. The line of an image is followed by a line of points, which hand-written files
+    often lack."""
     images: list[ColmapImage] = []
     after_image = False
     for line in _text_lines(data):
@@ -210,11 +210,10 @@ def _text_images(data: bytes) -> list[ColmapImage]:
 
 
 def _is_of_points(line: str) -> bool:
-    """Tells whether a line is empty or can be a list of points (X, Y and a whole number each); such a line may still be
-    the next image's.
+    """Returns whether a line is empty or can be a list of points, each with X, Y and an integer.
 
-    An image's line has ten or more words, one of them a name; ten numbers cannot be points, since 3 does not divide
-    10."""
+    A line of an image has ten or more words, one of them a name. Ten numbers cannot be points, because 3 does not
+    divide 10."""
     words = line.split()
     try:
         return len(words) % 3 == 0 and bool(np.isfinite([float(word) for word in words]).all())
@@ -254,7 +253,7 @@ def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera, faults: l
 
 
 def _colmap_model(camera: Camera) -> tuple[str, list[float]]:
-    """Returns the name and the parameters of COLMAP's model for a camera."""
+    """Returns the name and the parameters of the COLMAP camera model that represents a camera."""
     k, lens = camera.intrinsics, camera.recorded
     frame = [k.fx, k.fy, k.cx + 0.5, k.cy + 0.5]
     if lens is None:

@@ -1,10 +1,10 @@
-"""Writes the JSON files that nerfstudio and GaussianAvatars read together with the pictures of a data set of views.
+"""Writes the JSON files of data sets of views for training by nerfstudio and GaussianAvatars.
 
-Both read ``transforms.json`` (``rig.formats.cameras.transforms_json``) with the same axes and half pixel.
-GaussianAvatars reads one file for each division of the data, only the field of view (``camera_angle_x``: square pixels,
-the principal point in the middle), and numbers of cameras and moments (https://github.com/ShenhanQian/GaussianAvatars,
-its dataset_readers; https://github.com/ShenhanQian/VHAP, whose data sets it reads). Lengths are metres, in the
-capture's world frame.
+Both nerfstudio and GaussianAvatars read ``transforms.json`` with the axes and pixel centres of
+``rig.formats.cameras.transforms_json``. GaussianAvatars (https://github.com/ShenhanQian/GaussianAvatars,
+dataset_readers) reads one file for each of training, validation and test. GaussianAvatars assumes square pixels and a
+central principal point, and needs only the field of view ``camera_angle_x`` and numbers of cameras and moments (as in
+https://github.com/ShenhanQian/VHAP). Lengths are in metres in the capture's world frame.
 """
 
 import json
@@ -31,7 +31,7 @@ POINT = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class DatasetLayout:
-    """Names the files of a data set. ``pictures`` and ``masks`` are folders, ``points`` a file."""
+    """Names the folders ``pictures`` and ``masks`` and the file ``points`` of a data set."""
 
     pictures: str
     masks: str
@@ -45,7 +45,7 @@ LAYOUTS: dict[DatasetFormat, DatasetLayout] = {
 
 
 def picture_names(rig: Rig, form: DatasetFormat) -> dict[str, str]:
-    """Returns the file name of each camera's picture, and of its mask."""
+    """Returns, by camera, the common file name of the camera's picture and mask."""
     if form == "nerfstudio":
         return {name: f"{name}.png" for name in rig.names}
     return {name: f"{MOMENT:05}_{index:02}.png" for index, name in enumerate(rig.names)}
@@ -54,8 +54,8 @@ def picture_names(rig: Rig, form: DatasetFormat) -> dict[str, str]:
 def dataset_documents(
     rig: Rig, form: DatasetFormat, *, with_points: bool, with_flame: bool = False
 ) -> dict[str, bytes]:
-    """Returns the JSON files of a data set by name. ``rig``: pinhole cameras of its pictures. ``with_points``: the data
-    set has a point cloud; ``with_flame``: it has FLAME parameters."""
+    """Returns the JSON files of a data set by file name. ``rig`` holds the pinhole cameras of the pictures.
+    ``with_points`` is True if the data set has a point cloud, and ``with_flame`` if it has FLAME parameters."""
     layout, names = LAYOUTS[form], picture_names(rig, form)
     head: dict[str, object] = {"camera_model": "OPENCV", "unit": "metre"}
     if with_points:
@@ -77,8 +77,7 @@ def dataset_documents(
 
 
 def held_out_camera(rig: Rig) -> str:
-    """Returns the camera that is held out of training to test the result: the one whose two nearest neighbours are
-    nearest, since training can best do without it."""
+    """Returns the camera to hold out of training for a test: the camera whose two nearest neighbours are nearest."""
     centres = np.stack([camera.centre_world for camera in rig])
     distances = np.sort(np.linalg.norm(centres[:, None] - centres[None], axis=2), axis=1)
     return rig.names[int(np.argmin(distances[:, 1:3].sum(axis=1)))]

@@ -1,7 +1,7 @@
-"""Holds the common parts of all readers of other programs' files: errors for damaged files, cameras' names, conversion
-of lenses, and a reader's findings (faults, unused keys, excluded cameras). Also recognises, by names and first bytes,
-files of cameras that no reader supports. A capture without cameras in a known format is treated as photographs alone,
-and its cameras are estimated. A message then tells the user that other files of cameras in it were not read."""
+"""Provides functions that all readers of other programs' camera files use. These functions report damaged files, name
+cameras, convert lenses and poses, and collect faults. The module also recognises camera files that no reader supports.
+If a capture has no readable cameras, the program estimates the cameras from the photographs, and a message names the
+unread camera files."""
 
 import csv
 import re
@@ -76,7 +76,7 @@ BYTES_MOST = 1 << 29  # far above the few megabytes of a rig's sparse model, who
 
 @dataclass(frozen=True, slots=True)
 class CamerasRead:
-    """Holds a rig, warnings of its reader, and the excluded cameras of the file, each with the reason."""
+    """Holds the rig from a file, warnings, and the reasons for which cameras were excluded."""
 
     rig: Rig
     remarks: tuple[Message, ...] = ()
@@ -85,7 +85,7 @@ class CamerasRead:
 
 @dataclass(slots=True)
 class Reading:
-    """Collects findings while the file named ``subject`` is read."""
+    """Collects faults, warnings and excluded cameras while the file ``subject`` is read."""
 
     subject: str
     faults: list[Message] = field(default_factory=list)
@@ -94,10 +94,10 @@ class Reading:
     _unknown: dict[str, None] = field(default_factory=dict)
 
     def judge(self, table: Table, values: Mapping[str, object], whose: str, *, place: str = "") -> None:
-        """Records the keys of ``values`` that the table refuses, wants reported or does not contain.
+        """Records the keys of ``values`` that ``table`` refuses, reports or does not contain.
 
-        ``whose`` is the camera's name, empty for keys of the whole file; ``place`` is the prefix of the keys in the
-        table."""
+        ``whose`` is the camera's name, or an empty text for keys of the whole file. ``place`` is the prefix of the keys
+        in the table."""
         for key, value in values.items():
             rule = table.get(place + key)
             if rule is None:
@@ -110,8 +110,8 @@ class Reading:
         self.left_out[name] = why
 
     def finish(self, entries: Sequence[Mapping[str, object]]) -> CamerasRead:
-        """Builds the rig from ``eigenhead-cameras/1`` entries and returns it with all notes. Raises InputError naming
-        every fault."""
+        """Builds the rig from ``eigenhead-cameras/1`` entries, and returns it with all recorded warnings. Raises
+        InputError naming every fault."""
         warnings: list[Message] = []
         for (key, rule), cases in self._meant.items():
             whose, value = _whose([name for name, _ in cases], key), shown(cases[0][1])
@@ -148,7 +148,7 @@ class Reading:
 
 
 def shown(value: object, most: int = VALUE_MOST) -> str:
-    """Returns a value as Python writes it, shortened to ``most`` characters inside its quotation marks."""
+    """Returns the ``repr`` of a value, shortened to ``most`` characters."""
     if isinstance(value, str):
         return repr(value if len(value) <= most else value[: most - 3] + "...")
     text = repr(value)
@@ -156,7 +156,7 @@ def shown(value: object, most: int = VALUE_MOST) -> str:
 
 
 def _whose(names: Sequence[str], key: str) -> str | Message:
-    """Names a key together with the cameras that have it; a key of the whole file is named alone."""
+    """Returns a text with a key and the names of the cameras that have the key."""
     cameras = [name for name in names if name]
     if len(cameras) == 1:
         return key.replace("<name>", cameras[0]) if "<name>" in key else f"{cameras[0]}.{key}"
@@ -164,7 +164,7 @@ def _whose(names: Sequence[str], key: str) -> str | Message:
 
 
 class Malformed(ValueError):
-    """Reports a fault that one of this project's parsers finds in the bytes of a file."""
+    """Reports a fault that a parser of this project finds in the bytes of a file."""
 
     def __init__(self, message: Message) -> None:
         self.message = message
@@ -172,8 +172,7 @@ class Malformed(ValueError):
 
 
 def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
-    """Applies ``parse`` to the bytes of a file. Raises InputError for a damaged file, whatever ``parse`` raises for
-    it."""
+    """Applies ``parse`` to the bytes of a file. Converts any exception due to a damaged file to InputError."""
     try:
         if path.stat().st_size > BYTES_MOST:
             raise InputError(path.name, [compose("file-large", most_mib=BYTES_MOST >> 20)])
@@ -190,8 +189,8 @@ def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
 
 
 def camera_names(files: list[str]) -> list[str]:
-    """Returns camera names: the pictures' names without their endings. If those repeat (``cam00/shot.png``), it is the
-    names of the innermost folders that distinguish all of them."""
+    """Returns camera names from the paths of pictures: the file names without suffix. If file names repeat
+    (``cam00/shot.png``), uses the names of the innermost folders that differ for all pictures."""
     paths = [tuple(part for part in file.replace("\\", "/").split("/") if part not in ("", ".")) for file in files]
     stems = [picture_stem(path[-1]) if path else "" for path in paths]
     if len(set(stems)) == len(stems):
@@ -211,8 +210,8 @@ def camera_entry(
     rotation: Float[np.ndarray, "3 3"],
     translation: Float[np.ndarray, " 3"],
 ) -> dict[str, object]:
-    """Returns a camera's entry of ``eigenhead-cameras/1``: width and height, fx fy cx cy, ``lens_entry``'s lens, and
-    rotation and translation (mm) of camera_from_world."""
+    """Returns a camera's entry of ``eigenhead-cameras/1``. ``size`` is width and height (px), ``intrinsics`` fx fy cx
+    cy (px), ``lens`` a result of ``lens_entry``. Rotation and translation (mm) are of camera_from_world."""
     return {
         "name": name,
         "width": size[0],
@@ -229,7 +228,7 @@ def matrix_intrinsics(matrix: Float[np.ndarray, "3 3"]) -> list[float]:
 
 
 def pose_rotation(value: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Returns the matrix of a rotation vector, and any other array as it is."""
+    """Converts a rotation vector to a matrix. Returns any other array unchanged."""
     if value.size != 3:
         return value
     return rotation_from_vector(value.ravel()) if np.isfinite(value).all() else np.full((3, 3), np.nan)
@@ -238,10 +237,10 @@ def pose_rotation(value: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 def lens_entry(
     parameters: Mapping[str, float], where: str, faults: list[Message], *, fisheye: bool = False, skew: float = 0.0
 ) -> dict[str, str | float]:
-    """Returns the ``distortion`` entry of ``eigenhead-cameras/1`` for coefficients under OpenCV's names; missing ones
-    are 0. ``skew`` is entry (0, 1) of the camera matrix in focal lengths fx.
+    """Returns the ``distortion`` entry of ``eigenhead-cameras/1`` for coefficients with OpenCV's names. A missing
+    coefficient is 0. ``skew`` is entry (0, 1) of the camera matrix divided by fx.
 
-    All lenses from other programs get their model here. A nonzero coefficient that the model lacks is a fault."""
+    The function chooses the lens model from the coefficients. A nonzero coefficient that the model lacks is a fault."""
     model: LensModel | None = "kannala-brandt" if fisheye else None
     if model is None and any(parameters.get(key, 0.0) for key in ("k4", "k5", "k6")):
         model = "rational"
@@ -255,8 +254,8 @@ def lens_entry(
 
 
 def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: list[Message]) -> np.ndarray:
-    """Converts ``value`` to an array. If that fails, a fault is appended and an array of NaN of the wanted shape
-    returned, so that the remaining faults are still found."""
+    """Converts ``value`` to an array. If that fails, appends a fault and returns an array of NaN of the wanted shape,
+    so that the reader can find further faults."""
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -269,7 +268,7 @@ def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: 
 
 
 def word_numbers(text: str | None, count: int, where: str, faults: list[Message]) -> Float[np.ndarray, " n"]:
-    """Returns the numbers in a text, as ``number_array`` does."""
+    """Converts the words of a text to numbers. Appends a fault and returns NaN if that fails."""
     try:
         values = np.array([float(word) for word in (text or "").split()])
     except ValueError:
@@ -281,25 +280,24 @@ def word_numbers(text: str | None, count: int, where: str, faults: list[Message]
 
 
 def pose_matrix(value: Any, where: str, faults: list[Message]) -> Float[np.ndarray, "3 4"]:
-    """Converts the 4 x 4 numbers of a pose, or their first three rows, as ``number_array`` does."""
+    """Converts a 4 x 4 or 3 x 4 pose to its first three rows. Appends a fault and returns NaN if that fails."""
     rows = 3 if isinstance(value, list) and len(value) == 3 else 4
     return number_array(value, (rows, 4), where, faults)[:3]
 
 
 def matrix_skew(matrix: Float[np.ndarray, "3 3"]) -> float:
-    """Returns entry (0, 1) of a camera matrix in focal lengths fx."""
+    """Returns entry (0, 1) of a camera matrix divided by fx."""
     return float(matrix[0, 1] / matrix[0, 0]) if matrix.shape == (3, 3) and matrix[0, 0] else 0.0
 
 
 def millimetres_of(centres: Sequence[Float[np.ndarray, " 3"]]) -> float:
-    """Returns the unit of the cameras' positions in millimetres: 1000 for metres, otherwise 1."""
+    """Returns 1000 if the cameras' positions seem to be in metres, and 1 if they seem to be in millimetres."""
     known = [centre for centre in centres if np.isfinite(centre).all()]
     return 1000.0 if known and np.ptp(known, axis=0).max() < METRES_MOST else 1.0
 
 
 def xml_root(data: bytes) -> ElementTree.Element:
-    """Returns the root of an XML file. Raises Malformed for a file with declarations, because entities can expand to
-    any size."""
+    """Returns the root of an XML file. Raises Malformed for a DOCTYPE or entities, which can expand to any size."""
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise Malformed(compose("xml-declares"))
     try:
@@ -309,10 +307,10 @@ def xml_root(data: bytes) -> ElementTree.Element:
 
 
 def sized(folder: Path, name: str, faults: list[Message]) -> tuple[int, int]:
-    """Returns width and height of the picture of camera ``name`` in ``folder`` or its ``images``, for formats without
-    sizes.
+    """Returns width and height (px) of the picture of camera ``name`` in ``folder`` or ``folder/images``, for file
+    formats that do not state sizes.
 
-    If there is no picture, a fault that says where to put it is appended, and a placeholder size is returned."""
+    Without a picture, appends a fault that says where to put the picture, and returns a placeholder size."""
     from rig.formats.pictures.images import picture_size  # decoders, which most formats do without
 
     for place in (folder, entry(folder, "images"), entry(folder.parent, "images")):
@@ -332,9 +330,9 @@ def sized(folder: Path, name: str, faults: list[Message]) -> tuple[int, int]:
 def brown_conrady(
     radial: Sequence[float], radius: float, focal: float, where: str, faults: list[Message]
 ) -> list[float]:
-    """Fits k1 k2 k3 to the ``radial`` polynomial k1 k2 k3 k4 ... up to the ``radius`` (of ``X / Z``) of the picture's
-    corner; copies them if k4 and higher are zero. With the focal length (px), a fault is appended if the fit is wrong
-    by more than ``LENS_LOSS_PX``."""
+    """Approximates the polynomial ``radial`` with coefficients k1 k2 k3 k4 ... by three coefficients k1 k2 k3.
+    ``radius`` is that of the picture's corner, in units of ``X / Z``. Appends a fault if the error exceeds
+    ``LENS_LOSS_PX`` at the focal length ``focal`` (px)."""
     if not any(radial[3:]) or not np.isfinite([*radial, radius, focal]).all():
         return list(radial[:3])
     r2 = np.linspace(0.0, max(radius, 1e-3) ** 2, 400)
@@ -348,13 +346,13 @@ def brown_conrady(
 
 
 def corner_radius(size: tuple[int, int], focal: tuple[float, float], centre: tuple[float, float]) -> float:
-    """Returns the radius (of ``X / Z``) of the picture's farthest corner from the optical axis."""
+    """Returns the radius, in units of ``X / Z``, of the picture's corner that is farthest from the optical axis."""
     across, down = (max(c, n - c) / f if f > 0 else np.nan for n, f, c in zip(size, focal, centre, strict=True))
     return float(np.hypot(across, down))
 
 
 def unread_programs(folder: Path) -> list[Message]:
-    """Returns, for each program, the files of cameras in ``folder`` that are not read."""
+    """Returns a message for each unsupported program that lists its camera files in ``folder``."""
     files: dict[str, list[str]] = {}
     for path in sorted(folder.iterdir()):
         if path.is_file() and (program := program_of(path)):
@@ -363,7 +361,7 @@ def unread_programs(folder: Path) -> list[Message]:
 
 
 def program_of(path: Path) -> str | None:
-    """Returns the program that wrote an unsupported file of cameras, and a remedy; None for another file."""
+    """Returns the program that wrote an unsupported camera file, and a remedy. Returns None for any other file."""
     named = (program for pattern, program in PATTERNS if fnmatch(path.name.lower(), pattern))
     held = (
         program
@@ -374,7 +372,7 @@ def program_of(path: Path) -> str | None:
 
 
 def head_of(path: Path) -> str:
-    """Returns the beginning of a text, which identifies its format; empty if it cannot be read."""
+    """Returns the beginning of a text file, which identifies its format, or an empty text for an unreadable file."""
     try:
         with path.open("rb") as file:
             return as_utf8(file.read(HEAD_BYTES)).decode("utf-8", "replace")

@@ -1,9 +1,9 @@
-"""Declares how each key of another program's file of cameras is treated; readers obey this table.
+"""Declares how the readers treat each key in the camera files of other programs.
 
-A key is ``read``: the reader uses it. ``refused``: it changes a camera in a way that this project cannot represent; the
-file is refused if the key has a value that matters. ``told``: its value is not used, and a warning (``unknown-key``)
-names it. ``nothing``: it has no influence on poses and lenses. A key missing from the table also gives a warning.
-``docs/foreign-cameras.md`` is generated from this table; a test plants each key, and another compares the page."""
+The reader uses a key that is ``read``. A key that is ``refused`` changes a camera in a way that this project cannot
+represent, so a file with a value that has an effect is refused. The reader ignores the value of a key that is ``told``,
+and reports the key by the warning ``unknown-key``. A key that is ``nothing`` has no influence on poses and lenses. A
+key missing from the table also gives a warning. ``docs/foreign-cameras.md`` is generated from this table."""
 
 from collections.abc import Iterator, Mapping
 from typing import Literal, NamedTuple
@@ -14,11 +14,10 @@ Treatment = Literal["read", "refused", "told", "nothing"]
 
 
 class ForeignKey(NamedTuple):
-    """Holds the rule for one key.
+    """Holds the rule for one key of a file.
 
-    ``why`` says what the key is read as, or why it is not read (a message if a reader reports it). ``silent`` lists
-    values at which a refused or reported key has no effect, as if it were missing; for a list, all its elements must be
-    among them.
+    ``why`` says what the key means, or why it is not read. ``silent`` lists the values at which a refused or reported
+    key has no effect, as if it were missing. If the value is a list, all its elements must be in ``silent``.
     """
 
     treatment: Treatment
@@ -30,7 +29,7 @@ Table = Mapping[str, ForeignKey]
 
 
 def says_nothing(value: object, rule: ForeignKey) -> bool:
-    """Tells whether ``value`` is missing or one of those at which the key has no effect."""
+    """Returns whether ``value`` is missing or has no effect according to ``rule``."""
     return all(any(_plain(part) == _plain(one) for one in rule.silent) for part in _parts(value))
 
 
@@ -48,7 +47,7 @@ def _parts(value: object) -> Iterator[object]:
 
 
 def _plain(value: object) -> str | float:
-    """Converts numbers and truth values to a comparable form, however a file writes them."""
+    """Converts numbers and Boolean values to a comparable form, because files write the same value differently."""
     text = str(value).strip().casefold()
     try:
         return {"true": 1.0, "false": 0.0}[text] if text in ("true", "false") else float(text)

@@ -1,9 +1,10 @@
-"""Reads and writes Agisoft Metashape's XML of cameras (File > Export > Export Cameras, format Agisoft XML).
+"""Reads and writes cameras in Agisoft Metashape's XML format (File > Export > Export Cameras).
 
-Each camera has a transform to the chunk (4 x 4, axes as OpenCV's); the transform of its component or of the chunk then
-maps to the world, in metres. The lens (user manual, appendix "Camera models") is ``u = w / 2 + cx + x' f + x' b1 + y'
-b2``, where the corner of the picture is 0, so half a pixel is subtracted. Compared with OpenCV, p1 and p2 are
-exchanged. Type ``fisheye`` is equidistant; with k1 to k4 it is Kannala and Brandt's lens."""
+A chunk is Metashape's group of aligned cameras. Each camera has a 4 x 4 transform to the chunk's frame, with OpenCV's
+camera axes. The transform of the camera's component or of the chunk then converts to the world, in metres. The lens
+model (user manual, appendix "Camera models") is ``u = w / 2 + cx + x' f + x' b1 + y' b2``. The picture's corner is at
+0, so half a pixel is subtracted. The coefficients p1 and p2 are exchanged relative to OpenCV. A lens of type
+``fisheye`` with k1 to k4 is Kannala and Brandt's lens."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -40,8 +41,8 @@ Similarity = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], float]  # 
 
 
 def read_metashape(path: Path) -> CamerasRead:
-    """Returns the aligned and enabled cameras of a Metashape export. Their names are their labels or, if labels repeat,
-    their groups' labels. Raises InputError naming every fault."""
+    """Returns the aligned and enabled cameras of a Metashape export. A camera's name is its label or, if labels repeat,
+    its group's label. Raises InputError naming every fault."""
     root = parsed(path, xml_root)
     reading = Reading(path.name)
     chunk = _chunk(root, reading)
@@ -70,7 +71,7 @@ def read_metashape(path: Path) -> CamerasRead:
 
 
 def _chunk(root: ElementTree.Element, reading: Reading) -> ElementTree.Element:
-    """Returns the only chunk with aligned cameras. Raises InputError if there is none or more than one."""
+    """Returns the only chunk with aligned cameras. Raises InputError for none or several such chunks."""
     chunks = [root] if root.tag == "chunk" else root.findall("chunk")
     if not chunks:
         raise InputError(reading.subject, [compose("no-chunk")])
@@ -82,7 +83,7 @@ def _chunk(root: ElementTree.Element, reading: Reading) -> ElementTree.Element:
 
 
 def _cameras(chunk: ElementTree.Element, reading: Reading) -> Iterator[tuple[str, ElementTree.Element]]:
-    """Yields each camera with the label of its group, which is empty without a group."""
+    """Yields each camera with the label of its group, or an empty text if it has no group."""
     holder = chunk.find("cameras")
     for node in holder if holder is not None else ():
         if node.tag == "camera":
@@ -110,7 +111,7 @@ def _takes_part(name: str, camera: ElementTree.Element, reading: Reading) -> boo
 def _judge(
     node: ElementTree.Element, place: str, whose: str, reading: Reading, *, children: bool = True, tags: tuple = ()
 ) -> None:
-    """Checks attributes and child elements against the table of keys; children in ``tags`` are skipped."""
+    """Checks attributes and child elements of a node against the table of keys, except children in ``tags``."""
     keys: dict[str, object] = {f"{place}@{name}": text for name, text in node.attrib.items()}
     if place in ("sensor", "camera") and node.get("master_id") == node.get("id"):
         keys.pop(f"{place}@master_id", None)  # a camera that is its own master is no slave
@@ -144,7 +145,7 @@ def _read_camera(
 
 
 def write_metashape(rig: Rig, path: Path) -> None:
-    """Writes the export that ``read_metashape`` reads. Raises InputError for a lens that Metashape lacks."""
+    """Writes a file that Metashape and ``read_metashape`` read. Raises InputError for a lens that Metashape lacks."""
     rational = [camera.name for camera in rig if camera.recorded is not None and camera.recorded.model == "rational"]
     if rational:
         raise InputError("metashape", [compose("metashape-without-rational", cameras=rational)])
@@ -168,8 +169,8 @@ def write_metashape(rig: Rig, path: Path) -> None:
 
 
 def _similarity(node: ElementTree.Element, faults: list[Message]) -> Similarity:
-    """Returns the transform from the chunk to the world (mm). Without one the chunk's free scale is taken as
-    millimetres."""
+    """Returns the transform from the chunk to the world (mm). Without a transform, the chunk's arbitrary unit is taken
+    as millimetres."""
     found = node.find("transform")
     if found is None or not len(found):
         return np.eye(3), np.zeros(3), 1.0
@@ -182,7 +183,7 @@ def _similarity(node: ElementTree.Element, faults: list[Message]) -> Similarity:
 def _lens(
     sensor: ElementTree.Element, size: tuple[int | None, int | None], name: str, reading: Reading
 ) -> tuple[tuple[float, ...], dict[str, str | float]]:
-    """Returns fx, fy, cx and cy, and the lens's entry."""
+    """Returns fx, fy, cx and cy (px), and the ``distortion`` entry of ``eigenhead-cameras/1``."""
     faults = reading.faults
     calibrations = sensor.findall("calibration")
     found = next((node for node in calibrations if node.get("class") == "adjusted"), None)
@@ -220,7 +221,7 @@ def _lens(
 
 
 def _drop_invisible(values: dict[str, float], size: tuple[int, int], *, fisheye: bool) -> None:
-    """Drops a fisheye's ``p1`` and ``p2`` if they move a corner by less than ``LENS_LOSS_PX``."""
+    """Removes a fisheye's ``p1`` and ``p2`` if both move the picture's corners by less than ``LENS_LOSS_PX``."""
     if fisheye and values["f"] > 0:
         reach = np.hypot(*size) / 2 / values["f"]  # of the corner, in radians
         if 3 * max(abs(values["p1"]), abs(values["p2"])) * reach**2 * values["f"] <= LENS_LOSS_PX:
@@ -249,7 +250,7 @@ def _numbers(node: ElementTree.Element | None, count: int, where: str, faults: l
 
 
 def _size(node: ElementTree.Element | None) -> tuple[int | None, int | None]:
-    """Returns width and height; None if they are no valid numbers of pixels."""
+    """Returns width and height (px), each None if it is not a valid number of pixels."""
     texts = ["" if node is None else node.get(key, "") for key in ("width", "height")]
     whole = [int(text) if text.isdecimal() and len(text) < 7 else None for text in texts]
     return whole[0], whole[1]

@@ -1,14 +1,14 @@
-"""Reads and writes OpenCV's YAML of several cameras, as EasyMocap lays it out
+"""Reads and writes cameras in OpenCV's YAML format, with the keys of EasyMocap
 (https://chingswy.github.io/easymocap-public-doc).
 
-``names``, ``K_<name>`` and ``dist_<name>`` are in ``intri.yml``; ``Rot_<name>`` (or ``R_<name>``, a rotation vector)
-and ``T_<name>`` are in ``extri.yml`` and give camera_from_world. All may also be in one file of another name. Lengths
-are metres if all cameras lie within 30 units of each other, otherwise millimetres. ``W_<name>`` and ``H_<name>`` are
-the size; without them it is read from the pictures.
+The file ``intri.yml`` contains ``names``, ``K_<name>`` and ``dist_<name>``. The file ``extri.yml`` contains
+camera_from_world as ``T_<name>`` and ``Rot_<name>`` (or ``R_<name>``, a rotation vector). One file of another name may
+contain all these keys. Lengths are in metres if all cameras lie within 30 units of each other, otherwise in
+millimetres. If the size keys ``W_<name>`` and ``H_<name>`` are missing, the size is read from the pictures.
 
-In TOML it reads and writes caliscope's ``camera_array.toml`` (metres; https://mprib.github.io/caliscope) and
-aniposelib's (in the unit of its board, see ``_aniposelib_unit``; https://anipose.readthedocs.io). All use OpenCV's
-pixels, so nothing is shifted."""
+The module also reads and writes two TOML formats: caliscope's ``camera_array.toml`` (metres;
+https://mprib.github.io/caliscope) and aniposelib's (in the unit of the board; https://anipose.readthedocs.io). All
+these formats have OpenCV's pixel centres, so no principal point is shifted."""
 
 import json
 import re
@@ -54,7 +54,7 @@ POSE_KEY = re.compile(r"(R|Rot|T)_")
 
 
 def read_yaml(path: Path) -> CamerasRead:
-    """Returns the rig in ``intri.yml`` and the ``extri.yml`` in the same folder, or in ``path`` alone. Raises
+    """Returns the rig in ``intri.yml`` and ``extri.yml`` of one folder, or in the single file ``path``. Raises
     InputError naming every fault."""
     parts = [entry(path.parent, name) for name in FILES] if path.name.lower() in FILES else [path, path]
     lenses, poses = (parsed(part, _matrices) for part in parts)
@@ -95,8 +95,8 @@ def read_yaml(path: Path) -> CamerasRead:
 
 
 def _taking_part(held: list[str], listed: list[str] | None, reading: Reading) -> list[str]:
-    """Returns the cameras listed in ``names``, or all if there is no such list. A listed camera that the file lacks is
-    a fault."""
+    """Returns the cameras that the file's list ``names`` contains, or all cameras without such a list. Appends a fault
+    if the file lacks a listed camera."""
     if not listed:
         return held
     lacking = [name for name in listed if name not in held]
@@ -109,7 +109,7 @@ def _taking_part(held: list[str], listed: list[str] | None, reading: Reading) ->
 
 
 def _judge(values: Mapping[str, object], held: Sequence[str], reading: Reading) -> None:
-    """Checks every key against the table of keys, with ``<name>`` in place of a camera's name."""
+    """Checks every key of the file against the table of keys."""
     for key, value in values.items():
         name = next((name for name in sorted(held, key=len, reverse=True) if key.endswith(f"_{name}")), "")
         general = key.removesuffix(name) + "<name>" if name else key
@@ -119,7 +119,7 @@ def _judge(values: Mapping[str, object], held: Sequence[str], reading: Reading) 
 
 
 def _check_alike(poses: Mapping[str, Any], name: str, faults: list[Message]) -> None:
-    """Appends a fault if a camera's rotation vector and rotation matrix are both given and disagree."""
+    """Appends a fault if a camera has a rotation vector and a different rotation matrix."""
     vector, matrix = _array(poses, f"R_{name}"), _array(poses, f"Rot_{name}")
     if vector.size not in (3, 9) or matrix.shape != (3, 3):
         return
@@ -128,8 +128,7 @@ def _check_alike(poses: Mapping[str, Any], name: str, faults: list[Message]) -> 
 
 
 def write_yaml(rig: Rig, folder: Path) -> None:
-    """Writes ``intri.yml`` and ``extri.yml`` into a folder. Raises InputError for a fisheye lens, which the format
-    cannot state."""
+    """Writes ``intri.yml`` and ``extri.yml`` to a folder. Raises InputError for a fisheye lens."""
     fisheyes = [c.name for c in rig if c.recorded is not None and c.recorded.model == "kannala-brandt"]
     if fisheyes:
         raise InputError("opencv-yaml", [compose("yaml-fisheye", cameras=fisheyes)])
@@ -168,7 +167,7 @@ def _written(rig: Rig, fill: "Callable[[cv2.FileStorage], None]") -> bytes:
 
 
 def _matrices(data: bytes) -> dict[str, Any]:
-    """Returns all matrices and numbers of a file by key, and lists of words. Raises ValueError for damaged YAML."""
+    """Returns all matrices, numbers and lists of words in a file by key. Raises ValueError for damaged YAML."""
     import cv2
 
     try:
@@ -192,7 +191,7 @@ def _matrices(data: bytes) -> dict[str, Any]:
 
 
 def _listed(node: "cv2.FileNode") -> list[str] | Float[np.ndarray, "..."]:
-    """Returns the words of a list, or its numbers as an array, which is empty where its rows differ in length."""
+    """Returns a list of words, or an array of numbers, which is empty if the rows differ in length."""
     entries = [node.at(i) for i in range(node.size())]
     if any(entry.isString() for entry in entries):
         return [entry.string() for entry in entries if entry.isString()]
@@ -203,7 +202,7 @@ def _listed(node: "cv2.FileNode") -> list[str] | Float[np.ndarray, "..."]:
 
 
 def _array(values: Mapping[str, Any], key: str) -> Float[np.ndarray, "..."]:
-    """Returns the numbers under a key; an empty array if there are none."""
+    """Returns the numbers under a key, or an empty array if they are missing."""
     value = values.get(key)
     return value if isinstance(value, np.ndarray) else np.zeros(0)
 
@@ -237,7 +236,7 @@ def read_toml(path: Path) -> CamerasRead:
 
 
 def write_caliscope(rig: Rig, path: Path) -> None:
-    """Writes ``camera_array.toml``: metres, cameras numbered in the rig's order, with their names."""
+    """Writes ``camera_array.toml`` in metres, with cameras numbered in the rig's order."""
     blocks = []
     for number, camera in enumerate(rig):
         keys: dict[str, object] = {
@@ -255,7 +254,7 @@ def write_caliscope(rig: Rig, path: Path) -> None:
 
 
 def write_aniposelib(rig: Rig, path: Path) -> None:
-    """Writes an aniposelib calibration, in millimetres (as ``metadata`` states)."""
+    """Writes an aniposelib calibration in millimetres."""
     blocks = []
     for number, camera in enumerate(rig):
         keys: dict[str, object] = {"name": camera.name, **_toml_intrinsics(camera)}
@@ -269,7 +268,7 @@ def write_aniposelib(rig: Rig, path: Path) -> None:
 
 
 def _switch(table: Mapping[str, Any], key: str, name: str, faults: list[Message]) -> bool:
-    """Returns a truth value; an absent one is false."""
+    """Returns a Boolean value of a table, or False if the key is missing."""
     value = table.get(key, False)
     if not isinstance(value, bool) and value not in (0, 1):
         faults.append(compose("no-switch", key=f"{name}.{key}", value=shown(value)))
@@ -295,10 +294,10 @@ def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults:
 
 
 def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]], reading: Reading) -> float:
-    """Returns the unit of an aniposelib file in millimetres.
+    """Returns how many millimetres the unit of an aniposelib file has.
 
-    ``metadata.unit`` states it. Without it the size of the rig decides, because aniposelib uses the unit of the board:
-    cameras within 30 units of each other are in metres."""
+    The key ``metadata.unit`` states the unit. Without this key, cameras within 30 units of each other are taken to be
+    in metres, because aniposelib uses the unit of the board."""
     metadata = document.get("metadata")
     unit = metadata.get("unit") if isinstance(metadata, dict) else None
     if isinstance(metadata, dict):
@@ -311,14 +310,14 @@ def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]
 
 
 def _centre(table: Mapping[str, Any]) -> Float[np.ndarray, " 3"]:
-    """Returns the position of a camera; NaN if its pose is invalid."""
+    """Returns the position of a camera in the file's unit, or NaN if the camera's pose is invalid."""
     translation = number_array(table.get("translation"), (3,), "", [])
     rotation = pose_rotation(number_array(table.get("rotation"), None, "", []))
     return -rotation.T @ translation if rotation.shape == (3, 3) else np.full(3, np.nan)
 
 
 def looks_like_aniposelib(path: Path) -> bool:
-    """Tells whether a TOML file consists of aniposelib's camera tables."""
+    """Returns whether a TOML file consists of camera tables with aniposelib's keys."""
     try:
         document = parsed(path, lambda data: tomllib.loads(data.decode()))
     except InputError:

@@ -1,12 +1,12 @@
-"""Reads and writes RealityCapture's and RealityScan's cameras: XMP files beside the pictures, and the CSV
+"""Reads and writes cameras of RealityCapture and RealityScan, in XMP files beside the pictures and in the CSV format
 "Internal/External camera parameters".
 
-XMP (https://support.capturingreality.com/hc/en-us/articles/360017783459): ``Rotation`` is camera_from_world with
-OpenCV's axes; ``Position`` is the camera's centre in metres; the focal length is for a film whose longer side is 36 mm;
-the principal point is relative to the middle, in multiples of the longer side. CSV: the same focal length, the
-principal point in millimetres of that film, and heading, pitch and roll (degrees). At 0 0 0 a camera points down, with
-its top to the north. Neither contains the picture's size, which comes from the picture files. Distortion, of ``X / Z``:
-k1 to k4; t1 and t2 are OpenCV's p1 and p2."""
+In XMP (https://support.capturingreality.com/hc/en-us/articles/360017783459), ``Rotation`` is camera_from_world with
+OpenCV's axes, and ``Position`` is the camera's centre in metres. The focal length is for a film whose longer side is 36
+mm. The principal point is relative to the middle, in multiples of the longer side. The CSV has the same focal length,
+the principal point in millimetres on the film, and heading, pitch and roll in degrees. With all three angles zero, a
+camera points down with its top to the north. The picture's size comes from the picture files. Distortion applies to ``X
+/ Z`` with k1 to k4; t1 and t2 are OpenCV's p1 and p2."""
 
 import csv
 import io
@@ -63,8 +63,8 @@ _XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
 
 
 def read_xmp(file: Path) -> CamerasRead:
-    """Returns the rig in an XMP file and the others in its folder, one camera each. Cameras that are not aligned or not
-    used for meshing are excluded. Raises InputError naming every fault."""
+    """Returns the rig in all XMP files of the folder that contains ``file``; each file holds one camera. Cameras that
+    are not aligned or not used for meshing are excluded. Raises InputError naming every fault."""
     folder = file.parent
     reading = Reading(f"{folder.name}/*.xmp")
     entries = []
@@ -90,8 +90,7 @@ def read_xmp(file: Path) -> CamerasRead:
 
 
 def write_xmp(rig: Rig, folder: Path) -> None:
-    """Writes ``<camera>.xmp`` into the folder of the pictures. Raises InputError for a lens that the format cannot
-    state."""
+    """Writes ``<camera>.xmp`` files beside the pictures. Raises InputError for an unsupported lens."""
     for camera in _held(rig, "realitycapture"):
         k, d, side = camera.intrinsics, camera.intrinsics.distortion, _side(camera)
         text = _XMP.format(
@@ -107,7 +106,7 @@ def write_xmp(rig: Rig, folder: Path) -> None:
 
 
 def read_csv(path: Path) -> CamerasRead:
-    """Returns the rig in a CSV of internal and external camera parameters. Raises InputError naming every fault."""
+    """Returns the rig in a CSV file of RealityCapture. Raises InputError naming every fault."""
     rows = parsed(path, lambda data: list(csv.DictReader(io.StringIO(_with_commas(data.decode())))))
     if not rows or not set(COLUMNS[:8]) <= rows[0].keys():
         raise InputError(path.name, [compose("no-camera-csv", columns=",".join(COLUMNS))])
@@ -128,17 +127,17 @@ def read_csv(path: Path) -> CamerasRead:
 
 
 def looks_like_csv(head: str) -> bool:
-    """Tells whether a file with this beginning is the CSV, as RealityCapture wrote it or as a spreadsheet saved it."""
+    """Returns whether a text begins like a CSV file of RealityCapture, perhaps saved by a spreadsheet program."""
     return _with_commas(head).startswith(",".join(COLUMNS[:8]))
 
 
 def _with_commas(text: str) -> str:
-    """Returns the table with commas between values, after a spreadsheet used semicolons and decimal commas."""
+    """Converts a table with semicolons and decimal commas, as some spreadsheets have, to one with commas."""
     return text.replace(",", ".").replace(";", ",") if text.startswith(COLUMNS[0] + ";") else text
 
 
 def write_csv(rig: Rig, path: Path) -> None:
-    """Writes the CSV. Raises InputError for pixels that are not square, and for a lens that the format cannot state."""
+    """Writes the CSV file. Raises InputError for pixels that are not square or an unsupported lens."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -160,8 +159,8 @@ def write_csv(rig: Rig, path: Path) -> None:
 
 
 def _attitude(values: Mapping[str, float]) -> Float[np.ndarray, "3 3"]:
-    """Returns ``world_from_camera`` in the CSV's axes: heading about z, clockwise, then pitch about x, then roll about
-    y."""
+    """Returns the rotation ``world_from_camera`` in the CSV's axes, from heading (clockwise about z), pitch (about x)
+    and roll (about y)."""
     from scipy.spatial.transform import Rotation
 
     angles = [-values["heading"], values["pitch"], values["roll"]]
@@ -169,7 +168,7 @@ def _attitude(values: Mapping[str, float]) -> Float[np.ndarray, "3 3"]:
 
 
 def _xmp_values(path: Path) -> dict[str, str]:
-    """Returns the values of the namespace ``xcr`` by name, whether written as attributes or as elements."""
+    """Returns the values in the namespace ``xcr`` by name, from attributes and elements."""
     described = parsed(path, xml_root).find(f".//{RDF}Description")
     if described is None:
         raise InputError(path.name, [compose("no-rdf-description")])

@@ -1,4 +1,4 @@
-"""Reads ``scale.json``: a known length that gives a scene its scale, in one of three forms.
+"""Reads ``scale.json``, which states a known length of a scene in one of three forms.
 
 {"points": {"a": {CAMERA: [x, y], ...}, "b": {...}}, "distance_mm": 62.0}     two points, seen by two cameras or more
 {"tag": {"dictionary": "DICT_4X4_50", "size_mm": 40.0}}                       printed ArUco tags, their black side
@@ -24,7 +24,7 @@ KINDS = ("points", "tag", "cameras")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointDistance:
-    """Holds the pixels of two points of the scene by camera, and the distance between the points."""
+    """Holds the pixels of two scene points by camera, and the distance between the points (mm)."""
 
     first: Mapping[str, Float[np.ndarray, " 2"]]
     second: Mapping[str, Float[np.ndarray, " 2"]]
@@ -33,7 +33,7 @@ class PointDistance:
 
 @dataclass(frozen=True, slots=True)
 class TagSize:
-    """Describes tags of one of OpenCV's ArUco dictionaries, of one size."""
+    """Describes printed ArUco tags of one size (mm) and one dictionary of OpenCV."""
 
     dictionary: str
     size_mm: float
@@ -41,7 +41,7 @@ class TagSize:
 
 @dataclass(frozen=True, slots=True)
 class CameraDistance:
-    """Holds the distance between the centres of two cameras."""
+    """Holds the distance (mm) between the centres of projection of two cameras."""
 
     cameras: tuple[str, str]
     distance_mm: float
@@ -51,7 +51,7 @@ KnownLength = PointDistance | TagSize | CameraDistance
 
 
 def read_scale(path: Path, cameras: Collection[str]) -> KnownLength:
-    """Reads ``scale.json`` for photographs of ``cameras``. Raises InputError naming every fault."""
+    """Reads ``scale.json`` for photographs by ``cameras``. Raises InputError naming every fault."""
     try:
         document = json.loads(path.read_bytes())  # UTF-8, 16 or 32, which json recognises by the first bytes
     except (OSError, ValueError, RecursionError) as error:
@@ -60,7 +60,7 @@ def read_scale(path: Path, cameras: Collection[str]) -> KnownLength:
 
 
 def scale_from_document(document: Any, cameras: Collection[str], subject: str = "scale.json") -> KnownLength:
-    """Returns the length in a decoded ``scale.json``. Raises InputError naming every fault."""
+    """Returns the known length in a decoded ``scale.json``. Raises InputError naming every fault."""
     present = [kind for kind in KINDS if isinstance(document, dict) and kind in document]
     if len(present) != 1:
         several = compose("scale-kinds", kinds=KINDS, held=present)

@@ -1,10 +1,11 @@
-"""Reads and writes ``transforms.json``: cameras of nerfstudio, instant-ngp and Blender's exporters for them.
+"""Reads and writes cameras in ``transforms.json``, the format of nerfstudio and instant-ngp.
 
 ``transform_matrix`` is world_from_camera with OpenGL's axes (x right, y up, z backwards;
 https://docs.nerf.studio/quickstart/data_conventions.html). The centre of the top-left pixel is (0.5, 0.5), as in
-COLMAP, from which nerfstudio takes its intrinsics. Intrinsics are at the top level or in a frame. Blender's files give
-``camera_angle_x``; the size comes from the pictures. Lengths are metres if all cameras lie within 30 units of each
-other, otherwise millimetres; ``applied_scale`` is undone. Of several moments (``timestep_index``), one is read."""
+COLMAP. Intrinsics are at the top level or in a frame. Files from Blender state only ``camera_angle_x``, and the size
+comes from the pictures. Lengths are in metres if all cameras lie within 30 units of each other, otherwise in
+millimetres, after dividing by ``applied_scale``. If a file has several moments (``timestep_index``), only one is
+read."""
 
 import json
 import math
@@ -41,7 +42,7 @@ PER_CAMERA = (*LENS, "k5", "k6", "rolling_shutter")  # keys at the top that hold
 
 
 def read_transforms(document: Any, path: Path) -> CamerasRead:
-    """Returns the rig in a decoded ``transforms.json``: each frame is a camera. Raises InputError naming every
+    """Returns the rig in a decoded ``transforms.json``, a camera for each frame. Raises InputError naming every
     fault."""
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
@@ -74,9 +75,8 @@ def read_transforms(document: Any, path: Path) -> CamerasRead:
 def _frames_of_one_moment(
     document: dict[str, Any], names: list[str], frames: list[dict[str, Any]], reading: Reading
 ) -> tuple[list[str], list[dict[str, Any]]]:
-    """Returns the cameras and frames of one moment and leaves the others out. It is the first moment listed in the
-    file's ``timestep_indices``, otherwise the first one present. Frames without a number belong to every moment, and a
-    frame without a pose to none."""
+    """Returns the cameras and frames of one moment: the first in the file's ``timestep_indices`` or, without this list,
+    of the first frame. Frames without a moment are always returned, and frames without a pose never."""
     posed = [k for k, frame in enumerate(frames) if frame.get("transform_matrix") is not None]
     for name in (name for k, name in enumerate(names) if k not in posed):
         reading.leave_out(name, compose("left-without-pose"))
@@ -94,8 +94,8 @@ def _frames_of_one_moment(
 
 
 def read_splatting(document: Any, path: Path) -> CamerasRead:
-    """Returns the rig in Gaussian splatting's ``cameras.json``: world_from_camera with OpenCV's axes, of pinholes with
-    the principal point in the middle. Its scale is free. Raises InputError naming every fault."""
+    """Returns the rig in Gaussian splatting's ``cameras.json``. The file holds world_from_camera with OpenCV's axes, in
+    an arbitrary unit, of pinholes with a central principal point. Raises InputError naming every fault."""
     reading = Reading(path.name)
     faults, entries, names = reading.faults, [], camera_names([str(camera["img_name"]) for camera in document])
     centres = [number_array(camera["position"], (3,), "position", faults) for camera in document]
@@ -111,8 +111,9 @@ def read_splatting(document: Any, path: Path) -> CamerasRead:
 
 
 def read_nersemble(document: Any, path: Path) -> CamerasRead:
-    """Returns the rig in NeRSemble's ``camera_params.json``: camera_from_world in metres, OpenCV's axes, one camera
-    matrix for all cameras. The size is read from the pictures. Raises InputError naming every fault."""
+    """Returns the rig in NeRSemble's ``camera_params.json``. The file holds camera_from_world in metres with OpenCV's
+    axes, and one camera matrix for all cameras. The size is read from the pictures. Raises InputError naming every
+    fault."""
     reading = Reading(path.name)
     faults, poses = reading.faults, document["world_2_cam"]
     if not isinstance(poses, dict):
@@ -127,18 +128,18 @@ def read_nersemble(document: Any, path: Path) -> CamerasRead:
 
 
 def write_transforms(rig: Rig, path: Path) -> None:
-    """Writes a ``transforms.json`` in metres, pictures called ``images/<camera>.png``."""
+    """Writes ``transforms.json`` in metres, with the picture paths ``images/<camera>.png``."""
     frames = [frame_document(camera, f"images/{camera.name}.png") for camera in rig]
     write_atomically(path, json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1).encode())
 
 
 def frame_document(camera: Camera, file_path: str) -> dict[str, object]:
-    """Returns the frame of one camera, in metres. Raises InputError for a lens that the format cannot state."""
+    """Returns one camera's entry of ``transforms.json``, in metres. Raises InputError for an unsupported lens."""
     return {"file_path": file_path, **_lens(camera), "transform_matrix": opengl_pose(camera)}
 
 
 def opengl_pose(camera: Camera) -> list[list[float]]:
-    """Returns world_from_camera as 4 x 4 numbers, in metres, with OpenGL's axes of the camera."""
+    """Returns world_from_camera as a 4 x 4 matrix in metres, with OpenGL's camera axes."""
     matrix = np.eye(4)
     pose = camera.camera_from_world.inverse()
     matrix[:3, :3], matrix[:3, 3] = pose.rotation @ OPENGL, pose.translation / 1000.0
@@ -179,7 +180,7 @@ def _entry(
 
 
 def _is_fisheye(values: dict[str, Any], name: str, faults: list[Message]) -> bool:
-    """Tells whether the lens is Kannala-Brandt's: nerfstudio states it by ``camera_model``, instant-ngp by
+    """Returns whether the lens model is Kannala-Brandt, from nerfstudio's ``camera_model`` or instant-ngp's
     ``is_fisheye``."""
     model, flag = values.get("camera_model"), values.get("is_fisheye", False)
     if not (model is None or (isinstance(model, str) and model in MODELS)):
@@ -194,10 +195,9 @@ def _is_fisheye(values: dict[str, Any], name: str, faults: list[Message]) -> boo
 
 
 def _check_applied(value: object, faults: list[Message]) -> None:
-    """Appends a fault if the applied transform scales or mirrors, which would change lengths or exchange left and
-    right.
+    """Appends a fault if ``applied_transform`` scales or mirrors the scene.
 
-    A rotation is accepted and not undone, because the world frame is arbitrary."""
+    A rotation by ``applied_transform`` is accepted and not undone, because the world frame is arbitrary."""
     if value is None:
         return
     try:

@@ -1,3 +1,3 @@
-"""Reads and writes captures: folders and archives of one synchronised shot, with masks, feature points and outlines.
+"""Reads and writes captures: folders and archives with the pictures of one synchronised shot, masks and feature points.
 
-In: a folder or an archive from any source. Out: a ``Capture`` with its ``Rig``, or all faults at once."""
+The input is a folder or an archive. The output is a ``Capture`` with its ``Rig``, or an error that lists all faults."""

@@ -1,15 +1,15 @@
-"""Extracts an uploaded .zip, .tar or .tar.gz safely.
+"""Extracts an uploaded .zip, .tar or .tar.gz archive safely.
 
-An archive comes from a stranger, so none of its statements is trusted. Members are checked by name and kind before the
-first byte is written, bytes are counted while unpacking, and a refused archive leaves the folder empty. Every fault
-names the member that has it.
+An uploaded archive may be malicious, so the module does not trust the sizes and names that it states. Each member's
+name and kind are checked before the member is written, and bytes are counted while unpacking. If the archive is
+refused, the folder stays empty. Every fault names a member of the archive.
 
-A member's name is read as UTF-8 if its bytes are valid UTF-8, whatever the archive states, because macOS writes UTF-8
-without setting the flag for it; otherwise as code page 437, the zip format's own. Some names are not written: folders
-around the capture, and files that file managers add. These must only be valid for output.
+A member's name is decoded as UTF-8 if its bytes are valid UTF-8, because macOS writes UTF-8 without setting the zip
+flag for it. Other names are decoded as code page 437, the default of the zip format. Folders that enclose the capture,
+and files that file managers add, are not written, so their names are checked less strictly.
 
-Sources of the attacks: https://www.bamsoftware.com/hacks/zipbomb (overlapping members), CVE-2007-4559 (traversal and
-links in tar), https://www.unicode.org/reports/tr39 (confusable names)."""
+Known attacks are described at https://www.bamsoftware.com/hacks/zipbomb (overlapping members), CVE-2007-4559 (traversal
+and links in tar), https://www.unicode.org/reports/tr39 (confusable names)."""
 
 import errno
 import gzip
@@ -58,7 +58,8 @@ WINDOWS_NAMES = re.compile(r"(?i)^(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)")
 
 @dataclass(frozen=True, slots=True)
 class ArchiveLimits:
-    """Limits the content of one archive. 64 cameras with 32 clean plates each are about 2,200 files."""
+    """Limits the content of one archive. 64 cameras with 32 pictures of the empty studio each have about 2,200
+    files."""
 
     members: int = 5000
     total_bytes: int = 16 << 30
@@ -71,7 +72,7 @@ class ArchiveLimits:
 
 @dataclass(frozen=True, slots=True)
 class _Member:
-    """Holds one member of an archive. ``guessed`` tells that the archive does not state the encoding of the name."""
+    """Holds one member of an archive. ``guessed`` is True if the archive does not state the encoding of the name."""
 
     name: str
     size: int
@@ -81,14 +82,14 @@ class _Member:
 
     @property
     def shown(self) -> str:
-        """Returns the name for messages; a possibly garbled name is replaced."""
+        """Returns the name for messages, or a replacement for a name that may be garbled."""
         text = re.sub(r"[^\x00-\x7f]", "?", self.name) if self.guessed else self.name
         return f"{text!r:.120}"
 
 
 @dataclass(slots=True)
 class _Faults:
-    """Collects faults of members; those whose messages differ only in ``member`` are reported once."""
+    """Collects faults of members, and merges messages that differ only in the parameter ``member``."""
 
     by_cause: dict[tuple[object, ...], list[Message]] = field(default_factory=dict)
 
@@ -107,15 +108,14 @@ class _Faults:
 
 
 def is_archive(path: Path) -> bool:
-    """Tells whether the content (not the name) of ``path`` begins like a .zip, .tar or .tar.gz."""
+    """Returns whether the content of ``path`` begins like a .zip, .tar or .tar.gz archive."""
     return _format(path) is not None
 
 
 def extract_archive(path: Path, folder: Path, limits: ArchiveLimits = ArchiveLimits()) -> tuple[str, ...]:
     """Unpacks ``path`` into the empty or absent ``folder`` and returns the relative names of the files written.
 
-    Raises InputError naming every fault, and OSError (a full disk, for example). In both cases ``folder`` is empty
-    afterwards."""
+    Raises InputError naming every fault, and OSError for a full disk. After an error, ``folder`` is empty."""
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise InputError(folder.name, [compose("archive-folder-not-empty")])
@@ -128,7 +128,7 @@ def extract_archive(path: Path, folder: Path, limits: ArchiveLimits = ArchiveLim
 
 
 def pack_folder(folder: Path, path: Path) -> None:
-    """Writes the files below ``folder`` into a .tar without compression, since images do not compress further."""
+    """Writes the files below ``folder`` to an uncompressed .tar, because image files do not compress further."""
     with tarfile.open(path, "w") as archive:
         for file in sorted(file for file in folder.rglob("*") if file.is_file()):
             archive.add(file, arcname=file.relative_to(folder).as_posix(), recursive=False)
@@ -145,7 +145,7 @@ def _format(path: Path) -> str | None:
 
 
 def _is_old_header(head: bytes) -> bool:
-    """Tells whether a tar from before POSIX begins like this; only its first header's checksum identifies it."""
+    """Returns whether ``head`` is the first header of a tar from before POSIX, recognised by its checksum."""
     if len(head) < tarfile.BLOCKSIZE or not head[0]:
         return False
     try:
@@ -162,7 +162,7 @@ def _foreign_kind(path: Path) -> str | None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Iterable[_Member]]:
-    """Yields the members of an archive. Every failure due to damage is raised as InputError."""
+    """Yields the members of an archive. Converts every exception due to a damaged archive to InputError."""
     kind = _format(path)
     if kind is None:
         foreign = _foreign_kind(path)
@@ -195,8 +195,7 @@ def _opened(path: Path) -> Iterator[Iterable[_Member]]:
 
 
 class _TarInfo(tarfile.TarInfo):
-    """Limits the size of extra headers, such as a long name: tarfile reads them whole into memory, whatever their
-    stated size."""
+    """Limits the size of extra headers, such as long names, because tarfile reads a whole extra header into memory."""
 
     def _proc_member(self, archive: tarfile.TarFile) -> tarfile.TarInfo:
         if self.type not in (*tarfile.SUPPORTED_TYPES, tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE):
@@ -209,7 +208,7 @@ class _TarInfo(tarfile.TarInfo):
 
 
 def _check_directory_size(path: Path) -> None:
-    """Raises InputError if the zip's list of members is too long: zipfile reads it whole into memory."""
+    """Raises InputError if the zip's list of members is too long, because zipfile reads the whole list into memory."""
     with path.open("rb") as stream:
         end = zipfile._EndRecData(stream)  # type: ignore[attr-defined]
     if end is not None and end[5] > DIRECTORY_BYTES_MOST:
@@ -238,8 +237,8 @@ def _zip_members(archive: zipfile.ZipFile) -> list[_Member]:
 
 
 def _zip_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, *, windows: bool) -> _Member:
-    """Returns a member of a zip. ``windows``: no name in the archive has a slash, so that backslashes separate
-    folders."""
+    """Returns a member of a zip. ``windows`` is True if no name in the archive has a slash, so that backslashes
+    separate folders."""
     name, guessed = info.orig_filename, False
     if not info.flag_bits & UTF8_FLAG:
         raw = name.encode("cp437")  # as zipfile decoded it
@@ -290,8 +289,8 @@ def _buffered(stream: object) -> BufferedIOBase:
 
 
 def _extract(members: Iterable[_Member], folder: Path, limits: ArchiveLimits, packed_bytes: int) -> tuple[str, ...]:
-    """Writes the files until the first fault; the members after it are only checked. A fault in the name of a folder
-    counts only if the folder is written. A folder around all files is not, which is known only at the end."""
+    """Writes the files until the first fault, and only checks later members. Faults in names of folders that enclose
+    all files are ignored at the end, because such folders are not written."""
     faults = _Faults()
     seen: dict[str, tuple[str, str]] = {}
     odd: dict[tuple[str, ...], list[Message]] = {}
@@ -360,8 +359,8 @@ def _judge(
     faults: _Faults,
     limits: ArchiveLimits,
 ) -> str | None:
-    """Returns the relative name to write a member to; None if there is nothing to write. Adds its faults to ``faults``.
-    ``odd``: faults of folder names, by path, which count only if the folder is written."""
+    """Returns the relative name to which a member is written, or None to skip it. Adds the member's faults to
+    ``faults``. ``odd`` collects faults of folder names by path, which are ignored if the folder is not written."""
     if member.kind not in ("file", "folder"):
         faults.add(compose("member-no-file", member=member.shown, kind=_NO_FILES[member.kind]))
         return None
@@ -396,13 +395,13 @@ def _words(error: Exception) -> str:
 
 
 def _empty(folder: Path) -> None:
-    """Removes what this module wrote below ``folder``, which was empty before."""
+    """Removes all files and folders in ``folder``."""
     for path in sorted(folder.rglob("*"), key=lambda p: len(p.parts), reverse=True):
         path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
 def decoded_name(raw: bytes) -> tuple[str, bool]:
-    """Returns a name, and whether its encoding is a guess."""
+    """Decodes a member's name. Returns the name, and whether its encoding is a guess."""
     try:
         return raw.decode("utf-8"), False
     except UnicodeDecodeError:
@@ -410,8 +409,8 @@ def decoded_name(raw: bytes) -> tuple[str, bool]:
 
 
 def unicode_path(extra: bytes, raw: bytes) -> bytes | None:
-    """Returns the name in UTF-8 from Info-ZIP's extra field, or None. The field counts only if its checksum matches the
-    name ``raw``."""
+    """Returns the UTF-8 name from Info-ZIP's extra field of a member. Returns None if the field is missing or its
+    checksum does not match the name ``raw``."""
     at = 0
     while at + 4 <= len(extra):
         kind, size = struct.unpack_from("<HH", extra, at)
@@ -428,7 +427,7 @@ def unicode_path(extra: bytes, raw: bytes) -> bytes | None:
 
 
 def name_clash(parts: list[str], shown: str, kind: str, seen: dict[str, tuple[str, str]]) -> Message | None:
-    """Returns a fault if a name repeats another member's, or if some file system or reader would not distinguish them.
+    """Returns a fault if a name equals another member's name, or if some file systems do not distinguish the two names.
     Adds the name to ``seen``."""
     name = "/".join(parts)
     key = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
@@ -444,7 +443,7 @@ def name_clash(parts: list[str], shown: str, kind: str, seen: dict[str, tuple[st
 
 
 def path_faults(name: str, shown: str, *, depth: int, name_length: int) -> list[Message]:
-    """Returns faults of a member's path that no member may have, written or not. Messages call the member ``shown``."""
+    """Returns faults of a member's path that not even skipped members may have. ``shown`` is its name in messages."""
     if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
         return [compose("member-name-invisible", member=shown)]
     if "\\" in name or re.match(r"^[A-Za-z]:", name):
@@ -463,7 +462,7 @@ def path_faults(name: str, shown: str, *, depth: int, name_length: int) -> list[
 
 
 def name_faults(part: str, shown: str, *, name_length: int) -> list[Message]:
-    """Returns faults that one part of a written file's or folder's path must not have."""
+    """Returns faults of one part of the path of a file or folder that is written."""
     faults = []
     if any(unicodedata.category(c) in ("Cf", "Co", "Cn", "Zl", "Zp") for c in part):
         faults.append(compose("member-name-invisible", member=shown))

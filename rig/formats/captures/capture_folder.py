@@ -7,10 +7,11 @@ features.json                      optional
 masks/<camera>.png                 optional; then background/ may be absent
 texture_sets/<set>/<camera>.<ext>  optional: further photographs by the same cameras, for the texture
 
-Without background/ and masks/, the subject is the opaque part of the pictures if every picture was cut out; otherwise
-it is segmented from the photographs. Without images/ the pictures lie in the same folder as cameras.json.
-``shot_files`` assigns files to cameras if names differ. Pictures are reduced (``rig.formats.pictures.work_size``).
-Pores need all pixels, so pictures can also be read one at a time at full size.
+Without background/ and masks/, the subject is the opaque part of the pictures if all have a transparent background;
+otherwise the photographs are segmented. Without images/ the pictures lie in the same folder as cameras.json.
+``shot_files`` assigns files to cameras if names differ. Large pictures are reduced
+(``rig.formats.pictures.work_size``). Skin pores need all pixels, so pictures can also be read one at a time at full
+size.
 """
 
 import hashlib
@@ -61,11 +62,11 @@ SETS_ALIKE = 0.9  # to texture_sets: "texture_set" 0.96, "texture-sets" 0.92; "t
 
 
 def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Capture, Rig]:
-    """Reads a capture folder and returns its capture and cameras, without cameras whose pictures cannot be used.
+    """Reads a capture folder. Returns its capture and cameras, without cameras whose pictures are unusable.
 
-    Pictures and feature points of a ``recorded`` lens are undistorted. Pictures of more than ``pixels_most`` pixels are
-    reduced, and their cameras with them (``rig.formats.pictures.work_size``). Raises InputError naming every fault of
-    the folder."""
+    Pictures and feature points of cameras with a ``recorded`` lens are undistorted. Pictures of more than
+    ``pixels_most`` pixels are reduced, and the cameras' intrinsics scaled. Raises InputError naming every fault of the
+    folder."""
     folder = capture_root(folder)
     rigs, read, files, faults = open_capture(folder)
     rig_file, rig = rigs[0], read.rig
@@ -87,8 +88,8 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
 
 
 def judge_lost(lost: Mapping[str, Sequence[Message]], rig: Rig, faults: list[Message]) -> list[Message]:
-    """Returns a warning for each camera that is excluded because its pictures cannot be used; ``lost`` holds the
-    reasons. If too few cameras remain, all faults are appended to ``faults``."""
+    """Returns a warning for each camera with unusable pictures; ``lost`` holds the reasons by camera. If too few other
+    cameras remain, appends the reasons to ``faults``."""
     left, needed = len(rig) - len(lost), max(CAMERAS_LEAST, ceil(REST_LEAST * len(rig)))
     if left < needed:
         faults += [fault for of_camera in lost.values() for fault in of_camera]
@@ -99,8 +100,8 @@ def judge_lost(lost: Mapping[str, Sequence[Message]], rig: Rig, faults: list[Mes
 
 
 def open_capture(folder: Path) -> tuple[list[Path], CamerasRead, ShotFiles, list[Message]]:
-    """Returns a capture folder's files of cameras (the first is read), its cameras, the files of the shot, and the
-    faults of all of them. Raises InputError if no cameras can be read."""
+    """Returns a capture folder's camera files (only the first is read), its cameras, the files of the shot, and all
+    faults. Raises InputError if no cameras can be read."""
     rigs = [*rig_files(folder)]
     if not rigs:
         raise InputError("capture", [no_rig_fault(folder)])
@@ -114,7 +115,7 @@ def open_capture(folder: Path) -> tuple[list[Path], CamerasRead, ShotFiles, list
 
 
 def read_rig_of(rig_file: Path) -> CamerasRead:
-    """Calls ``read_cameras`` on a capture's file. Raises InputError whose faults name the file."""
+    """Reads the cameras of a capture. Raises an InputError whose faults name the file."""
     try:
         return read_cameras(rig_file)
     except InputError as error:
@@ -122,13 +123,13 @@ def read_rig_of(rig_file: Path) -> CamerasRead:
 
 
 def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
-    """Returns remarks on pictures that belong to no camera, and on folders of pictures that are not read."""
+    """Returns warnings about pictures that belong to no camera, and about folders of pictures that are not read."""
     remarks = [stray_sentence(files.strays, rig)] if files.strays else []
     return [compose("file-unread", remark=message) for message in [*remarks, *unread_folders(folder, files, rig)]]
 
 
 def unread_folders(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
-    """Returns remarks on folders that hold pictures and are not read."""
+    """Returns warnings about folders that contain pictures but are not read."""
     remarks: list[Message] = []
     known = ("images", *BESIDE_PICTURES, TEXTURE_SETS, *rig.names)
     for path in sorted(folder.iterdir()):
@@ -141,9 +142,8 @@ def unread_folders(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
 
 
 def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
-    """Returns remarks on unread files of cameras in the folder: those of other programs, and further rigs, since only
-    the first of ``rigs`` is read. Next to photographs without a rig, all files except pictures and notes are
-    reported."""
+    """Returns warnings about camera files in the folder that are not read: files of unsupported programs, and all but
+    the first of ``rigs``. If ``rigs`` is empty, warns about all files except pictures and notes."""
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and path not in rigs]
     if rigs:
         read, *others = (path.relative_to(folder).as_posix() for path in rigs)
@@ -164,7 +164,7 @@ def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
 
 
 def _other_models(folder: Path, rig_file: Path) -> list[str]:
-    """Returns further COLMAP models: the same one in the other encoding, and models of images registered separately."""
+    """Returns the files of further COLMAP models: text beside binary, and models of separately registered images."""
     if rig_file.suffix not in (".bin", ".txt"):
         return []
     twin = entry(rig_file.parent, "cameras.txt" if rig_file.suffix == ".bin" else "cameras.bin")
@@ -175,14 +175,12 @@ def _other_models(folder: Path, rig_file: Path) -> list[str]:
 
 
 def has_known_length(folder: Path) -> bool:
-    """Tells whether scale.json fixes the unit of the cameras. It does not if it was already used when the cameras were
-    calibrated from the photographs."""
+    """Returns whether scale.json determines the unit of the cameras. With calibration.json, the unit is known."""
     return entry(folder, SCALE).is_file() and not (folder / "calibration.json").is_file()
 
 
 def capture_root(folder: Path) -> Path:
-    """Returns the capture's own folder: ``folder``, or the single folder inside, and so on, because archives have
-    enclosing folders.
+    """Returns the folder of the capture: ``folder`` without the enclosing folders that archives often add.
 
     Raises InputError if ``folder`` is no folder."""
     if not folder.is_dir():
@@ -198,9 +196,9 @@ def capture_root(folder: Path) -> Path:
 
 
 def check_folders(folder: Path, rig: Rig) -> None:
-    """Raises InputError for folders whose names resemble a capture's own folders, such as "backgrounds".
+    """Raises InputError for folders with names similar to those of the format, such as "backgrounds".
 
-    Unread, they would leave the subject without clean plates, or every picture missing."""
+    If a misnamed folder were ignored, clean plates or all pictures would be missing."""
     kinds = ("images", *BESIDE_PICTURES)
     folders = [path.name for path in sorted(folder.iterdir()) if path.is_dir()]
     others = {name.casefold(): name for name in folders if not {name, name.lower()} & {*kinds, *rig.names}}
@@ -227,10 +225,10 @@ def read_shot(
     with_cut_outs: bool = True,
     lost: dict[str, list[Message]] | None = None,
 ) -> Capture:
-    """Returns the images of a folder for a known rig, at the size and undistorted as ``work_rig`` describes them.
+    """Reads the pictures of a folder for a known rig, reduced to ``pixels_most`` pixels and undistorted.
 
-    Every fault is appended to ``faults``, except those in ``files``, which were reported already. With ``lost``,
-    unusable pictures, masks and plates are recorded there by camera, and that camera gets no pictures at all."""
+    Appends every fault to ``faults``, except the faults in ``files``. If ``lost`` is not None, reasons for unusable
+    pictures, masks and plates are recorded there by camera, and all pictures of such a camera are omitted."""
     if files is None:
         files = find_files(folder, rig)
         faults += files.faults
@@ -288,7 +286,7 @@ def _decoded(
     pixels_most: int | None,
     bits: Mapping[str, int],
 ) -> tuple[dict[str, list[tuple[str, str, np.ndarray]]], dict[str, str]]:
-    """Returns camera, file and pixels of every readable picture, by kind, and the SHA-256 of the files."""
+    """Returns camera, file and pixels of every readable picture by kind, and the SHA-256 of each file."""
 
     def decode(job: tuple[str, str, Path]) -> tuple[np.ndarray | None, str, Message | None]:
         return decode_picture(folder, *job, rig=rig, pixels_most=pixels_most, bits=bits[job[0]])
@@ -314,10 +312,9 @@ def _decoded(
 def _cut_outs(
     folder: Path, jobs: Sequence[tuple[str, str, Path]], rig: Rig, pixels_most: int | None
 ) -> MaskSubjects | None:
-    """Returns masks made of the alpha channel, if the subject was cut out in every picture.
+    """Returns masks from the alpha channels, if every picture has a transparent background.
 
-    Returns None if one picture is not cut out, or its alpha is no valid mask. That is no fault, since nobody declared
-    the alpha to be a mask."""
+    Returns None, and no fault, if one picture is opaque or its alpha channel is no valid mask."""
     found = {}
     for _, name, path in (job for job in jobs if job[0] == "images"):
         alpha, k = cut_out_alpha(path), rig[name].intrinsics
@@ -332,8 +329,8 @@ def _cut_outs(
 def _sample_bits(
     jobs: Sequence[tuple[str, str, Path]], faults: list[Message]
 ) -> tuple[Mapping[str, int], list[Message]]:
-    """Returns, for each kind of files, how many of 16 bits are used, and a remark if they are fewer. Raw sensor mosaics
-    are appended to ``faults``."""
+    """Returns the number of used bits in 16-bit files by kind of file, and a warning if not all bits are used. Appends
+    a fault for files with a raw sensor mosaic."""
     kinds = [*dict.fromkeys(("images", "background", *(kind for kind, _, _ in jobs if kind != "masks")))]
     samples = {kind: measure_samples([path for of, _, path in jobs if of == kind]) for kind in kinds}
     mosaics = [f"{kind}/" for kind in kinds if samples[kind].mosaic]
@@ -348,7 +345,7 @@ def _sample_bits(
 
 
 def _page_remarks(folder: Path, jobs: Sequence[tuple[str, str, Path]]) -> list[Message]:
-    """Returns a remark on files that contain several pictures, of which only the first is read."""
+    """Returns a warning about files that contain several pictures, because only the first is read."""
     paged = [path.relative_to(folder).as_posix() for _, _, path in jobs if page_count(path) > 1]
     if not paged:
         return []
@@ -356,14 +353,13 @@ def _page_remarks(folder: Path, jobs: Sequence[tuple[str, str, Path]]) -> list[M
 
 
 def _grey_remarks(images: Mapping[str, np.ndarray]) -> list[Message]:
-    """Returns a remark on grey pictures among coloured ones."""
+    """Returns a warning if some pictures are grey and others are in colour."""
     grey = [name for name, image in images.items() if is_grey(image)]
     return [compose("pictures-grey", cameras=some_of(grey))] if 0 < len(grey) < len(images) else []
 
 
 def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
-    """Writes a capture folder of PNG files, each under a temporary name first. ``rig`` are the cameras of these
-    pictures."""
+    """Writes a capture folder of PNG files atomically. ``rig`` holds the cameras of the pictures."""
     write_rig(rig, folder / "cameras.json")
     files: list[tuple[Path, np.ndarray]] = []
     for name, image in capture.images.items():
@@ -397,8 +393,8 @@ def _in_read_pictures(features: Features, rig: Rig) -> Features:
 def decode_picture(
     folder: Path, kind: str, name: str, path: Path, *, rig: Rig, pixels_most: int | None, bits: int
 ) -> tuple[np.ndarray | None, str, Message | None]:
-    """Decodes a file of a camera, reduced and undistorted. Returns its pixels and the sha256 of the file; or a fault in
-    place of pixels. ``kind`` is images, background, masks or a texture set's folder."""
+    """Decodes, reduces and undistorts a picture file of camera ``name``. Returns its pixels and the file's SHA-256, or
+    a fault if it is damaged. ``kind`` is images, background, masks or a texture set's folder."""
     camera = rig[name]
     wanted, share = (camera.intrinsics.width, camera.intrinsics.height), work_share(camera.intrinsics, pixels_most)
     where, whole = path.relative_to(folder).as_posix(), kind == "masks"
@@ -424,7 +420,7 @@ def decode_picture(
 
 
 def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> Message:
-    """Describes a picture whose size (width, height) differs from its camera's."""
+    """Returns a fault that reports a picture whose size (width, height) differs from that of the camera."""
     of_picture, of_camera = f"{size[0]} x {size[1]}", f"{k.width} x {k.height}"
     fault = compose("picture-size-differs", picture=where, size=of_picture, wanted=of_camera)
     if size == (k.height, k.width):
@@ -439,8 +435,8 @@ def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> Message:
 
 
 def full_size_reader(folder: Path, rig: Rig, left_out: Sequence[str] = ()) -> ReadImage:
-    """Returns a function that reads the picture of a camera of ``rig`` from a capture's own folder, undistorted as in
-    ``read_capture``. ``left_out`` are cameras in its file but not in the rig."""
+    """Returns a function that reads and undistorts the picture of a camera at full size. ``folder`` is the capture's
+    folder. ``left_out`` lists cameras that are in its camera file but not in ``rig``."""
     files = find_files(folder, rig, left_out)
     paths = {name: path for name in rig.names for kind, path in files.of_camera(name) if kind == "images"}
     bits = measure_samples([*paths.values()]).bits or WHOLE_BITS

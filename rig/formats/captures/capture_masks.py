@@ -1,8 +1,7 @@
-"""Reads the masks of one capture together, to decide what their values mean and which of two levels is the subject.
+"""Reads the masks of one capture together, to decide whether black or white is the subject.
 
-In: one plane for each camera, decoded by ``rig.formats.pictures.images``. Out: masks (True = subject) at the working
-size of the pictures, the grey values of masks with soft edges, and remarks. Faults are appended to a list; files with
-the same fault share one message."""
+The input is the decoded pixels of a mask file for each camera. The output is masks (True = subject) at the size of the
+reduced pictures, grey values of masks with soft edges, and warnings. Files with the same fault share one message."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,8 +22,8 @@ SPECKS_TOLD = 0.011  # of the subject's area: a remark from here on; strands of 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskSubjects:
-    """Holds the masks of a capture by camera. ``masks`` are True for the subject; ``soft`` holds the subject's share of
-    each pixel, 0 to 255, of masks with soft edges; ``remarks`` are warnings."""
+    """Holds the masks of a capture by camera. ``masks`` is True for the subject. ``soft`` holds the subject's share of
+    each pixel, 0 to 255, for masks with soft edges. ``remarks`` holds warnings."""
 
     masks: Mapping[str, Bool[np.ndarray, "_ _"]]
     soft: Mapping[str, UInt8[np.ndarray, "_ _"]]
@@ -39,9 +38,9 @@ def mask_subjects(
     pixels_most: int | None = None,
     lost: dict[str, list[Message]] | None = None,
 ) -> MaskSubjects:
-    """Reads the masks of one capture, at the size that ``work_rig`` describes for ``pixels_most``. ``planes`` holds by
-    camera the file's name and its pixels, of the camera's size. Unusable masks are reported in ``faults`` or, by
-    camera, in ``lost``."""
+    """Interprets the masks of one capture, reduced to ``pixels_most`` pixels. ``planes`` holds each mask file's name
+    and full-size pixels by camera. Unusable masks are reported in ``lost`` by camera or, if ``lost`` is None, in
+    ``faults``."""
     readings = read_masks({name: plane for name, (_, plane) in planes.items()})
     files = {name: file for name, (file, _) in planes.items()}
     usable = {name: reading for name, reading in readings.items() if not reading.fault}
@@ -75,10 +74,10 @@ def mask_subjects(
 
 
 def _without_specks(share: Share) -> tuple[Share, float]:
-    """Removes small pieces apart from the subject and fills small holes; returns the mask, and the relative changed
-    area.
+    """Removes small components beside the subject and fills small holes. Returns the mask and the changed area,
+    relative to the subject's.
 
-    A single speck at the border would otherwise become part of the outline with which cameras are compared."""
+    A small component would otherwise distort the outline that is compared between cameras."""
     white = share > 127
     changed, area, lost = share, max(int(np.count_nonzero(white)), 1), 0
     for fill in (0, 255):
@@ -106,7 +105,7 @@ def _without_specks(share: Share) -> tuple[Share, float]:
 def _in_picture(
     share: Share, reading: MaskReading, name: str, rig: Rig, pixels_most: int | None
 ) -> UInt8[np.ndarray, "_ _"]:
-    """Returns a mask at the working size of the pictures, and undistorted like them."""
+    """Reduces and undistorts a mask as its camera's picture is reduced and undistorted."""
     camera = rig[name]
     scale = work_share(camera.intrinsics, pixels_most)
     pixels = at_share(share, (share.shape[1], share.shape[0]), scale)
@@ -117,7 +116,7 @@ def _in_picture(
 
 
 def _middles(rig: Rig) -> dict[str, np.ndarray]:
-    """Returns the pixel where each camera sees the point at which all are directed; empty for a single camera."""
+    """Projects the point nearest to all optical axes to each camera. Returns an empty result for a single camera."""
     if len(rig) < 2:
         return {}
     point = rig.centre_world()[None]
@@ -127,7 +126,7 @@ def _middles(rig: Rig) -> dict[str, np.ndarray]:
 
 
 def _by_cause(messages: Mapping[str, Message | None]) -> list[Message]:
-    """Groups equal messages: one for all files with the same fault."""
+    """Returns one message for all files with the same fault."""
     files: dict[Message, list[str]] = {}
     for file, message in messages.items():
         if message is not None:

@@ -1,4 +1,4 @@
-"""Reads and writes ``features.json`` (``eigenhead-features/1``): feature points, pixels of landmarks by camera."""
+"""Reads and writes ``features.json`` (``eigenhead-features/1``), which holds the pixels of landmarks by camera."""
 
 import json
 from typing import Any, TypedDict
@@ -17,14 +17,14 @@ OUTSIDE_LEAST, OUTSIDE_SHARE = 3, 0.2  # points outside their pictures, and of a
 
 
 class FeaturesDocument(TypedDict):
-    """Describes ``features.json``: pixels by point and camera."""
+    """Describes ``features.json``, which holds pixels by landmark and camera."""
 
     format: str
     points: dict[str, dict[str, list[float]]]
 
 
 def features_from_bytes(data: bytes, rig: Rig, faults: list[Message]) -> Features:
-    """Returns the points of a ``features.json``; appends every fault to ``faults``."""
+    """Reads the points in the bytes of a ``features.json``. Appends every fault to ``faults``."""
     try:
         document = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -34,7 +34,7 @@ def features_from_bytes(data: bytes, rig: Rig, faults: list[Message]) -> Feature
 
 
 def features_from_document(document: Any, rig: Rig, faults: list[Message]) -> Features:
-    """Returns the points of a decoded ``features.json``; appends every fault to ``faults``."""
+    """Returns the points of a decoded ``features.json``. Appends every fault to ``faults``."""
     if not isinstance(document, dict) or not isinstance(document.get("points"), dict):
         faults.append(compose("of-file", file=FILE, fault=compose("features-no-points")))
         return {}
@@ -73,8 +73,8 @@ def features_from_document(document: Any, rig: Rig, faults: list[Message]) -> Fe
 
 
 def _fault_of_all(points: dict[str, Any], rig: Rig) -> Message | None:
-    """Returns the fault that all points share: cameras and landmarks nested in the wrong order, fractions of the
-    picture in place of pixels, or pixels of other pictures. None if there is none."""
+    """Returns a fault that all points share: cameras and landmarks nested in the wrong order, fractions of the picture
+    instead of pixels, or pixels of pictures of another size. Returns None without a common fault."""
     inner = {name for views in points.values() if isinstance(views, dict) for name in views}
     if points and inner and all(name in rig for name in points) and not any(name in rig for name in inner):
         return compose("features-by-camera")

@@ -1,10 +1,10 @@
-"""Assigns the files of a capture folder to cameras: each camera's picture, mask and clean plates.
+"""Finds each camera's picture, mask and clean plates in a capture folder.
 
-A file named like a camera belongs to that camera. If a camera has no file of exactly its name, a similar name is
-accepted if it fits only one camera (``rig.formats.pictures.picture_names``). Otherwise the body's serial number decides
-(EXIF's BodySerialNumber (CIPA DC-008, tag 0xA431) of JPEG, TIFF, PNG, WebP and HEIC, of RAW files built like TIFF, and
-of Canon's CR3 (its box CMT2), and DNG's CameraSerialNumber (0xC62F)). A camera's file may also lie in a folder with the
-camera's name, and all files together in one more folder."""
+A file with the name of a camera belongs to that camera. If a camera has no such file, a similar name is accepted if it
+fits only one camera (``rig.formats.pictures.picture_names``). If no name matches, the camera body's serial number in
+the file decides. The number is EXIF's BodySerialNumber (CIPA DC-008, tag 0xA431), for Canon's CR3 in its box CMT2, or
+DNG's CameraSerialNumber (0xC62F). Files may also lie in a folder with the camera's name, and all folders in one
+enclosing folder."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,7 +40,7 @@ NAME_SHOWN = 60  # characters of a name that is too long
 
 
 def camera_serial(path: Path) -> str | None:
-    """Returns the serial number in a picture file; None if there is none or it cannot be read."""
+    """Returns the camera's serial number in a picture file, or None without a readable number."""
     with suppress(Exception):  # damaged EXIF fails in more ways than Pillow's documentation has
         for tags in _tag_sets(path):
             for tag in (BODY_SERIAL, DNG_SERIAL):
@@ -73,8 +73,8 @@ def _exif(data: bytes) -> Image.Exif:
 
 
 def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
-    """Returns the rig with each camera's ``serial`` read from its picture. Serials shared by two pictures are left out,
-    since one body took both."""
+    """Returns the rig with each camera's ``serial`` read from its picture. A serial number in two pictures is omitted,
+    because it does not identify one camera."""
     serials = {name: camera_serial(path) for name, path in pictures.items()}
     recorded = [serial for serial in serials.values() if serial is not None]
     unique = {name: serial for name, serial in serials.items() if serial is not None and recorded.count(serial) == 1}
@@ -82,10 +82,10 @@ def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
 
 
 def pictures_by_serial(folder: Path, rig: Rig, faults: list[Message]) -> dict[str, Path]:
-    """Returns pictures of ``folder`` by camera, matched by serial number, if their names fit no camera.
+    """Matches pictures of ``folder`` to cameras by serial number. Returns the pictures by camera.
 
-    Nothing is read if every camera has a picture with its name. Appends a fault for each unmatched picture, and for two
-    pictures of one body."""
+    If every camera has a picture with its name, reads no file. Appends a fault for each unmatched picture, and for two
+    pictures by one camera body."""
     here = sorted(path for path in folder.iterdir() if is_picture(path))
     inside = {path.name for path in folder.iterdir() if path.is_dir()}
     lacking = [camera for camera in rig if camera.name not in {path.stem for path in here} | inside]
@@ -115,9 +115,9 @@ def pictures_by_serial(folder: Path, rig: Rig, faults: list[Message]) -> dict[st
 
 @dataclass(frozen=True, slots=True)
 class ShotFiles:
-    """Holds the files of a shot by camera. ``strays`` are pictures without a camera, relative to the capture's folder;
-    ``faults`` are messages on missing or ambiguous files; ``texture_sets`` are files by set and camera; ``absent``
-    names, by camera, a file that it lacks but others have."""
+    """Holds the files of a shot by camera. ``strays`` lists pictures that match no camera, relative to the capture's
+    folder. ``faults`` holds messages about missing or ambiguous files. ``texture_sets`` holds files by set and camera.
+    ``absent`` reports, by camera, a file that only this camera lacks."""
 
     images: Mapping[str, Path]
     masks: Mapping[str, Path]
@@ -128,7 +128,7 @@ class ShotFiles:
     absent: Mapping[str, Message] = field(default_factory=dict)
 
     def of_camera(self, name: str) -> list[tuple[str, Path]]:
-        """Returns the kind (the folder, relative to the capture's) and path of each file of a camera."""
+        """Returns the kind (its folder's path in the capture) and the path of each file of a camera."""
         found = [("images", self.images.get(name)), ("masks", self.masks.get(name))]
         found += [("background", plate) for plate in self.plates.get(name, ())]
         found += [(f"{TEXTURE_SETS}/{kind}", files.get(name)) for kind, files in self.texture_sets.items()]
@@ -136,7 +136,7 @@ class ShotFiles:
 
 
 def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFiles:
-    """Finds the files of one shot. Files of the excluded cameras ``left_out`` are neither used nor strays."""
+    """Finds the files of one shot. Ignores the files of the excluded cameras ``left_out``."""
     names, faults = [*rig.names, *left_out], list[Message]()
     places = {"images": picture_folder(folder), **{kind: entry(folder, kind) for kind in BESIDE_PICTURES}}
     owned = {kind: _owned(place, names, kind, rig, faults) for kind, place in places.items()}
@@ -161,7 +161,7 @@ def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFile
 
 
 def _texture_sets(folder: Path, rig: Rig, names: Sequence[str], faults: list[Message]) -> dict[str, dict[str, Path]]:
-    """Returns the pictures of each texture set by camera. A set's name becomes a file's name, so it is lower case."""
+    """Returns the pictures of each texture set by camera. A set's name must be lower case."""
     place = entry(folder, TEXTURE_SETS)
     if not place.is_dir():
         return {}
@@ -181,7 +181,7 @@ def _texture_sets(folder: Path, rig: Rig, names: Sequence[str], faults: list[Mes
 
 
 def _texture_set(folder: Path, place: Path, rig: Rig, names: Sequence[str], faults: list[Message]) -> dict[str, Path]:
-    """Returns the pictures of one texture set by camera. Every camera must have one, and no picture may be left."""
+    """Returns the pictures of one texture set by camera. Appends a fault unless each camera has one picture."""
     where = place.relative_to(folder).as_posix()
     owned = _owned(place, names, TEXTURE_SETS, rig, faults)
     pictures = {name: path for name in rig.names if (path := _one(owned.get(name, []), folder, faults))}
@@ -198,24 +198,24 @@ def _texture_set(folder: Path, place: Path, rig: Rig, names: Sequence[str], faul
 
 
 def picture_folder(folder: Path) -> Path:
-    """Returns the folder of a capture's photographs: images/ if it exists, otherwise the capture folder itself."""
+    """Returns the folder of a capture's photographs: images/ if it exists, otherwise the capture folder."""
     return images if (images := entry(folder, "images")).is_dir() else folder
 
 
 def listed_pictures(folder: Path) -> list[Path]:
-    """Returns the pictures in a folder, sorted; an empty list if the folder does not exist."""
+    """Returns the sorted pictures in a folder, or an empty list if the folder does not exist."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if is_picture(path) and not has_raw_beside(path))
 
 
 def stray_sentence(strays: Sequence[str], rig: Rig) -> Message:
-    """Returns a message that names the pictures without a camera."""
+    """Returns a message that lists the pictures that match no camera."""
     return compose("pictures-strange", count=len(strays), pictures=some_of(strays), cameras=rig.names)
 
 
 def _owned(place: Path, names: Sequence[str], kind: str, rig: Rig, faults: list[Message]) -> dict[str, list[Path]]:
-    """Returns the files and folders of each camera in one of the capture's folders."""
+    """Returns the files and folders of each camera in ``place``, a folder of the capture."""
     if not place.is_dir():
         return {}
     inner = _unwrapped(place, names)
@@ -236,8 +236,8 @@ def _owned(place: Path, names: Sequence[str], kind: str, rig: Rig, faults: list[
 
 
 def _unwrapped(place: Path, names: Sequence[str]) -> Path:
-    """Returns the single enclosing folder in a folder without pictures, unless it is a camera's own:
-    ``images/shot01/cam00.png``."""
+    """Returns the only folder inside ``place``, as in ``images/shot01/cam00.png``, if it belongs to no camera and
+    ``place`` has no pictures. Otherwise returns ``place``."""
     folders = [path for path in _folders(place) if path.name.lower() not in (*BESIDE_PICTURES, "images")]
     alone = len(folders) == 1 and not listed_pictures(place) and place.name.lower() in ("images", *BESIDE_PICTURES)
     alone = alone and not match_names([folders[0].name], names) and folders[0].name not in names
@@ -249,8 +249,7 @@ def _folders(place: Path) -> list[Path]:
 
 
 def _one(paths: Sequence[Path], root: Path, faults: list[Message]) -> Path | None:
-    """Returns a camera's single picture or mask: the file itself, or the file in the camera's folder. More than one is
-    a fault."""
+    """Returns a camera's only picture or mask, which may lie in a folder. Appends a fault if there are several."""
     files = [path for path in paths if path.is_file()]
     if len(files) > 1:
         where = files[0].parent.relative_to(root).as_posix()
@@ -264,12 +263,12 @@ def _one(paths: Sequence[Path], root: Path, faults: list[Message]) -> Path | Non
 
 
 def _flat(paths: Sequence[Path]) -> list[Path]:
-    """Returns the files among the paths, and the pictures in the folders among them."""
+    """Returns the files in ``paths``, and the pictures inside the folders in ``paths``."""
     return [path for entry in paths for path in (listed_pictures(entry) if entry.is_dir() else [entry])]
 
 
 def _strays(place: Path, used: set[Path], names: Sequence[str], kind: str) -> list[Path]:
-    """Returns pictures in a folder of the capture that fit no camera, including those of unreadable formats."""
+    """Returns pictures in a folder of the capture that match no camera, unsupported formats included."""
     if not place.is_dir():
         return []
     is_root = kind == "images" and place.name.lower() != "images"
@@ -279,7 +278,7 @@ def _strays(place: Path, used: set[Path], names: Sequence[str], kind: str) -> li
 
 
 def shows_something(path: Path) -> bool:
-    """Tells whether a path is a picture, readable or not, and no copy of a RAW file."""
+    """Returns whether a path is a picture, perhaps in an unsupported format, without a RAW file of the same picture."""
     if has_raw_beside(path):
         return False
     return is_picture(path) or (path.suffix.lower() in UNREAD_PICTURES and not is_junk(path.name) and path.is_file())
@@ -295,9 +294,10 @@ def _missing(
     places: Mapping[str, Path],
     strays: Mapping[str, Sequence[Path]],
 ) -> tuple[list[Message], dict[str, Message], bool]:
-    """Returns faults of files, the missing file of single cameras, and whether the faults already name the strays.
+    """Returns faults about missing files, the missing file of individual cameras, and whether the faults name the
+    unmatched pictures.
 
-    If no camera has a file with its name and other files exist, one message reports the common cause."""
+    If no camera has a file but unmatched files exist, one message reports the common cause."""
     inside = "" if places["images"] == folder else "images/"
     faults, alone, named = list[Message](), not any(entry(folder, kind).is_dir() for kind in BESIDE_PICTURES), False
     absent: dict[str, Message] = {}
@@ -332,7 +332,7 @@ def _missing(
 
 
 def _of_other_kind(name: str, folder: Path, strays: Sequence[Path]) -> Message | None:
-    """Returns the fault of a camera's file in an unreadable format, or None."""
+    """Returns a fault if a camera's file exists only in an unsupported format; otherwise None."""
     for path in strays:
         kind = UNREAD_PICTURES.get(path.suffix.lower())
         if kind is not None and picture_stem(path.name) == name:
@@ -341,7 +341,7 @@ def _of_other_kind(name: str, folder: Path, strays: Sequence[Path]) -> Message |
 
 
 def _broken_link(place: Path, name: str) -> Path | None:
-    """Returns a symbolic link with the camera's name whose target is missing, or None."""
+    """Returns a broken symbolic link with the camera's name, or None."""
     links = (path for path in sorted(place.iterdir()) if path.is_symlink() and not path.exists())
     return next((path for path in links if picture_stem(path.name) == name), None)
 
@@ -349,7 +349,7 @@ def _broken_link(place: Path, name: str) -> Path | None:
 def _cause(
     rig: Rig, lacking: Sequence[str], strays: Sequence[Path], place: str | Message, what: Message
 ) -> Message | None:
-    """Returns one message if all cameras lack a file and there are at least as many other files; otherwise None."""
+    """Returns one message if all cameras lack a file and at least as many unmatched files exist; otherwise None."""
     strangers = [path for path in strays if is_picture(path)]
     if not len(lacking) == len(rig) > 1 or len(strangers) < max(len(lacking), 2):
         return None
@@ -363,7 +363,7 @@ def _cause(
 
 
 def _doubt(strangers: Sequence[Path], rig: Rig) -> Message | None:
-    """Returns why file names that contain cameras' names cannot be assigned: there are several for each camera."""
+    """Returns a message if several file names contain each camera's name, so that they are ambiguous."""
     several = match_names([path.name for path in strangers], rig.names, several=True)
     if len(several) < len(rig) or all(len(pictures) == 1 for pictures in several.values()):
         return None

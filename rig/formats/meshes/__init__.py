@@ -1,3 +1,3 @@
-"""Reads and writes meshes: PLY, OBJ, GLB, USDZ, and STL and 3MF for printers.
+"""Reads and writes meshes in the formats PLY, OBJ, GLB, USDZ, STL and 3MF.
 
-In: vertices in millimetres with colours, textures or morph targets. Out: bytes that are the same on every machine."""
+Writers take vertices in millimetres with colours, textures or morph targets, and give the same bytes everywhere."""

@@ -1,10 +1,10 @@
-"""Writes binary glTF: meshes with vertex colours or textures, morph targets, and nodes at the pivots of parts. It does
-not use trimesh, whose bytes differ between versions.
+"""Writes binary glTF files with meshes, vertex colours or textures, morph targets, and nodes at the pivots of parts.
+The library trimesh is not used, because its output differs between versions.
 
-If there are pivots, the top node is ``neck``, at the joint of skull and spine. Under it are the parts that turn with
-it, and a node for every other pivot (``jaw``, ``eye_right``, ``eye_left``). A part with a pivot's name is the mesh of
-that node; others are nodes below it. Morph targets are sparse, because an expression moves only a part of the face;
-their names are in ``extras.targetNames``, where three.js, Blender and others read them.
+If a scene has pivots, the top node is ``neck``, at the joint of skull and spine. The child nodes of ``neck`` are the
+parts that turn with it, and a node for every other pivot (``jaw``, ``eye_right``, ``eye_left``). A part with the name
+of a pivot is the mesh of the pivot's node. Morph targets are sparse, because an expression moves only a part of the
+face. Their names are in ``extras.targetNames``, where three.js and Blender read them.
 """
 
 import json
@@ -30,7 +30,7 @@ GREY = 200  # of a mesh without colours
 
 
 def scene_glb_bytes(scene: Scene, extras: Mapping[str, Any] | None = None) -> bytes:
-    """Encodes a glTF 2.0 binary of a scene in the head frame: metres, y up, face towards +z. ``extras`` are written as
+    """Encodes a scene as binary glTF 2.0 in metres, with y up and the face towards +z. ``extras`` is written as
     ``asset.extras``."""
     writer = _Writer(extras)
     document = writer.document
@@ -52,7 +52,7 @@ def scene_glb_bytes(scene: Scene, extras: Mapping[str, Any] | None = None) -> by
 
 
 def _append_pivots(nodes: list[dict[str, Any]], scene: Scene, below: dict[str, list[int]]) -> None:
-    """Appends the nodes of pivots; ``neck`` is last and the parent of all others."""
+    """Appends the nodes of pivots. The last node, ``neck``, is the parent of all others."""
     neck = scene.pivots_mm[NECK] / 1000.0
     for number in below[NECK]:
         nodes[number]["translation"] = (-neck).tolist()
@@ -72,7 +72,7 @@ def _append_pivots(nodes: list[dict[str, Any]], scene: Scene, below: dict[str, l
 
 
 class _Writer:
-    """Collects the document of a GLB and its one buffer."""
+    """Collects the JSON document and the binary buffer of a GLB file."""
 
     def __init__(self, extras: Mapping[str, Any] | None) -> None:
         self.payload = bytearray()
@@ -82,7 +82,7 @@ class _Writer:
         self._textures: dict[bytes, int] = {}
 
     def encoded(self) -> bytes:
-        """Returns the file."""
+        """Returns the bytes of the GLB file."""
         data = bytes(self.payload) + b"\0" * (-len(self.payload) % 4)
         text = json.dumps(self.document | {"buffers": [{"byteLength": len(data)}]}, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
@@ -90,10 +90,10 @@ class _Writer:
         return header + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
 
     def append_mesh(self, part: Part, vertices: Float[np.ndarray, "v 3"]) -> int:
-        """Appends a part as a mesh, whose vertices (mm) are relative to its node. Returns the mesh's index.
+        """Appends a part as a mesh and returns the mesh's index. The vertices (mm) are relative to the part's node.
 
-        glTF's ``COLOR_0`` is linear, while colours here are sRGB. They are converted to 16 bits, so that dark tones
-        stay distinct. https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes
+        The sRGB colours are converted to linear values for glTF's ``COLOR_0``, with 16 bits to keep dark tones
+        distinct. https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes
         """
         skin, colours = part.skin, part.mesh.colours
         rows = np.arange(len(vertices)) if skin is None or skin.source is None else skin.source
@@ -132,7 +132,7 @@ class _Writer:
         return targets
 
     def _material(self, part: Part) -> int:
-        """Appends the material of a part with a texture, or returns that of parts without one."""
+        """Returns the index of a part's material. Appends a material for each part with a texture."""
         materials, skin = self.document["materials"], part.skin
         surface: dict[str, Any] = {"metallicFactor": 0, "roughnessFactor": ROUGHNESS}
         name = "colours" if skin is None else "skin" if not materials else part.name
@@ -152,7 +152,7 @@ class _Writer:
         return len(materials) - 1
 
     def _texture(self, image: bytes, mime: str) -> int:
-        """Returns the number of an encoded image's texture; identical images are written once."""
+        """Returns the index of the texture of an encoded image. Identical images share one texture."""
         if image in self._textures:
             return self._textures[image]
         self.document.setdefault("samplers", [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}])
@@ -171,7 +171,8 @@ class _Writer:
                 self.document[key].append(extension)
 
     def _view(self, data: bytes, target: int | None = None) -> int:
-        """Appends bytes to the buffer and returns the number of their view. ``target``: glTF's number of their use."""
+        """Appends bytes to the buffer and returns the index of their buffer view. ``target`` is glTF's
+        ``bufferView.target``."""
         self.payload.extend(b"\0" * (-len(self.payload) % 4))
         view = {"buffer": 0, "byteOffset": len(self.payload), "byteLength": len(data)}
         self.document["bufferViews"].append(view | ({} if target is None else {"target": target}))
@@ -185,7 +186,7 @@ class _Writer:
         return len(self.document["accessors"]) - 1
 
     def _sparse(self, values: Float[np.ndarray, "n 3"], least: float) -> int:
-        """Appends a sparse accessor of the values that are not nearly zero, and returns its number."""
+        """Appends a sparse accessor of the rows whose values exceed ``least``, and returns its index."""
         rows = np.flatnonzero(np.abs(values).max(axis=1) > least)
         accessor: dict[str, Any] = {"componentType": COMPONENTS["<f4"], "count": len(values), "type": "VEC3"}
         if len(rows):

@@ -1,7 +1,7 @@
-"""Reads and writes point lists of 3D Slicer: ``.mrk.json``, markups schema 1.0.3.
+"""Reads and writes point lists of 3D Slicer (``.mrk.json``, markups schema 1.0.3).
 
-A file states its axes: LPS (x to the patient's left, y to the back, z up) or RAS (x to the right, y to the front, z
-up). Both are right-handed; a half turn about z converts one to the other. Lengths are mm.
+A file states whether its axes are LPS (x to the patient's left, y to the back, z up) or RAS (x to the right, y to the
+front, z up). A half turn about z converts one to the other. Lengths are in millimetres.
 """
 
 import json
@@ -27,19 +27,19 @@ SCHEMA = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkupPoint:
-    """Holds a point (mm) of a list with its label and description."""
+    """Holds the position (mm), label and description of a point."""
 
     position: Float[np.ndarray, " 3"]
     description: str = ""
 
 
 def axes_turn(wanted: Axes, held: Axes) -> Float[np.ndarray, "3 3"]:
-    """Returns the rotation that converts coordinates in axes ``held`` to ``wanted``."""
+    """Returns the rotation that converts coordinates from the axes ``held`` to the axes ``wanted``."""
     return np.eye(3) if wanted == held else RAS_FROM_LPS
 
 
 def markups_document(points: Mapping[str, MarkupPoint], axes: Axes, name: str = "landmarks") -> dict[str, Any]:
-    """Returns a point list as JSON types. Positions are in ``axes`` already."""
+    """Returns a point list as plain values for JSON. Positions (mm) must be in ``axes``."""
     controls = [
         {
             "id": str(number),
@@ -61,8 +61,8 @@ def markups_document(points: Mapping[str, MarkupPoint], axes: Axes, name: str = 
 
 
 def read_markups(path: Path, axes: Axes) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns the points of all lists of a file by their labels, converted to ``axes``; points without a position are
-    left out. Raises InputError."""
+    """Reads the points (mm) of all lists in a file by label, converted to ``axes``. Omits points without a position.
+    Raises InputError."""
     found: dict[str, Float[np.ndarray, " 3"]] = {}
     turns: dict[str, Float[np.ndarray, "3 3"]] = {}
     try:

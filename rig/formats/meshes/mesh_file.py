@@ -1,7 +1,8 @@
-"""Reads meshes of other programs through trimesh: PLY, OBJ, GLB and, on request, STL.
+"""Reads meshes of other programs through the library trimesh: PLY, OBJ, GLB and, on request, STL.
 
-trimesh ignores glTF's normalised integers, sparse accessors and compressions without an error. A GLB that uses one of
-them is refused by the feature's name (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, sections 3.6.2, 3.12).
+trimesh ignores glTF's normalised integers, sparse accessors and compressions without an error. A GLB file with such
+integers, accessors or compression is refused, and the message names the feature
+(https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, sections 3.6.2, 3.12).
 """
 
 import json
@@ -33,7 +34,7 @@ SURFACE_ENDINGS = (*MESH_ENDINGS, ".stl")  # STL has neither colours nor joined 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TexturedMesh:
-    """Holds a mesh in its file's own unit, with its texture if it has one. Vertices are repeated along seams."""
+    """Holds a mesh in the unit of its file, with an optional texture. Vertices are repeated along texture seams."""
 
     mesh: Mesh
     uv: Float[np.ndarray, "v 2"] | None = None  # of the vertices, v upwards
@@ -41,12 +42,12 @@ class TexturedMesh:
 
 
 def read_mesh(path: Path, endings: tuple[str, ...] = MESH_ENDINGS) -> Mesh:
-    """Reads PLY, OBJ, GLB or other formats in ``endings``, in the file's own units. Raises InputError."""
+    """Reads a mesh in one of the formats ``endings``, in the unit of the file. Raises InputError."""
     return _mesh(_loaded(path, endings), path)
 
 
 def read_textured_mesh(path: Path) -> TexturedMesh:
-    """Reads PLY, OBJ or GLB with its texture. A texture that cannot be read is left out. Raises InputError."""
+    """Reads a PLY, OBJ or GLB file with its texture. Omits an unreadable texture. Raises InputError."""
     loaded = _loaded(path)
     mesh, visual = _mesh(loaded, path), loaded.visual
     if visual is None or visual.kind != "texture" or visual.uv is None or len(visual.uv) != len(mesh.vertices):
@@ -88,8 +89,8 @@ def _loaded(path: Path, endings: tuple[str, ...] = MESH_ENDINGS) -> Any:
 
 
 def _plain_obj(path: Path) -> StringIO:
-    """Returns an OBJ without what trimesh misreads: a byte order mark, line ends of old systems, tabs, and comments
-    after numbers. Raises InputError if its faces count from 0, because trimesh would take 0 for the last vertex."""
+    """Removes from an OBJ file all that trimesh misreads: a byte order mark, old line ends, tabs, and comments after
+    numbers. Raises InputError if face indices start at 0, because trimesh would take 0 for the last vertex."""
     text = as_utf8(path.read_bytes()).decode("utf-8", "replace")
     text = re.sub(r"\r\n?", "\n", text).replace("\t", " ")
     text = re.sub(r"^((?:v|vt|vn|f) [^#\n]*)#.*", r"\1", text, flags=re.MULTILINE)
@@ -99,7 +100,7 @@ def _plain_obj(path: Path) -> StringIO:
 
 
 def _check_glb(path: Path) -> None:
-    """Raises InputError for a damaged GLB, and for data in encodings that trimesh does not decode."""
+    """Raises InputError for a damaged GLB file or data in encodings that trimesh does not decode."""
     data = path.read_bytes()
     try:
         (length,) = struct.unpack_from("<I", data, 12)

@@ -1,8 +1,8 @@
-"""Reads arrays from untrusted files: an npz within size limits, a pickle without running any code in it.
+"""Reads arrays from untrusted files: npz files within size limits, and pickles without running code.
 
-A pickle is a program: loading it imports and calls the names in it. This module imports none of them. NumPy's arrays
-and types, SciPy's sparse matrices and chumpy's arrays become harmless stand-ins, which decode plain numbers by
-themselves; any other name is refused. Pickles of Python 2 are also read.
+Loading a pickle normally imports and calls the classes and functions that it names. This module does not import
+anything that a pickle names. Objects of NumPy, SciPy and chumpy are replaced by harmless stand-in classes that decode
+plain numbers. A pickle with any other name is refused. Pickles of Python 2 are also read.
 """
 
 import io
@@ -41,8 +41,8 @@ DAMAGE = (
 
 @contextmanager
 def open_npz(source: Path | io.BytesIO) -> Iterator[Any]:
-    """Opens an archive of arrays; each array is read on access. Raises OSError or one of ``DAMAGE`` for another kind of
-    file, and for an archive or an array that exceeds ``MAX_UNPACKED`` or its stated size."""
+    """Opens an npz archive, whose arrays are read on access. Raises OSError or an exception in ``DAMAGE`` for another
+    kind of file, and for an archive or array that exceeds ``MAX_UNPACKED`` or its stated size."""
     with np.load(source, allow_pickle=False) as file:
         if sum(entry.file_size for entry in file.zip.infolist()) > MAX_UNPACKED:
             raise ValueError(f"more than {MAX_UNPACKED >> 20} MB of arrays")
@@ -50,8 +50,8 @@ def open_npz(source: Path | io.BytesIO) -> Iterator[Any]:
 
 
 def read_pickled_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Returns the arrays of a pickled dictionary by name; entries without numbers are left out, and sparse matrices
-    become dense. Raises InputError with the fault, such as a name of no array type."""
+    """Returns the arrays of a pickled dictionary by name. Omits entries without numbers, and converts sparse matrices
+    to dense arrays. Raises InputError with the fault."""
     if path.stat().st_size > MAX_BYTES:
         large = compose("mesh-file-large", size_mb=path.stat().st_size >> 20, most_mb=MAX_BYTES >> 20)
         raise InputError(path.name, [large])
@@ -70,22 +70,22 @@ def read_pickled_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 class _Foreign(Exception):
-    """Reports a name in a pickle that belongs to no array type."""
+    """Reports that a pickle names a class or function other than array types."""
 
 
 class _StandIn:
-    """Replaces any object in a pickle. Stand-ins are classes, never functions, because a pickle can set attributes of
-    objects without ``__setstate__``."""
+    """Is the base class of the stand-ins for objects in a pickle. A stand-in is never a function, because a pickle can
+    set any attribute of an object without ``__setstate__``."""
 
     def __init__(self, *_: Any) -> None:
-        """Ignores the arguments that a pickle passes before the state."""
+        """Ignores the constructor arguments in a pickle."""
 
     def __setstate__(self, state: Any) -> None:
-        """Ignores the state."""
+        """Ignores the object's state in a pickle."""
 
 
 class _Type(_StandIn):
-    """Replaces numpy.dtype: one of the plain kinds of numbers, and its byte order."""
+    """Replaces numpy.dtype. Stores a plain number type and its byte order."""
 
     def __init__(self, kind: Any = "", *_: Any) -> None:
         self.kind, self.order = str(kind), "<"
@@ -94,13 +94,13 @@ class _Type(_StandIn):
         self.order = ">" if state[1] == ">" else "<"
 
     def decoded(self) -> np.dtype | None:
-        """Returns the type, or None if it is not one of plain numbers."""
+        """Returns the NumPy type, or None if the type is not a plain number type."""
         kind = self.kind.lstrip("<>=|")
         return np.dtype(self.order + kind) if kind in KINDS else None
 
 
 class _Array(_StandIn):
-    """Replaces numpy.ndarray: shape, type, order and bytes."""
+    """Replaces numpy.ndarray. Stores shape, type, memory order and bytes."""
 
     value: np.ndarray | None = None
 
@@ -119,7 +119,7 @@ def _decoded(raw: Any, kind: Any, shape: Any, order: Any) -> np.ndarray | None:
 
 
 class _Inert(_StandIn):
-    """Replaces an object of SciPy or chumpy, and stores its state."""
+    """Replaces an object of SciPy or chumpy. Stores the object's state."""
 
     state: Any = None
     kind = ""
@@ -129,14 +129,14 @@ class _Inert(_StandIn):
 
 
 class _Encoded(_StandIn):
-    """Replaces _codecs.encode, with which Python 3 writes bytes for Python 2."""
+    """Replaces _codecs.encode, by which pickles for Python 2 represent bytes."""
 
     def __new__(cls, text: str = "", *_: Any) -> Any:
         return text.encode("latin1")
 
 
 class _FromBuffer(_StandIn):
-    """Replaces the function that makes an array from a buffer."""
+    """Replaces NumPy's function that creates an array from a buffer."""
 
     def __new__(cls, raw: Any = b"", kind: Any = None, shape: Any = (), order: Any = "C", *_: Any) -> Any:
         array = _Array()
@@ -145,7 +145,7 @@ class _FromBuffer(_StandIn):
 
 
 class _Empty(_StandIn):
-    """Replaces the function that makes an empty object of a class; it makes only stand-ins."""
+    """Replaces the function that creates an empty object of a class. It creates only stand-ins."""
 
     def __new__(cls, kind: Any = None, *_: Any) -> Any:
         return kind() if isinstance(kind, type) and issubclass(kind, _Array | _Inert) else _Inert()
@@ -168,7 +168,7 @@ _INERT = ("scipy", "chumpy")
 
 class _Reader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> type[_StandIn]:
-        """Returns the stand-in for a name, and imports nothing. Raises _Foreign for names of other programs."""
+        """Returns the stand-in class for a name in a pickle. Raises _Foreign for all names that have no stand-in."""
         package = module.partition(".")[0]
         if (name, package) in _BY_NAME:
             return _BY_NAME[name, package]
@@ -178,7 +178,7 @@ class _Reader(pickle.Unpickler):
 
 
 def _array(value: Any) -> np.ndarray | None:
-    """Returns the numbers of an entry as an array, None if it has none."""
+    """Returns the numbers of an entry as an array, or None for an entry without numbers."""
     if isinstance(value, _Array):
         return value.value
     if not isinstance(value, _Inert) or not isinstance(value.state, dict):
@@ -190,7 +190,7 @@ def _array(value: Any) -> np.ndarray | None:
 
 
 def _dense(kind: str, state: dict[str, Any]) -> np.ndarray | None:
-    """Converts a sparse matrix of compressed columns or rows to an array."""
+    """Converts a sparse matrix in compressed column or row format to a dense array."""
     data, at, ends = (_array(state.get(name)) for name in ("data", "indices", "indptr"))
     shape = state.get("_shape", state.get("shape"))
     if data is None or at is None or ends is None or shape is None:

@@ -1,5 +1,5 @@
-"""Writes PLY according to docs/capture-format.md, and reads it. It does not use trimesh, which lacks the additional
-vertex properties and whose bytes differ between versions."""
+"""Reads and writes PLY files with the vertex properties of docs/capture-format.md. The library trimesh is not used,
+because it lacks these properties and its output differs between versions."""
 
 import re
 from collections.abc import Sequence
@@ -36,10 +36,10 @@ def ply_bytes(
     corner_uv: Float[np.ndarray, "f 3 2"] | None = None,
     comments: Sequence[str] = (),
 ) -> bytes:
-    """Encodes a binary little-endian PLY of a surface (mm): unit normals, sRGB colours, ``quality`` (standard deviation
-    of each vertex along its normal, mm), ``views`` (number of images that coloured it), optionally ``part`` (skin, hair
-    or clothes), and ``corner_uv`` (of the faces' corners, v downwards; written as MeshLab's ``texcoord``, v upwards).
-    ``comments`` are lines of the header."""
+    """Encodes a surface (mm) as binary little-endian PLY with unit normals and sRGB colours. ``quality`` is the
+    standard deviation of each vertex along its normal (mm), ``views`` the number of images that coloured it, and
+    ``part`` its label (skin, hair or clothes). ``corner_uv`` holds texture coordinates of the faces' corners with v
+    downwards, written as MeshLab's ``texcoord`` with v upwards. ``comments`` are lines of the header."""
     kind = PLY_VERTEX if part is None else PLY_PART_VERTEX
     vertices = np.empty(len(mesh.vertices), kind)
     for i, axis in enumerate("xyz"):
@@ -71,15 +71,15 @@ def ply_bytes(
 
 
 def write_ply(path: Path, mesh: Mesh, **properties: Any) -> None:
-    """Writes ``ply_bytes`` to a file, under a temporary name first."""
+    """Writes the result of ``ply_bytes`` to a file atomically."""
     write_atomically(path, ply_bytes(mesh, **properties))
 
 
 def read_head_ply(path: Path) -> tuple[Mesh, Float[np.ndarray, " v"]]:
-    """Reads a head.ply of this project. Returns the mesh (mm, world frame) and each vertex's standard deviation (mm)
-    along its normal.
+    """Reads a head.ply file of this project. Returns the mesh (mm, world frame) and each vertex's standard deviation
+    (mm) along its normal.
 
-    Raises InputError for a file that is truncated or another program's."""
+    Raises InputError for a truncated file or a file of another program."""
     vertices, faces = _head_rows(path)
     places = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(float)
     colours = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=1)
@@ -87,20 +87,19 @@ def read_head_ply(path: Path) -> tuple[Mesh, Float[np.ndarray, " v"]]:
 
 
 def read_view_counts(path: Path) -> UInt8[np.ndarray, " v"]:
-    """Reads how many images coloured each vertex of a head.ply; 0 if interpolated. Raises InputError."""
+    """Reads the number of images that coloured each vertex of a head.ply, 0 if interpolated. Raises InputError."""
     return _head_rows(path)[0]["views"].copy()
 
 
 def read_vertex_numbers(path: Path, name: str) -> Float[np.ndarray, " v"] | None:
-    """Reads a number for each vertex from a file by ``write_ply``; None if the file lacks it. Raises InputError for
-    another program's file."""
+    """Reads the property ``name`` of each vertex from a file by ``write_ply``. Returns None if the file lacks the
+    property. Raises InputError for a file of another program."""
     vertices, _ = _head_rows(path)
     return vertices[name].astype(np.float32) if name in (vertices.dtype.names or ()) else None
 
 
 def _head_rows(path: Path) -> tuple[np.ndarray, Int[np.ndarray, "f 3"]]:
-    """Reads the records of the vertices (``PLY_VERTEX`` or ``PLY_PART_VERTEX``) and the corners of the faces. Raises
-    InputError."""
+    """Reads the vertex records (``PLY_VERTEX`` or ``PLY_PART_VERTEX``) and the faces. Raises InputError."""
     try:
         header, end, body = path.read_bytes().partition(b"end_header\n")
     except OSError as error:

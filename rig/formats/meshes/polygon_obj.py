@@ -1,8 +1,7 @@
-"""Reads and writes Wavefront OBJ without changing its polygons: vertex order, quads, texture coordinates, groups and
-materials.
+"""Reads and writes Wavefront OBJ without changing vertex order, polygons, texture coordinates, groups and materials.
 
-``mesh_file`` reads triangles through trimesh, which splits polygons and may reorder vertices; templates need both
-unchanged."""
+The module ``mesh_file`` uses trimesh, which splits polygons and may reorder vertices. Template meshes need the original
+polygons and order."""
 
 import io
 import math
@@ -28,8 +27,8 @@ KEPT_STATEMENTS = ("o", "g", "s", "usemtl")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolygonMesh:
-    """Holds a mesh as its file describes it. ``corners`` concatenates the corners of all polygons; v of ``uv`` points
-    upwards."""
+    """Holds a polygon mesh with the order of its file. ``corners`` concatenates the corners of all polygons. In ``uv``,
+    v points upwards."""
 
     vertices: Float[np.ndarray, "v 3"]
     sizes: Int[np.ndarray, " p"]  # corners of each polygon, 3 or more
@@ -39,12 +38,12 @@ class PolygonMesh:
     statements: tuple[tuple[int, str], ...] = ()  # groups and materials: before which polygon, and the line
 
     def triangles(self) -> Int[np.ndarray, "f 3"]:
-        """Returns every polygon as a fan about its first corner."""
+        """Triangulates every polygon as a fan of triangles at its first corner."""
         return self.corners[fan(self.sizes)]
 
 
 def fan(sizes: Int[np.ndarray, " p"]) -> Int[np.ndarray, "f 3"]:
-    """Returns, for polygons of the given sizes, rows of ``corners`` that form their triangles."""
+    """Triangulates polygons with ``sizes`` corners each. Returns the rows of ``corners`` that form each triangle."""
     first = np.cumsum(sizes) - sizes
     count = sizes - 2
     owner = np.repeat(np.arange(len(sizes)), count)
@@ -53,7 +52,7 @@ def fan(sizes: Int[np.ndarray, " p"]) -> Int[np.ndarray, "f 3"]:
 
 
 def read_polygons(path: Path) -> PolygonMesh:
-    """Returns the mesh of an OBJ file, in its own units and order. Raises InputError naming every fault found."""
+    """Reads an OBJ file, in the unit and the order of the file. Raises InputError naming every fault."""
     try:
         size = path.stat().st_size
         if size > MOST_BYTES:
@@ -71,7 +70,7 @@ def read_polygons(path: Path) -> PolygonMesh:
 
 
 def _whole_lines(file: Iterable[str]) -> Iterable[tuple[int, str]]:
-    """Yields lines with their numbers; a line that ends with a backslash is joined with the next."""
+    """Yields lines with their numbers. Joins a line that ends with a backslash with the next line."""
     begun = ""
     for number, raw in enumerate(file, start=1):
         line = raw.rstrip()
@@ -86,7 +85,7 @@ def _whole_lines(file: Iterable[str]) -> Iterable[tuple[int, str]]:
 
 @dataclass(slots=True)
 class _Reading:
-    """Collects the contents of an OBJ file while it is read."""
+    """Collects the content of an OBJ file while reading it."""
 
     vertices: list[tuple[float, ...]] = field(default_factory=list)
     uv: list[tuple[float, ...]] = field(default_factory=list)
@@ -142,8 +141,8 @@ class _Reading:
         self.sizes.append(len(named))
 
     def _row(self, number: int, index: int | None, count: int) -> int:
-        """Returns the row of an index. OBJ counts from 1, and backwards from -1. An index beyond the rows read so far
-        is checked at the end of the file."""
+        """Converts an index of OBJ, which counts from 1 or backwards from -1, to a row number. Indices beyond the
+        ``count`` rows so far are checked at the end of the file."""
         row = -1 if index is None else index - 1 if index > 0 else count + index
         if not index or row < 0:
             self.fault(lambda: compose("line-strange-row", line=number, row=f"{index}"))
@@ -154,7 +153,7 @@ class _Reading:
         return len(self.vertices) > MOST_VERTICES or len(self.corners) > MOST_CORNERS or len(self.uv) > MOST_CORNERS
 
     def finished(self, name: str) -> PolygonMesh:
-        """Returns the arrays. Raises InputError."""
+        """Returns the mesh after the end of the file. Raises InputError naming every fault."""
         faults = self.faults
         if self.untold:
             faults.append(compose("lines-more", more=self.untold))
@@ -192,9 +191,9 @@ def polygon_obj_bytes(
     library: str | None = None,
     decimals: int = 4,
 ) -> bytes:
-    """Encodes an OBJ with other vertex positions; order, polygons, texture coordinates, groups and materials stay the
-    same. Colours are sRGB and follow the position, as MeshLab and Blender read them; ``comments`` are lines at the top,
-    ``library`` is the name of an .mtl file in the same folder, ``decimals`` applies to positions."""
+    """Encodes ``mesh`` as OBJ with the vertex positions ``vertices``. sRGB colours follow the position on a line, as
+    MeshLab and Blender expect. ``comments`` are lines at the top. ``library`` is the name of an .mtl file in the same
+    folder. ``decimals`` applies to positions."""
     text = io.StringIO()
     text.writelines(f"# {line}\n" for line in comments)
     position = " ".join([f"%.{decimals}f"] * 3)
@@ -226,10 +225,10 @@ def _write_faces(text: io.StringIO, mesh: PolygonMesh) -> None:
 
 
 def scene_obj_bytes(scene: Scene, library: str | None = None) -> bytes:
-    """Encodes parts as objects of a Wavefront OBJ, in mm, with the scene's rotations.
+    """Encodes a scene's parts as objects of a Wavefront OBJ in millimetres, with the scene's rotations applied.
 
-    Vertices are the meshes' own: only texture coordinates are doubled at seams. A part without a texture has the vertex
-    colours that MeshLab and Blender read after the position. ``library`` is the name of the .mtl file.
+    Only texture coordinates, not vertices, are doubled at seams. If a part has no texture, its sRGB vertex colours
+    follow the positions. ``library`` is the name of the .mtl file.
     """
     text, first, first_uv, first_normal = io.StringIO(), 1, 1, 1
     if library is not None:
@@ -257,6 +256,6 @@ def scene_obj_bytes(scene: Scene, library: str | None = None) -> bytes:
 
 
 def mtl_bytes(image: str) -> bytes:
-    """Returns the material of a textured part; ``image`` is the texture's file name in the same folder."""
+    """Returns the .mtl file for a textured part. ``image`` is the texture's file name in the same folder."""
     lines = ("newmtl skin", "Ka 1 1 1", "Kd 1 1 1", "Ks 0.04 0.04 0.04", "Ns 20", "illum 2", f"map_Kd {image}", "")
     return "\n".join(lines).encode()

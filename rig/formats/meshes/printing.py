@@ -1,4 +1,4 @@
-"""Writes closed meshes as STL and 3MF, for 3D printing. Both are in millimetres, but only 3MF can state that."""
+"""Writes closed meshes in millimetres as STL and 3MF, for 3D printing. Only 3MF files state their unit."""
 
 import io
 import zipfile
@@ -23,8 +23,8 @@ RELATIONS = (
 
 
 def stl_bytes(mesh: Mesh) -> bytes:
-    """Encodes a mesh as a binary STL. The vertices are rounded to float32 before the normals are computed, so that both
-    agree in the file."""
+    """Encodes a mesh as a binary STL. Vertices are rounded to float32 before the normals are computed, so that normals
+    and vertices agree."""
     vertices = mesh.vertices.astype("<f4")
     normals = face_normals(vertices.astype(float), mesh.faces)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -34,8 +34,8 @@ def stl_bytes(mesh: Mesh) -> bytes:
 
 
 def threemf_bytes(mesh: Mesh) -> bytes:
-    """Encodes 3MF core 1.3 (https://github.com/3MFConsortium/spec_core) with one object and no times, so that equal
-    meshes give equal bytes."""
+    """Encodes a mesh as 3MF core 1.3 (https://github.com/3MFConsortium/spec_core). The file contains no time, so that
+    equal meshes give equal bytes."""
     text = io.StringIO()
     text.write(
         '<?xml version="1.0" encoding="UTF-8"?>\n<model unit="millimeter" xml:lang="en-US" '

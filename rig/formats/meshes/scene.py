@@ -1,5 +1,4 @@
-"""Defines the content of GLB, USDZ and OBJ files of heads: named meshes with colours, texture and shapes, and their
-pivots."""
+"""Defines the content of GLB, USDZ and OBJ files: named meshes with colours, textures, morph targets and pivots."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,11 +15,12 @@ Shapes = Mapping[str, Float[np.ndarray, "v 3"]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Skin:
-    """Holds a texture: coordinates (from the image's upper left corner, v downwards) and the encoded image.
+    """Holds an encoded texture image and texture coordinates, from the image's upper left corner with v downwards.
 
-    ``source`` is the mesh vertex of each coordinate, and ``faces`` are the triangles of coordinates; without them each
-    vertex has one coordinate. A normal map (PNG, linear, +Y up) refers to ``tangents``, which hold the signs of the
-    bitangents. ``specular`` is the strength of mirrored light, the alpha of a PNG.
+    ``source`` is the mesh vertex of each texture coordinate, and ``faces`` holds triangles of texture coordinates.
+    Without ``source`` and ``faces``, each vertex has one texture coordinate. A normal map (PNG, linear, +Y up) refers
+    to ``tangents``, which include the signs of the bitangents. ``specular`` is the strength of specular reflection, as
+    the alpha channel of a PNG.
     """
 
     uv: Float[np.ndarray, "n 2"]
@@ -35,10 +35,10 @@ class Skin:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """Holds a mesh (mm, head frame, not rotated; sRGB colours). It may have unit normals other than its triangles', and
-    displacements by name (mm, at weight 1) with the weights at which it is shown.
+    """Holds a mesh (mm, head frame) before any rotation, with sRGB colours. Optional unit normals replace the normals
+    of the triangles. Optional morph targets are displacements (mm, at weight 1) by name, with their initial weights.
 
-    ``pivot`` names the point with which the part turns. ``rows`` are the vertices of a file that it consists of.
+    ``pivot`` names the point about which the part turns. ``rows`` lists the vertices of a file that form the part.
     """
 
     name: str
@@ -51,26 +51,26 @@ class Part:
     rows: Sequence[int] | None = None
 
     def unit_normals(self) -> Float[np.ndarray, "v 3"]:
-        """Returns the normals of the vertices."""
+        """Returns the unit normals of the vertices."""
         return self.mesh.normals() if self.normals is None else self.normals
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Holds parts, their pivots (mm, by name; none, or ``neck`` among them), and rotations about some of them."""
+    """Holds parts, pivots (mm, including ``neck``) by name, and rotations about some pivots."""
 
     parts: Sequence[Part]
     pivots_mm: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)
     turns: Mapping[str, Float[np.ndarray, "3 3"]] = field(default_factory=dict)
 
     def about(self, part: Part) -> tuple[Float[np.ndarray, "v 3"], RigidTransform]:
-        """Returns the vertices of a part relative to its pivot, and the pivot's position (mm) and rotation."""
+        """Returns the vertices (mm) of a part relative to its pivot, and the pivot's position (mm) and rotation."""
         pivot = np.zeros(3) if part.pivot == NECK else self.pivots_mm[part.pivot]
         return part.mesh.vertices - pivot, RigidTransform(self.turns.get(part.pivot, np.eye(3)), pivot)
 
 
 def quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
-    """Returns a rotation as a unit quaternion x, y, z, w."""
+    """Converts a rotation matrix to a unit quaternion x, y, z, w."""
     vector = vector_from_rotation(rotation)
     angle = float(np.linalg.norm(vector))
     return np.append(vector * (0.5 * np.sinc(angle / (2.0 * np.pi))), np.cos(0.5 * angle))

@@ -1,4 +1,4 @@
-"""Writes USDZ of parts, through OpenUSD (the extra ``usd``)."""
+"""Writes the parts of a scene as USDZ, with the library OpenUSD (optional dependency group ``usd``)."""
 
 import importlib
 import tempfile
@@ -25,7 +25,7 @@ PADDING = 4  # bytes of the header of a zip entry's padding field
 
 
 class NoUsd(EigenheadError):
-    """Reports that the extra ``usd`` is not installed."""
+    """Reports that OpenUSD is not installed."""
 
     def __init__(self) -> None:
         super().__init__(compose("usd-not-installed", remedy=how_to_install("usd")))
@@ -40,8 +40,8 @@ def check_usd() -> None:
 
 
 def scene_usdz_bytes(scene: Scene) -> bytes:
-    """Encodes parts as meshes of one USDZ, y up, in metres, with a UsdPreviewSurface or vertex colours. A part's
-    translation and orientation are separate operations. The same input is the same bytes. Raises NoUsd."""
+    """Encodes a scene's parts as meshes of one USDZ file in metres, y up, with a UsdPreviewSurface or vertex colours.
+    Translation and orientation of a part are separate operations. Equal scenes give equal bytes. Raises NoUsd."""
     check_usd()
     images = {f"{part.name}{SUFFIXES[part.skin.mime]}": part.skin.image for part in scene.parts if part.skin}
     with tempfile.TemporaryDirectory() as scratch:
@@ -56,7 +56,7 @@ def openusd_module(name: str) -> Any:
 
 
 def write_layer(path: Path, scene: Scene) -> None:
-    """Writes the parts to ``path`` (.usdc); their textures must lie in the same folder."""
+    """Writes the scene's parts to ``path`` (.usdc). The texture files must lie in the same folder."""
     Gf, Usd, UsdGeom = map(openusd_module, ("Gf", "Usd", "UsdGeom"))
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -79,7 +79,7 @@ def write_layer(path: Path, scene: Scene) -> None:
 
 
 def vectors(kind: str, values: np.ndarray) -> Any:
-    """Returns an OpenUSD array of a given kind: Vec3fArray, Vec2fArray or IntArray."""
+    """Converts values to an OpenUSD array of the type ``kind``: Vec3fArray, Vec2fArray or IntArray."""
     dtype = np.int32 if kind == "IntArray" else np.float32
     return getattr(openusd_module("Vt"), kind).FromNumpy(np.ascontiguousarray(values, dtype))
 
@@ -125,8 +125,8 @@ def _write_skin(stage: Any, shape: Any, part: Part, skin: Skin) -> None:
 
 
 def package(files: dict[str, bytes]) -> bytes:
-    """Returns a zip without compression or times, in which files begin at multiples of 64 bytes; the USD layer comes
-    first."""
+    """Packs files into a zip without compression or times. As USDZ requires, each file begins at a multiple of 64
+    bytes, and the USD layer is first."""
     data = BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
         for name, content in files.items():

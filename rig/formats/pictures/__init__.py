@@ -1,3 +1,3 @@
-"""Reads and writes pictures and masks, and interprets their names and numbers.
+"""Reads and writes pictures and masks, and interprets their file names and pixel values.
 
-In: files from any source. Out: arrays of 8 bits and the subject's share in every pixel."""
+The output is 8-bit arrays and, for masks, the subject's share in every pixel."""

@@ -1,6 +1,7 @@
-"""Writes OpenEXR pictures: linear light in half precision, compressed without loss (ZIP, 16 rows a block).
+"""Writes OpenEXR pictures of linear light in half precision, with lossless compression (ZIP, 16 rows in a block).
 
-https://openexr.com/en/latest/OpenEXRFileLayout.html. None of this project's libraries writes the format.
+The format is described at https://openexr.com/en/latest/OpenEXRFileLayout.html. No library of this project writes
+OpenEXR.
 """
 
 import struct
@@ -21,7 +22,7 @@ THREADS = 4
 
 
 def exr_bytes(image: Float[np.ndarray, "h w 3"]) -> bytes:
-    """Encodes linear light (Rec. 709's primaries, which are sRGB's) as a picture with the channels B, G and R."""
+    """Encodes linear light with sRGB's primaries (Rec. 709) as a picture with the channels B, G and R."""
     height, width = image.shape[:2]
     samples = image.astype("<f2")[:, :, ::-1].transpose(0, 2, 1)  # by row, then by channel in the order of their names
     rows = range(0, height, BLOCK_ROWS)
@@ -34,7 +35,7 @@ def exr_bytes(image: Float[np.ndarray, "h w 3"]) -> bytes:
 
 
 def write_exr(path: Path, image: Float[np.ndarray, "h w 3"]) -> None:
-    """Writes ``exr_bytes`` to a file, under a temporary name first. Raises OSError."""
+    """Writes an OpenEXR file atomically. Raises OSError."""
     write_atomically(path, exr_bytes(image))
 
 
@@ -56,8 +57,8 @@ def _header(width: int, height: int) -> bytes:
 
 
 def _block(samples: Float[np.ndarray, "r 3 w"]) -> bytes:
-    """Compresses some rows: low bytes before high ones, differences of neighbours, then zlib. If that is not shorter,
-    returns the samples unchanged."""
+    """Compresses some rows: separates low from high bytes, takes differences of neighbours, and applies zlib. Returns
+    the samples uncompressed if that is shorter."""
     raw = np.frombuffer(np.ascontiguousarray(samples).tobytes(), np.uint8)
     parted = np.concatenate([raw[::2], raw[1::2]])
     differences = np.concatenate([parted[:1], parted[1:] - parted[:-1] + np.uint8(128)])

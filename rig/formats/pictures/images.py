@@ -1,8 +1,8 @@
-"""Reads picture files by their content, and writes them so that a reader never sees a half-written file.
+"""Reads picture files, whose content determines the format, and writes picture files atomically.
 
-Ordinary pictures (8 or 16 bits) are decoded by OpenCV, RAW and DNG by LibRaw, HEIC by libheif; all become 8-bit sRGB.
-For Netpbm's maps the header states the value of white (4095 for 12 bits), which becomes 255. EXIF's orientation is
-ignored, because calibrations refer to the sensor's own rows and columns."""
+OpenCV decodes ordinary pictures (8 or 16 bits), LibRaw decodes RAW and DNG, and libheif decodes HEIC. Photographs are
+converted to 8-bit sRGB. The header of a Netpbm file states the value of white (4095 for 12 bits), which becomes 255.
+EXIF's orientation is ignored, because calibrations refer to the sensor's rows and columns."""
 
 import hashlib
 import re
@@ -68,21 +68,21 @@ PNG_OPTIONS = (
 
 
 def is_picture(path: Path) -> bool:
-    """Tells whether a path is a visible file (no folder, pipe or broken link) with a picture's suffix."""
+    """Returns whether a path is a visible regular file with a picture's suffix."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
 def write_image(
     path: Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"], quality: int = 95, *, parents: bool = True
 ) -> None:
-    """Writes RGB or grey pixels in the format of the suffix. ``quality`` is JPEG's; ``parents`` makes the folder if
-    need be."""
+    """Writes RGB or grey pixels in the format of the suffix. ``quality`` is JPEG's. ``parents`` creates missing
+    folders."""
     options = (cv2.IMWRITE_JPEG_QUALITY, quality) if path.suffix == ".jpg" else PNG_OPTIONS
     write_atomically(path, encode_image(path.suffix, image, options), parents=parents)
 
 
 def encode_image(suffix: str, image: np.ndarray, options: Sequence[int] = ()) -> bytes:
-    """Returns RGB or grey pixels as the bytes of a file of the format ``suffix``; ``options`` are OpenCV's."""
+    """Encodes RGB or grey pixels in the format ``suffix``. ``options`` are encoding options of OpenCV."""
     pixels = np.ascontiguousarray(image[:, :, ::-1] if image.ndim == 3 else image)  # OpenCV's blue comes first
     done, data = cv2.imencode(suffix, pixels, options)
     assert done
@@ -90,7 +90,7 @@ def encode_image(suffix: str, image: np.ndarray, options: Sequence[int] = ()) ->
 
 
 def read_image(path: Path) -> ImageRgb:
-    """Returns an RGB image. Raises InputError for a file that is no picture or damaged."""
+    """Reads a picture file as RGB. Raises InputError for a damaged file or one that is no picture."""
     pixels, _, fault = decode_image_file(path, path.name, "colour")
     if pixels is None:
         assert fault is not None
@@ -99,14 +99,14 @@ def read_image(path: Path) -> ImageRgb:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Returns width and height from the header, without decoding: a small file may claim any size. Raises InputError if
-    there is no such header."""
+    """Returns width and height (px) from the header. The file is not decoded, because a small file may claim a huge
+    size. Raises InputError without a valid header."""
     with _faults_of(path.name):
         return _header_size(path.read_bytes(), path.suffix.lower())[0]
 
 
 def page_count(path: Path) -> int:
-    """Returns how many pictures a TIFF or WebP file holds (only the first is read); 1 for other and damaged files."""
+    """Returns the number of pictures in a TIFF or WebP file, or 1 for other and damaged files."""
     if path.suffix.lower() not in PAGED_SUFFIXES:
         return 1
     try:
@@ -117,7 +117,7 @@ def page_count(path: Path) -> int:
 
 
 def open_picture(path: Path) -> Image.Image:
-    """Opens a picture with Pillow, which decodes only as much as a thumbnail needs. Raises InputError."""
+    """Opens a picture with Pillow, which can decode only as much as a thumbnail needs. Raises InputError."""
     if path.suffix.lower() in (*RAW_SUFFIXES, *HEIC_SUFFIXES):
         return Image.fromarray(read_image(path))
     with _faults_of(path.name):
@@ -127,10 +127,10 @@ def open_picture(path: Path) -> Image.Image:
 def decode_image_file(
     path: Path, where: str, kind: PictureKind, *, share: float = 1.0, bits: int = 16
 ) -> tuple[np.ndarray | None, str, Message | None]:
-    """Decodes a picture file, called ``where`` in messages. Returns its pixels and the sha256 of the file; or a fault
-    in place of pixels. The ``kind`` colour gives RGB, grey one channel, mask the mask's channel in the file's own
-    values (``rig.formats.pictures.mask_values``). ``share`` scales width and height, except for masks; ``bits`` are the
-    used bits of samples in a 16-bit file (``rig.formats.pictures.picture_samples``)."""
+    """Decodes a picture file, called ``where`` in messages. Returns its pixels and the file's SHA-256, or a fault if it
+    is damaged. For ``kind`` colour the pixels are RGB, for grey one channel, and for mask the unchanged values of the
+    channel with the mask (``rig.formats.pictures.mask_values``). ``share`` scales width and height, except for masks.
+    ``bits`` is the number of used bits in a 16-bit file (``rig.formats.pictures.picture_samples``)."""
     suffix, data = path.suffix.lower(), b""
     try:
         with _faults_of(where):
@@ -152,11 +152,11 @@ def decode_image_file(
 
 
 def cut_out_alpha(path: Path) -> Plane | None:
-    """Returns the alpha channel, in the file's own values, of a picture from which the subject was cut out.
+    """Returns the unchanged alpha channel of a picture in which only the subject is opaque.
 
-    Returns None if the file has no alpha, is too large or damaged, or if its alpha shows no subject. A subject must be
-    in the middle, with at least ``CUT_AWAY_LEAST`` of the picture transparent around it; rounded corners and the empty
-    rim of an undistorted picture do not count."""
+    Returns None if the file has no alpha channel, is too large or damaged, or if the opaque part cannot be a subject. A
+    subject is in the middle, and at least the fraction ``CUT_AWAY_LEAST`` of the picture around it is transparent.
+    Rounded corners and empty rims of undistorted pictures are smaller than this fraction."""
     data, suffix = path.read_bytes(), path.suffix.lower()
     if data.startswith(PNG):
         if len(data) <= PNG_COLOUR_TYPE or data[PNG_COLOUR_TYPE] not in PNG_WITH_ALPHA:
@@ -182,7 +182,7 @@ def cut_out_alpha(path: Path) -> Plane | None:
 
 @contextmanager
 def _faults_of(where: str, fault: Message | None = None) -> Iterator[None]:
-    """Raises InputError in place of the errors that decoders raise for a damaged file."""
+    """Converts the exceptions that decoders raise for a damaged file to InputError."""
     said = fault or compose("no-picture")
     try:
         yield
@@ -197,7 +197,7 @@ def _faults_of(where: str, fault: Message | None = None) -> Iterator[None]:
 
 
 def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
-    """Returns width and height, and the colour profile (empty for sRGB)."""
+    """Returns width and height (px) and the colour profile, which is empty for sRGB."""
     if suffix in RAW_SUFFIXES:
         with _raw(data) as raw:
             return (raw.sizes.width, raw.sizes.height), b""
@@ -213,8 +213,8 @@ def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
 
 
 def _check_metadata(data: bytes) -> None:
-    """Raises InputError for a JPEG with more metadata before its pixels than cameras write, because Pillow joins EXIF
-    segments in quadratic time. Steps from segment to segment as Pillow does."""
+    """Raises InputError for a JPEG with far more metadata than cameras write, because Pillow joins EXIF segments in
+    quadratic time."""
     if not data.startswith(JPEG):
         return
     at, segments, exif = 2, 0, 0
@@ -232,8 +232,7 @@ def _check_metadata(data: bytes) -> None:
 
 
 def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int, bits: int) -> np.ndarray:
-    """Returns the decoded pixels. ``halved``: how often a JPEG is halved during decoding, which is faster; other
-    formats are never halved."""
+    """Returns the decoded pixels. ``halved`` is how many times a JPEG is halved during decoding, which saves time."""
     if suffix in RAW_SUFFIXES:
         with _raw(data) as raw:
             # The camera's white balance, and no automatic brightness: pictures of all cameras must stay comparable.
@@ -261,7 +260,7 @@ def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int, bits: 
 
 
 def _holds_floats(data: bytes) -> bool:
-    """Tells whether a TIFF file holds floating-point numbers, as programs for high dynamic range write them."""
+    """Returns whether a TIFF file contains floating-point values, as HDR programs write."""
     if not data.startswith(TIFF):
         return False
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -269,7 +268,7 @@ def _holds_floats(data: bytes) -> bool:
 
 
 def _of_white(data: bytes, white: int, kind: PictureKind) -> np.ndarray:
-    """Decodes a Netpbm map whose white level is neither 255 nor 65535. Raises ValueError."""
+    """Decodes a Netpbm file whose value of white is neither 255 nor 65535. Raises ValueError."""
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or not 0 < white < 65536:
         raise ValueError("not decoded")
@@ -301,7 +300,7 @@ def _raw(data: bytes) -> Iterator[Any]:
 
 
 def heif_header(data: bytes) -> Any:
-    """Opens a HEIC file without decoding it. Raises InputError if the extra ``heic`` is not installed."""
+    """Opens a HEIC file without decoding it. Raises InputError if libheif is not installed."""
     try:
         import pi_heif
     except ModuleNotFoundError:
@@ -310,7 +309,8 @@ def heif_header(data: bytes) -> Any:
 
 
 def _in_srgb(pixels: ImageRgb, profile: bytes) -> ImageRgb:
-    """Converts colours of another profile (Display P3, Adobe RGB) to sRGB. An unreadable profile is treated as sRGB."""
+    """Converts colours from ``profile`` (such as Display P3 or Adobe RGB) to sRGB. An unreadable profile counts as
+    sRGB."""
     from PIL import ImageCms
 
     try:

@@ -1,15 +1,15 @@
 """Interprets the values of mask files as the subject's share in every pixel.
 
-Programs write masks as 0 and 1, 0 and 255, 16 bits, two colours, the alpha of a cut-out, soft greys, and through JPEG,
-whose ringing leaves values of 1 to 40 ten pixels outside an outline. All these have two levels that fill areas, with
-the outline half way between them. Levels are measured over all masks of a capture, so that the noise of an empty mask
-is not stretched to a subject. Files with other content (labels, depth, a photograph, a single value) are faults.
+Programs write masks as 0 and 1, 0 and 255, 16 bits, two colours, an alpha channel, soft greys, and as JPEG, whose
+ringing leaves values of 1 to 40 ten pixels outside an outline. All these masks have two values that fill areas, and the
+outline lies at the mean of both values. The values are measured over all masks of a capture, so that noise in an empty
+mask is not mistaken for a subject. Files with other content, such as labels, depth or a photograph, are faults.
 
 The subject is white by this project's convention, but black in programs that mark the pixels to ignore. Two criteria
-decide. Background covers all borders of a picture but one (the subject's shoulders fill the bottom, or another side if
-the camera is mounted on its side). The subject covers the middle. A mask is inverted if both criteria agree on that.
-They disagree for a close-up that fills the frame and for a subject off the middle; such views follow the majority of
-the others.
+decide which value is the subject. The background covers all borders of a picture but one, which shows the subject's
+shoulders. The subject covers the middle. A mask is inverted if both criteria say that the subject is black. The
+criteria disagree for a close-up that fills the frame and for a subject beside the middle. Such undecided masks are
+treated as most other masks of the capture.
 """
 
 from collections.abc import Mapping
@@ -53,9 +53,9 @@ VALUES_NAMED = 6
 class MaskReading:
     """Holds a mask and its interpretation.
 
-    ``share`` is the subject's share in each pixel, 0 to 255. ``soft`` tells that edges are soft, so that grey values
-    locate the outline within a pixel. ``fault`` is the reason why the file is no mask (then the share is 0); ``remark``
-    is a warning."""
+    ``share`` is the subject's share in each pixel, 0 to 255. ``soft`` is True if edges are soft, so that grey values
+    locate the outline within a pixel. ``fault`` is the reason why the file is no valid mask, for which ``share`` is 0.
+    ``remark`` is a warning."""
 
     share: Share
     soft: bool = False
@@ -66,8 +66,9 @@ class MaskReading:
 def mask_plane(pixels: Pixels) -> Plane | Message:
     """Returns the channel of decoded pixels (BGR order) that contains the mask, or a fault if there is none.
 
-    It is the alpha of a cut-out. In a picture of two colours it is the channel in which they differ most. A picture
-    that was cut out on one colour becomes 1 where it has another colour and 0 elsewhere."""
+    The mask is the alpha channel if its values vary. In a picture of two colours, the mask is the channel in which the
+    colours differ most. If a photograph of the subject has a background of exactly one colour, the result is 0 at this
+    colour and 1 elsewhere."""
     channels = pixels[:, :, None] if pixels.ndim == 2 else pixels
     if channels.shape[2] in (2, 4):
         alpha = channels[:, :, -1]
@@ -97,7 +98,7 @@ def _plane_of_colours(channels: Num[np.ndarray, "h w c"]) -> Plane | Message:
 
 
 def read_masks(planes: Mapping[str, Plane]) -> dict[str, MaskReading]:
-    """Reads the masks of one capture. All files with the same data type together determine the range of values."""
+    """Interprets the masks of one capture. All files with the same data type together determine the range of values."""
     ranges: dict[str, tuple[float, float]] = {}
     for plane in planes.values():
         low, high = _range(plane)
@@ -142,7 +143,7 @@ def _constant_fault(value: float, common: tuple[float, float]) -> Message:
 
 
 def _levels(plane: Plane, span: tuple[float, float]) -> list[float]:
-    """Returns the values that fill areas, in rising order. Of values close together it takes the most frequent."""
+    """Returns the values that fill areas, in ascending order. Of close values, returns the most frequent."""
     low, high = span
     exact = plane.dtype.kind in "ui" and high - low < BINS
     count = int(high - low) + 1 if exact else BINS
@@ -163,13 +164,13 @@ def _levels(plane: Plane, span: tuple[float, float]) -> list[float]:
 
 
 def _is_area(pixels: Bool[np.ndarray, "h w"]) -> bool:
-    """Tells whether most of these pixels have only each other as neighbours, unlike one grey level of a soft edge."""
+    """Returns whether most True pixels have only True neighbours, unlike those of one grey level in a soft edge."""
     within = cv2.erode(pixels.astype(np.uint8), np.ones((3, 3), np.uint8))
     return bool(np.count_nonzero(within) > AREA_WITHIN * np.count_nonzero(pixels))
 
 
 def _fills_areas(plane: Plane, levels: list[float], span: float) -> bool:
-    """Tells whether there are at least two levels, and they hold most of the picture."""
+    """Returns whether there are at least two levels, and most pixels have one of them."""
     near = sum(np.count_nonzero(np.abs(plane.astype(np.float64) - level) <= NEAR_LEVEL * span) for level in levels)
     return len(levels) > 1 and bool(near >= AREAS_LEAST * plane.size)
 
@@ -180,8 +181,8 @@ def _share_between(plane: Plane, black: float, white: float) -> Share:
 
 
 def _read_trimap(plane: Plane, levels: list[float]) -> MaskReading:
-    """Reads a trimap: the outline is set to the middle of its undecided band, which must be narrow and lie between
-    black and white."""
+    """Reads a trimap. The outline becomes the middle of the band of undecided pixels, which must be narrow and lie
+    between black and white."""
     named = [f"{level:g}" for level in levels[:VALUES_NAMED]] + ["..."] * (len(levels) > VALUES_NAMED)
     labels = compose("mask-of-labels", count=len(levels), values=named)
     if len(levels) > 3:
@@ -204,7 +205,7 @@ def _read_trimap(plane: Plane, levels: list[float]) -> MaskReading:
 def subject_convention(
     mask: Bool[np.ndarray, "h w"], middle_px: Float[np.ndarray, " 2"] | None = None
 ) -> Convention | None:
-    """Returns the subject's level according to this mask alone: white or black; None if the criteria disagree.
+    """Returns whether the subject is white or black according to this mask alone, or None if the criteria disagree.
 
     Args:
         mask: True where it is white.
@@ -228,7 +229,7 @@ def subject_convention(
 def inverted_masks(
     masks: Mapping[str, Bool[np.ndarray, "_ _"]], middles_px: Mapping[str, Float[np.ndarray, " 2"]]
 ) -> list[str]:
-    """Returns the names of the masks whose subject is black. Undecided masks follow the majority of the others.
+    """Returns the names of the masks whose subject is black. An undecided mask is interpreted as most other masks are.
 
     Args:
         masks: by camera, True where they are white.

@@ -1,8 +1,8 @@
-"""Lists the suffixes of picture files, and matches files to cameras by their names. It needs no decoder.
+"""Lists the suffixes of picture files, and matches files to cameras by file names.
 
-Programs call the mask of "cam00.png" "cam00.png.png" (COLMAP), "cam00.png.mask.png" (RealityScan) or "cam00_mask.png",
-and number a picture of "cam00" "shot_0001_cam00.tif". Names are therefore compared as words: runs of letters, and
-numbers without leading zeros. Separators, case and suffixes of pictures do not count."""
+The mask of "cam00.png" may be named "cam00.png.png" (COLMAP), "cam00.png.mask.png" (RealityScan) or "cam00_mask.png",
+and a picture of "cam00" may be named "shot_0001_cam00.tif". Names are therefore split into words: runs of letters, and
+numbers without leading zeros. Separators, case and suffixes of pictures are ignored."""
 
 import re
 import unicodedata
@@ -49,14 +49,14 @@ WORD = re.compile(r"\d+|[^\W\d_]+")
 
 
 def is_junk(name: str) -> bool:
-    """Tells whether a file or folder with this name is hidden, or was added by a file manager."""
+    """Returns whether a file or folder with this name is hidden or was added by a file manager."""
     return name.casefold() in {junk.casefold() for junk in JUNK} or name.startswith(".")
 
 
 def entry(folder: Path, name: str) -> Path:
-    """Returns the file or folder with that name in a folder, ignoring case, since programs and systems change it.
+    """Returns the path of the file or folder ``name`` in a folder, ignoring case, because operating systems change it.
 
-    Without one, it returns the path with exactly that name. Raises InputError if two names differ only in case."""
+    If none exists, returns the path with exactly this name. Raises InputError if two names differ only in case."""
     found = [path for path in sorted(folder.iterdir()) if path.name.casefold() == name] if folder.is_dir() else []
     if len(found) > 1:
         raise InputError(folder.name, [compose("names-of-other-case", names=[path.name for path in found])])
@@ -64,16 +64,16 @@ def entry(folder: Path, name: str) -> Path:
 
 
 def has_raw_beside(path: Path) -> bool:
-    """Tells whether a camera wrote the picture twice: its RAW file is in the same folder, and is read instead."""
+    """Returns whether the RAW file of a picture lies in the same folder, so that the RAW file is read instead."""
     if path.suffix.lower() not in IMAGE_SUFFIXES or path.suffix.lower() in RAW_SUFFIXES:
         return False
     return any(path.with_suffix(cased).is_file() for end in RAW_SUFFIXES for cased in (end, end.upper()))
 
 
 def safe_name(name: str) -> str:
-    """Returns a camera's name in letters, digits and ``-_.``, for files and addresses: blanks and signs become ``_``,
-    accents are dropped, and other letters become their numbers. Names that lead into other folders, or that are hidden,
-    stay as they are."""
+    """Converts a camera's name to letters, digits and ``-_.``, for file names and URLs. Blanks and signs become ``_``,
+    accents are dropped, and other letters become their code points. Hidden names, and names that lead into other
+    folders, are not changed."""
     if name.startswith(".") or any(c in "/\\" or unicodedata.category(c) in ("Cc", "Cf", "Cs") for c in name):
         return name
     plain = unicodedata.normalize("NFKD", name.strip())
@@ -82,15 +82,15 @@ def safe_name(name: str) -> str:
 
 
 def picture_stem(name: str) -> str:
-    """Returns a file's name without a picture's suffix. A dot that begins no such suffix belongs to the name."""
+    """Removes a picture's suffix from a file name. Any other text after a dot is kept."""
     stem, dot, ending = name.rpartition(".")
     return stem if dot and stem and f".{ending.lower()}" in (*IMAGE_SUFFIXES, *UNREAD_PICTURES) else name
 
 
 def match_names(names: Iterable[str], cameras: Sequence[str], *, several: bool = False) -> dict[str, list[str]]:
-    """Matches files by similar names to the cameras that have no file of exactly their own name. Returns the matched
-    files by camera; doubtful ones are left out. ``names`` are of files (with suffixes) or of folders; ``several``: a
-    camera may have more than one file."""
+    """Matches files to cameras by similar names, for cameras without a file of exactly their name. Returns the files by
+    camera, without ambiguous files. ``names`` holds names of files (with suffixes) or folders. ``several`` allows a
+    camera to have several files."""
     files = sorted(set(names))
     exact = {picture_stem(name) for name in files} | {name for name in files if name in cameras}
     lacking = {camera for camera in cameras if camera not in exact}
@@ -121,15 +121,15 @@ def _words(name: str) -> Words:
 
 
 def _equal(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Matches files whose words equal those of a camera: "CAM_0.png" to cam00."""
+    """Matches files whose words equal a camera's words, for example "CAM_0.png" to cam00."""
     times = Counter(cameras.values())
     owners = {words: camera for camera, words in cameras.items() if words and times[words] == 1}
     return _by_owner((owners[words], name) for name, words in strays.items() if words in owners)
 
 
 def _alike_about(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Matches files that have the same words before and after each camera's words. The pair of words that fits most
-    cameras counts."""
+    """Matches files whose names have the same words before and after each camera's words. Uses the words before and
+    after that fit most cameras."""
     fitting: dict[tuple[Words, Words], dict[str, list[str]]] = {}
     for name, words in strays.items():
         for camera, known in cameras.items():
@@ -148,8 +148,7 @@ def _alike_about(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> F
 
 
 def _naming_one(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Matches files whose words contain those of a single camera, whatever else they contain: times, exposures,
-    counters."""
+    """Matches files whose words contain the words of a single camera, besides others such as times or counters."""
     pairs = []
     for name, words in strays.items():
         said = [camera for camera, known in cameras.items() if _is_telling(known) and _places(known, words)]
@@ -159,8 +158,7 @@ def _naming_one(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Fo
 
 
 def _numbered(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Matches files that contain only the words in which the cameras differ ("00.png" to cam00), if every camera has
-    one."""
+    """Matches files that have only the words that distinguish cameras ("00.png" to cam00), if each camera has one."""
     ways = list(cameras.values())
     head = next((i for i, said in enumerate(zip(*ways, strict=False)) if len(set(said)) > 1), None)
     if head is None or len(cameras) < 2:
@@ -171,7 +169,7 @@ def _numbered(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Foun
 
 
 def _places(known: Words, words: Words) -> list[int]:
-    """Returns the positions at which the words of a camera begin among the words of a file."""
+    """Returns the indices at which the words of a camera begin among the words of a file."""
     return [i for i in range(len(words) - len(known) + 1) if known and words[i : i + len(known)] == known]
 
 
@@ -180,7 +178,7 @@ def _within(known: Words, other: Words) -> bool:
 
 
 def _is_telling(words: Words) -> bool:
-    """Tells whether the words contain more than numbers, since numbers may be counters or dates."""
+    """Returns whether any word is not a number, because numbers alone may be counters or dates."""
     return any(not word.isdecimal() for word in words)
 
 

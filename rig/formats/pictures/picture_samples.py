@@ -1,14 +1,12 @@
-"""Finds how the samples of picture files are stored, before any measurement in the pictures.
+"""Determines the bit depth of picture files, and detects raw sensor mosaics.
 
-Machine vision software writes 10 or 12 bits into 16-bit files; read without scaling, such pictures are nearly black.
-Such software also writes the sensor's mosaic as a grey picture: a quarter of its pixels is red and a quarter blue.
+Machine vision software writes 10 or 12 bits into 16-bit files. Without scaling, such pictures are nearly black. Machine
+vision software also writes the sensor's colour filter mosaic as a grey picture, in which a quarter of the pixels is red
+and a quarter blue.
 
-In: files of one kind (photographs or clean plates) of all cameras. Out: the number of bits used, and whether the files
-are mosaics.
-
-The module also fills the empty rims of pictures if the clean plates have none, and the reverse. Undistortion leaves an
-empty rim: transparent, black, and sometimes white. Compared with a plate without a rim, the rim would look like a
-subject all around the picture. The scene behind the rim is unknown and taken as backdrop."""
+The module also fills the empty rims of pictures if their clean plates (pictures of the empty studio) have no rims, and
+the reverse. Undistortion leaves an empty rim that is transparent, black or white. In a comparison with a plate without
+a rim, the rim would seem to be a subject. The filled rim counts as background."""
 
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -40,15 +38,15 @@ TIFF = (b"II*\x00", b"MM\x00*")
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Describes how the files of one kind are stored. ``bits``: how many of 16 bits are used, None for files of 8 bits;
-    ``mosaic``: whether they hold a sensor's mosaic."""
+    """Describes the files of one kind, photographs or clean plates. ``bits`` is the number of used bits in 16-bit
+    files, or None for 8-bit files. ``mosaic`` is True for raw sensor mosaics."""
 
     bits: int | None
     mosaic: bool
 
 
 def measure_samples(paths: Sequence[Path]) -> Samples:
-    """Measures the samples of files of one kind. The largest sample of all files determines the number of bits."""
+    """Measures files of one kind. The largest sample in all files determines the number of bits."""
     with ThreadPoolExecutor(max_workers=4) as pool:
         measured = [*pool.map(_measure, paths)]
     largest = [most for most, _ in measured if most is not None]
@@ -58,13 +56,13 @@ def measure_samples(paths: Sequence[Path]) -> Samples:
 
 
 def used_bits(largest: int) -> int:
-    """Returns the smallest number of bits in ``USED_BITS`` that holds ``largest``, or 16 if no such number does."""
+    """Returns the smallest number of bits in ``USED_BITS`` that can represent ``largest``, or else 16."""
     return next((bits for bits in USED_BITS if largest < 2**bits), WHOLE_BITS)
 
 
 def _measure(path: Path) -> tuple[int | None, bool]:
-    """Returns the largest sample of a 16-bit file (otherwise None), and whether it is a mosaic; (None, False) for
-    damaged files."""
+    """Returns the largest sample of a 16-bit file (None for other files), and whether the file is a mosaic. Returns
+    (None, False) for a damaged file."""
     try:
         depth, channels = _depth_and_channels(path)
         if depth != WHOLE_BITS and channels != 1:
@@ -80,8 +78,7 @@ def _measure(path: Path) -> tuple[int | None, bool]:
 
 
 def _depth_and_channels(path: Path) -> tuple[int, int]:
-    """Returns bits per sample and samples per pixel from the header of a PNG or TIFF file; 8 and 3 for other
-    formats."""
+    """Returns bits per sample and samples per pixel from the header of a PNG or TIFF; 8 and 3 for other formats."""
     with path.open("rb") as file:
         data = file.read(HEADER_BYTES)
     if data.startswith(PNG) and len(data) > 25:
@@ -95,8 +92,8 @@ def _depth_and_channels(path: Path) -> tuple[int, int]:
 
 
 def is_mosaic(pixels: Num[np.ndarray, "h w"]) -> bool:
-    """Tells whether a grey picture is a sensor's mosaic: its pixels resemble their second neighbours, which have the
-    same colour filter, more than their neighbours."""
+    """Returns whether a grey picture is a sensor mosaic: pixels resemble their second neighbours, which have the same
+    colour filter, more than their direct neighbours."""
     values = pixels.astype(np.float32)
     if min(values.shape) < 3:
         return False
@@ -111,8 +108,8 @@ def _mean_step(values: Float32[np.ndarray, "h w"], apart: int) -> float:
 def fill_rims(
     images: Mapping[str, ImageRgb], plates: Mapping[str, Sequence[ImageRgb]], masked: Collection[str]
 ) -> tuple[dict[str, ImageRgb], dict[str, tuple[ImageRgb, ...]], list[Message]]:
-    """Fills the rim of a picture whose plates have none with the first plate's pixels, and the reverse. Plates of
-    cameras in ``masked`` are ignored."""
+    """Fills the empty rim of a picture from the first clean plate if the plates have no rim, and the reverse. Ignores
+    the plates of cameras in ``masked``."""
     filled, behind = dict(images), {name: tuple(of) for name, of in plates.items()}
     rimmed = []
     for name, image in images.items():
@@ -127,7 +124,7 @@ def fill_rims(
 
 
 def _without_rim(image: ImageRgb, other: ImageRgb) -> ImageRgb:
-    """Returns the picture with its empty rim filled from ``other``; unchanged if it has none or both have one."""
+    """Fills the empty rim of a picture from ``other``. Returns it unchanged if it has no rim or both have one."""
     rim = empty_rim(image)
     if rim is None or rim.mean() > MAX_SHARE or (rim & ~_empty(other)).mean() < MIN_SHARE:
         return image
@@ -138,8 +135,8 @@ def _without_rim(image: ImageRgb, other: ImageRgb) -> ImageRgb:
 
 
 def empty_rim(image: ImageRgb) -> Bool[np.ndarray, "h w"] | None:
-    """Returns the pixels of one value, black or white, that are connected to the border. Returns None if they do not
-    touch all four sides, as with dark clothes and overexposed windows."""
+    """Returns a mask of the black or white pixels that are connected to the border. Returns None if the pixels do not
+    touch all four sides, as with dark clothes or overexposed windows."""
     for dark in (True, False):
         sides = (image[:1], image[-1:], image[:, :1], image[:, -1:])
         if not all(_of_value(side, dark=dark).any() for side in sides):

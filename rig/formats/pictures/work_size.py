@@ -1,9 +1,9 @@
-"""Computes the reduced size at which large photographs are read, and the cameras for pictures of that size.
+"""Computes the reduced size at which large photographs are read, and the intrinsics for pictures of this size.
 
-A head fills 60 % of a picture's height, so with four megapixels a pixel covers 0.24 mm of it: finer than depth is
-measured (0.4 mm, ``PIXEL_MM`` of pipeline/stereo/estimate.py) and than any mesh's vertices. Limits in pixels were tuned
-on pictures of 0.8 Mpx. At 12 Mpx correct outlines still satisfy them; at 24 Mpx they are wrongly reported to contradict
-their cameras."""
+A head fills 60 % of a picture's height, so that a pixel of a four-megapixel picture covers 0.24 mm. Depth is measured
+only at 0.4 mm (``PIXEL_MM`` of pipeline/stereo/estimate.py), and vertices are farther apart. The program's limits in
+pixels were tuned on pictures of 0.8 Mpx. At 12 Mpx correct outlines still satisfy the limits; at 24 Mpx correct
+outlines are reported to contradict their cameras."""
 
 from dataclasses import replace
 
@@ -22,7 +22,8 @@ HALVINGS_MOST = 3  # JPEG decoders reduce to 1/8 at most
 
 
 def work_share(intrinsics: Intrinsics, pixels_most: int | None) -> float:
-    """Returns the scale, 1 or less, at which a camera's pictures are read. ``pixels_most`` None means full size."""
+    """Returns the scale, 1 or less, at which a camera's pictures are read to have at most ``pixels_most`` pixels. None
+    means full size."""
     pixels = intrinsics.width * intrinsics.height
     if pixels_most is None or pixels <= pixels_most:
         return 1.0
@@ -31,7 +32,7 @@ def work_share(intrinsics: Intrinsics, pixels_most: int | None) -> float:
 
 
 def work_rig(rig: Rig, pixels_most: int | None) -> Rig:
-    """Returns the cameras for pictures that are read at the reduced size."""
+    """Returns the rig with intrinsics for pictures of at most ``pixels_most`` pixels."""
     shares = {camera.name: work_share(camera.intrinsics, pixels_most) for camera in rig}
     return replace(
         rig,
@@ -43,7 +44,7 @@ def work_rig(rig: Rig, pixels_most: int | None) -> Rig:
 
 
 def work_features(features: Features, rig: Rig, work: Rig) -> Features:
-    """Converts feature points from the files' pictures to the reduced pictures."""
+    """Converts feature points (px) from the original pictures to the reduced pictures."""
 
     def moved(name: str, pixel: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " 2"]:
         full, scaled = rig[name].intrinsics, work[name].intrinsics
@@ -53,9 +54,10 @@ def work_features(features: Features, rig: Rig, work: Rig) -> Features:
 
 
 def halvings(share: float, size: tuple[int, int]) -> int:
-    """Returns how often a decoder may halve a picture of ``size`` (width, height) that will be scaled by ``share``.
+    """Returns how many times a decoder may halve a picture of ``size`` (width, height) that will be scaled by
+    ``share``.
 
-    Only halvings that divide the picture into whole blocks count, so that no pixel averages half a block."""
+    Halving stops if width or height is odd, so that every pixel averages a whole block."""
     count = 0
     while count < HALVINGS_MOST and share <= 0.5 ** (count + 1) and not any(side % 2 ** (count + 1) for side in size):
         count += 1
@@ -65,8 +67,8 @@ def halvings(share: float, size: tuple[int, int]) -> int:
 def at_share(
     pixels: UInt8[np.ndarray, "h w *channels"], size: tuple[int, int], share: float
 ) -> UInt8[np.ndarray, "r c *channels"]:
-    """Returns a picture at scale ``share`` of its file's ``size`` (width, height). A decoder may have reduced the
-    pixels already."""
+    """Resizes a picture to ``share`` times the ``size`` (width, height) of its file. A decoder may have reduced
+    ``pixels`` before."""
     wanted = (round(size[0] * share), round(size[1] * share))
     if wanted == (pixels.shape[1], pixels.shape[0]):
         return pixels

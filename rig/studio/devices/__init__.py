@@ -1,1 +1,1 @@
-"""Presents the simulated studio as devices: camera streams, a trigger box on a serial line, and files in a folder."""
+"""Makes the simulated studio available as camera streams, as a trigger box on a serial line, and as files."""

@@ -1,5 +1,4 @@
-"""Writes a simulated capture to disk: the folder described in docs/capture-format.md, and a folder with its ground
-truth."""
+"""Writes a simulated capture as a capture folder (docs/capture-format.md), and its ground truth as a second folder."""
 
 import io
 import json
@@ -19,13 +18,14 @@ from rig.studio.sensor.preset import REALISM, made_real
 
 
 def simulate_to_folder(out: Path, simulated: SimulatedCapture, *, seed: int | None = None) -> Path:
-    """Writes a simulated capture as the folder ``out`` and its ground truth as the folder ``<out>.truth``. Returns the
-    latter.
+    """Writes a simulated capture to the folder ``out`` and its ground truth to the folder ``<out>.truth``. Returns the
+    path of ``<out>.truth``.
 
-    The truth holds head.ply (world frame, mm, colours as lit), face_mask.npy and colour_mask.npy (a boolean for each
-    vertex), silhouettes/ (subject with hair and clothes, at least half covered), head_silhouettes/ (bare head),
-    coverage/ (0 to 255), parts/ (0 background, 1 skin, 2 hair or beard, 3 clothes, cap or glasses), visible.npz (points
-    of head, hair and clothes in two or more views), cameras.json (the true cameras) and meta.json.
+    The truth folder contains the true cameras (cameras.json) and the head (head.ply, world frame, mm, lit colours) with
+    a Boolean for each vertex in face_mask.npy and colour_mask.npy. Masks of the subject with hair and clothes are in
+    silhouettes/, masks of the bare head in head_silhouettes/, and the coverage of pixels (0 to 255) in coverage/. The
+    labels in parts/ are 0 background, 1 skin, 2 hair or beard, 3 clothes, cap or glasses. Surface points that two or
+    more cameras see are in visible.npz.
     """
     write_capture(out, simulated.capture, simulated.rig)
     truth = out.with_name(out.name + ".truth")
@@ -34,7 +34,7 @@ def simulate_to_folder(out: Path, simulated: SimulatedCapture, *, seed: int | No
 
 
 def write_truth(folder: Path, simulated: SimulatedCapture, *, seed: int | None = None) -> None:
-    """Writes the ground truth of a simulated capture, without the capture, into ``folder``."""
+    """Writes only the ground truth of a simulated capture to ``folder``."""
     scene = simulated.scene
     count = len(scene.head.vertices)
     face = np.ones(count, bool) if scene.face_region is None else np.asarray(scene.face_region)

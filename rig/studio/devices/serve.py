@@ -1,8 +1,7 @@
-"""Serves the simulated studio as a set of real devices: motion-JPEG streams on loopback and a trigger box on a
-pseudo-terminal.
+"""Serves the simulated studio as devices: motion-JPEG streams on loopback and a trigger box on a pseudo-terminal.
 
-The opencv driver and the serial client run against it unchanged. The caller provides the cameras' pictures: an
-``ImageSource`` for the empty studio and one with the subject seated. This module adds lamps, cables, triggers, and
+The program's camera driver and trigger client use these devices as they use real ones. The caller provides an
+``ImageSource`` of the empty studio and one with the seated subject. This module simulates lamps, cables, triggers and
 their faults.
 """
 
@@ -55,8 +54,8 @@ _JPEG = [
 
 @dataclass(frozen=True, slots=True)
 class DeviceFault:
-    """Holds a fault of one of ``KINDS``: its camera (None: the whole rig) and its amount (None: the usual amount of its
-    kind)."""
+    """Holds a simulated fault of one of ``KINDS``. ``camera`` is None for the whole rig; ``amount`` is None for the
+    usual amount of the kind."""
 
     kind: str
     camera: str | None = None
@@ -64,13 +63,13 @@ class DeviceFault:
 
     @property
     def strength(self) -> float:
-        """Returns the fault's amount, or the usual amount of its kind if none was set."""
+        """Returns the fault's amount, or the usual amount of its kind if ``amount`` is None."""
         return self.amount if self.amount is not None else DEFAULT_AMOUNT.get(self.kind, 0.0)
 
 
 def device_fault_from_text(text: str) -> DeviceFault:
-    """Reads a fault from ``kind[:camera][=amount]``. Raises InputError for text of another form or an unknown kind;
-    whether the camera exists is checked by ``StudioDevices.inject``."""
+    """Reads a fault from ``kind[:camera][=amount]``. Raises InputError for another form or an unknown kind.
+    ``StudioDevices.inject`` checks whether the camera exists."""
     kind, camera, amount = fault_parts(text)
     if kind not in KINDS:
         raise InputError("fault", [compose("none-of", value=f"{kind!r}", known=KINDS)])
@@ -79,7 +78,7 @@ def device_fault_from_text(text: str) -> DeviceFault:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """Holds everything that determines a camera's picture."""
+    """Holds the state of lamps and faults that determines a camera's picture."""
 
     camera: str
     seated: bool
@@ -88,11 +87,11 @@ class _Look:
 
 
 class StudioDevices:
-    """Runs the cameras of the simulated studio as streams, and its trigger box, while a block runs. ``folder`` receives
-    rig.toml and the link to the box's port.
+    """Runs camera streams and a trigger box during a ``with`` block. ``folder`` receives rig.toml and a link to the
+    box's port.
 
-    ``takes`` is the number of pictures of the empty studio, each with its own noise, that the live view shows in turn;
-    more clean plates than that would contain repetitions. ``close`` leaves no thread, port or link behind.
+    ``takes`` is the number of pictures of the empty studio, with different noise, that the live view repeats. More
+    clean plates than ``takes`` would be duplicates. ``close`` leaves no thread, port or link behind.
     """
 
     def __init__(
@@ -136,24 +135,24 @@ class StudioDevices:
         self.close()
 
     def close(self) -> None:
-        """Ends the streams and the trigger box. Safe to call twice."""
+        """Ends the streams and the trigger box. The call may be repeated."""
         if self.box is not None:
             self.box.close()
         self.streams.close()
 
     @property
     def port_link(self) -> Path:
-        """Returns the path under which rig.toml finds the trigger box."""
+        """Returns the path of the trigger box's port in rig.toml."""
         return self.folder.resolve() / "trigger-box"
 
     def seat(self, present: bool) -> None:
-        """Seats the subject, or empties the seat. Returns when every camera shows the change."""
+        """Adds the subject to all cameras' pictures, or removes it. Returns when every camera shows the change."""
         with self._busy:
             self.present = present
             self._refresh()
 
     def inject(self, fault: DeviceFault) -> None:
-        """Adds a fault that lasts until ``clear``. Raises InputError for an unknown kind or camera."""
+        """Adds a fault that lasts until a call of ``clear``. Raises InputError for an unknown kind or camera."""
         faults = []
         if fault.kind not in KINDS:
             strange = compose("none-of", value=f"{fault.kind!r}", known=KINDS)
@@ -198,7 +197,7 @@ class StudioDevices:
         self.box = SimulatedTriggerBox(self.port_link, BoxLogic(self._on_release, self._on_lights, self.streams.arm))
 
     def _apply(self) -> None:
-        """Applies the listed faults to every device."""
+        """Applies all current faults to the devices."""
         kinds = {(fault.kind, fault.camera) for fault in self.faults}
         views = {name: name for name in self.names}
         for kind, camera in kinds:
@@ -246,7 +245,7 @@ class StudioDevices:
         return _Look(camera, self.present, light, self._strength("bumped", camera))
 
     def _refresh(self) -> None:
-        """Encodes the cameras' current pictures in advance, with the lamps on and off."""
+        """Encodes the current pictures of all cameras in advance, with the lamps on and off."""
         with ThreadPoolExecutor(2) as pool:
             films = [film for films in pool.map(self._films_of, self.names) for film in films.items()]
         # The empty studio comes back with every subject that leaves: its films are kept, theirs are not.
@@ -255,7 +254,7 @@ class StudioDevices:
             self.streams.show(name, self._films[self._look(name)])
 
     def _films_of(self, camera: str) -> dict[_Look, Film]:
-        """Returns the films of one camera, with the lamps off and on."""
+        """Returns the encoded pictures of one camera with the lamps off and on."""
         lightings = [self._look(camera, lamps) for lamps in (0, (1 << LIGHTS) - 1)]
         if all(lighting in self._films for lighting in lightings):
             return {lighting: self._films[lighting] for lighting in lightings}
@@ -270,7 +269,7 @@ class StudioDevices:
         return films
 
     def _answer(self, method: str, path: str, query: Mapping[str, str]) -> tuple[int, str]:
-        """Answers the studio's page and controls: GET /, POST /subject?present=1, POST and DELETE /faults."""
+        """Answers HTTP requests to the studio: GET /, POST /subject?present=1, POST and DELETE /faults."""
         try:
             if (method, path) == ("GET", "/"):
                 return 200, self._page()
@@ -311,8 +310,7 @@ class StudioDevices:
 def serve_scene(
     folder: Path, scene: Scene, *, fps: float = 4.0, host: str = "127.0.0.1", port: int = 0
 ) -> StudioDevices:
-    """Starts the devices of a rendered scene, its seat empty, and returns them. ``folder`` receives rig.toml and
-    cameras.json."""
+    """Starts the devices of a rendered scene without the subject. ``folder`` receives rig.toml and cameras.json."""
     folder.mkdir(parents=True, exist_ok=True)
     write_rig(scene.rig, folder / "cameras.json")
     empty, seated = SceneImages(scene, seated=False, seed=1), SceneImages(scene, seated=True, seed=2)
@@ -322,7 +320,7 @@ def serve_scene(
 
 
 def _develop(image: ImageRgb, lighting: _Look, rng: np.random.Generator) -> bytes:
-    """Encodes ``image`` as JPEG, with reduced light and the camera displaced."""
+    """Encodes ``image`` as JPEG, with the light and the camera's displacement of ``lighting``."""
     if lighting.bump_px:
         image = _bumped(image, lighting.bump_px)
     if lighting.light < 1:
@@ -333,7 +331,8 @@ def _develop(image: ImageRgb, lighting: _Look, rng: np.random.Generator) -> byte
 
 
 def _bumped(image: ImageRgb, amount_px: float) -> ImageRgb:
-    """Shifts a knocked camera's picture along (0.8, 0.6), and rotates it by a third of ``amount_px`` at its edge."""
+    """Simulates a displaced camera. Shifts the picture by ``amount_px`` along (0.8, 0.6), and rotates it by a third of
+    ``amount_px`` at its edge."""
     height, width = image.shape[:2]
     turn_deg = float(np.degrees(2 * amount_px / (3 * width)))
     warp = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn_deg, 1.0)

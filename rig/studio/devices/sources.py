@@ -1,4 +1,4 @@
-"""Takes pictures of a studio scene one by one, for simulated cameras: an ``ImageSource`` of a ``Scene``."""
+"""Takes single pictures of a studio scene for simulated cameras."""
 
 import itertools
 import threading
@@ -21,7 +21,7 @@ from rig.studio.sensor.sensor import drift, expose
 
 @runtime_checkable
 class ImageSource(Protocol):
-    """Describes a function that takes the picture of a simulated camera, sensor noise included."""
+    """Declares a function that takes a picture with a simulated camera, sensor noise included."""
 
     def __call__(self, camera: str, time_s: float) -> ImageRgb:
         """Returns the named camera's picture at ``time_s``, in seconds since the studio began."""
@@ -29,11 +29,10 @@ class ImageSource(Protocol):
 
 
 class SceneImages:
-    """Takes pictures of a still scene, with the subject seated or without. Every picture has its own noise.
-    Thread-safe.
+    """Takes pictures of a static scene with or without the subject. Every picture has different noise. Any thread may
+    call it.
 
-    With the subject seated, the light differs from the empty studio's by the drift that the scene's preset sets between
-    clean plate and shot.
+    The light differs between pictures with and without the subject by the drift in the scene's preset.
     """
 
     def __init__(self, scene: Scene, *, seated: bool, seed: int = 0) -> None:
@@ -65,10 +64,9 @@ _building = threading.Lock()
 
 
 def scene_of_file(mesh_file: Path) -> Scene:
-    """Returns the default studio with the head of a mesh file in it (head frame, mm). The last scene is kept for the
-    next call.
+    """Returns the default studio with the head of a mesh file (head frame, mm). The last scene is cached.
 
-    Raises InputError for a file that is no mesh.
+    Raises InputError for a file that is not a mesh.
     """
     with _building:
         return _scene_of_file(mesh_file.resolve())

@@ -1,11 +1,10 @@
 """Serves the cameras of the simulated studio as motion-JPEG streams on one HTTP port (on loopback by default).
 
-A stream behaves like a network camera with a trigger input. It has a live view at ``fps``, which pauses while the box
-is armed. When its input is raised it sends one frame at once, and then continues the live view. A camera's pictures are
-a ``Film``: some pictures, which differ in their noise, are for the live view; others are for releases, so that no
-released frame appeared in the live view before.
+A stream behaves like a network camera with a trigger input. The camera's live view at ``fps`` pauses while the trigger
+box is armed. When the trigger input rises, the stream sends one frame at once and then continues the live view. A
+``Film`` holds a camera's pictures, which differ in their noise: some for the live view, others for triggered frames.
 
-The server's event loop owns all state; other threads pass work to it (``call_soon_threadsafe``).
+Only the server's event loop changes the state; other threads pass it functions to call (``call_soon_threadsafe``).
 """
 
 import asyncio
@@ -28,7 +27,7 @@ Control = Callable[[str, str, Mapping[str, str]], tuple[int, str]]
 
 @dataclass(frozen=True, slots=True)
 class Film:
-    """Holds JPEG files of one scene from one camera: some for the live view, others for triggered frames."""
+    """Holds JPEG files of one scene by one camera: some for the live view, others for triggered frames."""
 
     live: tuple[bytes, ...]
     released: tuple[bytes, ...]
@@ -51,8 +50,8 @@ class _Camera:
 
 
 class StreamServer:
-    """Serves the address ``/<camera>.mjpeg`` for every camera while a block runs. ``close`` leaves no thread and no
-    port behind."""
+    """Serves ``/<camera>.mjpeg`` for every camera during a ``with`` block. ``close`` leaves no thread and no port
+    behind."""
 
     def __init__(
         self, names: Sequence[str], control: Control, *, fps: float = 5.0, host: str = "127.0.0.1", port: int = 0
@@ -81,7 +80,7 @@ class StreamServer:
 
     @property
     def address(self) -> str:
-        """Returns the server's address, as the beginning of a URL."""
+        """Returns the beginning of the server's URLs."""
         return f"http://{self._host}:{self.port}"
 
     def url(self, name: str) -> str:
@@ -89,7 +88,7 @@ class StreamServer:
         return f"{self.address}/{name}.mjpeg"
 
     def close(self) -> None:
-        """Ends every connection, the port and the thread. Safe to call twice."""
+        """Ends every connection, the port and the thread. The call may be repeated."""
         if self._closed:
             return
         self._closed = True
@@ -100,11 +99,11 @@ class StreamServer:
         self._loop.close()
 
     def show(self, name: str, film: Film) -> None:
-        """Sets a camera's pictures from now on."""
+        """Replaces a camera's pictures."""
         self._do(lambda: setattr(self._cameras[name], "film", film))
 
     def arm(self, armed: bool) -> None:
-        """Pauses or continues all live views."""
+        """Pauses (``armed``) or continues all live views."""
 
         def hold() -> None:
             for camera in self._cameras.values():
@@ -113,8 +112,8 @@ class StreamServer:
         self._do(hold)
 
     def release(self, at_s: Mapping[str, float]) -> None:
-        """Raises the trigger inputs of the cameras in ``at_s``, each at its time (time.monotonic, s). The live views of
-        the other cameras continue."""
+        """Triggers the cameras in ``at_s``, each at its time (time.monotonic, s). The live views of the other cameras
+        continue."""
 
         def plan() -> None:
             for name, camera in self._cameras.items():
@@ -126,8 +125,8 @@ class StreamServer:
         self._do(plan)
 
     def disturb(self, name: str, *, frozen: bool = False, hung: bool = False, drop_next: bool = False) -> None:
-        """Sets a camera's faults: it repeats its last picture, keeps its connections but sends nothing, or loses its
-        next triggered frame."""
+        """Sets a camera's faults. A ``frozen`` camera repeats its last picture, a ``hung`` camera sends nothing, and
+        ``drop_next`` loses the next triggered frame."""
 
         def change() -> None:
             camera = self._cameras[name]
@@ -136,11 +135,11 @@ class StreamServer:
         self._do(change)
 
     def connect(self, views: Mapping[str, str]) -> None:
-        """Sets which camera's pictures each address shows, to simulate exchanged cables."""
+        """Sets the camera whose pictures each URL shows, to simulate exchanged cables."""
         self._do(lambda: self._views.update(views))
 
     def _do(self, work: Callable[[], Any]) -> None:
-        """Runs ``work`` in the loop and waits until it is done."""
+        """Runs ``work`` in the event loop and waits for its end."""
         done = threading.Event()
 
         def run() -> None:
@@ -241,7 +240,7 @@ class StreamServer:
             left.cancel()
 
     async def _wait(self, camera: _Camera, left: asyncio.Future[bytes]) -> None:
-        """Waits until the camera has a frame, the client disconnects, or some time passes (cables may be exchanged)."""
+        """Waits until the camera has a frame, the client disconnects, or a short time has passed."""
         shown = asyncio.ensure_future(camera.shown_event.wait())
         try:
             await asyncio.wait({left, shown}, timeout=self._period_s, return_when=asyncio.FIRST_COMPLETED)

@@ -1,8 +1,8 @@
-"""Simulates the trigger box: it speaks the protocol of rig.acquisition.trigger on a pseudo-terminal, to the real
-client.
+"""Simulates the trigger box, which releases all cameras, with the protocol of ``rig.acquisition.trigger`` on a
+pseudo-terminal.
 
-``BoxLogic`` is the state machine, without clock or files. ``SimulatedTriggerBox`` runs it in a thread on a
-pseudo-terminal, and passes changes of the box's outputs on to the studio.
+``BoxLogic`` is the state machine, without clock or files. ``SimulatedTriggerBox`` runs the state machine in a thread,
+and reports changes of the box's outputs to the studio.
 """
 
 import os
@@ -32,8 +32,7 @@ LIGHTS = 4
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """Holds the outputs that one FIRE request raises: for each channel the delay (s) after ``time_s``
-    (time.monotonic)."""
+    """Holds the delay (s) after ``time_s`` (time.monotonic) at which one FIRE request raises each output channel."""
 
     time_s: float
     delays_s: dict[int, float]
@@ -41,8 +40,8 @@ class Release:
 
 @dataclass(slots=True)
 class BoxLogic:
-    """Holds the state of one trigger box. ``handle`` returns the reply to a request; ``on_release``, ``on_lights`` and
-    ``on_armed`` are called when outputs change."""
+    """Holds the state of one trigger box. ``handle`` returns the reply to a request. The callbacks ``on_release``,
+    ``on_lights`` and ``on_armed`` report changes of outputs."""
 
     on_release: Callable[[Release], None]
     on_lights: Callable[[int], None]
@@ -58,8 +57,8 @@ class BoxLogic:
     _last_reply: str = ""
 
     def handle(self, sequence: int, body: str, now_s: float) -> str:
-        """Returns the reply to a request. A request repeated with the same sequence number gets the same reply and has
-        no further effect."""
+        """Returns the reply to a request. A repeated request with the same sequence number gets the same reply and has
+        no effect."""
         if self._last == (sequence, body):
             return self._last_reply
         self.expire(now_s)
@@ -73,7 +72,7 @@ class BoxLogic:
         return reply
 
     def expire(self, now_s: float) -> None:
-        """Disarms the box once its armed time has passed."""
+        """Disarms the box if the time limit for FIRE has passed."""
         if self.armed_until_s is not None and now_s > self.armed_until_s:
             self._disarm()
 
@@ -150,8 +149,8 @@ _COMMANDS: dict[str, Callable[[BoxLogic, list[str], float], str]] = {
 
 
 class SimulatedTriggerBox:
-    """Runs a simulated trigger box on a pseudo-terminal. ``port`` is the path of a link to it, removed when the box is
-    closed."""
+    """Runs a simulated trigger box on a pseudo-terminal. ``port`` is the path of a link to the pseudo-terminal, which
+    ``close`` removes."""
 
     def __init__(self, port: Path, logic: BoxLogic) -> None:
         self.port = port
@@ -174,7 +173,8 @@ class SimulatedTriggerBox:
         self.close()
 
     def close(self) -> None:
-        """Ends the box's thread and removes its port: a client's next read or write fails. Safe to call twice."""
+        """Ends the box's thread and removes its port, so that a client's next read or write fails. The call may be
+        repeated."""
         if self._stopped:
             return
         self._stopped = True

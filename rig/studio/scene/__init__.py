@@ -1,2 +1,1 @@
-"""Models what is in front of the cameras (subject, hair, clothes, lights, backdrop), and takes a shot of it with ground
-truth."""
+"""Models the subject, hair, clothes, lights and backdrop, and simulates a shot of this scene with ground truth."""

@@ -1,5 +1,4 @@
-"""Finds the points of a head from which hair, paint and clothes are constructed, and makes their grids: vertices
-numbered row by row."""
+"""Finds the points of a head from which hair, skin colours and clothes are constructed. Also makes vertex grids."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,8 +18,8 @@ PAINTED = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anatomy:
-    """Holds the points of a head from which hair, paint and clothes are constructed (head frame, mm). ``unit`` is the
-    head's size relative to the head for which the constructions were designed."""
+    """Holds the points (head frame, mm) of a head from which hair, skin colours and clothes are constructed. ``unit``
+    is the head's size relative to the head for which the constructions were designed."""
 
     ears: Float[np.ndarray, " 3"]  # middle between the ears' openings
     half_breadth: float
@@ -30,8 +29,8 @@ class Anatomy:
 
 
 def anatomy(vertices: Float[np.ndarray, "v 3"], landmarks: Landmarks) -> Anatomy:
-    """Finds the anatomy of a head from its landmarks. If they are unknown, it is estimated from the extent of the mesh,
-    as for a head of 225 mm from chin to crown."""
+    """Finds the anatomy of a head from its landmarks. Without landmarks, estimates the anatomy from the extent of the
+    mesh, scaled from a head of 225 mm from chin to crown."""
     if {"tragion_right", "tragion_left", "gnathion", "glabella"} <= set(landmarks):
         right, left = landmarks["tragion_right"], landmarks["tragion_left"]
         chin = float(landmarks["gnathion"][1])
@@ -47,8 +46,8 @@ def anatomy(vertices: Float[np.ndarray, "v 3"], landmarks: Landmarks) -> Anatomy
 
 
 def grid_faces(rows: int, columns: int, *, closed: bool = True) -> Int[np.ndarray, "f 3"]:
-    """Returns the triangles of a grid of vertices numbered row by row. If ``closed``, the last column is joined to the
-    first."""
+    """Returns the triangles of a grid of vertices, which are numbered row by row. If ``closed``, triangles join the
+    last column to the first."""
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns - (not closed)), indexing="ij")
     a, b = row * columns + column, row * columns + (column + 1) % columns
     c, d = a + columns, b + columns
@@ -58,20 +57,20 @@ def grid_faces(rows: int, columns: int, *, closed: bool = True) -> Int[np.ndarra
 def turned_along(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], outward: Float[np.ndarray, "v 3"]
 ) -> Int[np.ndarray, "f 3"]:
-    """Returns the triangles, all turned over if they look against ``outward``, the directions at the vertices."""
+    """Reverses all triangles if their normals point against ``outward``, the outward directions at the vertices."""
     along = (face_normals(vertices, faces) * outward[faces[:, 0]]).sum() > 0
     return faces if along else faces[:, ::-1]
 
 
 def directions_of(elevation: Float[np.ndarray, "r c"], azimuth: Float[np.ndarray, "_ c"]) -> Float[np.ndarray, "r c 3"]:
-    """Returns the unit vectors of a grid; both angles in radians, azimuth counted from z towards x."""
+    """Returns a grid of unit vectors from elevation and azimuth (rad); azimuth is counted from z towards x."""
     ring = np.cos(elevation)
     return np.stack([ring * np.sin(azimuth), np.sin(elevation), ring * np.cos(azimuth)], axis=-1)
 
 
 def finer_grid(field: Float[np.ndarray, "r c *_"], times: int) -> Float[np.ndarray, "_ _ *_"]:
-    """Interpolates a field linearly to a grid ``times`` as fine in both directions. The grid is closed: its last column
-    is next to its first."""
+    """Interpolates a field linearly to a grid that is finer by the factor ``times``. The field is periodic: its last
+    column is next to its first."""
     if times == 1:
         return field
     rows, columns = field.shape[:2]

@@ -1,8 +1,8 @@
-"""Gives a subject eyeballs with a gaze: white, limbus, iris, pupil and a cornea that reflects the lamps.
+"""Creates a simulated subject's eyeballs, directed by a gaze, with white, limbus, iris, pupil and a reflecting cornea.
 
-Sizes are an adult's: a ball of 12 mm, a cornea of 7.8 mm that meets it at a limbus of 5.85 mm (visible iris diameter
-11.7 mm; Ruefer et al. 2005). The limbus is a gradual transition some tenths of a millimetre wide, half way at that
-radius. A head with skin across its eyes is cut open between the lids.
+An adult's eyeball has a radius of 12 mm. The cornea has a radius of 7.8 mm, and meets the eyeball at the limbus of
+radius 5.85 mm (visible iris diameter 11.7 mm; Ruefer et al. 2005). At the limbus, the colour changes gradually over
+some tenths of a millimetre. If the mesh of a head closes the eyes with skin, the skin is cut open between the lids.
 """
 
 from collections.abc import Mapping
@@ -43,7 +43,7 @@ SIDES = ("right", "left")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eye:
-    """Holds an eyeball (mm): its centre, its gaze (a unit vector), and the albedo of its iris."""
+    """Holds an eyeball's centre (mm), its gaze (a unit vector), and the albedo of its iris."""
 
     centre: Vector
     gaze: Vector
@@ -51,17 +51,17 @@ class Eye:
 
     @property
     def iris_centre(self) -> Vector:
-        """Returns the middle of the limbus."""
+        """Returns the middle (mm) of the limbus, the circle around the iris."""
         return self.centre + np.sqrt(RADIUS_MM**2 - LIMBUS_MM**2) * self.gaze
 
     def placed(self, world_from_head: Similarity) -> "Eye":
-        """Returns the eye in the world frame (for a pose without scale)."""
+        """Transforms the eye to the world frame, by a pose without scaling."""
         return replace(
             self, centre=world_from_head.apply(self.centre[None])[0], gaze=world_from_head.rotation @ self.gaze
         )
 
     def reach(self, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Returns the distance of the surface from the centre in each direction (unit vectors), mm."""
+        """Returns the distance (mm) from the eyeball's centre to its surface in each direction (unit vectors)."""
         cosine = directions @ self.gaze
         ahead = np.sqrt(RADIUS_MM**2 - LIMBUS_MM**2) - np.sqrt(CORNEA_MM**2 - LIMBUS_MM**2)
         bulge = ahead * cosine + np.sqrt(np.maximum(CORNEA_MM**2 - ahead**2 * (1.0 - cosine**2), 0.0))
@@ -70,7 +70,7 @@ class Eye:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EyeSurface:
-    """Holds an eyeball's front as a mesh: paint as ``photograph.Part`` has it, and the strength of highlights."""
+    """Holds an eyeball's front as a mesh, with ``paint`` as in ``photograph.Part`` and the strength of highlights."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -79,7 +79,7 @@ class EyeSurface:
 
 
 def look_at_point(centres: Mapping[str, Vector], target: Vector, iris: Colour) -> dict[str, Eye]:
-    """Returns eyes, by side, directed at one point."""
+    """Returns the eyes by side, with both gazes directed at the point ``target``."""
     out = {}
     for side, centre in centres.items():
         towards = target - centre
@@ -88,7 +88,7 @@ def look_at_point(centres: Mapping[str, Vector], target: Vector, iris: Colour) -
 
 
 def surface(eye: Eye, rng: np.random.Generator) -> EyeSurface:
-    """Makes the surface of an eyeball, with random fibres in the iris."""
+    """Creates the surface of an eyeball, with random fibres in the iris."""
     limbus = np.arcsin(LIMBUS_MM / RADIUS_MM)
     angles = np.concatenate([np.linspace(0.004, limbus + 0.1, 56), np.linspace(limbus + 0.13, 0.6 * np.pi, 24)])
     around = np.arange(SECTORS) * 2.0 * np.pi / SECTORS
@@ -117,14 +117,15 @@ def _paint(off_axis: Float[np.ndarray, "r s"], iris: Colour, rng: np.random.Gene
 
 
 def _step(x: Float[np.ndarray, "r s"], middle: float, width: float) -> Float[np.ndarray, "r s"]:
-    """Returns 1 below ``middle``, 0 above and 1/2 at it."""
+    """Returns a smooth step of ``width``: 1 below ``middle``, 1/2 at it, and 0 above."""
     t = np.clip((middle + 0.5 * width - x) / width, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def opened(mesh: Mesh, landmarks: Landmarks) -> Mesh:
-    """Returns a head (head frame) with small triangles around its eyes, without skin between the lids, and with margins
-    of the lids. Its vertices begin with those of ``mesh``. Eyes that are already open in the mesh keep their border."""
+    """Removes the skin between a head's lids (head frame), after subdividing triangles there, and gives the lids a
+    thickness. The result's first vertices are those of ``mesh``. Eyes that are already open in the mesh keep their
+    border."""
     for side in SIDES:
         mesh, cut = _cut(mesh, landmarks, side)
         mesh = _with_margins(mesh, cut)
@@ -132,7 +133,7 @@ def opened(mesh: Mesh, landmarks: Landmarks) -> Mesh:
 
 
 def _cut(mesh: Mesh, landmarks: Landmarks, side: str) -> tuple[Mesh, Int[np.ndarray, "e 2"]]:
-    """Cuts an eye open; the second result is the edges of the cut, empty if the mesh is already open there."""
+    """Cuts the skin of one eye open. Also returns the edges of the cut, or none if the eye is already open."""
     inner, outer = landmarks[f"endocanthion_{side}"], landmarks[f"exocanthion_{side}"]
     middle = 0.5 * (inner + outer)
     border = mesh.vertices[np.unique(boundary_edges(mesh.faces))]
@@ -154,7 +155,7 @@ def _cut(mesh: Mesh, landmarks: Landmarks, side: str) -> tuple[Mesh, Int[np.ndar
 
 
 def _with_margins(mesh: Mesh, edges: Int[np.ndarray, "e 2"]) -> Mesh:
-    """Returns a head whose skin continues backwards from a cut, because lids have a thickness."""
+    """Extends the skin of a head backwards from a cut, because lids have a thickness."""
     rim, number = np.unique(edges, return_inverse=True)
     start, end = number.reshape(-1, 2).T + len(mesh.vertices)
     behind = mesh.vertices[rim] - (0.0, 0.0, MARGIN_MM)
@@ -163,7 +164,7 @@ def _with_margins(mesh: Mesh, edges: Int[np.ndarray, "e 2"]) -> Mesh:
 
 
 def eye_centres(mesh: Mesh, landmarks: Landmarks, gaze: Vector) -> dict[str, Vector]:
-    """Returns the centres of a head's eyeballs by side (head frame), as far in front as the lids permit for the
+    """Returns the centres (mm, head frame) of a head's eyeballs by side, as far forward as the lids permit with the
     direction ``gaze``."""
     out = {}
     for side in SIDES:

@@ -1,8 +1,8 @@
-"""Makes hair as geometry: a lumpy shell over the scalp, and strands that roughen its outline.
+"""Creates hair as meshes: an uneven shell over the scalp, and strands that roughen its outline.
 
-The shell is a grid of directions from the middle of the skull. Its radius is that of the head plus the thickness of the
-hair, which decreases to below the skin beyond the hairline. Further shapes are a sheet that hangs down around the neck,
-a bun on the crown, a full beard (a thicker copy of the lower face), and curls: ridges that wind over the surface.
+The shell has a vertex in each direction of a grid around the middle of the skull. The shell's radius is the radius of
+the head plus the thickness of the hair. Beyond the hairline the shell lies below the skin. Further shapes are a sheet
+that hangs down around the neck, a bun on the crown, a full beard, and curls, which are winding ridges on the surface.
 """
 
 from dataclasses import dataclass
@@ -46,8 +46,8 @@ HAIRLINE_OVER_EARS = np.array([(-200, -55), (-40, -52), (-10, -38), (22, -34), (
 
 @dataclass(frozen=True, slots=True)
 class HairStyle:
-    """Describes a hair style. ``fringe_mm`` is how far the hairline comes down over the forehead. A value of 0 means no
-    curls, hanging hair or bun."""
+    """Describes a hair style. ``fringe_mm`` is the distance by which the hairline reaches down over the forehead.
+    Curls, hanging hair and bun are absent if their size is 0."""
 
     thickness_mm: float = 14.0
     over_ears: bool = False
@@ -64,10 +64,10 @@ class HairStyle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hair:
-    """Holds one surface of hair, the shell, and the strands on it (head frame, mm).
+    """Holds one surface of hair (the shell) and the strands on the surface (head frame, mm).
 
-    ``shade`` is each vertex's tone relative to the style's; ``roots`` is the vertex of the shell whose light a strand's
-    vertex gets; ``one_sided`` tells that the inside of the shell is never visible.
+    ``shade`` is each vertex's tone relative to the style's tone. ``roots`` is, for each vertex of a strand, the shell's
+    vertex whose irradiance it gets. ``one_sided`` is True if the inside of the shell is never visible.
     """
 
     shell: Float[np.ndarray, "v 3"]
@@ -82,7 +82,7 @@ class Hair:
 
 
 def grow(vertices: Float[np.ndarray, "v 3"], body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
-    """Grows the hair of a head over its scalp. Vertices are in the head frame (mm)."""
+    """Creates the hair over a head's scalp. Vertices are in the head frame (mm)."""
     centre = body.ears + np.array([0.0, 28.0, -6.0]) * body.unit
     elevation, azimuth = np.meshgrid(
         np.radians(np.linspace(90.0, LOWEST_DEG, ROWS)), np.arange(COLUMNS) * 2 * np.pi / COLUMNS, indexing="ij"
@@ -115,8 +115,8 @@ def grow(vertices: Float[np.ndarray, "v 3"], body: Anatomy, style: HairStyle, rn
 
 
 def outer_radius(points: Float[np.ndarray, "v 3"], *, open_ears: bool) -> Float[np.ndarray, "r c"]:
-    """Returns the largest distance (mm) of points from the origin in each direction of the grid, smoothed. With
-    ``open_ears``, parts as narrow as an ear are ignored."""
+    """Returns the largest distance (mm) of points from the origin in each direction of a grid, smoothed. ``open_ears``
+    ignores parts as narrow as an ear."""
     length = np.linalg.norm(points, axis=1)
     elevation = np.degrees(np.arcsin(points[:, 1] / length))
     row = (90.0 - elevation) / (90.0 - LOWEST_DEG) * (ROWS - 1)
@@ -141,7 +141,7 @@ def outer_radius(points: Float[np.ndarray, "v 3"], *, open_ears: bool) -> Float[
 def _inside_hairline(
     surface: Float[np.ndarray, "r c 3"], body: Anatomy, style: HairStyle, rng: np.random.Generator
 ) -> Float[np.ndarray, "r c"]:
-    """Returns the height above the hairline, mm; positive under hair."""
+    """Returns the height (mm) of each point above the hairline, positive where hair grows."""
     line = HAIRLINE_OVER_EARS if style.over_ears else HAIRLINE
     relative = (surface - body.ears) / body.unit
     front = np.clip((relative[:, :, 2] - 35.0) / 40.0, 0.0, 1.0)
@@ -158,9 +158,9 @@ def grow_strands(
     style: HairStyle,
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "s 3"], Int[np.ndarray, "g 3"], Float[np.ndarray, "s 3"], Int[np.ndarray, " s"]]:
-    """Grows strands of hair: ribbons that leave the shell roughly in the directions ``along`` (about 3 mm long).
-    ``weight`` sets how densely they grow at each vertex. Returns their vertices, triangles, texture coordinates and
-    roots, in the form of ``Hair``."""
+    """Creates strands of hair as ribbons of about 3 mm, which leave the shell roughly in the directions ``along``.
+    ``weight`` is the density of strands at each vertex. Returns vertices, triangles, texture coordinates and roots of
+    the strands, as in ``Hair``."""
     count = style.strands
     weight = weight.copy()
     weight[np.setdiff1d(np.arange(len(shell)), faces)] = 0.0
@@ -198,8 +198,8 @@ def grow_strands(
 def curled(
     vertices: Vertices, normals: Vertices, curl_mm: float, amount: Float[np.ndarray, " v"], rng: np.random.Generator
 ) -> tuple[Vertices, Float[np.ndarray, " v"]]:
-    """Raises curls on a surface of hair. Returns the new vertices, and a shade for each, relative to the hair's tone.
-    Ridges follow the lines where a random field is near zero.
+    """Adds curls to a surface of hair as ridges along the zeros of a random field. Returns the new vertices, and each
+    vertex's shade relative to the hair's tone.
 
     Args:
         vertices: of the smooth surface (mm), a few to each curl.
@@ -217,7 +217,8 @@ def curled(
 
 
 def grow_beard(head: Mesh, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
-    """Grows beard and moustache on a head (head frame, mm). ``style`` sets thickness, curls and strands.
+    """Creates a beard and a moustache as a thicker copy of the lower face (head frame, mm). ``style`` sets thickness,
+    curls and strands.
 
     Raises InputError for a head without landmarks.
     """
@@ -238,8 +239,7 @@ def grow_beard(head: Mesh, body: Anatomy, style: HairStyle, rng: np.random.Gener
 
 
 def beard_share(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
-    """Returns the density of a beard at each vertex, 0 to 1: on jaw, chin and upper lip, up to the ears, not on the
-    lips."""
+    """Returns the density (0 to 1) of a beard at each vertex. Beards grow on jaw, chin and upper lip."""
     marks, (x, y, z) = body.landmarks, vertices.T
     mouth, ears = marks["stomion"], body.ears
     across = (x - mouth[0]) / body.half_breadth
@@ -261,7 +261,7 @@ def _lips(vertices: Float[np.ndarray, "v 3"], marks: Landmarks) -> Float[np.ndar
 
 
 def hang(shell: Hair, below: Points, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
-    """Makes the sheet of hair that hangs down from the shell to ``style.hanging_mm`` below the openings of the ears.
+    """Creates the sheet of hair that hangs down from the shell to ``style.hanging_mm`` below the openings of the ears.
 
     Args:
         shell: the hair over the scalp.
@@ -304,7 +304,8 @@ def hang(shell: Hair, below: Points, body: Anatomy, style: HairStyle, rng: np.ra
 def _fall(
     shell: Hair, below: Points, axis: Float[np.ndarray, " 3"], style: HairStyle, unit: float, length_mm: float
 ) -> Float[np.ndarray, "r c"]:
-    """Returns the radius (float32) by drop and angle: the shell's, then straight down except over protruding parts."""
+    """Returns the radius (mm, float32) of hanging hair by height and angle. Hair falls straight down except over
+    protruding parts."""
     hair = _envelope(shell.shell[np.unique(shell.shell_faces)] - axis, unit, length_mm)
     solid = _envelope(below, unit, length_mm)
     step = length_mm / (SHEET_ROWS - 1)
@@ -320,7 +321,7 @@ def _fall(
 
 
 def _envelope(points: Points, unit: float, length_mm: float) -> Float[np.ndarray, "r c"]:
-    """Returns the outermost radius around the vertical axis by height and angle (float32), 0 where there is nothing."""
+    """Returns the largest radius (mm, float32) of points around the vertical axis by height and angle, or 0."""
     limit = np.radians(FRONT_EDGE_DEG)
     angle = np.arctan2(-points[:, 0], -points[:, 2])
     row = np.rint((TOP_MM * unit - points[:, 1]) / length_mm * (SHEET_ROWS - 1)).astype(int)
@@ -334,7 +335,7 @@ def _envelope(points: Points, unit: float, length_mm: float) -> Float[np.ndarray
 
 
 def knot(shell: Hair, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
-    """Makes a bun of twisted hair on the crown, with the radius ``style.bun_mm``."""
+    """Creates a bun of twisted hair on the crown, with the radius ``style.bun_mm``."""
     elevation = np.radians(BUN_ELEVATION_DEG)
     outward = np.array([0.0, np.sin(elevation), -np.cos(elevation)])
     arms = shell.shell - body.ears

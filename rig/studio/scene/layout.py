@@ -1,7 +1,7 @@
-"""Places cameras: the default rig, and arrangements of other studios.
+"""Creates rigs of cameras: the default rig of the simulated studio, and rigs with other directions.
 
 Azimuth is counted from the front towards the subject's left, elevation upwards. The world's origin is in the middle of
-the head, y up, z towards the front camera.
+the head, with y up and z towards the front camera.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ DEFAULT_DIRECTIONS_DEG = (
 
 
 def default_layout() -> Rig:
-    """Returns the default rig: eleven cameras in front of and beside the head, 1.2 m away; cam00 is the front one."""
+    """Returns the default rig: eleven cameras in front of and beside the head, 1.2 m away. cam00 is in front."""
     return rig_from_directions(DEFAULT_DIRECTIONS_DEG)
 
 
@@ -34,8 +34,7 @@ def rig_from_directions(
     distance_mm: float = DISTANCE_MM,
     rolls_deg: Sequence[float] = (0.0,),
 ) -> Rig:
-    """Returns a rig with a camera in each direction (azimuth and elevation in degrees). Lenses and mountings differ
-    slightly from camera to camera.
+    """Returns a rig with a camera in each direction (azimuth and elevation in degrees). Lenses and poses vary slightly.
 
     Args:
         directions_deg: one for each camera.

@@ -1,7 +1,8 @@
-"""Lights the subject softly, with the shadows that it casts on itself.
+"""Computes soft light on the subject, with the shadows that the subject casts on itself.
 
-The lamps are soft boxes on a dome. The dome is sampled in ``DIRECTIONS`` directions, each with a depth map that says
-which vertices its light reaches; their number makes the shadows soft. Irradiance is computed for each vertex.
+The lamps are soft boxes on a dome. The dome is sampled in ``DIRECTIONS`` directions. A depth map from each direction
+shows which vertices its light reaches. The sum over many directions makes the shadows soft. Irradiance is computed for
+each vertex.
 """
 
 from collections.abc import Sequence
@@ -40,14 +41,14 @@ AMBIENT = (0.34, 0.34, 0.35)
 
 
 def lamp_directions(lamps: Sequence[Lamp] = LAMPS) -> Float[np.ndarray, "l 3"]:
-    """Returns the unit directions from the subject to the lamps, world frame."""
+    """Returns the unit directions from the subject to the lamps in the world frame."""
     towards = np.array([lamp.towards for lamp in lamps])
     return towards / np.linalg.norm(towards, axis=1, keepdims=True)
 
 
 def dome(lamps: Sequence[Lamp] = LAMPS) -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d 3"]]:
-    """Returns directions spread evenly over the part of the sphere above -45 degrees, and the linear RGB of the light
-    from each."""
+    """Returns directions spread evenly over the sphere above -45 degrees of elevation, and the linear RGB of the light
+    from each direction."""
     index = np.arange(DIRECTIONS) + 0.5
     y = 1.0 - index / DIRECTIONS * 1.7
     angle = index * np.pi * (3.0 - np.sqrt(5.0))
@@ -66,8 +67,8 @@ def irradiance(
     casters: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]],
     lamps: Sequence[Lamp] = LAMPS,
 ) -> list[Float[np.ndarray, "_ 3"]]:
-    """Computes the linear RGB of the light at the vertices of each receiver (vertices and unit normals, world frame),
-    shadowed by the triangles of ``casters``."""
+    """Computes the irradiance (linear RGB) at the vertices of each receiver, which is a pair of vertices and unit
+    normals in the world frame. The triangles of ``casters`` cast shadows."""
     directions, sent = dome(lamps)
     vertices, faces = casters
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
@@ -97,7 +98,7 @@ def _lamp_camera(
 def _reached(
     camera: Camera, depth: Float[np.ndarray, "h w"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns the bilinear fraction of the four nearest pixels of the depth map that do not hide the point."""
+    """Returns the bilinear weight of those of the four nearest depth map pixels that do not hide the point."""
     k = camera.intrinsics
     points_camera = camera.camera_from_world.apply(points)
     x, y = np.clip(lens_image(points_camera, k.values()), 0, (k.width - 1.001, k.height - 1.001)).T

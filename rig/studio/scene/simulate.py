@@ -1,7 +1,7 @@
-"""Simulates a capture of the studio, with ground truth.
+"""Simulates a capture in the studio, with ground truth.
 
-``build_scene`` renders and lights everything once; ``shoot`` takes the pictures, with the requested faults. A device
-that takes pictures one by one stores the scene and calls ``view_light`` and ``sensor.expose``.
+``build_scene`` lights and renders the subject once, and ``shoot`` takes the pictures with the requested faults.
+Simulated cameras that take single pictures store the scene and call ``view_light`` and ``sensor.expose``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,8 +37,8 @@ Plane = Float[np.ndarray, "h w"]
 def matt_light(
     renderer: Renderer, rig: Rig, parts: Sequence[Part], gallery: Gallery, preset: Preset
 ) -> Mapping[str, Float[np.ndarray, "_ _ 4"]]:
-    """Returns the subject without highlights in all cameras, in the form of ``Renderer.photograph``; empty unless the
-    preset requests it."""
+    """Renders the subject without highlights in all cameras, as ``Renderer.photograph`` does. Returns an empty mapping
+    unless the preset requests it."""
     if not preset.polarised:
         return {}
     matt = [replace(part, oil=None, grain=replace(part.grain, gloss=0.0)) for part in parts]
@@ -55,8 +55,8 @@ def backdrop(
     unevenness: float,
     colour: tuple[float, float, float] | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
-    """Draws the backdrop of one camera's picture (linear radiance, float32). ``colour`` is linear RGB; None draws one
-    at random."""
+    """Draws the backdrop of a camera's picture (linear radiance, float32). ``colour`` is linear RGB, or None for a
+    random one."""
     height, width = intrinsics.height, intrinsics.width
     base = np.array(COLOURS[rng.integers(len(COLOURS))] if colour is None else colour, np.float32)
     image = np.broadcast_to(base, (height, width, 3)).astype(np.float32)
@@ -82,7 +82,7 @@ def _panel(image: Float[np.ndarray, "h w 3"], rng: np.random.Generator, tint: np
 
 
 def chair(width: int, height: int, rng: np.random.Generator) -> Float[np.ndarray, "h w 4"]:
-    """Draws the back of a chair at one side of the picture: linear RGB times alpha, and alpha."""
+    """Draws the back of a chair at one side of a picture. Returns linear RGB times alpha, and alpha."""
     image = np.zeros((height, width, 4), np.float32)
     colour = (*(rng.uniform(0.02, 0.08, 3)).tolist(), 1.0)
     left = int(width * (rng.uniform(0.03, 0.08) if rng.random() < 0.5 else rng.uniform(0.76, 0.8)))
@@ -103,8 +103,8 @@ THREADS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Holds the light in one camera's view. ``subject`` is linear light times coverage, and coverage; ``backdrop`` is
-    the light behind the subject; ``matt`` is the subject without reflections, if the preset requests it."""
+    """Holds the linear light in one camera's view. ``subject`` is the subject's light times coverage, and coverage.
+    ``backdrop`` is the light behind the subject. ``matt`` is the subject without specular reflections, if requested."""
 
     subject: Float[np.ndarray, "h w 4"]
     backdrop: Float[np.ndarray, "h w 3"]
@@ -113,14 +113,13 @@ class View:
 
     @property
     def mask(self) -> Bool[np.ndarray, "h w"]:
-        """Returns the true silhouette: the pixels that the subject covers at least half."""
+        """Returns the true silhouette. A pixel is True if the subject covers at least half of it."""
         return self.subject[:, :, 3] >= 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Holds a lit studio with a subject in it. ``rig`` are the cameras as calibrated, ``true_rig`` the cameras at their
-    true poses."""
+    """Holds a lit studio with a subject. ``rig`` has calibration errors; ``true_rig`` holds the true cameras."""
 
     rig: Rig
     true_rig: Rig
@@ -141,7 +140,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedCapture:
-    """Holds a simulated capture, the rig as calibrated, and the scene with the ground truth."""
+    """Holds a simulated capture, the rig with calibration errors, and the scene with the ground truth."""
 
     capture: Capture
     rig: Rig
@@ -150,7 +149,7 @@ class SimulatedCapture:
 
     @property
     def masks(self) -> dict[str, Bool[np.ndarray, "h w"]]:
-        """Returns the true silhouettes by camera, hair and clothes included: where coverage is at least a half."""
+        """Returns the true silhouettes by camera, hair and clothes included."""
         return {name: view.mask for name, view in self.scene.views.items()}
 
 
@@ -165,7 +164,7 @@ def simulate(
     world_from_head: Similarity | None = None,
     faults: Sequence[Fault] = (),
 ) -> SimulatedCapture:
-    """Takes one capture of ``subject`` with ``rig``. Look and pose are random if they are None."""
+    """Simulates one capture of ``subject`` with ``rig``. If ``look`` or ``world_from_head`` is None, it is random."""
     scene_rng, shot_rng = rng.spawn(2)
     faults = tuple(_settled(fault, rig, shot_rng) for fault in faults)
     scene = build_scene(
@@ -186,8 +185,8 @@ def build_scene(
     faults: Sequence[Fault] = (),
     lamps: Sequence[Lamp] = LAMPS,
 ) -> Scene:
-    """Dresses, lights and renders the subject, and draws the backdrops. The same state of ``rng`` gives the same skin,
-    hair and backdrops for any pose and ``lamps``."""
+    """Dresses, lights and renders the subject, and draws the backdrops. Skin, hair and backdrops depend on ``rng``, but
+    not on pose and lamps."""
     look_rng, pose_rng, dress_rng, set_rng = rng.spawn(4)
     look = worn_look(look or random_look(look_rng), preset, faults)
     pose = world_from_head or random_pose(rig.centre_world(), preset.pose_spread_deg, preset.pose_spread_mm, pose_rng)
@@ -229,7 +228,7 @@ def build_scene(
 
 
 def view_light(view: View, *, subject: bool = True, gain: float = 1.0) -> Float[np.ndarray, "h w 3"]:
-    """Returns the light on one camera's sensor (linear, float32), with or without the subject in the picture."""
+    """Returns the light (linear, float32) on one camera's sensor, with or without the subject."""
     light = view.backdrop
     if subject:
         light = view.subject[:, :, :3] + (1 - view.subject[:, :, 3:]) * light
@@ -237,8 +236,8 @@ def view_light(view: View, *, subject: bool = True, gain: float = 1.0) -> Float[
 
 
 def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) -> Capture:
-    """Takes the clean plates of a scene, then the shot. Faults that need a camera must name it; ``simulate`` chooses
-    one for faults that do not."""
+    """Simulates the clean plates (pictures of the empty studio) and the shot of a scene. Faults that affect a single
+    camera must name the camera."""
     names = scene.rig.names
     click_rng, *rngs = rng.spawn(1 + len(names))
 
@@ -266,8 +265,8 @@ def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) 
 def _polarised(
     scene: Scene, source: Mapping[str, str], rng: np.random.Generator
 ) -> dict[str, dict[str, UInt8[np.ndarray, "_ _ 3"]]]:
-    """Returns texture sets of polarised light, of one moment and one exposure. A filter crossed with those of the lamps
-    removes surface reflections."""
+    """Simulates texture sets in polarised light, at one moment and one exposure. A filter that is crossed with the
+    lamps' filters removes specular reflections."""
     sets: dict[str, dict[str, np.ndarray]] = {"cross": {}, "parallel": {}}
     for name, camera_rng in zip(scene.rig.names, rng.spawn(len(scene.rig)), strict=True):
         view = scene.views[source[name]]
@@ -278,7 +277,7 @@ def _polarised(
 
 
 def click(scene: Scene, rng: np.random.Generator) -> dict[str, dict[str, Float[np.ndarray, " 2"]]]:
-    """Returns feature points (px) by landmark and camera as an operator would pick them: in the four views that see a
+    """Simulates feature points (px) that an operator picks, by landmark and camera: in the four views that see a
     landmark best, with the preset's noise."""
     clicked: dict[str, dict[str, np.ndarray]] = {}
     for landmark, views in scene.landmarks_seen.items():
@@ -299,7 +298,7 @@ def _settled(fault: Fault, rig: Rig, rng: np.random.Generator) -> Fault:
 
 
 def worn_look(look: Look, preset: Preset, faults: Sequence[Fault]) -> Look:
-    """Returns a look with the changes by the preset and the faults."""
+    """Applies the changes of the preset and the faults to a subject's appearance."""
     look = replace(restyled(look, preset.hairstyle), pores=preset.pores, oil=preset.oil)
     look = replace(look, scattering_mm=preset.scattering_mm)
     if not preset.hair:
@@ -321,7 +320,7 @@ def _knocked(camera: Camera, faults: Sequence[Fault], rng: np.random.Generator) 
 
 
 def _sway(preset: Preset, rng: np.random.Generator) -> Vector:
-    """Returns the displacement of the subject (mm) while a rolling shutter reads all rows."""
+    """Returns the random motion (mm) of the subject while a rolling shutter reads all rows."""
     direction = rng.standard_normal(3)
     return direction / np.linalg.norm(direction) * preset.sway_mm_s * preset.rolling_ms / 1000
 
@@ -329,8 +328,9 @@ def _sway(preset: Preset, rng: np.random.Generator) -> Vector:
 def _rolling(
     rig: Rig, light: Mapping[str, Float[np.ndarray, "_ _ 4"]], at_world: Vector, sway_mm: Vector
 ) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
-    """Distorts pictures as a rolling shutter does if the subject sways while rows are read. The true position is that
-    at the middle row. The whole image moves with the head's origin; parts nearer to it should move by a tenth more."""
+    """Distorts pictures as a rolling shutter does if the subject moves while rows are read. The middle row shows the
+    true position. All parts move like the head's origin, although parts nearer to the camera should move by a tenth
+    more."""
     shifts = {camera.name: camera.project_with_jacobian(at_world[None])[1][0] @ sway_mm for camera in rig}
     return {name: rolled(light[name], shifts[name]) for name in light}
 
@@ -342,7 +342,7 @@ def view_cameras(
     faults: Sequence[Fault],
     rng: np.random.Generator,
 ) -> dict[str, View]:
-    """Draws the backdrops and sensors of all cameras, around the subject's ``light``."""
+    """Draws random backdrops and sensors for all cameras, and combines these with the subject's ``light``."""
     colour = CAMOUFLAGE if any(fault.kind == "camouflage" for fault in faults) else None
 
     def one(camera: Camera, camera_rng: np.random.Generator) -> View:
@@ -362,7 +362,7 @@ def view_cameras(
 def _picture(
     view: View, preset: Preset, faults: Sequence[Fault], rng: np.random.Generator
 ) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[UInt8[np.ndarray, "_ _ 3"], ...]]:
-    """Returns the shot and the clean plates of one camera."""
+    """Simulates one camera's picture of the subject and its clean plates."""
     kinds = {fault.kind: fault for fault in faults}
     plate_view = shot_view = view
     if "chair" in kinds:
@@ -405,7 +405,7 @@ def _shadowed(view: View, amount: float) -> Float[np.ndarray, "h w 3"]:
 
 
 def _wrong_masks(scene: Scene, faults: Sequence[Fault]) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Returns masks with an operator's mistakes: mirrored, or shifted by a fifth of the image."""
+    """Simulates masks with an operator's mistakes: mirrored, or shifted by a fifth of the image."""
     wrong = [fault.camera for fault in faults if fault.kind == "wrong-mask" and fault.camera]
     masks = {name: scene.views[name].mask[:, ::-1] for name in wrong}
     return {name: np.roll(mask, mask.shape[1] // 5, axis=1) for name, mask in masks.items()}
@@ -414,7 +414,7 @@ def _wrong_masks(scene: Scene, faults: Sequence[Fault]) -> dict[str, Bool[np.nda
 def _photographed(
     rig: Rig, depth: Mapping[str, Plane], vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]
 ) -> Bool[np.ndarray, " v"]:
-    """Returns the vertices that at least one camera sees, not at a grazing angle and not behind hair."""
+    """Returns a mask of the vertices that at least one camera sees, neither at a grazing angle nor behind hair."""
     seen = np.zeros(len(vertices), bool)
     for camera in rig:
         towards = camera.centre_world - vertices
@@ -437,7 +437,7 @@ def _unhidden(
 def _seen_landmarks(
     coarse: Rig, rig: Rig, depth: Mapping[str, Plane], marks: Mapping[str, Vector]
 ) -> dict[str, dict[str, Float[np.ndarray, " 2"]]]:
-    """Returns the true pixels of each landmark in the cameras that see it, the most frontal cameras first."""
+    """Returns the true pixels of each landmark in the cameras that see it, ordered from the most frontal view."""
     front = rig[rig.front_camera()].centre_world - rig.centre_world()
     by_angle = sorted(rig, key=lambda c: -float(np.dot(c.centre_world - rig.centre_world(), front)))
     found: dict[str, dict[str, np.ndarray]] = {}

@@ -1,4 +1,4 @@
-"""Computes skin colour at each vertex: an even tone, blotches, and features placed by landmarks."""
+"""Computes the skin's colour at each vertex from a uniform tone, blotches, and features at landmarks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,8 +27,8 @@ def skin_paint(
     eyeballs: bool = False,
 ) -> Float[np.ndarray, "v 4"]:
     """Computes the linear albedo of the skin at each vertex (head frame, mm) and, as a fourth number, the strength of
-    its fine structure. ``closed`` is how far the lids of each side are closed, 0 to 1; a subject with ``eyeballs`` gets
-    no painted eyes."""
+    its fine structure. ``closed`` is the degree (0 to 1) to which each eye is closed. With ``eyeballs``, no eyes are
+    painted on the skin."""
     paint = np.ones((len(vertices), 4))
     paint[:, :3] = np.array(tone) * (1 + _blotches(vertices, rng) * (0.5, 1.0, 1.0))
     if body.landmarks:
@@ -42,8 +42,8 @@ def skin_paint(
 
 
 def oily_zones(vertices: Vertices, body: Anatomy) -> Float[np.ndarray, " v"]:
-    """Returns how oily the skin is at each vertex, 0 to 1: most on forehead, nose, cheeks and chin; the same everywhere
-    if landmarks are unknown."""
+    """Returns the oiliness (0 to 1) of the skin at each vertex. The skin is oiliest on forehead, nose, cheeks and chin.
+    Without landmarks, the oiliness is constant."""
     marks = body.landmarks
     if not marks:
         return np.full(len(vertices), DRY)
@@ -59,7 +59,7 @@ def oily_zones(vertices: Vertices, body: Anatomy) -> Float[np.ndarray, " v"]:
 
 
 def _blotches(vertices: Vertices, rng: np.random.Generator) -> Float[np.ndarray, "v 1"]:
-    """Returns a sum of waves in random directions, 15 to 60 mm long, standard deviation about 0.06."""
+    """Returns random blotches at each vertex: a sum of waves of 15 to 60 mm with a standard deviation of about 0.06."""
     waves = rng.normal(0, 1, (24, 3))
     waves *= (2 * np.pi / rng.uniform(15, 60, (24, 1))) / np.linalg.norm(waves, axis=1, keepdims=True)
     return 0.06 * np.sin(vertices @ waves.T + rng.uniform(0, 2 * np.pi, 24)).sum(axis=1, keepdims=True) / np.sqrt(12)
@@ -70,7 +70,7 @@ def _mix(paint: Float[np.ndarray, "v 4"], share: Float[np.ndarray, " v"], colour
 
 
 def smoothstep(low: float, high: float, x: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
-    """Returns 0 where ``x`` is ``low``, 1 where it is ``high``, and a smooth step in between."""
+    """Returns a smooth step from 0 where ``x`` is ``low`` to 1 where ``x`` is ``high``."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
 
@@ -111,7 +111,7 @@ def _mouth(paint: Float[np.ndarray, "v 4"], vertices: Vertices, marks: Landmarks
 def _eye(
     paint: Float[np.ndarray, "v 4"], vertices: Vertices, marks: Landmarks, side: str, closed: float, *, eyeballs: bool
 ) -> None:
-    """Paints a brow, and an eye or lashes."""
+    """Paints a brow, and either an eye or only lashes, on the skin of one side."""
     x, y, z = vertices.T
     outer, inner = marks[f"exocanthion_{side}"], marks[f"endocanthion_{side}"]
     span = outer[0] - inner[0]
@@ -133,8 +133,8 @@ def _eye(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EyeGap:
-    """Holds the position of vertices relative to the gap between two lids: along it (0 at the inner corner, 1 at the
-    outer), from its middle line (mm), half its height there (mm), how much its lids bend there, and its reach."""
+    """Holds the position of each vertex relative to the gap between two lids. The position along the gap is 0 at the
+    inner corner and 1 at the outer corner. The distance from its middle line and half its height are in mm."""
 
     along: Float[np.ndarray, " v"]
     off: Float[np.ndarray, " v"]
@@ -144,8 +144,8 @@ class EyeGap:
 
 
 def eye_gap(vertices: Vertices, inner: Vector, outer: Vector, closed: float) -> EyeGap:
-    """Returns the gap between the lids of an eye that is ``closed`` to a degree from 0 to 1; the upper lid moves down
-    to the lower one."""
+    """Computes positions relative to the gap between the lids of an eye. As ``closed`` rises from 0 to 1, the upper lid
+    moves down to the lower lid."""
     x, y, z = vertices.T
     along = np.clip((x - inner[0]) / (outer[0] - inner[0]), 0, 1)
     bow = 4 * along * (1 - along)
@@ -155,7 +155,7 @@ def eye_gap(vertices: Vertices, inner: Vector, outer: Vector, closed: float) -> 
 
 
 def _open_eye(paint: Float[np.ndarray, "v 4"], vertices: Vertices, inner: Vector, outer: Vector, closed: float) -> None:
-    """Paints white, iris and pupil between the lids, and the upper lashes."""
+    """Paints white, iris and pupil between the lids, and the upper lashes, on the skin."""
     x, y, _ = vertices.T
     gap = eye_gap(vertices, inner, outer, closed)
     opening = gap.here * smoothstep(0.6, -0.6, np.abs(gap.off) - gap.height) * (closed < 1.0)

@@ -1,4 +1,4 @@
-"""Describes the subject in the studio: a head from the caller, and its appearance."""
+"""Describes the subject in the simulated studio: a head and its appearance."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,8 +29,8 @@ Vertices = Float[np.ndarray, "v 3"]
 def scattered(
     vertices: Vertices, faces: Int[np.ndarray, "f 3"], irradiance: Vertices, scattering_mm: tuple[float, float, float]
 ) -> Vertices:
-    """Spreads light within the skin, by one implicit step of heat flow on the surface for each channel. The sum of the
-    light over the surface stays the same; a channel with 0 mm is unchanged.
+    """Simulates scattering of light within the skin, by one implicit step of heat flow on the surface for each channel.
+    The integral of the light over the surface does not change. A channel with 0 mm is unchanged.
 
     Args:
         vertices: mm.
@@ -48,7 +48,7 @@ def scattered(
 
 
 def _laplacian(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> tuple[sparse.csr_array, Float[np.ndarray, " v"]]:
-    """Returns the cotangent stiffness (positive semidefinite) and a third of the area about each vertex (mm2)."""
+    """Returns the cotangent stiffness matrix, and a third of the area (mm2) of the triangles at each vertex."""
     double = np.maximum(np.linalg.norm(face_normals(vertices, faces), axis=1), 1e-6)
     rows, columns, values = [], [], []
     for corner in range(3):
@@ -101,9 +101,9 @@ NO_GRAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """Holds a head (head frame, mm). Without landmarks, its skin has neither brows nor lips. ``closed`` is how far the
-    lids of each side are closed, 0 to 1. ``eyes`` are eyeballs by side (head frame); without them eyes are painted
-    on the skin."""
+    """Holds a head (head frame, mm). Without landmarks, its skin has neither brows nor lips. ``closed`` is the degree
+    (0 to 1) to which each eye is closed. ``eyes`` holds eyeballs by side (head frame); without eyeballs, eyes are
+    painted on the skin."""
 
     mesh: Mesh
     landmarks: Landmarks = field(default_factory=dict)
@@ -115,7 +115,7 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Holds the appearance of a subject. Colours are linear RGB albedos."""
+    """Holds the appearance of a subject. All colours are linear RGB albedos."""
 
     skin: Colour
     cloth: Colour
@@ -134,7 +134,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """Holds a part of the subject before it is placed and lit (head frame, mm). ``shows`` is head, hair or clothes."""
+    """Holds a part of the subject before lighting, in the head frame (mm). ``shows`` is head, hair or clothes."""
 
     shows: str
     vertices: Vertices
@@ -148,11 +148,11 @@ class Piece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dressed:
-    """Holds the lit subject in the world frame (mm): the bare head and what it wears. Hair is first, because it hides
-    most of the rest.
+    """Holds the lit subject in the world frame (mm): the head, hair and clothes. Hair is the first part, because it
+    hides most other parts.
 
-    ``solid`` are vertices and triangles of everything except strands of hair; they decide what is hidden. ``surfaces``
-    are the same by name: head, hair, clothes. ``skin`` is the visible head.
+    ``solid`` holds all vertices and triangles but strands of hair, and is used to decide which points are hidden.
+    ``surfaces`` holds the same meshes by name: head, hair, clothes. ``skin`` is the head's visible surface.
     """
 
     head: Part
@@ -164,7 +164,7 @@ class Dressed:
 
 
 def with_gaze(subject: Subject, azimuth_deg: float, elevation_deg: float, rng: np.random.Generator) -> Subject:
-    """Gives a subject eyeballs of a random colour directed at a point ``GAZE_MM`` away, in a direction relative to
+    """Adds eyeballs of a random colour to a subject, directed at a point ``GAZE_MM`` away. The direction is relative to
     straight ahead: azimuth to the subject's left, elevation upwards. Raises InputError for a head without landmarks."""
     marks = anatomy(subject.mesh.vertices, subject.landmarks).landmarks
     if not marks:
@@ -178,7 +178,7 @@ def with_gaze(subject: Subject, azimuth_deg: float, elevation_deg: float, rng: n
 
 
 def random_look(rng: np.random.Generator) -> Look:
-    """Draws a skin tone, a hair tone and a cloth tone from the lists of this module, and a hair style."""
+    """Draws a random skin tone, hair tone and cloth tone from the lists of this module, and a random hair style."""
     tone = HAIR_TONES[rng.integers(len(HAIR_TONES))]
     over_ears = bool(rng.random() < 0.4)
     hair = HairStyle(
@@ -197,7 +197,7 @@ def random_look(rng: np.random.Generator) -> Look:
 def random_pose(
     centre_world: Float[np.ndarray, " 3"], spread_deg: float, spread_mm: float, rng: np.random.Generator
 ) -> Similarity:
-    """Draws the pose (world_from_head) of a subject near the cameras' common point, slightly turned and displaced."""
+    """Draws a random pose world_from_head near ``centre_world`` (mm), with a small rotation and displacement."""
     rotation = rotation_from_vector(np.radians(rng.normal(0, spread_deg, 3)))
     return Similarity(1.0, rotation, centre_world + rng.normal(0, spread_mm, 3))
 
@@ -212,7 +212,7 @@ def dress(
     rng: np.random.Generator,
     lamps: Sequence[Lamp] = LAMPS,
 ) -> Dressed:
-    """Gives a head hair, clothes, paint and light. Returns it in the world frame (mm)."""
+    """Adds hair, clothes, skin colours and light to a head. Returns the subject in the world frame (mm)."""
     hair_rng, cloth_rng, noise_rng, strand_rng, skin_rng, eye_rng, cap_rng = rng.spawn(7)
     head, body = subject.mesh, anatomy(subject.mesh.vertices, subject.landmarks)
     worn = shirt(head, body, cloth_rng) if clothes else None
@@ -256,7 +256,7 @@ def dress(
 
 
 def _uncut(skin: Part, head: Mesh) -> Part:
-    """Returns the head's own vertices and triangles, which come first in skin that is cut between the lids."""
+    """Removes the vertices and triangles that opening the eyes added to the head's skin."""
     rows = slice(len(head.vertices))
     vertices = skin.vertices[rows]
     return replace(
@@ -299,7 +299,7 @@ def _hairs(
     worn: tuple[Float[np.ndarray, "_ 3"], np.ndarray] | None,
     rng: np.random.Generator,
 ) -> list[tuple[Hair, HairStyle]]:
-    """Returns all surfaces of hair, the scalp's first."""
+    """Returns all surfaces of hair with their styles. The hair over the scalp comes first."""
     styles: list[tuple[Hair, HairStyle]] = []
     if appearance.hair:
         scalp = grow(head.vertices, body, appearance.hair, rng)
@@ -409,8 +409,7 @@ without panes: the pipeline asks studios for that."""
 
 
 def restyled(appearance: Look, names: Sequence[str]) -> Look:
-    """Returns the look with the named changes of ``HAIRSTYLES`` applied one after the other. Raises InputError for an
-    unknown name."""
+    """Applies the changes ``names`` of ``HAIRSTYLES`` to an appearance. Raises InputError for an unknown name."""
     if unknown := [name for name in names if name not in HAIRSTYLES]:
         raise InputError("hair", [compose("none-of", value=name, known=[*HAIRSTYLES]) for name in unknown])
     for name in names:

@@ -1,7 +1,7 @@
-"""Finds the visible parts of a subject, as points on its true surface: head, hair and clothes.
+"""Samples points on the visible true surface of a simulated subject: head, hair and clothes.
 
-They serve as reference for a reconstruction of the whole visible surface. Strands of hair are left out: they are
-thinner than a pixel, and a mesh can only have the surface from which they grow.
+The points are the reference for a reconstruction of the whole visible surface. Strands of hair are left out, because
+they are thinner than a pixel and no reconstructed mesh contains them.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ HIDDEN_MM = 0.5  # a nearer surface hides a point beyond this: the depth map's o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisiblePoints:
-    """Holds points of the true surface that two or more cameras see (world frame, mm). ``part`` indexes ``PARTS``."""
+    """Holds points (world frame, mm) of the true surface that two or more cameras see. ``part`` indexes ``PARTS``."""
 
     points: Float32[np.ndarray, "n 3"]
     normals: Float32[np.ndarray, "n 3"]  # unit, outwards
@@ -34,7 +34,7 @@ class VisiblePoints:
     views: UInt8[np.ndarray, " n"]  # cameras that see the point
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Returns the arrays of ``visible.npz``. ``area`` is the area of surface (mm2) that each point stands for."""
+        """Returns the arrays of ``visible.npz``. ``area`` is the surface area (mm2) that each point represents."""
         counted = {"points": self.points, "normals": self.normals, "part": self.part, "views": self.views}
         return counted | {"area": np.asarray(AREA_MM2, np.float32)}
 
@@ -42,8 +42,8 @@ class VisiblePoints:
 def visible_points(
     rig: Rig, surfaces: Mapping[str, Mesh], *, renderer: Renderer, rng: np.random.Generator
 ) -> VisiblePoints:
-    """Draws points evenly over the surfaces (by part, world frame, mm), and returns those in view of at least
-    ``VIEWS_LEAST`` cameras."""
+    """Draws random points evenly on surfaces (world frame, mm) by part. Returns the points that at least
+    ``VIEWS_LEAST`` cameras see."""
     drawn = [sample_surface(mesh, AREA_MM2, rng) for mesh in surfaces.values()]
     points, normals = (np.concatenate(arrays) for arrays in zip(*drawn, strict=True))
     codes = np.array([PARTS.index(name) for name in surfaces], np.uint8)
@@ -63,10 +63,9 @@ def visible_points(
 def part_masks(
     rig: Rig, surfaces: Mapping[str, Mesh], masks: Mapping[str, Bool[np.ndarray, "_ _"]], *, renderer: Renderer
 ) -> dict[str, UInt8[np.ndarray, "_ _"]]:
-    """Returns the part at every pixel, by camera, in the codes of bust.ply: 1 skin, 2 hair, 3 clothes; 0 outside the
-    ``masks``.
+    """Returns the part at every pixel by camera: 1 skin, 2 hair, 3 clothes, and 0 outside ``masks``.
 
-    Pixels inside a mask that no surface covers show strands of hair.
+    Pixels inside a mask that no surface covers are hair, because only strands can be there.
     """
     depth = {name: renderer.depth(rig, mesh.vertices, mesh.faces) for name, mesh in surfaces.items()}
     codes = np.array([1 + PARTS.index(name) for name in surfaces], np.uint8)
@@ -80,8 +79,8 @@ def part_masks(
 
 
 def sample_surface(mesh: Mesh, area_mm2: float, rng: np.random.Generator) -> tuple[Points, Points]:
-    """Draws points on a surface at random, one for each ``area_mm2``. Returns the points and the unit normals of their
-    triangles."""
+    """Draws random points on a mesh, one for each ``area_mm2``. Returns the points and their triangles' unit
+    normals."""
     normals = face_normals(mesh.vertices, mesh.faces)
     double = np.linalg.norm(normals, axis=1)
     ends = np.cumsum(double / 2)
@@ -95,10 +94,10 @@ def sample_surface(mesh: Mesh, area_mm2: float, rng: np.random.Generator) -> tup
 
 
 def sees(camera: Camera, depth: Float[np.ndarray, "h w"], points: Points, normals: Points) -> np.ndarray:
-    """Tells which points of a surface a camera sees. ``depth`` is the surface's depth map in the camera (z, mm; inf
-    where there is nothing).
+    """Returns a mask of the surface points that a camera sees. ``depth`` is the surface's depth map in the camera (z,
+    mm), inf where no surface is.
 
-    The map is read at the centre of the nearest pixel and compared with the point's tangent plane there.
+    The depth at the centre of the pixel nearest to a point is compared with the point's tangent plane.
     """
     k, pose = camera.intrinsics, camera.camera_from_world
     at = np.rint(np.nan_to_num(camera.project(points), nan=-9.0))

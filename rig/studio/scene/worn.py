@@ -1,5 +1,5 @@
-"""Makes clothing: a shirt with shoulders (for a head whose mesh ends at the neck), a cap with a visor, a swim or wig
-cap (the scalp, pushed out), and glasses. Glasses have rims but no lenses, as studios request."""
+"""Creates meshes of clothing: a shirt with shoulders for a head whose mesh ends at the neck, a cap with a visor, a
+tight cap, and glasses without lenses."""
 
 from dataclasses import dataclass
 
@@ -49,8 +49,8 @@ SIDES = 10  # of a tube
 
 @dataclass(frozen=True, slots=True)
 class TightCap:
-    """Describes a cap: its albedo (linear RGB), its thickness, how high the folds near its edge stand, how much darker
-    they are, and whether it shines as silicone does."""
+    """Describes a tight cap by its albedo (linear RGB), its thickness, the height and darkness of the folds near its
+    edge, and whether it shines like silicone."""
 
     colour: tuple[float, float, float]
     thickness_mm: float = 1.0
@@ -62,7 +62,8 @@ class TightCap:
 def lay_cap(
     head: Mesh, body: Anatomy, cap: TightCap, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 3"]]:
-    """Lays a cap on a head (head frame, mm). Returns its vertices, triangles, and albedo (linear RGB) by vertex."""
+    """Creates a tight cap on a head (head frame, mm). Returns its vertices, triangles, and linear RGB albedo by
+    vertex."""
     above = above_edge_mm(head.vertices, body)
     faces = head.faces[(above[head.faces] > 0.0).any(axis=1)]
     rows, corners = np.unique(faces, return_inverse=True)
@@ -77,13 +78,13 @@ def lay_cap(
 
 
 def above_edge_mm(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
-    """Returns the height of each vertex of a head above the edge of a cap (mm); negative below the edge."""
+    """Returns the height (mm) of each vertex of a head above the edge of a cap, negative below the edge."""
     relative = (vertices - body.ears) / body.unit
     return (relative[:, 1] - np.interp(relative[:, 2], EDGE[:, 0], EDGE[:, 1])) * body.unit
 
 
 def cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, body: Anatomy) -> Surface:
-    """Makes a cap that fits over a head and its hair, if it has any (head frame, mm)."""
+    """Creates a cap that fits over a head and its hair (head frame, mm)."""
     centre = body.ears + np.array([0.0, 28.0, -6.0]) * body.unit
     radius = outer_radius(head - centre, open_ears=True)
     if hair is not None:
@@ -111,7 +112,7 @@ def cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, b
 
 
 def _visor(rim: Float[np.ndarray, "c 3"], azimuth: Float[np.ndarray, " c"], body: Anatomy) -> Surface:
-    """Makes two sheets that bend down to both sides, closed along the front edge."""
+    """Creates the visor of a cap as two sheets that bend down at both sides and join at the front edge."""
     turn = (azimuth + np.pi) % (2 * np.pi) - np.pi
     front = np.flatnonzero(np.abs(turn) < np.radians(VISOR_DEG))
     front = front[np.argsort(turn[front])]
@@ -129,7 +130,7 @@ def _visor(rim: Float[np.ndarray, "c 3"], azimuth: Float[np.ndarray, " c"], body
 
 
 def glasses(head: Vertices, body: Anatomy) -> AnySurface:
-    """Makes glasses from a head's landmarks: two rims, a bridge and two temples (head frame, mm).
+    """Creates glasses from a head's landmarks: two rims, a bridge and two temples (head frame, mm).
 
     Raises InputError for a head without landmarks.
     """
@@ -156,7 +157,7 @@ def glasses(head: Vertices, body: Anatomy) -> AnySurface:
 
 
 def _temple(head: Vertices, body: Anatomy, start: Vector, sign: float) -> Float[np.ndarray, "n 3"]:
-    """Makes the path of an arm of glasses: from the rim back beside the temple, over the ear and down behind it."""
+    """Returns the path (mm) of one arm of glasses, from the rim back over the ear and down behind the ear."""
     over = body.ears + np.array([0.0, 14.0, -4.0]) * body.unit
     between = np.abs(head[:, 1] - over[1]) < 6.0
     between &= (head[:, 2] > over[2] + 10.0) & (head[:, 2] < start[2] - 15.0)
@@ -171,7 +172,7 @@ def _temple(head: Vertices, body: Anatomy, start: Vector, sign: float) -> Float[
 
 
 def _tube(path: Float[np.ndarray, "n 3"], radius_mm: float, reference: Vector, *, closed: bool) -> Surface:
-    """Makes a round tube around a path; ``reference`` must not be parallel to it."""
+    """Creates a round tube around a path. The direction ``reference`` must not be parallel to the path."""
     tangent = np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0) if closed else np.gradient(path, axis=0)
     across = np.cross(tangent, reference)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -190,7 +191,7 @@ def _tube(path: Float[np.ndarray, "n 3"], radius_mm: float, reference: Vector, *
 
 
 def joined(surfaces: list[AnySurface]) -> AnySurface:
-    """Returns several surfaces as one: their vertices and renumbered triangles."""
+    """Merges several surfaces into one, with renumbered triangles."""
     starts = np.cumsum([0] + [len(vertices) for vertices, _ in surfaces])
     faces = [faces + start for (_, faces), start in zip(surfaces, starts[:-1], strict=True)]
     return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(faces)
@@ -199,8 +200,8 @@ def joined(surfaces: list[AnySurface]) -> AnySurface:
 def shirt(
     head: Mesh, body: Anatomy, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "s 3"], Int[np.ndarray, "f 3"]] | None:
-    """Makes a shirt for a head whose mesh ends at the neck: vertices (head frame, mm) and outward faces. Returns None
-    for a bust, which has shoulders."""
+    """Creates a shirt for a head whose mesh ends at the neck, as vertices (head frame, mm) and outward faces. Returns
+    None for a mesh with shoulders."""
     vertices = head.vertices
     collar_y = body.chin_y - 27.0 * body.unit
     if vertices[:, 1].min() < collar_y - BUST_MM or vertices[:, 1].min() > collar_y:
@@ -224,7 +225,7 @@ def shirt(
 def _rings(
     vertices: Float[np.ndarray, "v 3"], collar_y: float, axis: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "r c 3"]:
-    """Returns outlines from the collar down; each encloses the neck at its height and the ring above."""
+    """Returns the rings of a shirt's vertices (mm) from the collar down. Each ring encloses the ring above."""
     angle = np.arange(CLOTH_COLUMNS) * 2 * np.pi / CLOTH_COLUMNS
     across, ahead = np.sin(angle), np.cos(angle)
     rings, reach = [], np.zeros(CLOTH_COLUMNS)
@@ -239,7 +240,7 @@ def _rings(
 
 
 def _neck(vertices: Float[np.ndarray, "v 3"], y: float, axis: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " c"]:
-    """Returns the radius around the axis by angle, with a margin for the cloth; 0 below the mesh."""
+    """Returns the radius (mm) of the neck by angle, with a margin for the cloth, or 0 below the mesh."""
     near = vertices[np.abs(vertices[:, 1] - y) < 9.0] - axis
     radius = np.zeros(CLOTH_COLUMNS, np.float32)
     if len(near) < 20:

@@ -1,1 +1,1 @@
-"""Turns the light of a scene into pictures: lens and sensor noise, deliberate faults, presets."""
+"""Simulates a camera's lens and sensor, which convert the light of a scene to a picture, and deliberate faults."""

@@ -1,4 +1,4 @@
-"""Describes deliberate faults of a simulated shot."""
+"""Describes the deliberate faults of a simulated shot."""
 
 from dataclasses import dataclass
 
@@ -23,8 +23,8 @@ DEFAULT_AMOUNT = {"dark": 0.02, "lights-off": 0.02, "bumped": 0.6, "exposure": 0
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Holds a fault of one of ``KINDS``. If ``camera`` is None, the fault concerns the whole rig; if only a single
-    camera can have this kind, a camera is drawn at random."""
+    """Holds a simulated fault of one of ``KINDS``. If ``camera`` is None, the fault concerns the whole rig, or a random
+    camera if only single cameras can have this kind."""
 
     kind: str
     camera: str | None = None
@@ -36,7 +36,7 @@ class Fault:
 
     @property
     def strength(self) -> float:
-        """Returns the fault's amount, or the usual amount of its kind if none was set."""
+        """Returns the fault's amount, or the usual amount of its kind if ``amount`` is None."""
         return DEFAULT_AMOUNT.get(self.kind, 1.0) if self.amount is None else self.amount
 
 
@@ -47,8 +47,8 @@ def fault_from_text(text: str) -> Fault:
 
 
 def fault_parts(text: str) -> tuple[str, str | None, float | None]:
-    """Splits ``kind[:camera][=amount]`` into kind, camera and amount. Raises InputError for an
-    amount that is no number."""
+    """Splits ``kind[:camera][=amount]`` into kind, camera and amount. Raises InputError unless the amount is a
+    number."""
     head, _, amount = text.partition("=")
     kind, _, camera = head.partition(":")
     try:

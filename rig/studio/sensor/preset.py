@@ -1,4 +1,4 @@
-"""Sets the imperfections of the simulated studio, and adds by name properties of real photographs of skin. Every
+"""Defines the imperfections of the simulated studio, and optional properties of real photographs of skin. Every
 benchmark uses ``PRESET``."""
 
 from collections.abc import Callable, Mapping, Sequence
@@ -11,8 +11,8 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """Holds the imperfections of the simulated studio. Numbers without a unit in their name are fractions of full scale
-    or of the light; lengths in the picture are in pixels."""
+    """Holds the imperfections of the simulated studio. A number whose name states no unit is a fraction of full scale
+    or of the light."""
 
     noise: float = (
         0.015  # sensor noise at mid grey, standard deviation; grows with the light's square root (shot noise)
@@ -69,7 +69,7 @@ cameras write it."""
 
 
 def made_real(preset: Preset, names: Sequence[str]) -> Preset:
-    """Returns the preset with the named changes of ``REALISM``. Raises InputError for an unknown name."""
+    """Returns the preset with the changes ``names`` of ``REALISM``. Raises InputError for an unknown name."""
     if unknown := [name for name in names if name not in REALISM]:
         raise InputError("realism", [compose("none-of", value=name, known=[*REALISM]) for name in unknown])
     for name in names:
@@ -78,5 +78,5 @@ def made_real(preset: Preset, names: Sequence[str]) -> Preset:
 
 
 def realism_names(text: str | None) -> tuple[str, ...]:
-    """Reads the names in ``NAME[,NAME]``; ``all`` means all of ``REALISM``, None means none."""
+    """Splits ``NAME[,NAME]`` into names. The text ``all`` gives all names of ``REALISM``, and None gives none."""
     return tuple(REALISM) if text == "all" else tuple(text.split(",")) if text else ()

@@ -1,5 +1,5 @@
-"""Turns linear light into an 8-bit photograph: lens blur, vignetting, gains, shot noise, the sRGB curve. Also draws
-smooth random fields."""
+"""Converts linear light to an 8-bit photograph with lens blur, vignetting, gains, shot noise and the sRGB curve. Also
+draws smooth random fields."""
 
 from dataclasses import dataclass
 
@@ -17,8 +17,8 @@ READ_SHARE = 0.1  # of mid grey's noise variance: what is there without light
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Holds what is the same in every picture of one camera: its gains (exposure times white balance, by channel), and
-    imperfections."""
+    """Holds the gains (exposure times white balance, by channel) and imperfections of one camera, which do not change
+    between pictures."""
 
     gains: tuple[float, float, float]
     preset: Preset
@@ -34,8 +34,7 @@ _CURVE = _curve()
 
 
 def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarray, "h w 3"]:
-    """Returns the light on the sensor (linear, float32): blurred by the lens, darker in the corners, times the camera's
-    gains."""
+    """Returns the light on the sensor (linear, float32), with lens blur, vignetting and the camera's gains."""
     light = cv2.GaussianBlur(linear, (0, 0), sensor.preset.defocus_px) if sensor.preset.defocus_px > 0 else linear
     height, width = light.shape[:2]
     y, x = np.ogrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
@@ -44,8 +43,8 @@ def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarra
 
 
 def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "h w 4"]:
-    """Returns the subject as a rolling shutter records it while it moves by ``shift_px`` between the readouts of the
-    first and the last row. The middle row records it at its true position."""
+    """Returns the subject's image by a rolling shutter while the subject moves. ``shift_px`` is the motion between the
+    readouts of the first and the last row. The middle row shows the true position."""
     height, width = subject.shape[:2]
     across, down = shift_px / (height - 1)
     source = np.array([[1.0, -across, shift_px[0] / 2], [0.0, 1.0 - down, shift_px[1] / 2]])
@@ -54,7 +53,7 @@ def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"
 
 
 def expose(light: Float[np.ndarray, "h w 3"], sensor: Sensor, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
-    """Takes one picture (sRGB codes) of the linear light on the sensor, with fresh noise."""
+    """Converts linear light on the sensor to a picture (sRGB, 0 to 255) with random noise."""
     if sensor.preset.noise > 0:
         # The curve's slope at mid grey is 1.07, so that the noise there is ``noise`` of full scale in the picture.
         variance = (sensor.preset.noise / 1.07) ** 2 * (READ_SHARE + (1 - READ_SHARE) / MID_GREY * np.maximum(light, 0))
@@ -69,8 +68,8 @@ def expose(light: Float[np.ndarray, "h w 3"], sensor: Sensor, rng: np.random.Gen
 
 
 def through_mosaic(light: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Returns the light (float32) as a Bayer sensor records it, with red at the first pixel: one channel for each
-    pixel, the others interpolated along edges by OpenCV."""
+    """Simulates a Bayer sensor with red at the first pixel. A pixel measures one channel; OpenCV interpolates the other
+    channels along edges. Returns float32."""
     codes = np.rint(65535.0 * np.clip(light, 0.0, 1.0)).astype(np.uint16)
     bayer = codes[:, :, 1].copy()
     bayer[::2, ::2], bayer[1::2, 1::2] = codes[::2, ::2, 0], codes[1::2, 1::2, 2]
@@ -79,7 +78,7 @@ def through_mosaic(light: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 
 
 
 def compressed(picture: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns a picture compressed as JPEG and decoded again, its colour at half the resolution."""
+    """Compresses a picture as JPEG with colour at half resolution, and decodes it again."""
     flags = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
     data = cv2.imencode(".jpg", np.ascontiguousarray(picture[:, :, ::-1]), flags)[1]
     back = cv2.imdecode(data, cv2.IMREAD_COLOR)
@@ -88,8 +87,8 @@ def compressed(picture: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.nd
 
 
 def drift(shape: tuple[int, int], amount: float, rng: np.random.Generator) -> Float[np.ndarray, "h w 1"]:
-    """Draws the change of the light between clean plate and shot, as a gain for each pixel of a picture of this shape:
-    a common factor and a slope over the picture, both with a standard deviation of about ``amount``."""
+    """Draws a random change of the light between clean plate and shot, as a gain for each pixel. The change is a common
+    factor and a slope over the picture, both with a standard deviation of about ``amount``."""
     level, across, down = amount * rng.standard_normal(3)
     y, x = np.ogrid[-1.0 : 1.0 : shape[0] * 1j, -1.0 : 1.0 : shape[1] * 1j]
     return (1.0 + level + 0.5 * (across * x + down * y)).astype(np.float32)[:, :, None]
@@ -103,7 +102,7 @@ def volume(rng: np.random.Generator, cells: int) -> UInt8[np.ndarray, "n n n 4"]
 def smooth(
     rng: np.random.Generator, height: int, width: int, cells_high: int, cells_wide: int, channels: int = 1
 ) -> Float[np.ndarray, "h w c"]:
-    """Draws a smooth random field (float32): normal values on a coarse grid of cells, interpolated by cubics."""
+    """Draws a smooth random field (float32) by cubic interpolation of normally distributed values on a coarse grid."""
     grid = rng.standard_normal((cells_high + 3, cells_wide + 3, channels)).astype(np.float32)
     large = cv2.resize(grid, (width * (cells_wide + 3) // cells_wide, height * (cells_high + 3) // cells_high),
                        interpolation=cv2.INTER_CUBIC)  # fmt: skip
@@ -115,8 +114,7 @@ def smooth(
 def around(
     rng: np.random.Generator, rows: int, columns: int, cells_high: int, cells_wide: int
 ) -> Float[np.ndarray, "h w"]:
-    """Draws a smooth random field (float64) like ``smooth``, but of one channel and periodic: its first column follows
-    its last."""
+    """Draws a smooth random field (float64) with one channel that is periodic from the last to the first column."""
     grid = rng.standard_normal((cells_high + 2, cells_wide)).astype(np.float32)
     grid = np.concatenate([grid[:, -3:], grid, grid[:, :3]], axis=1)
     step = columns / cells_wide
@@ -128,8 +126,8 @@ def around(
 def waves(
     rng: np.random.Generator, points: Float[np.ndarray, "n 3"], shortest_mm: float, longest_mm: float
 ) -> Float[np.ndarray, " n"]:
-    """Draws a random field in space with standard deviation 1, and returns its values at ``points`` (mm). It is a sum
-    of waves of random directions, with lengths from ``shortest_mm`` to ``longest_mm``."""
+    """Draws a random field in space with standard deviation 1, and returns its values at ``points`` (mm). The field is
+    a sum of waves in random directions, with wavelengths from ``shortest_mm`` to ``longest_mm``."""
     count = 32
     directions = rng.normal(0, 1, (count, 3))
     lengths = rng.uniform(shortest_mm, longest_mm, (count, 1))
