@@ -69,7 +69,7 @@ class Driver(Protocol):
 
     def trigger(self) -> None:
         """Asks the camera for a picture now, if its ``trigger`` in rig.toml is "software". Other cameras ignore it."""
-        ...
+        return
 
     def close(self) -> None:
         """Releases the camera."""
@@ -151,15 +151,7 @@ class Pace:
         return True
 
 
-class FreeDriver:
-    """Sends frames at its own rate, whatever is asked of it."""
-
-    def trigger(self) -> None:
-        """Does nothing: there is no software trigger."""
-        return
-
-
-class PacedDriver(FreeDriver):
+class PacedDriver(Driver):
     """Delivers frames at the camera's rate without a device."""
 
     def __init__(self, camera: CameraConfig) -> None:

@@ -21,7 +21,7 @@ from urllib.parse import unquote, urlsplit
 import cv2
 import numpy as np
 
-from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverError, FreeDriver, GrabTimeout
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverError, GrabTimeout
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose
@@ -190,7 +190,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
     return MjpegDriver(camera) if camera.identity.startswith(_ADDRESSES) else VideoCaptureDriver(camera)
 
 
-class MjpegDriver(FreeDriver):
+class MjpegDriver(Driver):
     """Reads a motion-JPEG stream over HTTP."""
 
     live = True
@@ -247,7 +247,7 @@ class MjpegDriver(FreeDriver):
             self._stream = None
 
 
-class VideoCaptureDriver(FreeDriver):
+class VideoCaptureDriver(Driver):
     """Reads the sources that cv2.VideoCapture opens: /dev/v4l/by-id/..., /dev/v4l/by-path/..., rtsp://..."""
 
     live = True
