@@ -216,8 +216,8 @@ def test_files_of_another_kind_and_folders_of_pictures_that_nobody_reads_are_tol
     shutil.copytree(folder / "images", folder / "depth")
     (folder / "images" / "cam00.exr").write_bytes(b"v/1")
     strays, unread = (remark.text for remark in read_capture(folder)[0].remarks)
-    assert strays.startswith("images/cam00.exr has no camera")
-    assert unread == "depth/ is not read: pictures lie in images/, masks/ and background/"
+    assert ": images/cam00.exr has no camera" in strays
+    assert unread.endswith(": depth/ is not read: pictures lie in images/, masks/ and background/")
     (folder / "images").rename(folder / "Bilder")
     with pytest.raises(InputError, match="Bilder/ is not read: pictures lie in images/"):
         read_capture(folder)
