@@ -45,7 +45,6 @@ class Crop:
 
     levels: tuple[Level, ...]
     colour: Photograph
-    mask: Float32[np.ndarray, "h w"]  # coverage, 0 to 1; 0 beyond the photograph
 
     @property
     def camera(self) -> Camera:
@@ -90,7 +89,6 @@ def _crop(
         silhouette.distance, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=UNSEEN_PX
     )
     distance = np.where(distance > MAX_UNSEEN_PX, distance * scale, UNSEEN_PX).astype(np.float32)
-    mask = np.where(distance > MAX_UNSEEN_PX, np.clip(0.5 - distance, 0.0, 1.0), 0.0).astype(np.float32)
     grey = colour.astype(np.float32) @ LUMINANCE
     noise = noise_level(image.astype(np.float32) @ LUMINANCE)
     blur = BLUR_PX * blur_growth(noise)
@@ -101,7 +99,7 @@ def _crop(
         pinhole = replace(pinhole, intrinsics=pinhole.intrinsics.scaled(0.5))
         levels.append(Level(pinhole, grey, distance, noise))
     assert levels[-1].grey.shape == (k.height >> (LEVELS - 1), k.width >> (LEVELS - 1))
-    return Crop(tuple(levels), colour, mask)
+    return Crop(tuple(levels), colour)
 
 
 def crop_camera(camera: Camera, silhouette: Silhouette, scale: float) -> Camera:

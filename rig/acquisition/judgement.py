@@ -13,6 +13,7 @@ from rig.acquisition.shot import Fault, PictureCheck, ShotFailed
 from rig.formats.rig_toml import ShotConfig
 from rig.image import ImageRgb
 from rig.messages.message import compose
+from rig.rig import Rig
 
 SEEN_SHARE = 0.5  # of the cameras: all see a person in the seat; a change seen by one is of its own wall, or a bump
 OtherView = Callable[[str, Registration], str | None]
@@ -128,6 +129,20 @@ def _whose_view(name: str, image: ImageRgb, registration: Registration, plates: 
     others = {other: register(image, plate).found for other, plate in plates.first.items() if other != name}
     best = max(others, key=lambda other: others[other], default=None)
     return best if best is not None and others[best] >= max(FOUND_LEAST, 2 * registration.found) else None
+
+
+def size_faults(images: Mapping[str, ImageRgb], rig: Rig) -> list[Fault]:
+    """Returns a fault for each picture whose camera is not calibrated, or is calibrated for another size."""
+    faults = []
+    for name, image in images.items():
+        if name not in rig:
+            faults.append(Fault("size", name, compose("camera-not-calibrated")))
+            continue
+        lens = rig[name].intrinsics
+        size, wanted = f"{image.shape[1]} x {image.shape[0]}", f"{lens.width} x {lens.height}"
+        if size != wanted:
+            faults.append(Fault("size", name, compose("picture-size-wrong", size=size, wanted=wanted)))
+    return faults
 
 
 class PlatesRefused(ShotFailed):

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from rig.acquisition.judgement import PlatesRefused, examine, judge, occupied, plate_faults
+from rig.acquisition.judgement import PlatesRefused, examine, judge, occupied, plate_faults, size_faults
 from rig.acquisition.plates import Plates, keep_plates, read_plates, use_plates, write_plates
 from rig.acquisition.shot import Fault, Shot, ShotFailed, Timing, certify
-from rig.acquisition.trigger import Fired, TriggerBox, TriggerError
+from rig.acquisition.trigger import RigTrigger
 from rig.drivers.base import Driver, DriverError, Frame, driver_for
 from rig.drivers.feed import CameraFeed, FeedState
 from rig.formats.cameras.cameras_json import read_rig
@@ -32,7 +32,6 @@ from rig.rig import Rig
 MakeDriver = Callable[[CameraConfig, Path], Driver]
 
 _LIVE_WAIT_PERIODS = 3.0  # frame periods that a free-running camera may take for its next frame
-_ARM_TO_FIRE_S = 0.02  # pause in which the live view's present frame ends
 _CLOSE_S = 3.0
 _SILENT_S = 10.0  # so long nobody waits for a camera that gave no live picture
 _DIAGNOSIS_S = 1.0  # wait for pictures if the trigger failed: they may still show why
@@ -55,8 +54,7 @@ class RigSession:
         self.plates: Plates = read_plates(config.plates_folder, config.names)
         self._feeds: dict[str, CameraFeed] = {}
         self._broken: dict[str, Message] = {}
-        self._box: TriggerBox | None = None
-        self._box_error: TriggerError | None = None
+        self._trigger = RigTrigger(config)
         self._last_seen: dict[str, Frame] = {}  # to recognise a frozen stream
         self._silent_until_s: dict[str, float] = {}
         self._busy = threading.Lock()
@@ -83,19 +81,14 @@ class RigSession:
         """Opens the cameras and the trigger box at once. A camera that does not open is a fault of each shot."""
         for feed in self._feeds.values():
             feed.start()
-        self._open_box()
+        self._trigger.open()
         deadline_s = time.monotonic() + self.config.shot.open_timeout_s
         for feed in self._feeds.values():
             feed.wait_opened(deadline_s)
 
     def close(self) -> tuple[str, ...]:
         """Switches the lamps off and closes all devices. Returns the cameras whose driver hangs. Safe to call twice."""
-        if self._box is not None:
-            if not self.config.lights.keep_on:
-                self._try_box(lambda box: box.set_lights(0))
-            if self._box is not None:
-                self._box.close()
-                self._box = None
+        self._trigger.close()
         deadline_s = time.monotonic() + _CLOSE_S
         for feed in self._feeds.values():
             feed.stop()
@@ -109,12 +102,16 @@ class RigSession:
 
     def trigger_error(self) -> Message | None:
         """Returns why the trigger box cannot be used; None if it can, or if rig.toml names none."""
-        return None if self._box_error is None else self._box_error.message
+        return None if self._trigger.error is None else self._trigger.error.message
+
+    def _trigger_faults(self) -> tuple[Fault, ...]:
+        error = self.trigger_error()
+        return () if error is None else (Fault("trigger", None, error),)
 
     def warm_up(self) -> None:
         """Switches the lamps on and lets every camera's first frames pass, while exposure and lamps settle."""
         with self._busy:
-            self._lights_on()
+            self._trigger.switch_lamps_on()
             deadline_s = time.monotonic() + self.config.shot.timeout_s
             for feed in self._feeds.values():
                 # a camera that waits for triggers sends nothing by itself, so it is not waited for
@@ -125,14 +122,14 @@ class RigSession:
         """Returns a current picture of each camera that delivers one, without synchronisation. ``only`` names the
         cameras; None takes all."""
         with self._busy:
-            self._lights_on()
+            self._trigger.switch_lamps_on()
             frames = self._next_frames(time.monotonic() + 2 * self.config.shot.timeout_s, only)
             return {name: frame.image for name, frame in frames.items()}
 
     def shoot(self) -> Shot:
         """Takes one synchronised shot. It raises nothing for a failing device: the shot's faults say what is wrong."""
         with self._busy:
-            self._lights_on()
+            self._trigger.switch_lamps_on()
             self._glance()
             release = self._release()
             frames = self._collect(release)
@@ -144,7 +141,7 @@ class RigSession:
         """Takes clean plates of the empty studio and starts to use them. Raises ShotFailed, or PlatesRefused if they
         show a person whom the old plates do not show; the old plates then stay in use."""
         with self._busy:
-            self._lights_on()
+            self._trigger.switch_lamps_on()
             self._silent_until_s.clear()
             taken: dict[str, list[ImageRgb]] = {name: [] for name in self.config.names}
             pause_s = self.config.shot.plates_over_s / max(self.config.shot.plates - 1, 1)
@@ -153,7 +150,7 @@ class RigSession:
                 frames = self._next_frames(time.monotonic() + 2 * self.config.shot.timeout_s)
                 for name, frame in frames.items():
                     taken[name].append(frame.image)
-            faults = [*self._box_faults(), *self._plate_faults(taken)]
+            faults = [*self._trigger_faults(), *self._plate_faults(taken)]
             if faults:
                 raise ShotFailed(faults)
             images = {name: tuple(images) for name, images in taken.items()}
@@ -168,48 +165,6 @@ class RigSession:
         with self._busy:
             self.plates = use_plates(self.config.plates_folder, version, self.config.names)
             return self.plates
-
-    def _open_box(self) -> None:
-        trigger = self.config.trigger
-        if trigger is None or self._box is not None:
-            return
-        try:
-            self._box = TriggerBox(trigger.port, baud=trigger.baud)
-            for camera in self.config.cameras:
-                if camera.channel is not None:
-                    self._box.set_delay(camera.channel, camera.delay_us)
-            self._box_error = None
-        except TriggerError as error:
-            self._drop_box(error)
-
-    def _drop_box(self, error: TriggerError) -> None:
-        if self._box is not None:
-            self._box.close()
-        self._box, self._box_error = None, error
-
-    def _try_box(self, act: Callable[[TriggerBox], object]) -> bool:
-        """Tells whether the box carried out ``act``. If not it is closed; the next shot tries to open it."""
-        if self._box is None:
-            return False
-        try:
-            act(self._box)
-        except TriggerError as error:
-            self._drop_box(error)
-            return False
-        return True
-
-    def _box_faults(self) -> list[Fault]:
-        return [] if self._box_error is None else [Fault("trigger", None, self._box_error.message)]
-
-    def _lights_on(self) -> None:
-        self._open_box()
-        mask = sum(1 << output for output in self.config.lights.outputs)
-        if mask == 0 or self._box is None:
-            return
-        before: list[int] = []
-        if self._try_box(lambda box: before.append(box.status().lights)) and before != [mask]:
-            self._try_box(lambda box: box.set_lights(mask))
-            time.sleep(self.config.lights.settle_s)
 
     def _glance(self) -> None:
         """Stores the picture of each camera before the release; if the same picture follows, the stream is frozen."""
@@ -239,7 +194,7 @@ class RigSession:
         awaited = [name for name in feeds if self._silent_until_s.get(name, 0.0) <= now_s]
         early_s = now_s + (deadline_s - now_s) / 4
         missing = [n for n in awaited if feeds[n].collect(now_s, early_s) is None and feeds[n].state().opened]
-        if any(feeds[name].camera.trigger == "external" for name in missing) and self._fire() is not None:
+        if any(feeds[name].camera.trigger == "external" for name in missing) and self._trigger.fire() is not None:
             for name in missing:
                 feeds[name].collect(now_s, deadline_s)
         frames = {name: feed.collect(now_s, 0.0) for name, feed in feeds.items()}
@@ -251,30 +206,15 @@ class RigSession:
         self._last_seen |= received
         return received
 
-    def _fire(self) -> Fired | None:
-        """Arms and fires the box. Returns None, and stores the error, if that fails."""
-        trigger = self.config.trigger
-        mask = sum(1 << c.channel for c in self.config.cameras if c.trigger == "external" and c.channel is not None)
-        fired: list[Fired] = []
-
-        def act(box: TriggerBox) -> None:
-            assert trigger is not None, "there is a box"
-            box.synchronise()
-            box.arm(trigger.window_s)
-            time.sleep(_ARM_TO_FIRE_S)
-            fired.append(box.fire(mask, trigger.pulse_us))
-
-        return fired[0] if self._try_box(act) else None
-
     def _release(self) -> _Release:
         """Releases the shot and returns its time: the box's or, without a box in rig.toml, that of the command."""
         now_s = time.monotonic()
         for feed in self._feeds.values():
             feed.want(now_s)
         if self.config.trigger is not None:
-            fired = self._fire()
+            fired = self._trigger.fire()
             if fired is None:
-                return _Release(time.monotonic(), 0.0, False, tuple(self._box_faults()))
+                return _Release(time.monotonic(), 0.0, False, self._trigger_faults())
             for feed in self._feeds.values():
                 if feed.camera.trigger == "software":
                     feed.trigger()
@@ -307,10 +247,12 @@ class RigSession:
         return frames
 
     def _judge(self, release: _Release, frames: Mapping[str, Frame | None]) -> Shot:
-        periods_s = {name: feed.state().period_s for name, feed in self._feeds.items()}
         timings = {
             name: Timing(
-                self._due_s(feed.camera, release), periods_s[name], feed.camera.trigger == "external", not feed.live
+                self._due_s(feed.camera, release),
+                feed.state().period_s,
+                feed.camera.trigger == "external",
+                not feed.live,
             )
             for name, feed in self._feeds.items()
         }
@@ -331,7 +273,7 @@ class RigSession:
             *self._missing(frames, release.fired),
             *late,
             *self._still(images),
-            *self._sizes(images),
+            *(() if self.rig is None else size_faults(images, self.rig)),
             *judge(images, checks, self.plates, self.config.shot),
             *self._notes(images),
         ]
@@ -355,20 +297,6 @@ class RigSession:
             if self._feeds[name].live and name in self._last_seen and np.array_equal(self._last_seen[name].image, image)
         ]
 
-    def _sizes(self, images: Mapping[str, ImageRgb]) -> list[Fault]:
-        if self.rig is None:
-            return []
-        faults = []
-        for name, image in images.items():
-            if name not in self.rig:
-                faults.append(Fault("size", name, compose("camera-not-calibrated")))
-                continue
-            lens = self.rig[name].intrinsics
-            size, wanted = f"{image.shape[1]} x {image.shape[0]}", f"{lens.width} x {lens.height}"
-            if size != wanted:
-                faults.append(Fault("size", name, compose("picture-size-wrong", size=size, wanted=wanted)))
-        return faults
-
     def _notes(self, images: Mapping[str, ImageRgb]) -> list[Fault]:
         unmet = {name: feed.state().unmet for name, feed in self._feeds.items()}
         notes = [Fault("setting", name, line) for name, lines in unmet.items() for line in lines]
@@ -379,13 +307,10 @@ class RigSession:
         wanted, faults = self.config.shot.plates, []
         for name, images in taken.items():
             if len(images) < wanted:
-                state = self._feeds[name].state() if name in self._feeds else None
-                why = self._broken.get(name) or (state.error if state is not None else None)
-                faults.append(
-                    Fault("missing", name, why or compose("plates-incomplete", came=len(images), wanted=wanted))
-                )
-        came = {name: images for name, images in taken.items() if images}
-        complete = {name: images for name, images in came.items() if len(images) >= wanted}
+                why = self._broken.get(name) or self._feeds[name].state().error
+                why = why or compose("plates-incomplete", came=len(images), wanted=wanted)
+                faults.append(Fault("missing", name, why))
+        complete = {name: images for name, images in taken.items() if len(images) >= wanted}
         live = [name for name in complete if self._feeds[name].live]
         return faults + plate_faults(complete, live, self.config.shot)
 

@@ -10,14 +10,18 @@ characters, so that an echo is not mistaken for a reply.
 import string
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import serial
 
 from rig.errors import EigenheadError
+from rig.formats.rig_toml import RigConfig
 from rig.formats.trigger_lines import BAUD, CLOCK_PERIOD_US, PROTOCOL, REPLY, REQUEST, LineReader, encode_line
 from rig.messages.message import Message, compose
 
+ARM_TO_FIRE_S = 0.02  # pause in which the live view's present frame ends
 BUSY_S = 1.5  # longest release: delay and pulse take up to 0.5 s each, and the lines between them some time
 
 
@@ -120,12 +124,6 @@ class TriggerBox:
             self.close()
             raise
 
-    def __enter__(self) -> "TriggerBox":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def close(self) -> None:
         """Closes the serial port. The call may be repeated, and may follow an unplugged cable."""
         # pyserial's close restores nothing that could fail, but an unplugged descriptor may still raise
@@ -227,6 +225,71 @@ class TriggerBox:
             for answered, body in self._reader.feed(data):
                 if answered == sequence:
                     return body
+        return None
+
+
+class RigTrigger:
+    """Holds the trigger box that rig.toml names. After an error it is closed, and the next use opens it again.
+
+    ``error``: why it cannot be used; None if it can, or if rig.toml names none."""
+
+    def __init__(self, config: RigConfig) -> None:
+        self.error: TriggerError | None = None
+        self._config = config
+        self._box: TriggerBox | None = None
+
+    @contextmanager
+    def _attempt(self) -> Iterator[None]:
+        try:
+            yield
+        except TriggerError as error:
+            self.error = error
+            self._drop()
+
+    def _drop(self) -> None:
+        if self._box is not None:
+            self._box.close()
+        self._box = None
+
+    def open(self) -> None:
+        """Opens the box and sets the delays of the cameras, unless it is open."""
+        trigger = self._config.trigger
+        if trigger is None or self._box is not None:
+            return
+        with self._attempt():
+            self._box = TriggerBox(trigger.port, baud=trigger.baud)
+            for camera in self._config.cameras:
+                if camera.channel is not None:
+                    self._box.set_delay(camera.channel, camera.delay_us)
+            self.error = None
+
+    def close(self) -> None:
+        """Switches the lamps off, unless rig.toml keeps them on, and closes the box. Safe to call twice."""
+        with self._attempt():
+            if self._box is not None and not self._config.lights.keep_on:
+                self._box.set_lights(0)
+        self._drop()
+
+    def switch_lamps_on(self) -> None:
+        """Opens the box, switches the lamps of rig.toml on and waits until they are steady."""
+        self.open()
+        lights = self._config.lights
+        mask = sum(1 << output for output in lights.outputs)
+        with self._attempt():
+            if mask and self._box is not None and self._box.status().lights != mask:
+                self._box.set_lights(mask)
+                time.sleep(lights.settle_s)
+
+    def fire(self) -> Fired | None:
+        """Releases the cameras that wait for the box. Returns None if there is none or if it fails."""
+        trigger, cameras = self._config.trigger, self._config.cameras
+        mask = sum(1 << c.channel for c in cameras if c.trigger == "external" and c.channel is not None)
+        with self._attempt():
+            if trigger is not None and self._box is not None:
+                self._box.synchronise()
+                self._box.arm(trigger.window_s)
+                time.sleep(ARM_TO_FIRE_S)
+                return self._box.fire(mask, trigger.pulse_us)
         return None
 
 

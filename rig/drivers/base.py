@@ -68,7 +68,7 @@ class Driver(Protocol):
 
     def trigger(self) -> None:
         """Makes the camera take a picture if its ``trigger`` in rig.toml is "software"; otherwise does nothing."""
-        ...
+        return
 
     def close(self) -> None:
         """Stops the camera and frees its resources."""
@@ -149,15 +149,7 @@ class Pace:
         return True
 
 
-class FreeDriver:
-    """Implements ``trigger`` for cameras that always send frames at a fixed rate."""
-
-    def trigger(self) -> None:
-        """Does nothing, because the camera has no software trigger."""
-        return
-
-
-class PacedDriver(FreeDriver):
+class PacedDriver(Driver):
     """Implements ``grab`` for drivers without a device, which deliver frames at a fixed rate."""
 
     def __init__(self, camera: CameraConfig) -> None:

@@ -22,7 +22,7 @@ from urllib.parse import unquote, urlsplit
 import cv2
 import numpy as np
 
-from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverError, FreeDriver, GrabTimeout
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverError, GrabTimeout
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose
@@ -191,7 +191,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
     return MjpegDriver(camera) if camera.identity.startswith(_ADDRESSES) else VideoCaptureDriver(camera)
 
 
-class MjpegDriver(FreeDriver):
+class MjpegDriver(Driver):
     """Reads a motion-JPEG stream over HTTP."""
 
     live = True
@@ -248,7 +248,7 @@ class MjpegDriver(FreeDriver):
             self._stream = None
 
 
-class VideoCaptureDriver(FreeDriver):
+class VideoCaptureDriver(Driver):
     """Reads sources that cv2.VideoCapture can open: paths in /dev/v4l/by-id and /dev/v4l/by-path, and rtsp
     addresses."""
 

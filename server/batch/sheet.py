@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from pipeline.results.overlays import AZIMUTHS_DEG
+from rig.formats.pictures.images import encode_image
 from rig.messages.message import MessageDocument
 
 SEVERE = frozenset(
@@ -133,8 +134,7 @@ def views_of(turntable: Path, panel_px: tuple[int, int] = PANEL_PX) -> bytes | N
     panels = np.array_split(drawn, len(AZIMUTHS_DEG), axis=1)
     chosen = (panels[0], panels[len(panels) // 2], panels[-1])
     small = np.hstack([cv2.resize(panel, panel_px, interpolation=cv2.INTER_AREA) for panel in chosen])
-    encoded, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return data.tobytes() if encoded else None
+    return encode_image(".jpg", small[:, :, ::-1], (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
 
 
 def figures_of(row: Mapping[str, object]) -> str:

@@ -33,7 +33,7 @@ from rig.files import write_atomically
 from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.formats.meshes.ply import read_vertex_numbers
-from rig.formats.pictures.images import open_picture, read_image, write_image
+from rig.formats.pictures.images import encode_image, open_picture, read_image, write_image
 from rig.geometry import RigidTransform
 from rig.image import ImageRgb
 from rig.mesh import Mesh
@@ -357,9 +357,7 @@ def draw(context: WorkerContext, report: Progress, *, capture: str, cache: str, 
     shot, rig = read_scaled_capture(Path(capture))
     silhouettes = segment_once(Path(cache), shot, rig, report=report)
     for name, silhouette in silhouettes.items():
-        done, data = cv2.imencode(".png", outline(silhouette.mask)[:, :, [2, 1, 0, 3]])
-        assert done
-        write_atomically(Path(target) / f"{name}.png", data.tobytes())
+        write_atomically(Path(target) / f"{name}.png", encode_image(".png", outline(silhouette.mask)))
 
 
 def outline(mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "y x 4"]:

@@ -239,8 +239,8 @@ class Captures:
         jobs that need it."""
         record = self._store.capture(identity)
         if active := self._jobs.active(capture=identity):
-            detail = compose("capture-in-use")
-            raise Conflict("capture-in-use", detail, [compose("job-named", job=job) for job in active])
+            named = [compose("job-named", job=job) for job in active]
+            raise Conflict("capture-in-use", compose("capture-in-use"), named)
         return record
 
     def remove(self, identity: str) -> None:
@@ -253,12 +253,10 @@ class Captures:
         """Returns which data a removal of the capture would delete and which would stay. Raises NotFound."""
         record = self._store.capture(identity)
         of_capture = self._jobs.find(capture=identity, limit=100_000)
-        held = max(
-            record.bytes, folder_bytes(self._store.folder("captures", identity))
-        )  # some may be in the store alone
+        here = folder_bytes(self._store.folder("captures", identity))  # the store may hold more
         return HoldingsOut(
             pictures=len(record.cameras),
-            bytes=held + folder_bytes(self._store.cache_of(identity)),
+            bytes=max(record.bytes, here) + folder_bytes(self._store.cache_of(identity)),
             heads=[job.id for job in of_capture if job.state == "succeeded"],
             head_bytes=sum(file.bytes for job in of_capture for file in job.files.values()),
             jobs=[job.id for job in of_capture if job.state != "succeeded"],
@@ -280,8 +278,7 @@ class Captures:
         note of it; a ``board`` needs none."""
         consent = "" if session is None else self._store.session(session).consent
         if self._settings.ask_consent and not consent.strip() and not board:
-            detail = compose("consent-missing")
-            raise Conflict("consent-missing", detail)
+            raise Conflict("consent-missing", compose("consent-missing"))
 
     def _add(
         self,

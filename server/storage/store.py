@@ -100,16 +100,12 @@ _THINGS = {
 }
 
 
-class Store:
-    """Reads and changes the data folder. Methods block. Every id that comes from a request passes ``is_id`` before it
-    becomes part of a path."""
+class DataFolder:
+    """Knows where things lie in the data folder, and what in it is to be swept away. Methods block. Every id that comes
+    from a request passes ``is_id`` before it becomes part of a path."""
 
-    def __init__(
-        self, data: Path, index: Library | None = None, blobs: CaptureBlobs | None = None, spare: int = 0
-    ) -> None:
-        """``blobs``: second place for files of captures; ``spare``: bytes to keep free when fetching them."""
-        self.data, self._index, self.blobs, self._spare = data, index, blobs, spare
-        self._changing = threading.Lock()  # two changes of one record must not lose one of them
+    def __init__(self, data: Path) -> None:
+        self.data = data
         for name in FOLDERS:
             (data / name).mkdir(parents=True, exist_ok=True)
         data.chmod(0o700)  # faces are biometric data
@@ -147,6 +143,58 @@ class Store:
         """Raises DiskFull if ``wanted`` bytes would leave less than ``spare`` free."""
         if self.free_bytes() - wanted < spare:
             raise DiskFull
+
+    def cache_of(self, identity: str) -> Path:
+        """Returns the folder in which a capture's silhouettes, thumbnails and similar files are cached."""
+        return self.folder("cache/captures", identity)
+
+    def remove(self, path: Path) -> None:
+        """Deletes a file or folder. It is first renamed into ``trash``, so it disappears even if the deletion is
+        interrupted. Does nothing if it does not exist."""
+        target = self.data / "trash" / f"{new_id()}"
+        try:
+            path.rename(target)
+        except FileNotFoundError:
+            return
+        except OSError:  # a full file system may have no room for the new name
+            target = path
+        shutil.rmtree(target, ignore_errors=True) if target.is_dir() else target.unlink(missing_ok=True)
+
+    def sweep(self, older_s: float) -> int:
+        """Deletes files that crashes left in ``incoming`` and ``trash``, and half-written files, if untouched for
+        ``older_s`` seconds. Returns how many were deleted."""
+        removed = 0
+        left = [self.data / kind / identity for kind in ("incoming", "trash") for identity in self.ids(kind)]
+        for path in [*left, *self._unfinished()]:
+            with suppress(FileNotFoundError):  # its write has ended
+                if time.time() - newest(path) > older_s:
+                    shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink()
+                    removed += 1
+        return removed
+
+    def _unfinished(self) -> Iterator[Path]:
+        """Yields unfinished files of the folders and of things in them; deeper ones go with their thing."""
+        for kind in FOLDERS:
+            yield from unfinished(self.data / kind)
+            for entry in os.scandir(self.data / kind):
+                if entry.is_dir(follow_symlinks=False):
+                    yield from unfinished(Path(entry))
+
+    def list_quarantined(self) -> list[str]:
+        """Lists the names of damaged records that were moved to the folder ``set-aside``."""
+        return sorted(entry.name for entry in (self.data / "set-aside").iterdir())
+
+
+class Store(DataFolder):
+    """Reads and changes the records and files of captures and sessions in the data folder."""
+
+    def __init__(
+        self, data: Path, index: Library | None = None, blobs: CaptureBlobs | None = None, spare: int = 0
+    ) -> None:
+        """``blobs``: second place for files of captures; ``spare``: bytes to keep free when fetching them."""
+        super().__init__(data)
+        self._index, self.blobs, self._spare = index, blobs, spare
+        self._changing = threading.Lock()  # two changes of one record must not lose one of them
 
     def add_capture(self, folder: Path, record: CaptureRecord) -> None:
         """Writes a capture's record into ``folder``, which holds ``files/``, and moves the folder to its final place in
@@ -275,10 +323,6 @@ class Store:
             return (self.folder("uploads", identity) / "upload.json").read_text(encoding="utf-8")
         return ""
 
-    def cache_of(self, identity: str) -> Path:
-        """Returns the folder in which a capture's silhouettes, thumbnails and similar files are cached."""
-        return self.folder("cache/captures", identity)
-
     def add_session(self, record: SessionRecord) -> None:
         """Writes the record of a session, replacing an earlier one atomically."""
         path = self._record_path("sessions", record.id)
@@ -308,48 +352,6 @@ class Store:
     def session(self, identity: str) -> SessionRecord:
         """Returns the record of a session. Raises NotFound."""
         return self._read("sessions", identity, SESSION)
-
-    def remove(self, path: Path) -> None:
-        """Deletes a file or folder. It is first renamed into ``trash``, so it disappears even if the deletion is
-        interrupted. Does nothing if it does not exist."""
-        target = self.data / "trash" / f"{new_id()}"
-        try:
-            path.rename(target)
-        except FileNotFoundError:
-            return
-        except OSError:  # a full file system may have no room for the new name
-            target = path
-        shutil.rmtree(target, ignore_errors=True) if target.is_dir() else target.unlink(missing_ok=True)
-
-    def sweep(self, older_s: float) -> int:
-        """Deletes files that crashes left in ``incoming`` and ``trash``, and half-written files, if untouched for
-        ``older_s`` seconds. Returns how many were deleted."""
-        removed = 0
-        for kind in ("incoming", "trash"):
-            for identity in self.ids(kind):
-                folder = self.data / kind / identity
-                with suppress(FileNotFoundError):
-                    if time.time() - newest(folder) > older_s:
-                        shutil.rmtree(folder, ignore_errors=True) if folder.is_dir() else folder.unlink()
-                        removed += 1
-        for part in self._unfinished():
-            with suppress(FileNotFoundError):  # its write has ended
-                if time.time() - part.stat().st_mtime > older_s:
-                    part.unlink()
-                    removed += 1
-        return removed
-
-    def _unfinished(self) -> Iterator[Path]:
-        """Yields unfinished files of the folders and of things in them; deeper ones go with their thing."""
-        for kind in FOLDERS:
-            yield from unfinished(self.data / kind)
-            for entry in os.scandir(self.data / kind):
-                if entry.is_dir(follow_symlinks=False):
-                    yield from unfinished(Path(entry))
-
-    def list_quarantined(self) -> list[str]:
-        """Lists the names of damaged records that were moved to the folder ``set-aside``."""
-        return sorted(entry.name for entry in (self.data / "set-aside").iterdir())
 
     def _read(self, kind: str, identity: str, wanted: RecordFormat[T]) -> T:
         """Reads a record. Raises NotFound where there is none, and for a damaged one, which is set aside."""

@@ -84,11 +84,10 @@ class Worker:
         self.store = Store(settings.data, blobs=open_capture_blobs(settings, self.engine), spare=settings.free_bytes)
         self.events = EventLog(self.engine)
         self.id = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"[:64]
+        self._heartbeat = Heartbeat(self.engine, settings, self.events, self.id)
         self._children = ChildProcessPool(settings.concurrency, niceness=5)  # a busy machine still answers requests
         self._work: Callable[Concatenate[WorkerContext, Progress, ...], object] = function_at(settings.work)
         self._stop = threading.Event()
-        self._here: set[str] = set()  # workflows that run in this process
-        self._idle: dict[str, float] = {}  # those that it holds and that do not, and since when
         self._webhooks = Webhooks(self.engine, settings.webhook_origins)
         self._durations = StageDurations()
         self._states = _StateWatch(settings.poll_s)
@@ -114,8 +113,9 @@ class Worker:
         self._register()
         self._deliverer.register()
         DBOS.listen_queues([self.settings.queue, WEBHOOKS_QUEUE, DELIVERIES_QUEUE])
-        self._beat()  # before the first job: a worker without a heartbeat row would have nobody to notice its death
-        self._take_over()  # before the first job, too: an interrupted one goes on before the next begins
+        # Before the first job: nobody notices the death of a worker without a row, and an interrupted job goes first.
+        self._heartbeat.beat()
+        self._heartbeat.put_back()
         DBOS.launch()
         limit = self.settings.concurrency
         DBOS.register_queue(
@@ -126,7 +126,8 @@ class Worker:
         )
         DBOS.register_queue(WEBHOOKS_QUEUE, worker_concurrency=8, on_conflict="always_update")
         DBOS.register_queue(DELIVERIES_QUEUE, worker_concurrency=DELIVERIES_AT_ONCE, on_conflict="always_update")
-        threading.Thread(target=self._keep_alive, name="heartbeat", daemon=True).start()
+        beating = (self._stop, self.outcomes)
+        threading.Thread(target=self._heartbeat.keep_up, args=beating, name="heartbeat", daemon=True).start()
         threading.Thread(target=self._captures.tidy_forever, name="tidy", daemon=True).start()
         log.info("worker ready", worker=self.id, queue=self.settings.queue, concurrency=limit)
 
@@ -135,8 +136,7 @@ class Worker:
         then."""
         while not self._stop.wait(0.5):
             pass
-        with suppress(SQLAlchemyError), self.engine.begin() as connection:
-            connection.execute(sa.update(workers).where(workers.c.id == self.id).values(stopped=now_sql(connection)))
+        self._heartbeat.end()
         log.info("worker stopped", worker=self.id)
         os._exit(0)  # an orderly end of the engine would record a job that is cut off here as failed
 
@@ -160,7 +160,7 @@ class Worker:
             return insist(worker._stop, lambda: worker.publish(job_id, attempt))
 
         @DBOS.workflow(name=WORKFLOW, max_recovery_attempts=self.settings.attempts)
-        @self._noted()
+        @self._heartbeat.noted()
         def reconstruct_job(request: JobRequest) -> dict[str, FileEntry]:
             job_id = DBOS.workflow_id
             assert job_id is not None
@@ -189,7 +189,7 @@ class Worker:
             return worker._webhooks.post(message)
 
         @DBOS.workflow(name=DELIVERY)
-        @self._noted()
+        @self._heartbeat.noted()
         def deliver(message: WebhookMessage) -> int:
             return post(message)
 
@@ -198,24 +198,11 @@ class Worker:
             return worker.calibrate(identity)
 
         @DBOS.workflow(name=calibrations.WORKFLOW, max_recovery_attempts=self.settings.attempts)
-        @self._noted()
+        @self._heartbeat.noted()
         def calibrate_rig(identity: str) -> JsonObject:
             return calibrate(identity)
 
         del reconstruct_job, deliver, calibrate_rig  # known to the engine by name
-
-    @contextmanager
-    def _noted(self) -> Iterator[None]:
-        """Records the id of a running workflow. One whose writes the database refuses ends without a verdict."""
-        identity = DBOS.workflow_id or ""
-        self._here.add(identity)
-        try:
-            yield
-        except AWAY as error:
-            log.warning("interrupted", workflow=identity, reason=str(error)[:200])
-            raise WorkerStopped from error
-        finally:
-            self._here.discard(identity)
 
     def ingest(self, job_id: str, request: JobRequest) -> None:
         """Checks that a job's capture exists and that the disk has space, and makes the job's folder. Raises JobFailed
@@ -224,7 +211,7 @@ class Worker:
         try:
             self.store.folder("jobs", job_id).mkdir(parents=True, exist_ok=True)  # where its log goes
         except OSError as error:
-            raise self._failure(error) from error
+            raise failure_of(error) from error
         log.info("job started", capture=request["capture_id"])
         self._captures.check(request["capture_id"])
 
@@ -242,7 +229,7 @@ class Worker:
             shutil.rmtree(folder, ignore_errors=True)
             if isinstance(error, Cancelled):
                 log.info("job cancelled")  # here: the engine ends a cancelled workflow before its own handlers run
-            raise self._failure(error) from error
+            raise failure_of(error) from error
         return name
 
     def _fit_in_memory(self, job_id: str, request: JobRequest, folder: Path) -> None:
@@ -318,7 +305,7 @@ class Worker:
             move_durably(attempt, folder / "result")
         except BaseException as error:
             shutil.rmtree(attempt, ignore_errors=True)
-            failed = self._failure(error)
+            failed = failure_of(error)
             if isinstance(failed, JobFailed):
                 forget_scene(folder)
             raise failed from error
@@ -338,7 +325,7 @@ class Worker:
                 move_durably(folder / attempt, target)
             except OSError as error:
                 if not target.is_dir():
-                    raise self._failure(error) from error
+                    raise failure_of(error) from error
         for old in folder.glob("attempt-*"):
             shutil.rmtree(old, ignore_errors=True)
         files = described(target)
@@ -346,66 +333,96 @@ class Worker:
         log.info("job finished", bytes=sum(file["bytes"] for file in files.values()))
         return files
 
-    def _failure(self, error: BaseException) -> BaseException:
-        if isinstance(error, Cancelled):
-            return error
-        if isinstance(error, InputError):
-            problem = unusable_input(error)
-            return JobFailed(problem.kind, problem.detail, error.faults)
-        if isinstance(error, OSError) and error.errno in DISK_FULL:
-            return JobFailed("disk-full", compose("disk-full"))
-        if isinstance(error, OSError) and error.errno in UNWRITABLE:
-            return JobFailed("data-unwritable", compose("data-unwritable"))
-        if isinstance(error, WorkFailed):
-            if error.trace:
-                log.error("work raised", trace=error.trace)
-            return JobFailed(type_of_failure(error.kind), error.message, error.faults)
-        return error
 
-    def _keep_alive(self) -> None:
+def failure_of(error: BaseException) -> BaseException:
+    """Returns the JobFailed of an error that a repetition would not mend, and any other error unchanged."""
+    if isinstance(error, Cancelled):
+        return error
+    if isinstance(error, InputError):
+        problem = unusable_input(error)
+        return JobFailed(problem.kind, problem.detail, error.faults)
+    if isinstance(error, OSError) and error.errno in DISK_FULL:
+        return JobFailed("disk-full", compose("disk-full"))
+    if isinstance(error, OSError) and error.errno in UNWRITABLE:
+        return JobFailed("data-unwritable", compose("data-unwritable"))
+    if isinstance(error, WorkFailed):
+        if error.trace:
+            log.error("work raised", trace=error.trace)
+        return JobFailed(type_of_failure(error.kind), error.message, error.faults)
+    return error
+
+
+class Heartbeat:
+    """Says that a worker lives, and puts the work of dead workers back into its queues. Any number of workers may do so
+    at once, and again."""
+
+    def __init__(self, engine: sa.Engine, settings: ServiceSettings, events: EventLog, worker: str) -> None:
+        self._engine, self._settings, self._events, self._id = engine, settings, events, worker
+        self._here: set[str] = set()  # workflows that run in this process
+        self._idle: dict[str, float] = {}  # those that it holds and that do not, and since when
+
+    def keep_up(self, stop: threading.Event, outcomes: "Outcomes") -> None:
         """Writes heartbeats and finds dead workers, in its own thread, so that no job can delay it."""
-        while not self._stop.wait(self.settings.heartbeat_s):
+        while not stop.wait(self._settings.heartbeat_s):
             try:
-                self._beat()
-                self._take_over()
-                for job_id in self.outcomes.publish_set_aside():
+                self.beat()
+                self.put_back()
+                for job_id in outcomes.publish_set_aside():
                     log.warning("job set aside", job=job_id)
             except Exception as error:  # the database may be away for a while; the worker outlasts it
                 log.error("heartbeat failed", error=str(error)[:300])
 
-    def _beat(self) -> None:
+    def beat(self) -> None:
+        """Writes that the worker lives."""
         machine, host, pid, started = process_identity()
-        with self.engine.begin() as connection:
+        with self._engine.begin() as connection:
             seen = {"seen": now_sql(connection)}
-            changed = connection.execute(sa.update(workers).where(workers.c.id == self.id).values(**seen, stopped=None))
-            if not changed.rowcount:
-                row = {"id": self.id, "machine": machine, "host": host, "pid": pid, "pid_started": started}
-                row |= {"queue": self.settings.queue, "concurrency": self.settings.concurrency}
+            change = sa.update(workers).where(workers.c.id == self._id).values(**seen, stopped=None)
+            if not connection.execute(change).rowcount:
+                row = {"id": self._id, "machine": machine, "host": host, "pid": pid, "pid_started": started}
+                row |= {"queue": self._settings.queue, "concurrency": self._settings.concurrency}
                 row |= {"version": version("eigenhead"), "started": now_sql(connection)}
                 connection.execute(sa.insert(workers).values(**row, **seen))
 
-    def _take_over(self) -> None:
-        """Puts the jobs of dead workers, and lost jobs of this one, back into their queues. It may be repeated, and any
-        number of workers may call it at once."""
-        dead = dead_workers(self.engine, self.settings.silent_s, except_id=self.id)
-        for job_id in [*take_over(self.engine, dead), *self._take_back_lost()]:
+    def put_back(self) -> None:
+        """Puts the jobs of dead workers, and lost jobs of this one, back into their queues."""
+        dead = dead_workers(self._engine, self._settings.silent_s, except_id=self._id)
+        for job_id in [*take_over(self._engine, dead), *self._take_back_lost()]:
             log.warning("job taken over", job=job_id)
-            self.events.append(job_id, {"state": "queued", "stage": "queued", "progress": 0.0, "eta_s": None})
-        with self.engine.begin() as connection:
+            self._events.append(job_id, {"state": "queued", "stage": "queued", "progress": 0.0, "eta_s": None})
+        with self._engine.begin() as connection:
             old = sa.and_(workers.c.id.in_(dead), workers.c.seen < now_sql(connection) - FORGET_S)
             connection.execute(sa.delete(workers).where(old))
 
     def _take_back_lost(self) -> list[str]:
         """Puts the workflows that the engine gave to this worker, and in which nothing runs for ``LOST_S`` seconds,
         back into their queues: how they ended could not be written, as on a disk that was full. Returns their ids."""
-        job = engine_jobs(self.engine)
+        job = engine_jobs(self._engine)
         names = job.c.name.in_((WORKFLOW, DELIVERY, calibrations.WORKFLOW))
-        mine = sa.and_(job.c.status == RUNNING, job.c.executor_id == self.id, names)
-        with self.engine.connect() as connection:
+        mine = sa.and_(job.c.status == RUNNING, job.c.executor_id == self._id, names)
+        with self._engine.connect() as connection:
             held, now = [*connection.scalars(sa.select(job.c.workflow_uuid).where(mine))], time.monotonic()
         self._idle = {each: self._idle.get(each, now) for each in held if each not in self._here}
         lost = [each for each, since in self._idle.items() if now - since >= LOST_S]
-        return _put_back(self.engine, job, sa.and_(mine, job.c.workflow_uuid.in_(lost))) if lost else []
+        return _put_back(self._engine, job, sa.and_(mine, job.c.workflow_uuid.in_(lost))) if lost else []
+
+    def end(self) -> None:
+        """Writes that the worker stopped, if the database can be reached."""
+        with suppress(SQLAlchemyError), self._engine.begin() as connection:
+            connection.execute(sa.update(workers).where(workers.c.id == self._id).values(stopped=now_sql(connection)))
+
+    @contextmanager
+    def noted(self) -> Iterator[None]:
+        """Records the id of a running workflow. One whose writes the database refuses ends without a verdict."""
+        identity = DBOS.workflow_id or ""
+        self._here.add(identity)
+        try:
+            yield
+        except AWAY as error:
+            log.warning("interrupted", workflow=identity, reason=str(error)[:200])
+            raise WorkerStopped from error
+        finally:
+            self._here.discard(identity)
 
 
 class _StateWatch:

@@ -4,12 +4,13 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import httpx
+import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
 from rig.studio.devices.serve import DeviceFault, StudioDevices
-from tests.support.board_pictures import BoardPictures
 from tests.support.browser import LONG_MS, keep_screenshots, live_rate, visit
 from tests.support.services import RunningService
 from tests.support.shared_data import shared
@@ -20,6 +21,26 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(2400)]
 NAMES = tuple(f"cam_{i}" for i in range(4))
 SHOTS = range(0, 26, 2)
 ENDED = re.compile("succeeded|failed|cancelled")
+
+
+class BoardPictures:
+    """Somebody holds the calibration board: one recorded shot at a time, with sensor noise of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.shot = folder, 0
+        self._noise = np.random.default_rng(0)
+
+    def __call__(self, camera: str, time_s: float) -> np.ndarray:
+        picture = cv2.imread(str(self.folder / camera / f"shot{self.shot:02}.jpg"))
+        assert picture is not None
+        noisy = picture[:, :, ::-1] + self._noise.standard_normal(picture.shape, np.float32)
+        return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+
+    def hold(self, studio: StudioDevices, shot: int) -> None:
+        """From now on the studio's cameras see this shot."""
+        studio.seat(False)
+        self.shot = shot
+        studio.seat(True)
 
 
 @pytest.fixture

@@ -58,17 +58,11 @@ def rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurfa
     return RestSurface(vertices, faces, beside, excluded)
 
 
-def crossings(rest: RestSurface, displacement: Vertices, weights: tuple[float, ...] = WEIGHTS) -> Int[np.ndarray, " w"]:
-    """Returns, for each weight of a blendshape, the number of triangles that cross others only in the posed mesh."""
-    moved = _moved(rest, displacement)
-    return np.array([np.count_nonzero(_crossing(rest, displacement, w, moved)) for w in weights])
-
-
 def kept_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> Vertices:
     """Returns a blendshape's displacement (mm, at weight 1) with the smallest change that leaves as few new crossings
     of triangles at ``WEIGHTS`` as possible. If ``closing``, the shape closes the lids, which stop where they meet;
     otherwise vertices on both sides of a crossing move together."""
-    spot = _spot(rest, displacement, WEIGHTS[1::2])
+    spot = crossing_vertices(rest, displacement, WEIGHTS[1::2])
     best, fewest, zone = displacement, np.count_nonzero(spot), np.zeros(len(rest.vertices), bool)
     for _ in range(MAX_ZONES):
         if not fewest:
@@ -77,7 +71,7 @@ def kept_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> V
         rows = np.flatnonzero(zone[rest.faces].any(axis=1))
         out = _stopped(rest, displacement, rows) if closing else displacement
         out = _relaxed(rest, displacement, _together(rest, out, rows), rows)
-        spot = _spot(rest, out, WEIGHTS)
+        spot = crossing_vertices(rest, out, WEIGHTS)
         if np.count_nonzero(spot) < fewest:
             best, fewest = out, np.count_nonzero(spot)
     return best
@@ -94,7 +88,7 @@ def _stopped(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices:
     for _ in range(MEETING_ROUNDS):
         first = np.full(len(displacement), np.inf)
         for weight in reversed(MEETING):
-            spot = _spot(rest, scale[:, None] * displacement, (weight,), zone)
+            spot = crossing_vertices(rest, scale[:, None] * displacement, (weight,), zone)
             first[spot] = weight
         if np.isinf(first).all():
             break
@@ -111,7 +105,7 @@ def _together(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices
     for radius_mm in RADII_MM:
         base, times = out, np.zeros(len(out), int)
         while rounds < MAX_ROUNDS:
-            spot = _spot(rest, out, WEIGHTS, zone)
+            spot = crossing_vertices(rest, out, WEIGHTS, zone)
             if np.count_nonzero(spot) < fewest:
                 best, fewest = out, np.count_nonzero(spot)
             if not spot.any():
@@ -130,12 +124,12 @@ def _together(rest: RestSurface, displacement: Vertices, zone: Rows) -> Vertices
 
 def _relaxed(rest: RestSurface, wanted: Vertices, clean: Vertices, zone: Rows) -> Vertices:
     """Returns the displacement between ``clean`` and ``wanted`` that is nearest to ``wanted`` without crossings."""
-    if (wanted == clean).all() or _spot(rest, clean, WEIGHTS, zone).any():
+    if (wanted == clean).all() or crossing_vertices(rest, clean, WEIGHTS, zone).any():
         return clean
     low, high = 0.0, 1.0
     for _ in range(RELAXING):
         middle = 0.5 * (low + high)
-        crosses = _spot(rest, clean + middle * (wanted - clean), WEIGHTS, zone).any()
+        crosses = crossing_vertices(rest, clean + middle * (wanted - clean), WEIGHTS, zone).any()
         low, high = (low, middle) if crosses else (middle, high)
     return clean + low * (wanted - clean)
 
@@ -168,7 +162,7 @@ def _crossing_within(rest: RestSurface, displacement: Vertices, weight: float, r
     return out & ~rest.excluded
 
 
-def _spot(
+def crossing_vertices(
     rest: RestSurface, displacement: Vertices, weights: tuple[float, ...], zone: Rows | None = None
 ) -> Bool[np.ndarray, " t"]:
     """Returns a mask of the vertices whose triangles cross at some weight, in a ``zone`` or everywhere."""

@@ -82,9 +82,10 @@ def write_image(
 
 
 def encode_image(suffix: str, image: np.ndarray, options: Sequence[int] = ()) -> bytes:
-    """Encodes RGB or grey pixels in the format ``suffix``. ``options`` are encoding options of OpenCV."""
-    pixels = np.ascontiguousarray(image[:, :, ::-1] if image.ndim == 3 else image)  # OpenCV's blue comes first
-    done, data = cv2.imencode(suffix, pixels, options)
+    """Encodes RGB, RGBA or grey pixels in the format ``suffix``. ``options`` are encoding options of OpenCV."""
+    if image.ndim == 3:  # OpenCV's blue comes first
+        image = np.concatenate([image[:, :, 2::-1], image[:, :, 3:]], axis=2)
+    done, data = cv2.imencode(suffix, np.ascontiguousarray(image), options)
     assert done
     return data.tobytes()
 

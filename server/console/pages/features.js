@@ -96,53 +96,143 @@ export default spoken({
   template: `
     <section class="page" aria-label="Features" :data-digits="capture ? '1 2 3 4 5 6 7' : null">
       <header><h1>Features</h1>
-        <select v-if="capture" :value="capture.id" aria-label="Capture" @change="$emit('choose', { capture: $event.target.value })"><option v-for="c in state.captures" :key="c.id" :value="c.id">{{ c.label || clock(c.created) }} &middot; {{ c.id.slice(-6) }}</option></select>
+        <select v-if="capture" :value="capture.id" aria-label="Capture"
+          @change="$emit('choose', { capture: $event.target.value })">
+          <option v-for="c in state.captures" :key="c.id"
+            :value="c.id">{{ c.label || clock(c.created) }} &middot; {{ c.id.slice(-6) }}</option>
+        </select>
         <span class="lead" role="status">{{ lead }}</span>
-        <template v-if="capture"><span class="group" role="group" aria-label="Number of views"><button v-for="n in [3, 4]" :key="n" class="b" :aria-pressed="count === n" @click="count = n">{{ say('{count} view | {count} views', { count: n }) }}</button></span>
-        <button class="b" id="suggest" :disabled="!!busy" :aria-busy="busy === 'suggest'" @click="act('suggest')">{{ say(busy === 'suggest' ? 'Looking for the face ...' : 'Suggest all points') }}</button>
+        <template v-if="capture">
+          <span class="group" role="group" aria-label="Number of views">
+            <button v-for="n in [3, 4]" :key="n" class="b" :aria-pressed="count === n"
+              @click="count = n">{{ say('{count} view | {count} views', { count: n }) }}</button>
+          </span>
+        <button class="b" id="suggest" :disabled="!!busy" :aria-busy="busy === 'suggest'"
+          @click="act('suggest')">{{ say(busy === 'suggest' ? 'Looking for the face ...'
+            : 'Suggest all points') }}</button>
         <button class="b" id="save" :disabled="!capture.dirty || !!busy" @click="act('save')">Save <kbd>S</kbd></button>
-        <button class="b main-action" id="reconstruct" :disabled="!!busy" @click="act('reconstruct')">{{ say(ready ? 'Reconstruct' : 'Skip and reconstruct') }}</button></template></header>
-      <div v-if="capture && capture.is_contradictory && wrong.length" class="panel pad stack small" role="alertdialog" aria-label="Points contradict each other" id="contradictions" style="border-color: var(--warn)">
-        <p><strong class="warn">Not saved yet: views contradict each other.</strong> A job would leave these out. Right and left confused, or another point clicked?</p>
-        <ul class="faults"><li v-for="[name, text] in wrong" :key="name"><button class="b quiet" @click="at = names.indexOf(name)">{{ title(name) }}</button> {{ say(text) }}</li></ul>
-        <div class="line wrap"><button class="b main-action" @click="at = names.indexOf(wrong[0][0])">Look at them</button><button class="b" id="save-anyway" :disabled="!!busy" @click="act('save', { sure: true })">Save all the same</button></div></div>
-      <div v-if="suggestions" class="panel pad line wrap small" role="region" aria-label="Suggested places" id="suggestions" style="border-color: #ff9de0"><span class="grow"><strong>{{ say('{count} place is suggested, and not a point yet. | {count} places are suggested, and no points yet.', { count: suggestions }) }}</strong> Pink squares, by the face that was found: drag what is off, reject what is hidden, accept the rest.</span>
-        <button class="b main-action" id="accept-all" :disabled="!!busy" @click="act('accept')">Accept all</button><button class="b" id="reject-all" :disabled="!!busy" @click="act('reject')">Reject all</button></div>
-      <div v-if="!state.loading && !capture" class="panel grow" style="display: grid"><div class="empty"><h2>{{ say(state.requested ? 'This capture is not there' : 'No captures yet') }}</h2><p>Points are picked in the pictures of a capture.</p><a class="b main-action" :href="state.requested ? '/captures' : '/'">{{ say(state.requested ? 'Go to captures' : 'Go to the rig') }}</a></div></div>
+        <button class="b main-action" id="reconstruct" :disabled="!!busy"
+          @click="act('reconstruct')">{{ say(ready ? 'Reconstruct' : 'Skip and reconstruct') }}</button>
+      </template>
+    </header>
+      <div v-if="capture && capture.is_contradictory && wrong.length" class="panel pad stack small" role="alertdialog"
+        aria-label="Points contradict each other" id="contradictions" style="border-color: var(--warn)">
+        <p>
+          <strong
+            class="warn">Not saved yet: views contradict each other.</strong> A job would leave these out. Right and
+              left confused, or another point clicked?</p>
+        <ul class="faults">
+          <li v-for="[name, text] in wrong" :key="name">
+            <button class="b quiet" @click="at = names.indexOf(name)">{{ title(name) }}</button> {{ say(text) }}</li>
+        </ul>
+        <div class="line wrap">
+          <button class="b main-action" @click="at = names.indexOf(wrong[0][0])">Look at them</button>
+          <button class="b" id="save-anyway" :disabled="!!busy"
+            @click="act('save', { sure: true })">Save all the same</button>
+        </div>
+      </div>
+      <div v-if="suggestions" class="panel pad line wrap small" role="region" aria-label="Suggested places"
+        id="suggestions" style="border-color: #ff9de0">
+        <span class="grow">
+          <strong>{{ say('{count} place is suggested, and not a point yet. | {count} places are suggested, and no points yet.',
+            { count: suggestions }) }}</strong>
+            Pink squares, by the face that was found: drag what is off, reject what is hidden, accept the rest.</span>
+        <button class="b main-action" id="accept-all" :disabled="!!busy" @click="act('accept')">Accept all</button>
+        <button class="b" id="reject-all" :disabled="!!busy" @click="act('reject')">Reject all</button>
+      </div>
+      <div v-if="!state.loading && !capture" class="panel grow" style="display: grid">
+        <div class="empty">
+          <h2>{{ say(state.requested ? 'This capture is not there' : 'No captures yet') }}</h2>
+          <p>Points are picked in the pictures of a capture.</p>
+          <a class="b main-action" :href="state.requested ? '/captures'
+            : '/'">{{ say(state.requested ? 'Go to captures' : 'Go to the rig') }}</a>
+        </div>
+      </div>
       <div v-else-if="capture" class="columns" style="grid-template-columns: 15rem minmax(0, 1fr)">
         <div class="panel scroll" tabindex="0" role="region" aria-label="The points" data-scroll="points">
-          <button v-for="{ name, i } in offered" :key="name" class="row-button" :data-point="name" :aria-current="i === at" @click="at = i">
+          <button v-for="{ name, i } in offered" :key="name" class="row-button" :data-point="name"
+            :aria-current="i === at" @click="at = i">
             <span class="line"><kbd v-if="i < 7">{{ i + 1 }}</kbd><span class="grow">{{ title(name) }}</span></span>
-            <span class="small muted line"><span class="grow">{{ placed(name) }}</span><span v-if="capture.suggested[name]" class="tag suggested">{{ say('{count} suggested', { count: Object.keys(capture.suggested[name]).length }) }}</span><span v-if="capture.contradictions[name]" class="tag fault" :title="say(capture.contradictions[name])">contradicts</span><span v-if="worst(name) !== null" class="num" :class="{ warn: worst(name) > 3 }">{{ fixed(worst(name), 1) }} px</span></span></button>
-          <button class="b quiet small" style="margin: .5rem .75rem 0" :aria-pressed="all" @click="all = !all">{{ say(all ? 'The seven points alone' : 'All 26 points') }}</button>
-          <p class="small muted" style="padding: .7rem .75rem">Right and left are the subject's. Click the point in each view where you see it; lines show where the other views expect it, the ring where all of them do, the diamond where the model has it. <kbd>Enter</kbd> takes that place, arrows move it, <kbd>Del</kbd> takes it back.</p>
+            <span class="small muted line">
+              <span class="grow">{{ placed(name) }}</span>
+              <span v-if="capture.suggested[name]" class="tag suggested">{{ say('{count} suggested',
+                { count: Object.keys(capture.suggested[name]).length }) }}</span>
+              <span v-if="capture.contradictions[name]" class="tag fault"
+                :title="say(capture.contradictions[name])">contradicts</span>
+              <span v-if="worst(name) !== null" class="num"
+                :class="{ warn: worst(name) > 3 }">{{ fixed(worst(name), 1) }} px</span>
+            </span>
+          </button>
+          <button class="b quiet small" style="margin: .5rem .75rem 0" :aria-pressed="all"
+            @click="all = !all">{{ say(all ? 'The seven points alone' : 'All 26 points') }}</button>
+          <p class="small muted" style="padding: .7rem .75rem">Right and left are the subject's. Click the point in each
+            view where you see it; lines show where the other views expect it, the ring where all of them do, the
+            diamond where the model has it. <kbd>Enter</kbd> takes that place, arrows move it, <kbd>Del</kbd> takes it
+            back.</p>
         </div>
-        <div :style="{ display: 'grid', gap: '.6rem', minHeight: 0, gridTemplateColumns: 'repeat(2, minmax(0, 1fr))', gridTemplateRows: 'repeat(2, minmax(0, 1fr))' }">
-          <div v-for="(camera, i) in views" :key="i" class="panel" style="display: flex; flex-direction: column; min-height: 0; overflow: hidden">
-            <div class="line" style="padding: .25rem .5rem"><select :value="camera" :aria-label="say('Camera of view {number}', { number: i + 1 })" @change="chosen[i] = $event.target.value"><option v-for="c in capture.cameras" :key="c.name">{{ c.name }}</option></select>
+        <div :style="{ display: 'grid', gap: '.6rem', minHeight: 0, gridTemplateColumns: 'repeat(2, minmax(0, 1fr))',
+          gridTemplateRows: 'repeat(2, minmax(0, 1fr))' }">
+          <div v-for="(camera, i) in views" :key="i" class="panel"
+            style="display: flex; flex-direction: column; min-height: 0; overflow: hidden">
+            <div class="line" style="padding: .25rem .5rem">
+              <select :value="camera" :aria-label="say('Camera of view {number}', { number: i + 1 })"
+                @change="chosen[i] = $event.target.value">
+                <option v-for="c in capture.cameras" :key="c.name">{{ c.name }}</option>
+              </select>
               <span class="small muted cut grow">{{ position(camera) }}</span>
-              <template v-if="offer(camera)"><button class="b quiet small" data-accept :disabled="!!busy" @click="act('accept', { point, camera })">Accept</button><button class="b quiet small" data-reject :disabled="!!busy" @click="act('reject', { point, camera })">Reject</button></template></div>
-            <svg tabindex="0" role="application" :aria-label="say('{point} in {camera}, {place}', { point: title(point), camera, place: position(camera) || say('not set') })" :data-view="camera" :viewBox="'0 0 ' + sizes[camera].width + ' ' + sizes[camera].height" style="flex: 1; min-height: 0; width: 100%; cursor: crosshair; background: #08090b; touch-action: none"
-              @pointerdown="press($event, camera)" @pointermove="move($event, camera)" @pointerup="release" @pointerleave="lens = null" @keydown="nudge($event, camera)">
+              <template v-if="offer(camera)">
+                <button class="b quiet small" data-accept :disabled="!!busy"
+                  @click="act('accept', { point, camera })">Accept</button>
+                <button class="b quiet small" data-reject :disabled="!!busy"
+                  @click="act('reject', { point, camera })">Reject</button>
+              </template>
+            </div>
+            <svg tabindex="0" role="application" :aria-label="say('{point} in {camera}, {place}', { point: title(point),
+              camera, place: position(camera) || say('not set') })" :data-view="camera" :viewBox="'0 0 ' +
+              sizes[camera].width + ' ' + sizes[camera].height" style="flex: 1; min-height: 0; width: 100%; cursor:
+              crosshair; background: #08090b; touch-action: none"
+              @pointerdown="press($event, camera)" @pointermove="move($event, camera)" @pointerup="release"
+                @pointerleave="lens = null" @keydown="nudge($event, camera)">
               <image :href="address(camera)" :width="sizes[camera].width" :height="sizes[camera].height"></image>
               <g fill="none" :stroke-width="unit(camera)">
-                <polyline v-for="(curve, k) in curves(camera)" :key="'g' + k" :points="line(curve)" stroke="#8cc4ff" :stroke-width="1.7 * unit(camera)" :stroke-dasharray="7 * unit(camera)"></polyline>
+                <polyline v-for="(curve, k) in curves(camera)" :key="'g' + k" :points="line(curve)" stroke="#8cc4ff"
+                  :stroke-width="1.7 * unit(camera)" :stroke-dasharray="7 * unit(camera)"></polyline>
                 <path v-for="(d, name) in others(camera)" :key="name" :d="d" stroke="#ffffff" opacity=".55"></path>
-                <path v-for="(d, name) in otherOffers(camera)" :key="'s' + name" :d="d" stroke="#ff9de0" :stroke-width="1.4 * unit(camera)"></path>
-                <g v-if="offer(camera)" data-offer><path :d="square(offer(camera), camera, 8)" stroke="#000000" :stroke-width="3.5 * unit(camera)"></path><path :d="square(offer(camera), camera, 8)" stroke="#ff9de0" :stroke-width="1.8 * unit(camera)"></path><circle :cx="offer(camera)[0] + .5" :cy="offer(camera)[1] + .5" :r="1.4 * unit(camera)" fill="#ff9de0" stroke="none"></circle></g>
-                <path v-if="suggested('predicted', camera)" :d="diamond(suggested('predicted', camera), camera)" stroke="#f0b95b" :stroke-width="1.6 * unit(camera)"></path>
-                <circle v-if="suggested('reprojected', camera)" :cx="suggested('reprojected', camera)[0] + .5" :cy="suggested('reprojected', camera)[1] + .5" :r="7 * unit(camera)" stroke="#6cb2ff" :stroke-width="1.6 * unit(camera)"></circle>
-                <path v-if="here(camera)" :d="cross(here(camera), camera, 9)" stroke="#000000" :stroke-width="4 * unit(camera)"></path>
-                <path v-if="here(camera)" :d="cross(here(camera), camera, 9)" stroke="#ffffff" :stroke-width="1.6 * unit(camera)"></path>
+                <path v-for="(d, name) in otherOffers(camera)" :key="'s' + name" :d="d" stroke="#ff9de0"
+                  :stroke-width="1.4 * unit(camera)"></path>
+                <g v-if="offer(camera)" data-offer>
+                  <path :d="square(offer(camera), camera, 8)" stroke="#000000"
+                    :stroke-width="3.5 * unit(camera)"></path>
+                  <path :d="square(offer(camera), camera, 8)" stroke="#ff9de0"
+                    :stroke-width="1.8 * unit(camera)"></path>
+                  <circle :cx="offer(camera)[0] + .5" :cy="offer(camera)[1] + .5" :r="1.4 * unit(camera)" fill="#ff9de0"
+                    stroke="none"></circle>
+                </g>
+                <path v-if="suggested('predicted', camera)" :d="diamond(suggested('predicted', camera), camera)"
+                  stroke="#f0b95b" :stroke-width="1.6 * unit(camera)"></path>
+                <circle v-if="suggested('reprojected', camera)" :cx="suggested('reprojected', camera)[0] + .5"
+                  :cy="suggested('reprojected', camera)[1] + .5" :r="7 * unit(camera)" stroke="#6cb2ff"
+                  :stroke-width="1.6 * unit(camera)"></circle>
+                <path v-if="here(camera)" :d="cross(here(camera), camera, 9)" stroke="#000000"
+                  :stroke-width="4 * unit(camera)"></path>
+                <path v-if="here(camera)" :d="cross(here(camera), camera, 9)" stroke="#ffffff"
+                  :stroke-width="1.6 * unit(camera)"></path>
               </g>
             </svg>
           </div>
         </div>
       </div>
       <svg v-if="lens" :style="lensStyle()" :viewBox="lensBox()" aria-hidden="true">
-        <image :href="address(lens.camera)" :width="sizes[lens.camera].width" :height="sizes[lens.camera].height" style="image-rendering: pixelated"></image>
-        <g fill="none" stroke="#6cb2ff"><polyline v-for="(curve, k) in curves(lens.camera)" :key="k" :points="line(curve)" :stroke-width="lens.step * 1.2" opacity=".8"></polyline>
-        <path :d="'M' + (lens.x + .5) + ' ' + (lens.y - 999) + 'v1998M' + (lens.x - 999) + ' ' + (lens.y + .5) + 'h1998'" stroke="#ffffff" :stroke-width="lens.step" opacity=".8"></path></g></svg>
+        <image :href="address(lens.camera)" :width="sizes[lens.camera].width" :height="sizes[lens.camera].height"
+          style="image-rendering: pixelated"></image>
+        <g fill="none" stroke="#6cb2ff">
+          <polyline v-for="(curve, k) in curves(lens.camera)" :key="k" :points="line(curve)"
+            :stroke-width="lens.step * 1.2" opacity=".8"></polyline>
+        <path
+          :d="'M' + (lens.x + .5) + ' ' + (lens.y - 999) + 'v1998M' + (lens.x - 999) + ' ' + (lens.y + .5) + 'h1998'"
+          stroke="#ffffff" :stroke-width="lens.step" opacity=".8"></path>
+      </g>
+    </svg>
     </section>`,
   created() {
     Object.assign(this, { clock, fixed });

@@ -189,47 +189,208 @@ export default spoken({
   template: `
     <section class="page" aria-label="Result">
       <header class="wraps"><h1>Result</h1>
-        <label class="line grow"><span v-if="job" class="muted small">Head</span><select v-if="job" :value="job.id" aria-label="Head" style="max-width: 24rem" @change="$emit('choose', { job: $event.target.value })"><optgroup label="Of this subject"><option v-for="r in ofSubject" :key="r.id" :value="r.id">{{ headName(r) }}</option></optgroup><optgroup v-if="ofOthers.length" label="Of others"><option v-for="r in ofOthers" :key="r.id" :value="r.id">{{ headName(r) }}</option></optgroup></select><input v-if="state.total > 8" v-model="sought" id="find" type="search" maxlength="200" placeholder="Find a head" aria-label="Find heads" style="width: 9rem"></label>
-        <template v-if="job"><span v-if="surfaces.length > 1" class="group" role="group" aria-label="Surface"><button v-for="[name, title, k] in surfaces" :key="name" class="b" :aria-pressed="surface === name" @click="surface = name">{{ say(title) }} <kbd>{{ k }}</kbd></button></span>
-        <span class="group" role="group" aria-label="Colouring"><button v-for="[name, title, k] in colourings" :key="name" class="b" :aria-pressed="(!other || !!mateId) && colouring === name" @click="paintAs(name)">{{ say(title) }} <kbd>{{ k }}</kbd></button></span>
+        <label class="line grow">
+          <span v-if="job" class="muted small">Head</span>
+          <select v-if="job" :value="job.id" aria-label="Head" style="max-width: 24rem"
+            @change="$emit('choose', { job: $event.target.value })">
+            <optgroup label="Of this subject">
+              <option v-for="r in ofSubject" :key="r.id" :value="r.id">{{ headName(r) }}</option>
+            </optgroup>
+            <optgroup v-if="ofOthers.length" label="Of others">
+              <option v-for="r in ofOthers" :key="r.id" :value="r.id">{{ headName(r) }}</option>
+            </optgroup>
+          </select>
+          <input v-if="state.total > 8" v-model="sought" id="find" type="search" maxlength="200"
+            placeholder="Find a head" aria-label="Find heads" style="width: 9rem">
+        </label>
+        <template v-if="job">
+          <span v-if="surfaces.length > 1" class="group" role="group" aria-label="Surface">
+            <button v-for="[name, title, k] in surfaces" :key="name" class="b" :aria-pressed="surface === name"
+              @click="surface = name">{{ say(title) }} <kbd>{{ k }}</kbd>
+            </button>
+          </span>
+        <span class="group" role="group" aria-label="Colouring">
+          <button v-for="[name, title, k] in colourings" :key="name" class="b"
+            :aria-pressed="(!other || !!mateId) && colouring === name"
+            @click="paintAs(name)">{{ say(title) }} <kbd>{{ k }}</kbd>
+          </button>
+        </span>
         <button class="b" :aria-pressed="wire" @click="wire = !wire">Wireframe <kbd>W</kbd></button>
-        <button class="b" :aria-pressed="measuring" @click="measuring = !measuring">Measure <kbd>M</kbd></button></template></header>
+        <button class="b" :aria-pressed="measuring" @click="measuring = !measuring">Measure <kbd>M</kbd></button>
+      </template>
+    </header>
       <div class="columns beside">
         <div class="panel view3d" ref="view">
-          <img v-if="surfaces.length && !drawn" id="first-view" ref="first" class="first" :src="'/console/jobs/' + job.id + '/first-view.jpg'" alt="" @error="drawn = true">
-          <img v-if="picture" :src="picture.address" :alt="say('Photograph of {name}', { name: through })" :style="picture.style">
-          <canvas ref="canvas" v-show="job" :style="{ opacity: through ? 1 - fade : 1 }" tabindex="0" role="img" aria-label="The head in 3D: drag to turn, wheel to come near, arrow keys to turn" :data-loaded="loaded" @keydown="turn" @pointerdown="press" @click="pick"></canvas>
-          <face-marks v-if="picture" :faces="facesIn(job.id, through)" :size="picture.size" :style="picture.style"></face-marks>
-          <div v-if="!state.loading && !job" class="empty" style="position: absolute; inset: 0; align-content: center"><h2>{{ say(state.requested ? 'This job has no head' : 'No heads yet') }}</h2><p>{{ say(state.requested ? 'It is not done, it failed, or it was removed.' : 'A head appears here when a job is done.') }}</p><a class="b main-action" :href="state.requested ? '/jobs' : '/captures'">{{ say(state.requested ? 'Go to jobs' : 'Go to captures') }}</a></div>
-          <div v-if="scale" class="scale" role="img" :aria-label="say('{title}, 0 to {most} mm', { title: scale.title, most: fixed(scale.most, digits) })"><i :style="{ background: gradient }"></i><div><span>{{ scale.beyond ? '≥ ' : '' }}{{ fixed(scale.most, digits) }} mm</span><span>{{ fixed(scale.most / 2, digits) }}</span><span>0</span></div></div>
-          <p v-if="scale" class="small" style="position: absolute; left: .9rem; top: .8rem">{{ scale.title }}<br><span class="muted">{{ say('median {median} mm, 95 % below {p95} mm', { median: fixed(scale.median, 2), p95: fixed(scale.p95, 2) }) }}</span></p>
-          <template v-if="split"><p class="small cut" id="left-head" style="position: absolute; left: .9rem; top: 3.4rem; max-width: 45%">{{ headName(job) }}</p><p class="small cut" id="right-head" style="position: absolute; left: 50%; top: 3.4rem; max-width: 45%">{{ headName(others.find(r => r.id === mateId) || job) }}</p></template>
-          <ul v-if="colouring === 'parts' && surface === 'bust' && !other" class="legend small" aria-label="Parts"><li v-for="[name, colour] in parts" :key="name"><i :style="{ background: 'rgb(' + colour.map(v => Math.round(255 * v)) + ')' }"></i>{{ say(name) }}</li></ul>
-          <div class="below">
-            <p v-if="loading || fault" :class="['told', 'small', { fault }]" role="status">{{ say(fault || 'Loading ...') }}</p>
-            <p v-if="measuring" id="measured" class="told" role="status">{{ points.length === 0 ? say('Click the first point') : points.length === 1 ? say('Click the second point') : '' }}<strong v-if="distance" class="mono">{{ say('{distance} mm, straight', { distance: fixed(distance, 1) }) }}</strong></p>
-            <div v-if="surfaces.length && !through" class="views" role="group" aria-label="Views"><button v-for="[name, title] in sides" :key="name" class="b small" :data-side="name" :aria-pressed="side === name" @click="lookFrom(name)">{{ say(title) }}</button><button v-if="canFill" class="b small" id="full" :aria-pressed="full" @click="fill">Full screen <kbd>F</kbd></button></div>
+          <img v-if="surfaces.length && !drawn" id="first-view" ref="first" class="first"
+            :src="'/console/jobs/' + job.id + '/first-view.jpg'" alt="" @error="drawn = true">
+          <img v-if="picture" :src="picture.address" :alt="say('Photograph of {name}', { name: through })"
+            :style="picture.style">
+          <canvas ref="canvas" v-show="job" :style="{ opacity: through ? 1 - fade : 1 }" tabindex="0" role="img"
+            aria-label="The head in 3D: drag to turn, wheel to come near, arrow keys to turn" :data-loaded="loaded"
+            @keydown="turn" @pointerdown="press" @click="pick"></canvas>
+          <face-marks v-if="picture" :faces="facesIn(job.id, through)" :size="picture.size"
+            :style="picture.style"></face-marks>
+          <div v-if="!state.loading && !job" class="empty" style="position: absolute; inset: 0; align-content: center">
+            <h2>{{ say(state.requested ? 'This job has no head' : 'No heads yet') }}</h2>
+            <p>{{ say(state.requested ? 'It is not done, it failed, or it was removed.'
+              : 'A head appears here when a job is done.') }}</p>
+            <a class="b main-action" :href="state.requested ? '/jobs'
+              : '/captures'">{{ say(state.requested ? 'Go to jobs' : 'Go to captures') }}</a>
           </div>
-          <span v-for="(pin, i) in pins" :key="i" class="pin small mono" :style="{ left: pin.x + 'px', top: pin.y + 'px', visibility: pin.shown ? 'visible' : 'hidden' }">{{ i ? 'B' : 'A' }}</span>
+          <div v-if="scale" class="scale" role="img"
+            :aria-label="say('{title}, 0 to {most} mm', { title: scale.title, most: fixed(scale.most, digits) })">
+            <i :style="{ background: gradient }"></i>
+            <div>
+              <span>{{ scale.beyond ? '≥ ' : '' }}{{ fixed(scale.most, digits) }} mm</span>
+              <span>{{ fixed(scale.most / 2, digits) }}</span>
+              <span>0</span>
+            </div>
+          </div>
+          <p v-if="scale" class="small" style="position: absolute; left: .9rem; top: .8rem">{{ scale.title }}<br>
+            <span class="muted">{{ say('median {median} mm, 95 % below {p95} mm',
+              { median: fixed(scale.median, 2), p95: fixed(scale.p95, 2) }) }}</span>
+          </p>
+          <template v-if="split">
+            <p class="small cut" id="left-head"
+              style="position: absolute; left: .9rem; top: 3.4rem; max-width: 45%">{{ headName(job) }}</p>
+            <p class="small cut" id="right-head"
+              style="position: absolute; left: 50%; top: 3.4rem; max-width: 45%">{{ headName(others.find(r => r.id === mateId)
+                || job) }}</p>
+          </template>
+          <ul v-if="colouring === 'parts' && surface === 'bust' && !other" class="legend small" aria-label="Parts">
+            <li v-for="[name, colour] in parts" :key="name">
+              <i :style="{ background: 'rgb(' + colour.map(v => Math.round(255 * v)) + ')' }"></i>{{ say(name) }}</li>
+          </ul>
+          <div class="below">
+            <p v-if="loading || fault" :class="['told', 'small', { fault }]"
+              role="status">{{ say(fault || 'Loading ...') }}</p>
+            <p v-if="measuring" id="measured" class="told" role="status">{{ points.length === 0
+              ? say('Click the first point') : points.length === 1 ? say('Click the second point') : '' }}<strong
+              v-if="distance"
+              class="mono">{{ say('{distance} mm, straight', { distance: fixed(distance, 1) }) }}</strong>
+            </p>
+            <div v-if="surfaces.length && !through" class="views" role="group" aria-label="Views">
+              <button v-for="[name, title] in sides" :key="name" class="b small" :data-side="name"
+                :aria-pressed="side === name" @click="lookFrom(name)">{{ say(title) }}</button>
+              <button v-if="canFill" class="b small" id="full" :aria-pressed="full"
+                @click="fill">Full screen <kbd>F</kbd>
+              </button>
+            </div>
+          </div>
+          <span v-for="(pin, i) in pins" :key="i" class="pin small mono" :style="{ left: pin.x + 'px',
+            top: pin.y + 'px', visibility: pin.shown ? 'visible' : 'hidden' }">{{ i
+            ? 'B' : 'A' }}</span>
         </div>
         <div class="panel pad scroll stack" tabindex="0" role="region" aria-label="About the head">
           <template v-if="job">
-            <ul v-if="job.warnings.length" class="faults small"><li v-for="(w, i) in job.warnings" :key="i" class="warn">{{ say(w) }}</li></ul>
-            <div class="stack" style="gap: .35rem"><label class="field">Compare with<select v-model="other"><option value="">nothing</option><option v-if="job.truth" value="truth">the truth (simulated)</option><option v-for="r in others" :key="r.id" :value="r.id">{{ same(r) ? headName(r) : say('perhaps another person: {head}', { head: headName(r) }) }}</option></select></label>
-              <label v-if="other && other !== 'truth'" class="check small"><input type="checkbox" v-model="beside" id="beside">side by side, turned together</label>
-              <label v-if="elsewhere" class="check small"><input type="checkbox" v-model="strangers" id="strangers">{{ say('offer {count} head of other subjects, too | offer {count} heads of other subjects, too', { count: elsewhere }) }}</label>
-              <label v-if="cameras.length || !camerasKnown" class="field">Look through<select v-model="through" id="through" :disabled="!cameras.length"><option value="">no camera</option><option v-for="c in cameras" :key="c.name">{{ c.name }}</option></select></label>
-              <label v-if="through" class="field">Photograph<input type="range" min="0" max="1" step="0.05" v-model.number="fade" aria-label="How much of the photograph shines through the head"></label>
-              <label v-if="through" class="check small"><input type="checkbox" v-model="withFaces" id="faces">{{ say(finding ? 'Looking for faces ...' : 'the face that was found in it') }}</label>
-              <label class="field">Light<select v-model="lights"><option value="studio">studio</option><option value="side">from the side (shows shape)</option><option value="flat">flat</option></select></label></div>
-            <div class="line"><h2 class="third grow">Downloads</h2><a class="b" id="all" :href="'/console/jobs/' + job.id + '/all.zip'" :download="fileName + '.zip'">All files (.zip)</a></div>
-            <div class="line wrap"><button class="b" id="picture" title="What the view shows, on nothing, with the legend of its colours" @click="savePicture">Picture (PNG)</button><template v-if="video"><button class="b" id="turntable" :disabled="!!through || loading" :title="say(through ? 'Not through a camera' : 'One turn, as the view shows the head')" @click="turning === null ? turntable() : stopTurning()">{{ turning === null ? say('Turntable (video)') : say('Stop, {share} %', { share: Math.round(100 * turning) }) }}</button><select v-model.number="turnS" aria-label="Seconds of the turn"><option v-for="s in [4, 8, 16]" :key="s" :value="s">{{ s }} s</option></select></template></div>
-            <div class="line wrap"><label class="field">Another format<select v-model="form" id="form"><option v-for="f in ['glb', 'ply', 'obj', 'usdz', 'stl', '3mf']" :key="f" :value="f">{{ f }}</option></select></label><a class="b" id="export" :href="'/console/jobs/' + job.id + '/exports/' + form + '.zip'" :download="fileName + '-' + form + '.zip'">Export (.zip)</a></div>
-            <table class="small"><tbody><tr v-for="(bytes, name) in job.files" :key="name"><td><a :href="'/console/jobs/' + job.id + '/' + name" :download="name">{{ name }}</a></td><td class="num muted">{{ size(bytes) }}</td></tr></tbody></table>
+            <ul v-if="job.warnings.length" class="faults small">
+              <li v-for="(w, i) in job.warnings" :key="i" class="warn">{{ say(w) }}</li>
+            </ul>
+            <div class="stack" style="gap: .35rem">
+              <label class="field">Compare with<select v-model="other">
+                  <option value="">nothing</option>
+                  <option v-if="job.truth" value="truth">the truth (simulated)</option>
+                  <option v-for="r in others" :key="r.id" :value="r.id">{{ same(r) ? headName(r)
+                    : say('perhaps another person: {head}', { head: headName(r) }) }}</option>
+                </select>
+              </label>
+              <label v-if="other && other !== 'truth'" class="check small">
+                <input type="checkbox" v-model="beside" id="beside">side by side, turned together</label>
+              <label v-if="elsewhere" class="check small">
+                <input type="checkbox" v-model="strangers"
+                  id="strangers">{{ say('offer {count} head of other subjects, too | offer {count} heads of other subjects, too',
+                    { count: elsewhere }) }}</label>
+              <label v-if="cameras.length || !camerasKnown" class="field">Look through<select v-model="through"
+                id="through" :disabled="!cameras.length">
+                  <option value="">no camera</option>
+                  <option v-for="c in cameras" :key="c.name">{{ c.name }}</option>
+                </select>
+              </label>
+              <label v-if="through" class="field">Photograph<input type="range" min="0" max="1" step="0.05"
+                v-model.number="fade" aria-label="How much of the photograph shines through the head">
+              </label>
+              <label v-if="through" class="check small">
+                <input type="checkbox" v-model="withFaces"
+                  id="faces">{{ say(finding ? 'Looking for faces ...' : 'the face that was found in it') }}</label>
+              <label class="field">Light<select v-model="lights">
+                  <option value="studio">studio</option>
+                  <option value="side">from the side (shows shape)</option>
+                  <option value="flat">flat</option>
+                </select>
+              </label>
+            </div>
+            <div class="line">
+              <h2 class="third grow">Downloads</h2>
+              <a class="b" id="all" :href="'/console/jobs/' + job.id + '/all.zip'"
+                :download="fileName + '.zip'">All files (.zip)</a>
+            </div>
+            <div class="line wrap">
+              <button class="b" id="picture" title="What the view shows, on nothing, with the legend of its colours"
+                @click="savePicture">Picture (PNG)</button>
+              <template v-if="video">
+                <button class="b" id="turntable" :disabled="!!through || loading"
+                  :title="say(through ? 'Not through a camera' : 'One turn, as the view shows the head')"
+                  @click="turning === null ? turntable() : stopTurning()">{{ turning === null ? say('Turntable (video)')
+                    : say('Stop, {share} %', { share: Math.round(100 * turning) }) }}</button>
+                <select v-model.number="turnS" aria-label="Seconds of the turn">
+                  <option v-for="s in [4, 8, 16]" :key="s" :value="s">{{ s }} s</option>
+                </select>
+              </template>
+            </div>
+            <div class="line wrap">
+              <label class="field">Another format<select v-model="form" id="form">
+                  <option v-for="f in ['glb', 'ply', 'obj', 'usdz', 'stl', '3mf']" :key="f" :value="f">{{ f }}</option>
+                </select>
+              </label>
+              <a class="b" id="export" :href="'/console/jobs/' + job.id + '/exports/' + form + '.zip'"
+                :download="fileName + '-' + form + '.zip'">Export (.zip)</a>
+            </div>
+            <table class="small">
+              <tbody>
+                <tr v-for="(bytes, name) in job.files" :key="name">
+                  <td><a :href="'/console/jobs/' + job.id + '/' + name" :download="name">{{ name }}</a></td>
+                  <td class="num muted">{{ size(bytes) }}</td>
+                </tr>
+              </tbody>
+            </table>
             <h2 class="third">Measurements, mm</h2>
-            <table class="small" id="measurements"><thead v-if="theirs"><tr><th>of</th><th class="num">this</th><th class="num">other</th><th class="num" title="this less other">&Delta;</th></tr></thead><tbody><tr v-for="m in compared" :key="m.name"><td>{{ say(m.name.replaceAll('_', ' ')) }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td v-if="!theirs" class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td><template v-if="theirs"><td class="num">{{ fixed(m.theirs?.value, 1) }}</td><td class="num">{{ m.theirs ? fixed(m.value - m.theirs.value, 1) : '-' }}</td></template></tr></tbody></table>
+            <table class="small" id="measurements">
+              <thead v-if="theirs">
+                <tr>
+                  <th>of</th>
+                  <th class="num">this</th>
+                  <th class="num">other</th>
+                  <th class="num" title="this less other">&Delta;</th>
+                </tr>
+              </thead>
+              <tbody>
+                <tr v-for="m in compared" :key="m.name">
+                  <td>{{ say(m.name.replaceAll('_', ' ')) }}</td>
+                  <td class="num">{{ fixed(m.value, 1) }}</td>
+                  <td v-if="!theirs" class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td>
+                  <template v-if="theirs">
+                    <td class="num">{{ fixed(m.theirs?.value, 1) }}</td>
+                    <td class="num">{{ m.theirs ? fixed(m.value - m.theirs.value, 1) : '-' }}</td>
+                  </template>
+                </tr>
+              </tbody>
+            </table>
             <h2 class="third">Fit</h2>
-            <table class="small"><tbody><tr><td title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">{{ say('outline residual, {count} clear view | outline residual, {count} clear views', { count: job.clear_views }) }}</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>solver</td><td class="num">{{ methodWords(job.method) }}</td></tr><tr><td>level of detail</td><td class="num">{{ levelWords(job.level) }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
+            <table class="small">
+              <tbody>
+                <tr>
+                  <td
+                    title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">{{ say('outline residual, {count} clear view | outline residual, {count} clear views',
+                      { count: job.clear_views }) }}</td>
+                  <td class="num">{{ fixed(job.contour_px, 2) }} px</td>
+                </tr>
+                <tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr>
+                <tr><td>model</td><td class="num">{{ job.model_name }}</td></tr>
+                <tr><td>solver</td><td class="num">{{ methodWords(job.method) }}</td></tr>
+                <tr><td>level of detail</td><td class="num">{{ levelWords(job.level) }}</td></tr>
+                <tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr>
+              </tbody>
+            </table>
             <a class="small" href="/jobs">Residuals and overlays are with the job</a>
           </template>
         </div>

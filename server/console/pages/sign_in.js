@@ -8,9 +8,12 @@ export default spoken({
       <form class="panel pad stack" style="width: 26rem" @submit.prevent="send">
         <h1>eigenhead</h1>
         <p class="muted">This service asks for an API key. It stays between this browser and the service.</p>
-        <label class="field">API key<input ref="key" v-model="key" type="password" autocomplete="off" placeholder="eh_..." spellcheck="false"></label>
+        <label class="field">API key<input ref="key" v-model="key" type="password" autocomplete="off"
+          placeholder="eh_..." spellcheck="false">
+        </label>
         <p class="fault small" role="alert" style="min-height: 1.3em">{{ say(fault) }}</p>
-        <button class="b main-action" :disabled="busy || !key" style="justify-content: center">{{ say(busy ? 'Looking ...' : 'Sign in') }}</button>
+        <button class="b main-action" :disabled="busy || !key"
+          style="justify-content: center">{{ say(busy ? 'Looking ...' : 'Sign in') }}</button>
       </form>
     </div>`,
   mounted() {

@@ -15,8 +15,15 @@ export const FaceMarks = {
       return DOT_SHARE * (face.box_px[2] - face.box_px[0]);
     },
   },
-  template: `<svg v-if="faces && faces.length" class="face-marks" :viewBox="'-0.5 -0.5 ' + size[0] + ' ' + size[1]" preserveAspectRatio="xMidYMid meet" aria-hidden="true">
-    <g v-for="(face, i) in faces" :key="i" :class="{ other: !face.is_subject }"><rect :x="face.box_px[0]" :y="face.box_px[1]" :width="face.box_px[2] - face.box_px[0]" :height="face.box_px[3] - face.box_px[1]"></rect><path :d="dots(face)" :stroke-width="dot(face)"></path></g></svg>`,
+  template: `
+    <svg v-if="faces && faces.length" class="face-marks" :viewBox="'-0.5 -0.5 ' + size[0] + ' ' + size[1]"
+      preserveAspectRatio="xMidYMid meet" aria-hidden="true">
+      <g v-for="(face, i) in faces" :key="i" :class="{ other: !face.is_subject }">
+        <rect :x="face.box_px[0]" :y="face.box_px[1]" :width="face.box_px[2] - face.box_px[0]"
+          :height="face.box_px[3] - face.box_px[1]"></rect>
+        <path :d="dots(face)" :stroke-width="dot(face)"></path>
+      </g>
+    </svg>`,
 };
 
 // Keeps faces[id] of captures, or of jobs, which never change; `withFaces` is the switch, `finding` that in which

@@ -35,34 +35,68 @@ export default spoken({
   template: `
     <div class="frame">
       <nav class="rail" aria-label="Pages">
-        <div class="brand"><i v-if="faults.length" class="dot warn alarm"></i><svg viewBox="0 0 32 32" aria-hidden="true"><path d="M16 4c-5.4 0-9 4-9 9.3 0 3.2.6 5.2 1.8 7.700C10.2 24 12.7 28 16 28s5.8-4 7.2-7c1.2-2.5 1.8-4.5 1.8-7.700C25 8 21.4 4 16 4z" fill="none" stroke="currentColor" stroke-width="1.8"/><path d="M16 4v24M7.5 14h17" stroke="var(--accent)" stroke-width="1.8"/></svg>eigenhead</div>
-        <a v-for="(link, i) in links" :key="link.name" :href="link.path" :aria-current="link.name === current ? 'page' : null">
+        <div class="brand">
+          <i v-if="faults.length" class="dot warn alarm"></i>
+          <svg viewBox="0 0 32 32" aria-hidden="true">
+            <path
+              d="M16 4c-5.4 0-9 4-9 9.3 0 3.2.6 5.2 1.8 7.700C10.2 24 12.7 28 16 28s5.8-4 7.2-7c1.2-2.5 1.8-4.5 1.8-7.700C25 8 21.4 4 16 4z"
+              fill="none" stroke="currentColor" stroke-width="1.8"/>
+            <path d="M16 4v24M7.5 14h17" stroke="var(--accent)" stroke-width="1.8"/>
+          </svg>eigenhead</div>
+        <a v-for="(link, i) in links" :key="link.name" :href="link.path"
+          :aria-current="link.name === current ? 'page' : null">
           <span>{{ say(link.title) }}</span><kbd v-if="current !== 'features'" aria-hidden="true">{{ i + 1 }}</kbd></a>
         <div class="foot" role="status">
-          <div class="line"><i :class="['dot', lost || faults.length ? 'warn' : starting.length || !known ? '' : 'good']"></i>{{ lost ? say('Connection lost.') : starting.length && known && !faults.length ? say('Starting: {parts}', { parts: starting.join(', ') }) : say(!known ? 'Connecting ...' : faults.length ? 'Needs a look' : 'Ready') }}</div>
+          <div class="line">
+            <i
+              :class="['dot', lost || faults.length ? 'warn' : starting.length || !known ? '' : 'good']"></i>{{ lost
+                ? say('Connection lost.') : starting.length && known && !faults.length
+                ? say('Starting: {parts}', { parts: starting.join(', ') })
+                : say(!known ? 'Connecting ...' : faults.length ? 'Needs a look' : 'Ready') }}</div>
           <div v-for="[name, detail] in faults" :key="name" class="warn">{{ part(name) }}: {{ say(detail) }}</div>
           <div>{{ say('{count} job under way | {count} jobs under way', { count: status.jobs || 0 }) }}</div>
           <div>{{ say(status.disk) || '\\u00a0' }}</div>
           <a v-if="status.local === false" href="/sign-in" style="padding: 0">Other API key</a>
-          <button class="b quiet small" id="sound" style="padding-left: 0; justify-self: start" title="A quiet sound when a head that was begun in this tab is ready" :aria-pressed="sound" @click="turnSound">{{ say(sound ? 'Sound on' : 'Sound off') }}</button>
-          <div class="line"><button class="b quiet small" id="keys" style="padding-left: 0" :aria-expanded="help" @click="help = !help"><kbd>?</kbd> keys</button><button class="b quiet small push" id="look" :aria-pressed="look === 'light'" @click="turn">{{ look === 'light' ? say('Dark') : say('Light', { context: 'look' }) }}</button></div>
-          <button v-for="(name, tag) in otherLanguages" :key="tag" class="b quiet small language" :lang="tag" style="padding-left: 0; justify-self: start" @click="speak(tag)">{{ name }}</button>
+          <button class="b quiet small" id="sound" style="padding-left: 0; justify-self: start"
+            title="A quiet sound when a head that was begun in this tab is ready" :aria-pressed="sound"
+            @click="turnSound">{{ say(sound ? 'Sound on' : 'Sound off') }}</button>
+          <div class="line">
+            <button class="b quiet small" id="keys" style="padding-left: 0" :aria-expanded="help" @click="help = !help">
+              <kbd>?</kbd> keys</button>
+            <button class="b quiet small push" id="look" :aria-pressed="look === 'light'"
+              @click="turn">{{ look === 'light' ? say('Dark') : say('Light', { context: 'look' }) }}</button>
+          </div>
+          <button v-for="(name, tag) in otherLanguages" :key="tag" class="b quiet small language" :lang="tag"
+            style="padding-left: 0; justify-self: start" @click="speak(tag)">{{ name }}</button>
         </div>
       </nav>
       <div class="main"><slot></slot></div>
       <div class="messages" role="log" aria-live="polite" aria-label="Messages">
-        <div v-for="r in removed" :key="r.id" class="message line"><span class="grow">{{ say('Removed: {thing}', { thing: say(r.title) }) }}</span><button class="b" @click="$emit('undo', r.id)">Undo</button></div>
+        <div v-for="r in removed" :key="r.id" class="message line">
+          <span class="grow">{{ say('Removed: {thing}', { thing: say(r.title) }) }}</span>
+          <button class="b" @click="$emit('undo', r.id)">Undo</button>
+        </div>
         <div v-for="m in messages" :key="m.id" :class="['message', m.kind]">
           <div class="grow"><div>{{ m.text }} <a v-if="m.link" :href="m.link">Open it</a></div>
-            <ul v-if="m.faults.length" class="faults small muted"><li v-for="(f, i) in m.faults" :key="i">{{ f }}</li></ul></div>
+            <ul v-if="m.faults.length" class="faults small muted">
+              <li v-for="(f, i) in m.faults" :key="i">{{ f }}</li>
+            </ul>
+          </div>
           <button class="b quiet" aria-label="Close message" @click="drop(m.id)">&times;</button>
         </div>
       </div>
       <tour v-if="known" ref="tour" :links="links" :current="current" :empty="!!status.empty"></tour>
       <div v-if="help" class="keys" role="dialog" aria-label="Keys" @click="help = false">
         <div class="panel pad stack"><h2>Keys</h2>
-          <table><tbody><tr v-for="[k, what] in keys" :key="k"><td><kbd>{{ say(k) }}</kbd></td><td>{{ say(what) }}</td></tr></tbody></table>
-          <div v-if="known" class="line"><button class="b" id="tour-again" @click="$refs.tour.again()">Show the tour</button></div></div>
+          <table>
+            <tbody>
+              <tr v-for="[k, what] in keys" :key="k"><td><kbd>{{ say(k) }}</kbd></td><td>{{ say(what) }}</td></tr>
+            </tbody>
+          </table>
+          <div v-if="known" class="line">
+            <button class="b" id="tour-again" @click="$refs.tour.again()">Show the tour</button>
+          </div>
+        </div>
       </div>
     </div>`,
   created() {
@@ -116,7 +150,8 @@ export default spoken({
       const id = this.next++,
         further = faults.filter((fault) => !english(text).includes(english(fault))).map((fault) => say(fault));
       this.messages = [...this.messages, { id, kind, text: say(text), link, faults: further }].slice(-MESSAGES_MOST);
-      if (kind === "done" && !link) setTimeout(() => this.drop(id), MESSAGE_MS); // what went wrong stays until it was read
+      // What went wrong stays until it was read.
+      if (kind === "done" && !link) setTimeout(() => this.drop(id), MESSAGE_MS);
     },
     part(name) {
       return say(name === "egl" ? "graphics" : name);

@@ -8,7 +8,13 @@ const TYPING_MS = 250;
 export const Pager = spoken({
   props: { behind: Number, next: String, size: Number, total: Number },
   emits: ["back", "forward"],
-  template: `<div v-if="behind || next" class="line small pager"><button class="b" :disabled="!behind" @click="$emit('back')">Newer page</button><span class="muted grow" style="text-align: center" role="status">{{ say('page {number}, {total} in all', { number: behind + 1, total }) }}</span><button class="b" :disabled="!next" @click="$emit('forward')">Next page</button></div>`,
+  template: `
+    <div v-if="behind || next" class="line small pager">
+      <button class="b" :disabled="!behind" @click="$emit('back')">Newer page</button>
+      <span class="muted grow" style="text-align: center"
+        role="status">{{ say('page {number}, {total} in all', { number: behind + 1, total }) }}</span>
+      <button class="b" :disabled="!next" @click="$emit('forward')">Next page</button>
+    </div>`,
 });
 
 export const paged = {

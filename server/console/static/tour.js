@@ -46,9 +46,17 @@ export const Tour = spoken({
   },
   template: `
     <aside v-if="step" class="panel pad stack tour" aria-label="Tour" :data-step="at + 1">
-      <div class="line"><h2 class="grow">{{ say(step.title) }}</h2><span class="small muted">{{ at + 1 }} / {{ count }}</span></div>
+      <div class="line">
+        <h2 class="grow">{{ say(step.title) }}</h2>
+        <span class="small muted">{{ at + 1 }} / {{ count }}</span>
+      </div>
       <p class="small">{{ say(step.text) }}</p>
-      <div class="line"><button class="b main-action" id="tour-next" @click="go(at + 1)">{{ say(last ? 'Begin' : 'Next') }}</button><button v-if="at" class="b" @click="go(at - 1)">Back</button><button class="b quiet push" id="tour-skip" @click="end">Skip the tour</button></div></aside>`,
+      <div class="line">
+        <button class="b main-action" id="tour-next" @click="go(at + 1)">{{ say(last ? 'Begin' : 'Next') }}</button>
+        <button v-if="at" class="b" @click="go(at - 1)">Back</button>
+        <button class="b quiet push" id="tour-skip" @click="end">Skip the tour</button>
+      </div>
+    </aside>`,
   methods: {
     end() {
       this.kept = OVER;

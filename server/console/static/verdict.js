@@ -81,10 +81,25 @@ export const Verdict = spoken({
     },
   },
   template: `
-    <div class="stack verdict" role="region" aria-label="Verdict" :data-verdict="capture.verdict || 'none'" style="gap: .35rem">
-      <div class="line wrap"><span class="tag" :class="tag.kind">{{ tag.text }}</span><span>{{ sentence }}</span><span v-if="capture.sync" class="muted small push" :class="{ warn: !capture.sync.good }">{{ say(capture.sync.message) }}</span></div>
-      <ul v-if="lines.length" class="faults small"><li v-for="line in lines" :key="line.code" :data-fault="line.code"><strong class="warn">{{ line.cameras.join(', ') }}: {{ line.title }}.</strong> {{ line.details.slice(0, 3).join('; ') }}{{ line.details.length > 3 ? ' ...' : '' }}. <span>{{ say('To do: {remedy}.', { remedy: line.remedy }) }}</span></li></ul>
-      <ul v-if="capture.warnings?.length" class="faults small" aria-label="Warnings"><li v-for="told in capture.warnings" :key="told.message" :data-warning="told.code" class="warn">{{ say(told) }}</li></ul>
+    <div class="stack verdict" role="region" aria-label="Verdict" :data-verdict="capture.verdict || 'none'"
+      style="gap: .35rem">
+      <div class="line wrap">
+        <span class="tag" :class="tag.kind">{{ tag.text }}</span>
+        <span>{{ sentence }}</span>
+        <span v-if="capture.sync" class="muted small push"
+          :class="{ warn: !capture.sync.good }">{{ say(capture.sync.message) }}</span>
+      </div>
+      <ul v-if="lines.length" class="faults small">
+        <li v-for="line in lines" :key="line.code" :data-fault="line.code">
+          <strong class="warn">{{ line.cameras.join(', ') }}: {{ line.title }}.</strong>
+            {{ line.details.slice(0, 3).join('; ') }}{{ line.details.length > 3 ? ' ...' : '' }}.
+            <span>{{ say('To do: {remedy}.', { remedy: line.remedy }) }}</span>
+        </li>
+      </ul>
+      <ul v-if="capture.warnings?.length" class="faults small" aria-label="Warnings">
+        <li v-for="told in capture.warnings" :key="told.message" :data-warning="told.code"
+          class="warn">{{ say(told) }}</li>
+      </ul>
     </div>`,
 });
 
@@ -95,7 +110,11 @@ export const Outline = {
       return (this.view?.subject?.outline || []).map((corner) => corner.join(",")).join(" ");
     },
   },
-  template: `<svg v-if="points" class="outline" :viewBox="'-0.5 -0.5 ' + size[0] + ' ' + size[1]" preserveAspectRatio="xMidYMid meet" aria-hidden="true"><polygon :points="points" vector-effect="non-scaling-stroke"></polygon></svg>`,
+  template: `
+    <svg v-if="points" class="outline" :viewBox="'-0.5 -0.5 ' + size[0] + ' ' + size[1]"
+      preserveAspectRatio="xMidYMid meet" aria-hidden="true">
+      <polygon :points="points" vector-effect="non-scaling-stroke"></polygon>
+    </svg>`,
 };
 
 // Keeps checks[id] of captures: a capture's measures never change.

@@ -88,7 +88,7 @@ def test_named_codes_become_failures():
     ]
     refuse(warnings, ())
     refuse(warnings, ("camera-moved",))
-    with pytest.raises(ImplausibleResult, match="scale-implausible: the fitted head has"):
+    with pytest.raises(ImplausibleResult, match="the scale is implausible: the fitted head has"):
         refuse(warnings, ("scale-implausible",))
 
 

@@ -154,9 +154,7 @@ def test_report_has_every_key_of_the_contract_and_only_json_numbers(folder: Path
     assert report["cameras"]["cam03"]["view"]["contrast"] is None
     assert report["seconds"] == {"total": 2.0, "segmentation": 0.5, "fitting": 1.5}
     assert report["texture"]["filled"] == 5
-    assert report["warnings"] == [
-        {"code": "view-left-out", "message": "cam03: left out", "parameters": {"remark": "cam03: left out"}}
-    ]
+    assert report["warnings"] == [compose("view-left-out", remark="cam03: left out").document()]
     assert report["landmarks"]["pronasale"] == {"position": [1.0, 2.0, 3.0], "std": [0.1, 0.2, 0.3]}
     assert report["measurements"]["nose_length"] == {"value": 52.0, "std": None}
 

@@ -5,6 +5,7 @@ import threading
 import time
 import tty
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +85,7 @@ def test_malformed_lines_decode_to_nothing(line: bytes) -> None:
 
 
 def test_client_drives_every_command(port: Path, outputs: Outputs) -> None:
-    with TriggerBox(str(port)) as box:
+    with closing(TriggerBox(str(port))) as box:
         box.set_lights(0b1010)
         box.set_delay(3, 2500)
         box.arm(5.0)
@@ -100,7 +101,7 @@ def test_client_drives_every_command(port: Path, outputs: Outputs) -> None:
 
 
 def test_fire_needs_arming_and_arming_is_used_up(port: Path, outputs: Outputs) -> None:
-    with TriggerBox(str(port)) as box:
+    with closing(TriggerBox(str(port))) as box:
         with pytest.raises(TriggerRefused, match="NOT-ARMED"):
             box.fire(1, 1000)
         box.arm(5.0)
@@ -122,7 +123,7 @@ def test_fire_needs_arming_and_arming_is_used_up(port: Path, outputs: Outputs) -
     ["DELAY 12 0", "DELAY 0 500001", "DELAY 0", "ARM 60001", "ARM -1", "LIGHTS 10", "FIRE 1000 5", "FIRE 1 0", "ARM x"],
 )
 def test_arguments_out_of_range_and_unknown_commands_are_refused(port: Path, body: str) -> None:
-    with TriggerBox(str(port)) as box:
+    with closing(TriggerBox(str(port))) as box:
         with pytest.raises(TriggerRefused, match="ARGUMENT"):
             box._command(body)
         with pytest.raises(TriggerRefused, match="UNKNOWN"):
@@ -197,7 +198,7 @@ def test_client_gets_through_a_cable_that_loses_and_damages_lines(outputs: Outpu
                 replies += reply
         return replies
 
-    with Wire(answer) as wire, TriggerBox(wire.port, reply_timeout_s=0.1, attempts=40) as box:
+    with Wire(answer) as wire, closing(TriggerBox(wire.port, reply_timeout_s=0.1, attempts=40)) as box:
         for shot in range(1, 11):
             box.arm(60.0)
             assert box.fire(0x7FF, 1000).shot == shot
@@ -229,13 +230,13 @@ def test_what_is_no_box_is_named(answer, errors, name: str | None) -> None:
 def test_a_port_that_is_not_there_or_that_another_program_has(tmp_path: Path, port: Path) -> None:
     with pytest.raises(TriggerUnplugged, match="unplugged"):
         TriggerBox(str(tmp_path / "no-such-port"))
-    with TriggerBox(str(port)), pytest.raises(TriggerUnplugged, match="cannot be opened"):
+    with closing(TriggerBox(str(port))), pytest.raises(TriggerUnplugged, match="cannot be opened"):
         TriggerBox(str(port))
 
 
 def test_pulling_the_cable_is_an_error_at_once(tmp_path: Path, outputs: Outputs) -> None:
     plugged = SimulatedTriggerBox(tmp_path / "box", outputs.logic())
-    with TriggerBox(str(plugged.port)) as box:
+    with closing(TriggerBox(str(plugged.port))) as box:
         plugged.close()
         started_s = time.monotonic()
         with pytest.raises(TriggerUnplugged, match="unplugged"):
@@ -246,7 +247,10 @@ def test_pulling_the_cable_is_an_error_at_once(tmp_path: Path, outputs: Outputs)
 
 def test_a_closed_box_leaves_no_thread_descriptor_or_file(tmp_path: Path, outputs: Outputs) -> None:
     threads, descriptors = threading.active_count(), open_descriptors()
-    with SimulatedTriggerBox(tmp_path / "box", outputs.logic()) as simulated, TriggerBox(str(simulated.port)) as box:
+    with (
+        SimulatedTriggerBox(tmp_path / "box", outputs.logic()) as simulated,
+        closing(TriggerBox(str(simulated.port))) as box,
+    ):
         box.status()
     assert threading.active_count() == threads
     assert open_descriptors() == descriptors

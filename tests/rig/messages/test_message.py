@@ -47,7 +47,7 @@ def test_code_and_parameters_survive_every_way(message: Message) -> None:
 
 def test_the_text_is_the_templates_with_plain_numbers_and_infinite_ones_as_words() -> None:
     assert "12.3 GB free; uploads and jobs must leave 2.0 GB" in compose("disk-free", free_gb=12.34567, spare_gb=2).text
-    assert MOVED.text.startswith("cam03 contradicts all other cameras")
+    assert MOVED.text.startswith("a camera is not where it was calibrated: cam03 contradicts all other")
     message = compose("camera-gain", camera="cam00", factor=np.float32(0.5))
     assert type(message.parameters["factor"]) is float
     endless = compose("camera-gain", camera="cam00", factor=np.inf)

@@ -69,9 +69,9 @@ def test_the_console_fills_templates_in_as_the_service_does() -> None:
          "die Bilder von 2 Aufnahmen; 1 Kopf mit Fotos in den Überlagerungen bleibt"),
         (compose("job-without-result", state="failed"), "Der Auftrag hat kein Ergebnis (Status: gescheitert)."),
         (compose("not-in-sync", cameras=["front", "cam03"]), "nicht synchron: front, cam03"),  # a camera's name is none
-        (compose("view", remark=compose("located", where="cam03", fault=compose("view-unused", remark=LIGHT))),
-         "cam03: das Licht weicht um den Faktor 1,50 von dem des Leerbilds ab: neues Leerbild aufnehmen; "
-         "die Ansicht wird weggelassen"),
+        (compose("view-left-out", remark=compose("located", where="cam03", fault=compose("view-unused", remark=LIGHT))),
+         "nicht jede Ansicht wird benutzt: cam03: das Licht weicht um den Faktor 1,50 von dem des Leerbilds ab: "
+         "neues Leerbild aufnehmen; die Ansicht wird weggelassen"),
         (compose("print-off", side="width", percent=-0.5), "Breite ist um -0,50 % daneben"),
         (compose("jobs-queued", count=3), "3 Aufträge eingereiht. Zu verfolgen auf der Seite Aufträge."),
         (verbatim("nobody translates what a camera's maker says"), "nobody translates what a camera's maker says"),

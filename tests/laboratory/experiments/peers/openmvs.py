@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from pipeline.stereo.crops import Crop
+from pipeline.stereo.crops import MAX_UNSEEN_PX, Crop
 from rig.camera import Camera
 from rig.errors import EigenheadError, InputError
 from rig.formats.meshes.mesh_file import read_mesh
@@ -85,8 +85,7 @@ def _run(programs: Mapping[str, Path], name: str, folder: Path, *arguments: str)
 
 def write_input(crops: Sequence[Crop], hull_world: Mesh, folder: Path) -> None:
     """Writes ``images``, ``masks`` and ``sparse`` (cameras.txt, images.txt, points3D.txt) as the programs read them."""
-    rng = np.random.default_rng(0)
-    rows = rng.permutation(len(hull_world.vertices))[:SEEDS]
+    rows = np.random.default_rng(0).permutation(len(hull_world.vertices))[:SEEDS]
     points, normals = hull_world.vertices[rows], hull_world.normals()[rows]
     seen = np.stack([_faces_camera(each.camera, points, normals) for each in crops])
     points, seen = points[seen.sum(axis=0) >= 2], seen[:, seen.sum(axis=0) >= 2]
@@ -96,7 +95,8 @@ def write_input(crops: Sequence[Crop], hull_world: Mesh, folder: Path) -> None:
     for number, (view, at) in enumerate(zip(crops, seen, strict=True), start=1):
         camera = view.camera
         write_image(folder / "images" / f"{camera.name}.png", view.colour)
-        label = (view.mask > 0.5).astype(np.uint8) * 255
+        distance_px = view.levels[0].distance_px
+        label = ((distance_px > MAX_UNSEEN_PX) & (distance_px < 0.0)).astype(np.uint8) * 255
         write_image(folder / "masks" / f"{camera.name}.mask.png", np.repeat(label[:, :, None], 3, axis=2))
         k, pose = camera.intrinsics, camera.camera_from_world
         lens = (k.fx, k.fy, k.cx + COLMAP_PX, k.cy + COLMAP_PX)

@@ -114,7 +114,7 @@ def test_any_other_file_beside_photographs_is_named_too(tmp_path: Path) -> None:
     for name in ("studio.txt", "rig.vcal", "notes.md", "cam00.png", "Thumbs.db", "scale.json"):
         (tmp_path / name).write_text("cam00 1 2 3\n")
     (remark,) = unread_files(tmp_path, [])
-    assert remark.text.startswith("rig.vcal, studio.txt: not read")
+    assert ": rig.vcal, studio.txt: not read" in remark.text
 
 
 @pytest.mark.parametrize("name", ["cameras (1).json", "cameras.json.txt", "Rig.JSON"])
@@ -133,7 +133,7 @@ def test_pictures_of_rare_endings_are_read_and_folders_of_plates_named(tmp_path:
     one.rename(one.with_suffix(".jfif"))
     shutil.copytree(tmp_path / "images", tmp_path / "clean_plates" / "front")
     capture, _ = read_capture(tmp_path)
-    assert (one.stem in capture.images, [r.text.split()[0] for r in capture.remarks]) == (True, ["clean_plates/"])
+    assert (one.stem in capture.images, [": clean_plates/ is" in r.text for r in capture.remarks]) == (True, [True])
     two.rename(two.with_suffix(""))
     with pytest.raises(InputError, match=f"images/{two.stem} is not read: endingless files"):
         read_capture(tmp_path)
