@@ -99,7 +99,7 @@ def test_the_map_names_what_is_there() -> None:
     assert len(paths) > 10
     assert [path for path in paths if not (ROOT / path).exists()] == []
     gone = []
-    rooms = re.findall(r"^- \*\*([\w/]+)\*\*: (.*(?:\n  .*)*)$", text, re.MULTILINE)
+    rooms = re.findall(r"^- \*\*([\w/]+)\*\*:? (.*(?:\n  .*)*)$", text, re.MULTILINE)
     assert len(rooms) > 30
     for room, row in rooms:
         there = {path.stem for path in (ROOT / room).rglob("*")} | {"b_from_a"}

@@ -109,7 +109,7 @@ def blur_px(image: ImageRgb) -> float | None:
 
     A step of height A, blurred with standard deviation s, has the gradient energy A^2 / (2 sqrt(pi) s) across it.
     Blurring the picture further, by known s1 and by s2, gives energies whose ratio q = sqrt((s^2 + s2^2) / (s^2 +
-    s1^2)) does not depend on A. The equation is solved for s. Only pixels with the strongest gradients are used,
+    s1^2)) is the same for every A; it is solved for s. Only pixels with the strongest gradients are used,
     because they lie on steps. The energy of the noise, measured in other pixels, is subtracted first.
     """
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.float32)

@@ -94,9 +94,7 @@ def test_two_pages_agree_and_a_removal_is_taken_back_or_for_good(
     two.check_clean()
 
 
-def test_a_session_is_begun_filled_and_erased(
-    v: Visit, service: RunningService, screenshots: Path, tmp_path: Path
-) -> None:
+def test_a_session_is_filled_and_erased(v: Visit, service: RunningService, screenshots: Path, tmp_path: Path) -> None:
     uploaded_capture(service, tmp_path, 1)
     page = v.go("/captures")
     expect(page.locator(".row-button")).to_have_count(1)

@@ -102,9 +102,7 @@ def narrow_faults(page: Page, picture: Path) -> list[str]:
     return [*found, *page.evaluate(UNREACHABLE), *violations(page)]
 
 
-def test_a_page_comes_back_after_the_service_was_killed(
-    browser: Browser, service: RunningService, tmp_path: Path
-) -> None:
+def test_a_page_comes_back_after_a_kill(browser: Browser, service: RunningService, tmp_path: Path) -> None:
     uploaded_capture(service, tmp_path, 1)
     v = visit(browser, service.url)
     page = v.go("/captures")

@@ -58,9 +58,7 @@ def test_found_faces_lie_over_pictures(v: Visit, service: RunningService, screen
     expect(page.locator("svg.face-marks")).to_have_count(0)
 
 
-def test_the_verdict_says_who_lacks_the_face(
-    v: Visit, service: RunningService, screenshots: Path, tmp_path: Path
-) -> None:
+def test_the_verdict_names_faceless_views(v: Visit, service: RunningService, screenshots: Path, tmp_path: Path) -> None:
     capture = uploaded(service, tmp_path, "beard-smile", hidden=HIDDEN)
     page = v.go(f"/captures?capture={capture['id']}")
     expect(page.locator("[data-warning=face-missing]")).to_contain_text(f"was found in {HIDDEN}", timeout=SLOW_MS)

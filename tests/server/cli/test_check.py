@@ -224,9 +224,7 @@ def test_a_front_camera_that_nobody_knows_is_a_fault(kind: Callable[[Path], Path
 
 
 @pytest.mark.gl
-def test_a_wrong_variable_is_no_fault_of_the_capture(
-    masked: Shot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_variable_is_no_capture_fault(masked: Shot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_capture(tmp_path / "shot", *masked)
     monkeypatch.setenv("EIGENHEAD_THREADS", "-4")
     with pytest.raises(WrongVariable, match="EIGENHEAD_THREADS: the variable is '-4'"):

@@ -130,9 +130,7 @@ def test_a_resumable_upload_goes_on_after_a_break(http: httpx.Client, archive: b
     assert http.head(where, headers=tus).headers["location"] == last.headers["location"]
 
 
-def test_a_resumable_upload_of_a_bad_capture_gets_422(
-    service: RunningService, http: httpx.Client, archive: bytes
-) -> None:
+def test_a_resumed_bad_capture_gets_422(service: RunningService, http: httpx.Client, archive: bytes) -> None:
     before = stored(service)
     tus, data = {"Tus-Resumable": "1.0.0"}, archive[:5000]
     where = http.post("/v1/uploads", headers=tus | {"Upload-Length": str(len(data))}).headers["location"]

@@ -51,9 +51,7 @@ def test_metadata_is_refused_before_it_is_read(
 
 
 @pytest.mark.slow
-def test_a_slow_check_keeps_no_other_key_waiting_and_ends(
-    service: RunningService, keys: list[str], tmp_path: Path
-) -> None:
+def test_a_slow_check_keeps_no_key_waiting_and_ends(service: RunningService, keys: list[str], tmp_path: Path) -> None:
     slow, fine = slow_capture(tmp_path / "slow"), packed(small_capture(tmp_path / "fine"))
     with client(service, keys[1]) as other:
         assert upload(other, fine).status_code == 201

@@ -136,9 +136,7 @@ def test_one_is_in_use_until_another_is(calibrations: Calibrations, store: Store
         assert [each.id for each in calibrations.find() if each.in_use] == [identity]
 
 
-def test_a_failure_is_told_and_what_ended_can_be_removed(
-    calibrations: Calibrations, store: Store, engine: Engine
-) -> None:
+def test_a_failure_is_told_and_can_be_removed(calibrations: Calibrations, store: Store, engine: Engine) -> None:
     identity = calibrations.add_shots(BOARD, [board_shot(store, "one")], "").id
     engine.rows[identity].status = "MAX_RECOVERY_ATTEMPTS_EXCEEDED"
     found = calibrations.get(identity)

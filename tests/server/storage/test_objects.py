@@ -128,9 +128,7 @@ def test_a_folder_that_is_not_mounted_is_not_made(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [100, (16 << 20) + 5])  # in one request, in three parts
 @pytest.mark.parametrize("fault", ["503", "silent", "flipped"])
-def test_a_fault_that_passes_is_outlasted(
-    s3: ObjectStore, network: Network, tmp_path: Path, size: int, fault: Any
-) -> None:
+def test_a_passing_fault_is_outlasted(s3: ObjectStore, network: Network, tmp_path: Path, size: int, fault: Any) -> None:
     path, digest = made(tmp_path, hashlib.sha256(b"seed").digest() * (size // 32 + 1))
     network.fail(fault, 1, "PUT")
     s3.put("head.ply", path, digest)

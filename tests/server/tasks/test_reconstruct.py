@@ -43,9 +43,7 @@ def reconstruct(renderer: Renderer, folder: Path, report: Progress, **settings: 
     reconstruct_capture(context, report, **places, model=None, settings=settings)
 
 
-def test_a_capture_folder_becomes_a_head_and_its_report(
-    renderer: Renderer, shot: SimulatedCapture, tmp_path: Path
-) -> None:
+def test_a_capture_folder_becomes_a_head(renderer: Renderer, shot: SimulatedCapture, tmp_path: Path) -> None:
     write_capture(tmp_path / "capture", shot.capture, shot.rig)
     stored = {"code": "scale-assumed", "message": "as if these cameras had been found from the photographs"}
     digest = hashlib.sha256((tmp_path / "capture" / "cameras.json").read_bytes()).hexdigest()

@@ -91,9 +91,7 @@ def test_a_job_begins_where_its_capture_is_and_the_disk_has_room(
     assert full.value.kind == "disk-full"
 
 
-def test_a_job_whose_folder_cannot_be_made_says_so(
-    worker: Worker, capture: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_job_without_a_folder_says_so(worker: Worker, capture: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(self: Path, *positional: Any, **named: Any) -> None:
         raise OSError(30, "Read-only file system", str(self))
 

@@ -82,9 +82,7 @@ def test_what_the_model_cannot_be_becomes_offsets(model: FlameModel, arrays: dic
 
 
 @pytest.mark.parametrize("protocol", [2, 4])
-def test_pickles_are_read_without_chumpy(
-    arrays: dict[str, Any], model: FlameModel, tmp_path: Path, protocol: int
-) -> None:
+def test_pickles_need_no_chumpy(arrays: dict[str, Any], model: FlameModel, tmp_path: Path, protocol: int) -> None:
     read = read_flame(write_pickle(tmp_path / "generic_model.pkl", arrays, protocol))
     for name in ("template", "shape_modes", "expression_modes", "pose_modes", "joint_regressor", "parents", "faces"):
         np.testing.assert_array_equal(getattr(read, name), getattr(model, name))
