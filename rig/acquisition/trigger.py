@@ -124,6 +124,12 @@ class TriggerBox:
             self.close()
             raise
 
+    def __enter__(self) -> "TriggerBox":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def close(self) -> None:
         """Closes the serial port. The call may be repeated, and may follow an unplugged cable."""
         # pyserial's close restores nothing that could fail, but an unplugged descriptor may still raise
