@@ -50,8 +50,8 @@ def _outcome(folder: BatchFolder, task: BatchTask) -> Outcome:
 
 
 def _result(folder: BatchFolder, task: BatchTask) -> tuple[Origin | None, dict[str, Any] | None]:
-    """Returns origin and report of a capture's result if it was made with these settings and this model; otherwise
-    None, None."""
+    """Returns origin and report of a capture's result if it was made with the task's settings and model, otherwise None
+    twice."""
     origin = folder.origin(task.capture.name)
     wanted = task.settings_sha256, task.model_sha256
     if origin is None or (origin.settings_sha256, origin.model_sha256) != wanted:
