@@ -231,8 +231,7 @@ class Shard:
         return f"{self.number}/{self.count}"
 
     def takes(self, name: str) -> bool:
-        """Returns whether the capture with this name belongs to this part of the batch. Each capture of a batch belongs
-        to exactly one part."""
+        """Returns whether the capture with this name belongs to this part; each capture belongs to exactly one."""
         digest = hashlib.sha256(name.encode()).digest()
         return int.from_bytes(digest[:8], "big") % self.count == self.number - 1
 

@@ -157,8 +157,7 @@ class BatchFolder:
         """Renames the finished result of an attempt to its final place, replacing an earlier result of that name, and
         removes the failure record.
 
-        Raises ForeignFiles, and OSError if a process that divides the batch differently has just published the same
-        result.
+        Raises ForeignFiles, and OSError if a process that divides the batch otherwise has just published that result.
         """
         complete, target = attempt / "result", self.result(name)
         self.check_replaceable(name)

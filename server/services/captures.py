@@ -267,8 +267,7 @@ class Captures:
         """Cancels the jobs of a capture, then removes every trace of it: pictures, heads, caches and rows of the job
         database.
 
-        An interrupted erasure can be repeated. Raises NotFound, and Unavailable while a worker still writes results of
-        the capture.
+        An interrupted erasure can be repeated. Raises NotFound, and Unavailable while a worker still writes a result.
         """
         self._store.capture(identity)
         erase_captures(self._store, self._jobs, [identity])

@@ -27,8 +27,7 @@ log = structlog.get_logger()
 
 
 class JobFailed(EigenheadError):
-    """Reports a job that cannot succeed, however often it is repeated. The job engine stores the attribute ``data`` of
-    the error."""
+    """Reports a job that cannot succeed, however often it is repeated. The job engine stores the error's ``data``."""
 
     def __init__(self, kind: str, detail: Message | Kept, errors: Iterable[Message | Kept] = ()) -> None:
         super().__init__(_read(detail))
@@ -39,8 +38,7 @@ class JobFailed(EigenheadError):
         return self.detail.text
 
     def __setstate__(self, state: object) -> None:
-        """Ignores stored attributes of an error, which earlier versions wrote as texts; its arguments contain the same
-        data."""
+        """Ignores an error's attributes, which earlier versions also stored: its arguments contain the same data."""
 
 
 class _PlainUnpickler(pickle.Unpickler):

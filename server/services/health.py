@@ -80,8 +80,7 @@ def _workers(service: Service) -> CheckOut:
 
 
 def _queues(service: Service) -> CheckOut:
-    """Names queues whose jobs wait without a worker. A queue without a worker does not stop the service's other
-    work."""
+    """Names queues whose jobs wait without a worker, while the service is still ready for other work."""
     try:
         queued = service.jobs.index.queued()
         idle = {queue: found.jobs for queue, found in queued.items() if service.jobs.queue_notice(queue)}

@@ -94,8 +94,7 @@ class JobQueries:
     def find(
         self, *, state: str | None = None, capture: str | None = None, session: str | None = None, limit: int = 100
     ) -> list[JobOut]:
-        """Returns jobs, newest first, ``limit`` at most. ``state``, ``capture`` and ``session`` restrict the list if
-        they are not None."""
+        """Returns jobs, newest first, ``limit`` at most, of one state, capture or session if not None."""
         ids = None if capture is None and session is None else self.index.ids_of(capture, session)
         if ids == []:
             return []
@@ -129,8 +128,7 @@ class JobQueries:
         return {capture: [(job, STATES[status]) for job, status in jobs] for capture, jobs in found.items()}
 
     def active(self, *, capture: str | None = None, key: str | None = None) -> list[str]:
-        """Lists the ids of queued and running jobs. ``capture`` and ``key`` (an API key's id) restrict the list if they
-        are not None."""
+        """Lists the ids of queued and running jobs, of one capture or API key if not None."""
         wanted = {k: v for k, v in {"capture": capture, "key": key}.items() if v is not None}
         rows = self.client.list_workflows(
             name=WORKFLOW, status=STATUSES["queued"] + STATUSES["running"], load_input=False, load_output=False

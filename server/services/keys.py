@@ -129,8 +129,7 @@ def check_address(settings: ServiceSettings, keys: Keys) -> None:
 
 
 def note_keys(data: Path, keys: Keys) -> None:
-    """Records in the data folder whether its service has API keys, so that a lost database does not open the service to
-    all."""
+    """Records in the data folder whether the service has API keys, lest a lost database open the service to all."""
     if not keys.any():
         (data / HAS_KEYS).unlink(missing_ok=True)
     elif not (data / HAS_KEYS).exists():

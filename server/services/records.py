@@ -153,8 +153,7 @@ class CalibrationOut(Answer):
 
 
 class CameraOut(Answer):
-    """Describes a camera of the rig. The state is ``closed`` if it was not used since the start, ``ready`` if it is
-    simulated."""
+    """Describes a camera of the rig: ``closed`` if it was not used since the start, ``ready`` if simulated."""
 
     name: str
     driver: str

@@ -85,8 +85,8 @@ def sweep(service: Service) -> dict[str, int]:
 def _trusts_clock(service: Service) -> bool:
     """Compares the clock with the last sweep's. Since the last sweep the clock may have advanced by at most a day more
     than the machine ran; after a restart of the machine any advance is accepted, unless half of all records, and at
-    least ``MANY``, would be removed at once. If the clock is in doubt, the file ``STOPPED`` is written, and is valid
-    until somebody removes it."""
+    least ``MANY``, would be removed at once. A doubtful clock is noted in ``STOPPED``, which is valid until its
+    removal."""
     stopped, path = service.settings.data / STOPPED, service.settings.data / LAST_SWEEP
     now, up, boot = time.time(), time.clock_gettime(time.CLOCK_BOOTTIME), BOOT.read_text().strip()
     with suppress(FileNotFoundError, ValueError, KeyError, TypeError):

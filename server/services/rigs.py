@@ -176,9 +176,8 @@ class RealRig:
                 self._opened()
 
     def take_background(self) -> CleanPlates:
-        """Takes clean plates with all cameras and uses them for later captures. Raises Unavailable if cameras fail.
-        Raises Conflict if the plates show a person; such plates are kept as a version that ``use_plates`` can still
-        select."""
+        """Takes clean plates with all cameras and uses them for later captures. Raises Unavailable if cameras fail, and
+        Conflict if the plates show a person; ``use_plates`` can still select such plates."""
         with self._lock:
             try:
                 plates = self._opened().take_plates()

@@ -46,8 +46,7 @@ def tend_captures(store: Store, jobs: Jobs, most: int) -> int:
 
 def bound_captures(store: Store, most: int, is_used: Callable[[str], bool]) -> int:
     """Removes the least recently used large files of captures from the data folder, until all of them take at most
-    ``most`` bytes. Each file is first compared with its object in the store. Returns the number of captures whose files
-    were removed."""
+    ``most`` bytes. Each file is first compared with its stored object. Returns how many captures lost files."""
     assert store.blobs is not None
     found, total, removed = [], 0, 0
     for identity in store.ids("captures"):

@@ -49,9 +49,8 @@ class Threads:
         """Runs a function that unpacks or checks an upload in a thread and returns its result. The function's work in
         child processes ends after ``check_s`` seconds, or once ``hung_up()`` has returned (the client is gone).
 
-        At most ``checks`` such functions run at once; others wait. Raises TooMany if too many requests of the API key
-        ``key`` wait, InvalidInput if the time or the memory does not suffice, and Conflict if the client has
-        disconnected.
+        At most ``checks`` such functions run at once; others wait. Raises TooMany if too many requests of API key
+        ``key`` wait, InvalidInput if time or memory does not suffice, and Conflict if the client has disconnected.
         """
         if self._in_line[key] >= IN_LINE_MOST:
             raise TooMany("too-many-checks", compose("too-many-checks", most=IN_LINE_MOST), retry_after_s=AGAIN_S)

@@ -72,8 +72,7 @@ class Webhooks:
     ) -> None:
         """Queues one message for each webhook about the state of a job, and one for the job's own webhook if it has
         one. Each message has an id made of webhook, job and state, so a repeated call changes nothing. ``enqueue`` is
-        the job engine's function that queues a workflow. ``delivered_to``: where the result lies, if it was
-        delivered."""
+        the job engine's function to queue a workflow; ``delivered_to`` is a delivered result's place."""
         for hook_id in [*(hook.id for hook in self.all()), *([] if job_webhook is None else [OWN])]:
             identity = f"{messages_of(job_id)}{hook_id}-{state}"
             message: WebhookMessage = {"webhook": hook_id, "type": f"job.{state}", "job_id": job_id, "id": identity}
@@ -119,8 +118,7 @@ class Webhooks:
         return httpx.post(hook.url, content=body, headers=headers, timeout=TIMEOUT_S).raise_for_status().status_code
 
     def _post_own(self, message: WebhookMessage, hook: JobWebhook) -> int:
-        """Posts to an address that a caller named, and checks the address again, because it may have changed
-        meanwhile."""
+        """Posts to an address that a caller named, after checking anew whether the address is allowed."""
         aim = target(hook["url"], self._origins)
         body, headers = _signed(message, hook["secret"])
         with httpx.Client(trust_env=False, timeout=TIMEOUT_S) as client:

@@ -180,8 +180,7 @@ class BatchIndex:
             connection.execute(change.values(job_id=job), rows)
 
     def recall(self, identity: str, jobs: Collection[str]) -> None:
-        """Marks jobs of a batch for withdrawal. The mark survives a kill, so that a later call can complete the
-        withdrawal."""
+        """Marks jobs of a batch for withdrawal, so that after a kill a later call can complete the withdrawal."""
         self._change_items(identity, list(jobs), {"recalled": True})
 
     def recalled(self) -> dict[str, list[str]]:

@@ -1,9 +1,8 @@
 """Caches the silhouettes of a capture on disk, for jobs with other settings and for the operator's pages.
 
 A file's name is the SHA-256 of everything that its content depends on: the capture's files and the code. Cached
-silhouettes equal those that ``segment`` returned bit for bit. Silhouettes show a face, so ``Store.remove_capture``
-erases cached ones with their capture. An unreadable cached file is made again. A silhouette that cannot be written is
-not cached.
+silhouettes equal those that ``segment`` returned bit for bit. Silhouettes show a face: ``Store.remove_capture`` erases
+them. An unreadable cached file is made again. Silhouettes that cannot be written are not cached.
 """
 
 import dataclasses

@@ -81,8 +81,7 @@ class StoredFile:
     sha256: str
 
     def is_intact(self) -> bool:
-        """Returns whether the file's content matches its SHA-256. The file is read once, and again when its time, size
-        or inode changes."""
+        """Returns whether the file's content matches. The file is read anew when its time, size or inode changed."""
         said = self.path.stat()
         return _digest(self.path, said.st_mtime_ns, said.st_size, said.st_ino) == self.sha256
 
@@ -199,8 +198,7 @@ class Store(DataFolder):
 
     def add_capture(self, folder: Path, record: CaptureRecord) -> None:
         """Writes a capture's record into ``folder``, which holds ``files/``, and moves the folder to its final place in
-        one rename. After a kill the capture is complete or absent. The capture's files are also sent to the store of
-        captures."""
+        one rename. After a kill the capture is complete or absent. The store of captures also gets its files."""
         write_atomically(folder / "record.json", _encoded(CAPTURE.document(record)))
         move_durably(folder, self.folder("captures", record.id))
         self._tell(record)

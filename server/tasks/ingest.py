@@ -221,9 +221,8 @@ def _face_networks(context: WorkerContext) -> FaceNetworks | None:
 
 
 def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image_pixels: int) -> CaptureContent:
-    """Checks a shot of the calibration board and removes everything but its images from ``folder``: one for each
-    camera, of any size. Returns the content for the capture's record. Raises InputError naming the images that are too
-    large."""
+    """Checks a shot of the calibration board and removes everything but each camera's image, of any size, from
+    ``folder``. Returns the content for the capture's record. Raises InputError naming the images that are too large."""
     root = Path(folder)
     for path in root.iterdir():
         if path.name != "images":

@@ -66,8 +66,7 @@ def photographs_alone(folder: Path) -> bool:
 
 
 def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Progress) -> Prepared:
-    """Reads a capture folder. Cameras that the capture lacks are estimated from its photographs and written to
-    ``kept``.
+    """Reads a capture folder. Missing cameras are estimated from the photographs and written to ``kept``.
 
     Raises InputError naming every fault, and CalibrationRefused naming the unregistered views and what to add.
     """

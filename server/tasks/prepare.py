@@ -1,8 +1,7 @@
 """Compiles numerical loops ahead (those in ``pipeline.compute.kernel_list``), in several processes, so that no job
 waits for them.
 
-The installation compiles the loops (``eigenhead prepare``). A command that finds a loop missing compiles it before its
-work.
+The installation compiles the loops (``eigenhead prepare``). A command first compiles a loop that it finds missing.
 """
 
 import errno

@@ -68,8 +68,7 @@ class JobProgress:
         return self._progress
 
     def _rest_of_stage(self) -> float:
-        """Returns the expected remaining seconds of the stage: by its usual duration or its fraction, the larger
-        value."""
+        """Returns the expected remaining seconds of the stage: by usual duration or by fraction, the larger one."""
         spent, usual = self._spent_s() / self._pace(), self._expected.get(self._visit, 0.0)
         rest = max(usual - spent, OVERTIME * usual)
         if FRACTION_LEAST < self._fraction < 1:

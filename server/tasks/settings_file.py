@@ -32,17 +32,16 @@ def reason_of(error: OSError | ValueError | RecursionError) -> str:
 def settings_document(
     path: Path | None, *, strict: bool = False, **options: str | bool | Mapping[str, object] | None
 ) -> dict[str, object]:
-    """Returns the settings of a TOML or JSON file, or none without a file, overridden by ``options``. Tables in both
-    the file and ``options`` are merged. ``strict``: a camera without usable pictures makes the job fail. Raises
-    InputError if the file cannot be read."""
+    """Returns the settings of a TOML or JSON file, or none without a file, overridden by ``options``. Tables in file
+    and ``options`` are merged. ``strict``: a camera without usable pictures is an error. Raises InputError for a bad
+    file."""
     document = merged_settings({} if path is None else read_settings_file(path), options)
     codes = document.get("fail_on", [])
     return document | ({"fail_on": [*codes, LOST]} if strict and isinstance(codes, list) else {})
 
 
 def merged_settings(document: Mapping[str, object], over: Mapping[str, object]) -> dict[str, object]:
-    """Returns ``document`` overridden by ``over``. Tables in both documents are merged. A value of None in ``over``
-    overrides nothing."""
+    """Returns ``document`` overridden by ``over``, except by values of None; tables in both documents are merged."""
     merged = dict(document)
     for name, value in over.items():
         old = merged.get(name)

@@ -413,8 +413,7 @@ class Heartbeat:
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Records the id of a running workflow. A workflow whose writes the database refuses ends without an
-        outcome."""
+        """Records the id of a running workflow, which ends without an outcome if the database refuses its writes."""
         identity = DBOS.workflow_id or ""
         self._here.add(identity)
         try:
@@ -482,8 +481,7 @@ def dead_workers(engine: sa.Engine, silent_s: float, except_id: str = "") -> lis
 
 def take_over(engine: sa.Engine, dead: Collection[str]) -> list[str]:
     """Puts the running workflows of dead workers, and of those that have no row any more, back into their queues.
-    Workflows that another worker has taken meanwhile are left alone. Returns the ids of the workflows that were put
-    back."""
+    Workflows that another worker has taken meanwhile stay. Returns the ids of the workflows put back."""
     job = engine_jobs(engine)
     with engine.connect() as connection:
         holders = {*connection.scalars(sa.select(job.c.executor_id).where(job.c.status == RUNNING).distinct())}

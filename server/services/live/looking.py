@@ -1,8 +1,7 @@
 """Finds the head in one set of pictures after the other, in a child process that remembers the last head.
 
 The pictures arrive already reduced in size. Light and sharpness are measured on the pictures, sharpness for one camera
-in each set; faces are searched at ``SMALL_PX``. A face that some cameras miss is searched again in one of them for each
-set.
+in each set; faces are searched at ``SMALL_PX``. A missing face is searched again in one camera of each set.
 """
 
 from collections.abc import Mapping

@@ -92,8 +92,7 @@ class Word:
 
 
 class WordOut(Answer):
-    """Describes one instruction. ``camera``: the camera that the instruction is about; null: it is about the
-    subject."""
+    """Describes one instruction. ``camera``: the camera that the instruction concerns; null: the subject."""
 
     code: str
     text: str

@@ -30,8 +30,7 @@ LOOKING = 0.5  # cosine: both eyes are seen
 
 
 class Speaker:
-    """Converts successive sets of findings to lamps and instructions. A speaker remembers the findings of the last
-    second."""
+    """Converts successive sets of findings to lamps and instructions, remembering the last second's findings."""
 
     def __init__(self) -> None:
         self._since: dict[tuple[str, str | None], float] = {}
