@@ -18,7 +18,7 @@ SHEET, SHEET_PDF = "sheet.html", "sheet.pdf"
 
 def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]:
     """Writes the table and the sheets of all captures of a batch, including those of other parts, and returns the
-    files. Each file is replaced atomically. Raises OSError."""
+    files. Each written file is replaced atomically. Raises OSError."""
     folder.forget_failures_but_of({task.capture.name for task in tasks})
     columns = columns_of(expressions_of(task.model for task in tasks))
     outcomes = [_outcome(folder, task) for task in tasks]

@@ -175,7 +175,7 @@ class Batches:
         which batches have finished.
 
         The service calls ``serve`` every ``poll_s`` seconds. ``serve`` may run in several processes at once: a
-        transaction that locks the batch's row assigns the jobs. After a kill the next call repeats the steps.
+        transaction that locks the batch's row assigns the jobs. After a kill the next call of ``serve`` goes on.
         """
         for identity, jobs in self._index.recalled().items():  # also those that an ended process left
             self._take_back(identity, jobs)

@@ -51,7 +51,7 @@ def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: 
 
 def _await_workers(store: Store, jobs: Collection[str]) -> None:
     """Waits until no job has a folder ``attempt-*``, which exists while a worker writes, or until ``CANCEL_S`` seconds
-    have passed: a killed worker leaves its folder. Without this wait a worker could restore erased files."""
+    have passed: a killed worker leaves its folder. Without the wait a worker could restore erased files."""
     deadline = time.monotonic() + CANCEL_S
     folders = [store.folder("jobs", job) for job in jobs]
     while any([*folder.glob("attempt-*")] for folder in folders) and time.monotonic() < deadline:

@@ -92,8 +92,8 @@ def _queues(service: Service) -> CheckOut:
 
 
 def check_egl(service: Service) -> None:
-    """Makes an OpenGL context in a child process and stores the finding for ``readiness``. The call blocks for a second
-    or more; each process makes this test once."""
+    """Makes an OpenGL context in a child process and stores the finding for ``readiness``. The test blocks for a second
+    or more; each process makes it once."""
     try:
         with service.children.one() as child:
             service.known["egl"] = CheckOut(ok=True, detail=verbatim(child.remote(try_egl)()))

@@ -7,7 +7,7 @@ intervened (``STOPPED``).
 Retention also removes unreferenced data from object stores: results of jobs that were removed while a worker still
 wrote, and results and captures' files that a restored database lacks. Several services may remove data from one store
 at once. The row of a job is written before its result, and the store is listed before the rows are read, so a new
-result is never mistaken for one without a job. Each database removes only results of its own store.
+result is never mistaken for one without a job. Each database removes results only from its own store.
 """
 
 import json
@@ -85,8 +85,7 @@ def sweep(service: Service) -> dict[str, int]:
 def _trusts_clock(service: Service) -> bool:
     """Compares the clock with the last sweep's. Since the last sweep the clock may have advanced by at most a day more
     than the machine ran; after a restart of the machine any advance is accepted, unless half of all records, and at
-    least ``MANY``, would be removed at once. A doubtful clock is noted in ``STOPPED``, which is valid until its
-    removal."""
+    least ``MANY``, would be removed at once. A doubtful clock is noted in the file ``STOPPED`` until its removal."""
     stopped, path = service.settings.data / STOPPED, service.settings.data / LAST_SWEEP
     now, up, boot = time.time(), time.clock_gettime(time.CLOCK_BOOTTIME), BOOT.read_text().strip()
     with suppress(FileNotFoundError, ValueError, KeyError, TypeError):

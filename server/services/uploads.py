@@ -60,8 +60,8 @@ class ResumableUploads:
         raise NotFound(compose("thing-upload"), identity)
 
     def offset(self, record: UploadRecord) -> int:
-        """Returns how many bytes of an upload were received. After the capture was made the full length is returned,
-        although the data was deleted."""
+        """Returns how many bytes of an upload were received. After the upload became a capture, this is the upload's
+        full length, although the data was deleted."""
         if record.capture is not None:
             return record.length
         return self.data(record).stat().st_size

@@ -137,7 +137,7 @@ class UploadRecord:
 
 @dataclass(frozen=True, slots=True)
 class RigAdjustment:
-    """Holds the settings of cameras, by name, and the lamps of a shot that the operator changed. None stands for the
+    """Holds the settings of cameras, by name, and the lamps of a shot that the operator changed. A None stands for the
     value of rig.toml."""
 
     cameras: dict[str, dict[str, float | None]]
