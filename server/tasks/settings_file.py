@@ -32,8 +32,8 @@ def reason_of(error: OSError | ValueError | RecursionError) -> str:
 def settings_document(
     path: Path | None, *, strict: bool = False, **options: str | bool | Mapping[str, object] | None
 ) -> dict[str, object]:
-    """Returns the settings of a TOML or JSON file, or none without a file, overridden by ``options``. Tables in both
-    are merged. ``strict``: a camera without usable pictures is an error. Raises InputError for a bad file."""
+    """Returns the settings of a TOML or JSON file (none without one), overridden by ``options``, whose tables are
+    merged with the file's. ``strict``: a camera without usable pictures fails. Raises InputError for a bad file."""
     document = merged_settings({} if path is None else read_settings_file(path), options)
     codes = document.get("fail_on", [])
     return document | ({"fail_on": [*codes, LOST]} if strict and isinstance(codes, list) else {})
