@@ -50,7 +50,7 @@ def find_captures(folder: Path, out: Path) -> tuple[BatchCapture, ...]:
     """Finds all captures below a folder, sorted by name. Skips ``out`` and folders of results.
 
     Raises InputError if there is none, if the folder itself is a capture, and if the results of several captures would
-    have one folder (it names all of them).
+    have one folder (the error names all of them).
     """
     if is_capture(folder) and (find_rig_file(folder) is not None or entry(folder, "images").is_dir()):
         raise InputError(folder.name, [compose("batch-folder-is-capture")])
@@ -116,8 +116,8 @@ def _walk(folder: Path, out: Path) -> Iterator[Path]:
 
 
 def _name(path: Path, folder: Path) -> str:
-    """Returns a capture's name: its path below ``folder``, or its last part if it lies elsewhere, without an archive's
-    suffix."""
+    """Returns a capture's name: its path below ``folder``, or the path's last part if the capture lies elsewhere,
+    without an archive's suffix."""
     below = path.relative_to(folder) if path.is_relative_to(folder) else Path(path.resolve().name)
     name = below.as_posix()
     if path.is_dir():
@@ -231,7 +231,7 @@ class Shard:
         return f"{self.number}/{self.count}"
 
     def takes(self, name: str) -> bool:
-        """Returns whether the capture with this name belongs to this part. Each capture belongs to exactly one part."""
+        """Returns whether the capture with this name belongs to this part; each capture belongs to exactly one."""
         digest = hashlib.sha256(name.encode()).digest()
         return int.from_bytes(digest[:8], "big") % self.count == self.number - 1
 
@@ -265,8 +265,8 @@ def files_sha256(files: Mapping[str, str]) -> str:
 
 
 def _files(folder: Path, prefix: str, within: frozenset[tuple[int, int]]) -> Iterator[tuple[str, Path]]:
-    """Yields the files below a capture with their paths, following links. ``within`` are the enclosing folders, to stop
-    at circular links."""
+    """Yields the files below a capture with their paths, following links. ``within`` identifies the enclosing folders,
+    so that circular links end."""
     state = folder.stat()
     if (here := (state.st_dev, state.st_ino)) in within:
         return

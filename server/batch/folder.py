@@ -1,6 +1,6 @@
 """Manages the output folder of a batch: results by name, each complete or absent, and records of unfinished work.
 
-NAME/             a result as ``eigenhead reconstruct`` writes it, and batch.json: what it was made from
+``NAME/``         a result as ``eigenhead reconstruct`` writes it, and batch.json: what it was made from
 heads.csv heads.parquet sheet.html sheet.pdf
 .batch/           K-of-N.lock (a share at work), attempts/K-of-N.* (a result in the making), failures/: gone when
                   nothing is at work and none failed
@@ -32,7 +32,7 @@ FOUND_FILES = ("cameras.json", "calibration.json", "calibration.html", "masks") 
 
 
 class ForeignFiles(EigenheadError):
-    """Reports that the folder of a result holds other files too, so it must not be replaced."""
+    """Reports that the folder of a result holds files of no result, so the folder must not be replaced."""
 
     def __init__(self, folder: Path, names: list[str]) -> None:
         super().__init__(compose("batch-foreign-files", folder=str(folder), names=names[:5]))
@@ -157,7 +157,7 @@ class BatchFolder:
         """Renames the finished result of an attempt to its final place, replacing an earlier result of that name, and
         removes the failure record.
 
-        Raises ForeignFiles, and OSError if a process that divides the batch differently has just published it.
+        Raises ForeignFiles, and OSError if a process that divides the batch otherwise has just published that result.
         """
         complete, target = attempt / "result", self.result(name)
         self.check_replaceable(name)
@@ -172,7 +172,7 @@ class BatchFolder:
         self.failure_file(name).unlink(missing_ok=True)
 
     def check_replaceable(self, name: str) -> None:
-        """Raises ForeignFiles if the folder of a result holds other files too."""
+        """Raises ForeignFiles if the folder of a result holds files that are no part of a result."""
         try:
             entries = sorted(path.name for path in self.result(name).iterdir())
         except FileNotFoundError:
@@ -181,7 +181,7 @@ class BatchFolder:
             raise ForeignFiles(self.result(name), foreign)
 
     def failure(self, name: str) -> FailureRecord | None:
-        """Reads why the latest attempt at a capture failed. Returns None if there is no such record."""
+        """Reads why the latest attempt at a capture failed. Returns None if no failure is recorded."""
         with suppress(OSError, ValueError, KeyError, TypeError):
             record = json.loads(self.failure_file(name).read_text(encoding="utf-8"))
             origin = None if record["origin"] is None else Origin(**record["origin"])

@@ -60,8 +60,8 @@ ul { margin: 4px 0 0; padding-left: 1.1em; font-size: 13px; } code { font-size: 
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """Holds what the sheet shows of one capture. ``of``: subject and session; ``messages``: its warnings, or why it
-    failed; ``turntable``: the picture with its views; ``link``: address of its result, relative to the sheet."""
+    """Holds what the sheet shows of one capture. ``of``: subject and session; ``messages``: the capture's warnings, or
+    why the capture failed; ``turntable``: the picture with its views; ``link``: the result's address from the sheet."""
 
     name: str
     of: str
@@ -78,7 +78,7 @@ def severity(code: str) -> str:
 
 
 def card_class(card: Card) -> str:
-    """Returns the CSS class for a card's colour: its worst warning, or its state if it is not done."""
+    """Returns the CSS class for a card's colour: its worst warning's, or the state's of an unfinished capture."""
     if card.state != "done":
         return card.state
     severities = {severity(message["code"]) for message in card.messages}

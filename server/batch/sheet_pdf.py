@@ -1,8 +1,8 @@
 """Draws the contact sheet of a batch as a PDF, to be printed or sent: the cards of ``server.batch.sheet``, two beside
 each other on A4 pages.
 
-The fonts of a PDF contain only Latin-1 letters. A name with other letters is drawn as a picture; in messages such
-letters become question marks. The sheet contains no times, so that equal results give equal bytes.
+The fonts of a PDF contain only Latin-1 letters. A name with letters outside Latin-1 is drawn as a picture; in messages
+such letters become question marks. The sheet contains no times, so that equal results give equal bytes.
 """
 
 from collections.abc import Iterator, Sequence

@@ -18,7 +18,7 @@ SHEET, SHEET_PDF = "sheet.html", "sheet.pdf"
 
 def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]:
     """Writes the table and the sheets of all captures of a batch, including those of other parts, and returns the
-    files. Each file is replaced atomically. Raises OSError."""
+    files. Each written file is replaced atomically. Raises OSError."""
     folder.forget_failures_but_of({task.capture.name for task in tasks})
     columns = columns_of(expressions_of(task.model for task in tasks))
     outcomes = [_outcome(folder, task) for task in tasks]
@@ -50,8 +50,8 @@ def _outcome(folder: BatchFolder, task: BatchTask) -> Outcome:
 
 
 def _result(folder: BatchFolder, task: BatchTask) -> tuple[Origin | None, dict[str, Any] | None]:
-    """Returns origin and report of a capture's result if it was made with these settings and this model; otherwise
-    None, None."""
+    """Returns origin and report of a capture's result if it was made with the task's settings and model, otherwise None
+    twice."""
     origin = folder.origin(task.capture.name)
     wanted = task.settings_sha256, task.model_sha256
     if origin is None or (origin.settings_sha256, origin.model_sha256) != wanted:

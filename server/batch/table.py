@@ -1,8 +1,8 @@
 """Builds the table of a batch: one row for each capture, with the columns of ``columns_of``.
 
-It reads results' reports and failure records and computes plain values. Lengths are mm, in the world frame; there are
-no angles. A cell is None if the capture has no such value. The table is written as CSV and, if pyarrow is installed, as
-Parquet with units.
+The module reads results' reports and failure records and computes plain values. Lengths are mm, in the world frame;
+there are no angles. A cell of the table is None if the capture lacks its value. The table is written as CSV and, if
+pyarrow is installed, as Parquet with units.
 """
 
 import csv
@@ -29,8 +29,8 @@ CSV, PARQUET = "heads.csv", "heads.parquet"
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Describes one column of the table. ``unit`` is empty if it has none; ``words`` is its description in
-    docs/batch.md."""
+    """Describes one column of the table. ``unit`` is empty if the column has none; ``words`` is the column's
+    description in docs/batch.md."""
 
     name: str
     kind: Literal["text", "number", "count", "flag"]
@@ -40,8 +40,8 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Holds the outcome of a capture: ``report`` and ``origin`` if it is done, ``failure`` if it failed, neither if it
-    is not made yet. ``link``: the address of its result on the sheet."""
+    """Holds the outcome of a capture: ``report`` and ``origin`` if it is done, ``failure`` if it failed, neither if the
+    head is not made yet. ``link``: the address of the capture's result, for the sheet."""
 
     capture: BatchCapture
     result: Path
@@ -206,7 +206,7 @@ def write_table(folder: Path, columns: Sequence[Column], rows: Sequence[Row]) ->
 
 
 def has_parquet() -> bool:
-    """Returns whether Parquet files can be written here, which needs pyarrow."""
+    """Returns whether Parquet files can be written in this installation, which needs pyarrow."""
     try:
         import pyarrow.parquet  # noqa: F401
     except ImportError:

@@ -30,7 +30,7 @@ Said = Annotated[
 
 
 class MessageOut(BaseModel):
-    """Holds a message of the service as data. A program can show it in another language by its ``code`` and
+    """Holds a message of the service as data. A program can show the message in another language by its ``code`` and
     ``parameters``."""
 
     code: str = Field(description="stable; decides what parameters there are")
@@ -44,14 +44,14 @@ class MessageOut(BaseModel):
 
 
 class Answer(BaseModel):
-    """Is the base of all documents of the service; they can also be read from a record with equal fields."""
+    """Is the base of all documents of the service; a document can also be read from a record with equal fields."""
 
     model_config = ConfigDict(frozen=True, from_attributes=True)
 
 
 def as_data(field: str, form: Any = MessageOut) -> Any:
-    """Returns a field of an ``Answer`` that holds the message of the text field ``field`` as data. ``form``:
-    ``MessageOut``, with ``| None`` if there may be none, or a list of it."""
+    """Returns a field of an ``Answer`` that holds the message of the text field ``field`` as data. ``form``: the
+    field's type: ``MessageOut``, ``MessageOut | None`` or a list of ``MessageOut``."""
 
     def read(self: Answer) -> Any:
         said = getattr(self, field)

@@ -1,6 +1,6 @@
 """Makes the table and the contact sheet of a batch of the service, with the code that ``eigenhead batch`` uses.
 
-This is a separate module because it imports the code that measures and draws heads, which takes a second and would
+The module is separate because it imports the code that measures and draws heads: this import takes a second and would
 delay the start of the service.
 """
 
@@ -24,7 +24,7 @@ from server.storage.store import Store
 
 def batch_columns(batch: BatchOut) -> tuple[Column, ...]:
     """Returns the columns of a batch's table: those of every head, and those of each expression of the batch's model.
-    Columns of expressions are left out if the model was removed meanwhile."""
+    Columns of expressions are left out if the batch's model is no longer installed."""
     expressions: list[str] = []
     with suppress(UnknownModel):  # it was removed since
         expressions = expressions_of([batch.model])
@@ -33,7 +33,7 @@ def batch_columns(batch: BatchOut) -> tuple[Column, ...]:
 
 def batch_rows(batches: Batches, store: Store, batch: BatchOut, columns: Sequence[Column]) -> Iterator[Row]:
     """Yields the rows of a batch's table, in the order of its captures. A capture that was erased, or whose head is not
-    made yet, also has a row."""
+    made yet, also has a row in the table."""
     return (row_of(outcome, columns) for outcome in _outcomes(batches, store, batch))
 
 

@@ -1,9 +1,9 @@
 """Implements batches: many captures, one job each, in the same queues as other jobs and behind them.
 
 A batch states the desired outcome for its captures. ``Batches.serve``, which the service calls every ``poll_s``
-seconds, produces it. It keeps at most ``FED_MOST`` jobs of batches in each queue, so a batch of ten thousand captures
-does not fill the queue. It withdraws the queued jobs of a paused batch and cancels the jobs of a cancelled one. After
-any interruption of a call, the next call continues from the rows in the database.
+seconds, produces the desired outcome. ``serve`` keeps at most ``FED_MOST`` jobs of batches in each queue, so a batch of
+ten thousand captures does not fill the queue. ``serve`` withdraws the queued jobs of a paused batch and cancels the
+jobs of a cancelled one. After an interruption of ``serve``, the next call continues from the rows in the database.
 """
 
 import json
@@ -48,8 +48,8 @@ log = structlog.get_logger()
 @dataclass(frozen=True, slots=True)
 class BatchRequest:
     """Holds the request for a batch: the settings, the captures, and the queue (None: the service's default). Exactly
-    one of these is set: ``captures`` (their ids), ``session`` (its id), or ``prefix`` (the beginning of their labels).
-    Of two jobs the one with the lower ``priority`` runs first."""
+    one of three fields is set: ``captures`` (their ids), ``session`` (its id), or ``prefix`` (the beginning of their
+    labels). Of two jobs the one with the lower ``priority`` runs first."""
 
     work: ReconstructionRequest
     captures: Sequence[str] | None = None
@@ -174,8 +174,8 @@ class Batches:
         """Starts, withdraws and cancels jobs until they agree with the requested states of all batches, and records
         which batches have finished.
 
-        The service calls it every ``poll_s`` seconds. It may run in several processes at once: a transaction that locks
-        the batch's row assigns the jobs. A process killed between two steps loses nothing; the next call repeats them.
+        The service calls ``serve`` every ``poll_s`` seconds. ``serve`` may run in several processes at once: a
+        transaction that locks the batch's row assigns the jobs. After a kill the next call of ``serve`` goes on.
         """
         for identity, jobs in self._index.recalled().items():  # also those that an ended process left
             self._take_back(identity, jobs)
@@ -285,7 +285,7 @@ class Batches:
                     self._webhooks.announce(job_id, "cancelled", self._jobs.client.enqueue)
 
     def _take_back(self, identity: str, jobs: Sequence[str]) -> None:
-        """Removes withdrawn jobs, so that their captures wait again; a job that has ended meanwhile stays."""
+        """Removes withdrawn jobs, so that their captures wait again; a job that ended before its withdrawal stays."""
         for job_id in jobs:
             taken = True
             with suppress(NotFound):  # erased, or removed before this was noted

@@ -21,7 +21,7 @@ class RefusedOne(Answer):
 
 
 class BulkOut(Answer):
-    """Holds the result of an action on many objects. Each id is in one of the two lists."""
+    """Holds the result of an action on many objects. Each id is in one of the lists ``done`` and ``refused``."""
 
     done: list[str]
     refused: list[RefusedOne]

@@ -3,8 +3,8 @@ one of the results is selected for use.
 
 <data>/calibrations/<id>/record.json  board.toml  images/<camera>/<shot>.<ext>  result/cameras.json  calibration.json
 
-A scene has no board.toml, but may have scale.json. Its pictures may show a person, so its images/ are removed once the
-job has ended.
+The pictures of a scene have no board.toml, but may have scale.json. A scene's pictures may show a person, so they are
+removed once the job has ended.
 """
 
 import json
@@ -41,9 +41,9 @@ class Calibrations:
         self._store, self._client, self._queue, self._events = store, client, queue, events
 
     def add(self, folder: Path, source: str, label: str) -> CalibrationOut:
-        """Moves ``folder`` to its final place in the data folder and queues its calibration. The folder contains
-        images/, and board.toml if they show a board; ``source`` is their origin ("upload", "rig"). If the process is
-        killed before the job is queued, ``get`` queues it. Raises InputError for an invalid label."""
+        """Moves ``folder`` to its final place in the data folder and queues its calibration. ``folder`` contains
+        images/, and board.toml if the images show a board; ``source`` is the images' origin ("upload", "rig"). If the
+        process is killed before the job is queued, ``get`` queues the job. Raises InputError for an invalid label."""
         check_texts({"label": label})
         identity = new_id()
         cameras = {path.name: len(list(path.iterdir())) for path in sorted((folder / "images").iterdir())}
@@ -62,7 +62,7 @@ class Calibrations:
         scale: Mapping[str, object] | None = None,
     ) -> CalibrationOut:
         """Queues a calibration from captures. ``board``: the content of a ``board.toml``, None for captures of any
-        scene; ``scale``: of the scene, the content of a ``scale.json``. Raises NotFound for an unknown capture, and
+        scene; ``scale``: the content of a scene's ``scale.json``. Raises NotFound for an unknown capture, and
         InputError for a wrong board or scale, or captures without images."""
         from calibration.board.board import board_from_document, write_board
 
@@ -79,8 +79,8 @@ class Calibrations:
             return self.add(target, "rig", label)
 
     def get(self, identity: str) -> CalibrationOut:
-        """Returns a calibration with its progress or its outcome. Queues the job if the service was killed before it
-        did so. Raises NotFound."""
+        """Returns a calibration with its progress or its outcome. Queues the calibration's job if the service was
+        killed before it queued one. Raises NotFound."""
         record = self._store.calibration(identity)
         row = self._row(identity)
         state = STATES[row.status] if row else "queued"
@@ -128,8 +128,8 @@ class Calibrations:
         return StoredFile(path, sha256_of(path))
 
     def remove(self, identity: str) -> None:
-        """Removes a calibration, its pictures and its result. A rig that uses it keeps its own copy of cameras.json.
-        Raises NotFound, and Conflict while its job is queued or runs."""
+        """Removes a calibration, its pictures and its result. A rig that uses the calibration keeps its own copy of
+        cameras.json. Raises NotFound, and Conflict while the calibration's job is queued or runs."""
         if self.get(identity).state not in FINISHED:
             raise Conflict("calibration-active", compose("calibration-active"))
         self._store.remove(self._store.folder("calibrations", identity))
@@ -180,5 +180,5 @@ def link_shots(store: Store, folder: Path, captures: list[str]) -> None:
 
 
 def _messages(kept: Iterable[object]) -> tuple[Message, ...]:
-    """Reads messages; earlier versions stored them as texts."""
+    """Reads messages, which earlier versions stored as texts."""
     return tuple(read_message(one) for one in kept)

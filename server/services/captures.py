@@ -87,8 +87,8 @@ class Captures:
         return self._shoot(self._rig, about, seed, board=board)
 
     def sample(self) -> CaptureRecord:
-        """Takes a shot of the simulated studio, even if the service has a real rig. It shows no real person, so no
-        consent is needed. Raises Unavailable and DiskFull."""
+        """Takes a shot of the simulated studio, even if the service has a real rig. A simulated shot shows no real
+        person, so no consent is needed. Raises Unavailable and DiskFull."""
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
         studio = SimulatedRig(self._store.data / "rig" / "none")
         try:
@@ -135,8 +135,8 @@ class Captures:
         return ArchiveLimits(members=s.archive_members, total_bytes=s.archive_bytes, ratio=s.archive_ratio)
 
     def page(self, query: CaptureQuery, limit: int = 100, cursor: str | None = None) -> Page[CaptureRecord]:
-        """Returns one page of the captures that match a query, ``limit`` at most. ``cursor`` is that of the page
-        before. Raises InputError for a cursor of another list."""
+        """Returns one page of the captures that match a query, ``limit`` at most. ``cursor`` is the field ``next`` of
+        the page before. Raises InputError for a cursor of another list."""
         page = self._library.captures(query, limit, cursor)
         return page.of(self.of(page.items))
 
@@ -176,7 +176,7 @@ class Captures:
 
     def tag(self, identity: str, tags: Sequence[str]) -> CaptureRecord:
         """Adds tags to a capture. Raises NotFound, and InputError for invalid tags and if the capture would have too
-        many."""
+        many tags."""
         return self._store.change_capture(identity, lambda r: replace(r, tags=checked_tags([*r.tags, *tags])))
 
     def untag(self, identity: str, tags: Sequence[str]) -> CaptureRecord:
@@ -204,8 +204,8 @@ class Captures:
         raise NotFound(compose("thing-camera-file"), camera, compose("hint-capture-inputs"))
 
     def features(self, identity: str) -> Points:
-        """Returns the stored feature points of a capture, in pixels, by point and camera. It is empty if none were
-        stored. Raises NotFound for an unknown capture and if the points' file is missing or damaged."""
+        """Returns the stored feature points of a capture, in pixels, by point and camera. Returns an empty mapping if
+        no points were stored. Raises NotFound for an unknown capture and if the points' file is missing or damaged."""
         if not self._store.capture(identity).features:
             return {}
         path = self._store.folder("captures", identity) / "files" / "features.json"
@@ -216,7 +216,7 @@ class Captures:
 
     def put_features(self, identity: str, points: Points) -> CaptureRecord:
         """Checks feature points (pixels, by point and camera) against the capture's cameras and stores them in place of
-        earlier ones. Raises NotFound, Conflict for a capture of the calibration board, and InputError naming every
+        earlier points. Raises NotFound, Conflict for a capture of the calibration board, and InputError naming every
         point that does not fit."""
         refuse_board(self._store.capture(identity))
         folder = self._store.capture_files(identity)
@@ -236,7 +236,7 @@ class Captures:
 
     def check_unused(self, identity: str) -> CaptureRecord:
         """Returns the record of a capture that no queued or running job needs. Raises NotFound, and Conflict naming the
-        jobs that need it."""
+        jobs that need the capture."""
         record = self._store.capture(identity)
         if active := self._jobs.active(capture=identity):
             named = [compose("job-named", job=job) for job in active]
@@ -244,8 +244,8 @@ class Captures:
         return record
 
     def remove(self, identity: str) -> None:
-        """Removes a capture with its pictures and caches. Its jobs and their results stay. Raises NotFound, and
-        Conflict while a queued or running job needs it."""
+        """Removes a capture with its pictures and caches. The capture's jobs and their results stay. Raises NotFound,
+        and Conflict while a queued or running job needs the capture."""
         self.check_unused(identity)
         self._store.remove_capture(identity)
 
@@ -267,7 +267,7 @@ class Captures:
         """Cancels the jobs of a capture, then removes every trace of it: pictures, heads, caches and rows of the job
         database.
 
-        An interrupted call can be repeated. Raises NotFound, and Unavailable while a worker still writes.
+        An interrupted erasure can be repeated. Raises NotFound, and Unavailable while a worker still writes a result.
         """
         self._store.capture(identity)
         erase_captures(self._store, self._jobs, [identity])
@@ -275,7 +275,7 @@ class Captures:
 
     def _check_consent(self, session: str | None, *, board: bool = False) -> None:
         """Raises NotFound for an unknown session, and Conflict if the service requires consent and the session has no
-        note of it; a ``board`` needs none."""
+        note of it; a shot of the ``board`` needs no consent."""
         consent = "" if session is None else self._store.session(session).consent
         if self._settings.ask_consent and not consent.strip() and not board:
             raise Conflict("consent-missing", compose("consent-missing"))

@@ -38,7 +38,7 @@ UNDER_WAY = ("waiting", "delivering")
 
 def destination(url: str, settings: ServiceSettings) -> str:
     """Returns a destination named by a caller, with a slash at its end. Raises Forbidden if the service allows no
-    deliveries, and InvalidInput ("url-refused")."""
+    deliveries, and InvalidInput ("url-refused") for a forbidden destination."""
     if not settings.deliver_prefixes:
         raise Forbidden("deliveries-off", compose("deliveries-off"))
     place = url if url.endswith("/") else f"{url}/"
@@ -49,7 +49,7 @@ def destination(url: str, settings: ServiceSettings) -> str:
 def enqueue_delivery(
     enqueue: Callable[..., Any], job_id: str, to: str, settings: ServiceSettings, webhook: JobWebhook | None
 ) -> None:
-    """Queues the delivery of a job's result. Repeating the call changes nothing."""
+    """Queues the delivery of a job's result. A second call for the same job changes nothing."""
     wanted: DeliveryRequest = {"job_id": job_id, "to": to, "until": time.time() + settings.deliver_hours * HOUR_S}
     if webhook is not None:
         wanted["webhook"] = webhook
@@ -87,7 +87,7 @@ class Deliveries:
         }
 
     def forget(self, job_id: str) -> None:
-        """Ends the delivery of a job, if any, and removes its row; delivered files stay."""
+        """Ends the delivery of a job, if any, and removes the delivery's row; delivered files stay."""
         self.client.cancel_workflow(delivery_id(job_id))
         self.client.delete_workflow(delivery_id(job_id))
 

@@ -17,7 +17,7 @@ CANCEL_S = 5.0  # a cancelled job lets go of its files within one second
 
 
 class HoldingsOut(Answer):
-    """Lists the stored data of a capture. A removal deletes the pictures, an erasure everything."""
+    """Lists the stored data of a capture. A removal of the capture deletes its pictures, an erasure all its data."""
 
     pictures: int
     bytes: int = Field(description="of images, clean plates and caches")
@@ -31,7 +31,7 @@ def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: 
     """Cancels the jobs of the captures, and the jobs ``others``, then removes their results, pictures, caches and rows
     of the job database, messages to webhooks and labels of batches included.
 
-    A call that was interrupted is completed by a second one. Raises Unavailable if a worker still writes ``CANCEL_S``
+    An interrupted erasure is completed by a second call. Raises Unavailable if a worker still writes ``CANCEL_S``
     seconds after its job was cancelled.
     """
     of_captures = {job.id for capture in captures for job in jobs.find(capture=capture, limit=100_000)} | {*others}
@@ -51,7 +51,7 @@ def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: 
 
 def _await_workers(store: Store, jobs: Collection[str]) -> None:
     """Waits until no job has a folder ``attempt-*``, which exists while a worker writes, or until ``CANCEL_S`` seconds
-    have passed: a killed worker leaves its folder. Otherwise a worker could restore erased files."""
+    have passed: a killed worker leaves its folder. Without the wait a worker could restore erased files."""
     deadline = time.monotonic() + CANCEL_S
     folders = [store.folder("jobs", job) for job in jobs]
     while any([*folder.glob("attempt-*")] for folder in folders) and time.monotonic() < deadline:

@@ -1,7 +1,7 @@
 """Describes how a job failed: the exception that the job engine stores, and the failure that clients get.
 
-The job engine keeps requests, results and errors as JSON (``SERIALIZER``). Rows of versions before 0.3 are pickled;
-reading them builds only plain values and JobFailed, so no row can run code.
+The job engine keeps requests, results and errors as JSON (``SERIALIZER``). Rows of the job database from versions
+before 0.3 are pickled; reading such rows builds only plain values and JobFailed, so no row can run code.
 """
 
 import base64
@@ -27,7 +27,7 @@ log = structlog.get_logger()
 
 
 class JobFailed(EigenheadError):
-    """Reports a job that cannot succeed, however often it is repeated. The job engine stores ``data`` of it."""
+    """Reports a job that cannot succeed, however often it is repeated. The job engine stores the error's ``data``."""
 
     def __init__(self, kind: str, detail: Message | Kept, errors: Iterable[Message | Kept] = ()) -> None:
         super().__init__(_read(detail))
@@ -38,7 +38,7 @@ class JobFailed(EigenheadError):
         return self.detail.text
 
     def __setstate__(self, state: object) -> None:
-        """Ignores attributes, which earlier versions also stored as texts; the arguments contain the same data."""
+        """Ignores an error's attributes, which earlier versions also stored: its arguments contain the same data."""
 
 
 class _PlainUnpickler(pickle.Unpickler):

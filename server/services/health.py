@@ -32,8 +32,8 @@ log = structlog.get_logger()
 
 
 def readiness(service: Service) -> dict[str, CheckOut]:
-    """Checks database, disk, workers, queues, OpenGL (EGL), rig, records and results. Returns one finding for each, by
-    name. Tolerates a database that does not answer."""
+    """Checks database, disk, workers, queues, OpenGL (EGL), rig, records and results. Returns one finding for each of
+    these parts, by name. Tolerates a database that does not answer."""
     return {
         "database": _database(service),
         "disk": _disk(service),
@@ -80,7 +80,7 @@ def _workers(service: Service) -> CheckOut:
 
 
 def _queues(service: Service) -> CheckOut:
-    """Names queues whose jobs wait without a worker. The service is still ready for other work."""
+    """Names queues whose jobs wait without a worker, while the service is still ready for other work."""
     try:
         queued = service.jobs.index.queued()
         idle = {queue: found.jobs for queue, found in queued.items() if service.jobs.queue_notice(queue)}
@@ -92,8 +92,8 @@ def _queues(service: Service) -> CheckOut:
 
 
 def check_egl(service: Service) -> None:
-    """Makes an OpenGL context in a child process and stores the finding for ``readiness``. This takes a second or more,
-    during which the call blocks; each process does it once."""
+    """Makes an OpenGL context in a child process and stores the finding for ``readiness``. The test blocks for a second
+    or more; each process makes it once."""
     try:
         with service.children.one() as child:
             service.known["egl"] = CheckOut(ok=True, detail=verbatim(child.remote(try_egl)()))

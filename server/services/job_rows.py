@@ -48,7 +48,7 @@ def by_state(query: JobQuery) -> JobQuery:
 
 
 def request_of(row: WorkflowStatus) -> JobRequest | None:
-    """Returns a copy of a job's request; None if its input cannot be read."""
+    """Returns a copy of a job's request; None if the row's input cannot be read."""
     return cast(JobRequest, dict(row.input["args"][0])) if row.input else None
 
 

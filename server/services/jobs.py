@@ -60,7 +60,7 @@ def migrate(settings: ServiceSettings) -> None:
 
 
 class JobQueries:
-    """Answers what is asked about the jobs of one service. Methods block on the database: call them from a thread."""
+    """Answers queries about the jobs of one service. Methods block on the database: call them from a thread."""
 
     def __init__(self, settings: ServiceSettings, store: Store, engine: sa.Engine, library: Library) -> None:
         self._settings, self._store, self._engine, self._library = settings, store, engine, library
@@ -84,7 +84,7 @@ class JobQueries:
         return self._jobs([self._known(job_id)])[0]
 
     def request(self, job_id: str) -> JobRequest | None:
-        """Returns the request of a job, or None if it cannot be read. Raises NotFound."""
+        """Returns the request of a job, or None if the request cannot be read. Raises NotFound."""
         return request_of(self._known(job_id))
 
     def state(self, job_id: str) -> State:
@@ -94,7 +94,7 @@ class JobQueries:
     def find(
         self, *, state: str | None = None, capture: str | None = None, session: str | None = None, limit: int = 100
     ) -> list[JobOut]:
-        """Returns jobs, newest first, ``limit`` at most. They can be restricted to one state, capture or session."""
+        """Returns jobs, newest first, ``limit`` at most, of one state, capture or session if not None."""
         ids = None if capture is None and session is None else self.index.ids_of(capture, session)
         if ids == []:
             return []
@@ -128,7 +128,7 @@ class JobQueries:
         return {capture: [(job, STATES[status]) for job, status in jobs] for capture, jobs in found.items()}
 
     def active(self, *, capture: str | None = None, key: str | None = None) -> list[str]:
-        """Lists the ids of queued and running jobs. They can be restricted to one capture or API key."""
+        """Lists the ids of queued and running jobs, of one capture or API key if not None."""
         wanted = {k: v for k, v in {"capture": capture, "key": key}.items() if v is not None}
         rows = self.client.list_workflows(
             name=WORKFLOW, status=STATUSES["queued"] + STATUSES["running"], load_input=False, load_output=False
@@ -146,7 +146,7 @@ class JobQueries:
         return {name: FileEntry(bytes=file.bytes, sha256=file.sha256) for name, file in job.files.items()}
 
     def log(self, job_id: str) -> str:
-        """Returns the log that workers wrote of a job. Raises NotFound for an unknown job and for one that has not
+        """Returns the log that workers wrote of a job. Raises NotFound for an unknown job and for a job that has not
         begun."""
         self.state(job_id)
         try:
@@ -169,8 +169,8 @@ class JobQueries:
         return [job_id for job_id in there if job_id not in known]
 
     def result_file(self, job_id: str, name: str) -> StoredFile:
-        """Returns a file of a job's result. The name is looked up in the job's record. Raises NotFound for an unknown
-        job or file, and Conflict if the job has no result."""
+        """Returns a file of a job's result. The file's name is looked up in the job's record. Raises NotFound for an
+        unknown job or file, and Conflict if the job has no result."""
         file = self.files(job_id).get(name)
         if file is None:
             raise NotFound(compose("thing-file"), name, compose("hint-result-files", job=job_id))
@@ -185,7 +185,7 @@ class JobQueries:
         return folder
 
     def _unless_removed(self, job_id: str) -> None:
-        """Raises NotFound, and removes what was fetched, where the job was erased meanwhile."""
+        """Raises NotFound if the job was erased while its files were fetched, and removes the fetched files."""
         if self.results.objects is not None and self._status(job_id, load=False) is None:
             self.results.erase(job_id)
             raise NotFound(compose("thing-job"), job_id)
@@ -195,7 +195,7 @@ class JobQueries:
 
     def queue_notice(self, queue: str | None) -> Message | None:
         """Returns a message if no live worker serves a queue, so that its jobs cannot begin. Returns None if a live
-        worker serves it."""
+        worker serves the queue."""
         with self._engine.connect() as connection:
             alive = alive_workers(connection, self._settings.silent_s)
             if connection.scalar(sa.select(sa.func.count()).where(alive, workers.c.queue == queue)):
@@ -269,7 +269,7 @@ class JobQueries:
 
 
 class Jobs(JobQueries):
-    """Queues, cancels, repeats and deletes jobs; blocks as the queries do."""
+    """Queues, cancels, repeats and deletes jobs; its methods block on the database."""
 
     def submit(
         self,
@@ -282,7 +282,7 @@ class Jobs(JobQueries):
         priority: int = 100,
     ) -> JobOut:
         """Queues a reconstruction of a capture and returns the job. A repeated request with the same idempotency key
-        returns the job of the first one.
+        returns the job of the first request.
 
         Raises NotFound for an unknown capture; InputError for an unknown model, wrong settings or queue; InvalidInput
         for a webhook that may not be called and for a place where results may not be delivered; Conflict for a capture
@@ -305,7 +305,7 @@ class Jobs(JobQueries):
         return self._enqueue(request, capture.session, key, queue, priority, idempotency_key)
 
     def check_queue(self, queue: str | None) -> None:
-        """Raises InputError for a queue that jobs may not name. None stands for the service's own queue."""
+        """Raises InputError for a queue that jobs may not name. A queue of None stands for the service's own queue."""
         if queue is not None and queue not in self._settings.queues:
             raise InputError("queue", [compose("queue-unknown", queue=f"{queue!r:.40}", queues=self._settings.queues)])
 
@@ -344,8 +344,8 @@ class Jobs(JobQueries):
     def enqueue_within(
         self, connection: sa.Connection, request: JobRequest, session: str | None, batch: BatchRow
     ) -> str:
-        """Queues a job of a batch in the caller's transaction and returns its id. If the transaction fails, there is no
-        job. It does not count towards the limit of jobs of an API key."""
+        """Queues a job of a batch in the caller's transaction and returns its id. If the transaction fails, no job is
+        queued. A batch's job does not count towards the limit of jobs of an API key."""
         job_id = new_id()
         self.index.add_within(connection, job_id, request, session)
         options = enqueue_options(WORKFLOW, batch.queue, job_id)
@@ -364,7 +364,7 @@ class Jobs(JobQueries):
 
     def cancel(self, job_id: str) -> tuple[JobOut, bool]:
         """Cancels a queued or running job; a finished one stays as it is. Returns the job, and whether this call
-        cancelled it. A worker notices within about a second. Raises NotFound."""
+        cancelled it. A worker notices the cancellation within about a second. Raises NotFound."""
         if runs := self.state(job_id) not in FINISHED:
             self.client.cancel_workflow(job_id)
         job = self.get(job_id)
@@ -374,8 +374,8 @@ class Jobs(JobQueries):
 
     def restart(self, job_id: str, wanted: ReconstructionRequest, *, key: str = "local") -> JobOut:
         """Queues a new job for the capture of an earlier job, and records the earlier job's id in it. Model and
-        settings that are None in ``wanted`` are the earlier job's. Raises InputError for wrong ones, NotFound if the
-        job or its capture is gone, and TooMany."""
+        settings that are None in ``wanted`` are the earlier job's. Raises InputError for a wrong model or settings,
+        NotFound if the job or its capture is gone, and TooMany."""
         wanted.check()
         row = self._known(job_id)
         request = request_of(row)
@@ -390,8 +390,8 @@ class Jobs(JobQueries):
         return self._enqueue(request, (row.attributes or {}).get("session"), key, row.queue_name, row.priority or 0)
 
     def delete(self, job_id: str) -> None:
-        """Removes a finished job and its files. The files go first: that needs no room in the database, and the call
-        can be repeated. Raises NotFound, and Conflict for a queued or running job."""
+        """Removes a finished job and its files. The files are removed before the job, since their removal needs no room
+        in the database and can be repeated. Raises NotFound, and Conflict for a queued or running job."""
         if self.state(job_id) not in FINISHED:
             raise Conflict("job-active", compose("job-active"))
         self.deliveries.forget(job_id)

@@ -1,8 +1,8 @@
 """Manages API keys and their scopes, which state the actions that a caller may do.
 
-A key is ``eh_<id>_<secret>``. The database holds only the SHA-256 of the secret. The secret has 256 random bits, so a
-slow hash would not make it harder to guess. Without any key the service answers only its own machine and refuses to
-listen to other machines.
+A key is ``eh_<id>_<secret>``. The database holds only the SHA-256 of an API key's secret. The secret has 256 random
+bits, so a slow hash would not make the secret harder to guess. Without any key the service answers only its own machine
+and refuses to listen to other machines.
 """
 
 import hashlib
@@ -74,7 +74,7 @@ class Keys:
 
     def add_for(self, caller: Caller, name: str, scopes: tuple[str, ...]) -> str:
         """Makes an API key for a caller who already has one, as in ``add``. Raises Forbidden on a service without keys:
-        any process of the machine could make the first key, and it would lock out all other users."""
+        any process of the machine could make the first key, which would lock out all other users."""
         if caller.key == LOCAL:
             raise Forbidden("first-key", compose("first-key-by-command"))
         return self.add(name, scopes)
@@ -129,7 +129,7 @@ def check_address(settings: ServiceSettings, keys: Keys) -> None:
 
 
 def note_keys(data: Path, keys: Keys) -> None:
-    """Records in the data folder whether its service has API keys, so that a lost database does not open it to all."""
+    """Records in the data folder whether the service has API keys, lest a lost database open the service to all."""
     if not keys.any():
         (data / HAS_KEYS).unlink(missing_ok=True)
     elif not (data / HAS_KEYS).exists():

@@ -153,7 +153,7 @@ class CalibrationOut(Answer):
 
 
 class CameraOut(Answer):
-    """Describes a camera of the rig. ``closed``: not used since the start; ``ready``: simulated."""
+    """Describes a camera of the rig: ``closed`` if it was not used since the start, ``ready`` if simulated."""
 
     name: str
     driver: str
@@ -161,8 +161,8 @@ class CameraOut(Answer):
 
 
 class RigOut(Answer):
-    """Describes the rig. ``calibration``: ``own`` if it has a calibration, ``studio`` for the simulated studio without
-    one, null for a real rig without one."""
+    """Describes the rig. ``calibration``: ``own`` if the rig has a calibration, ``studio`` for the simulated studio
+    without one, null for a real rig without one."""
 
     id: str
     kind: Literal["simulated", "real"]
@@ -174,7 +174,7 @@ class RigOut(Answer):
 
 
 class CameraSettingsOut(Answer):
-    """Holds the settings requested of a camera (null: the camera decides), and which of them it rejected."""
+    """Holds the settings requested of a camera (null: the camera decides), and which of them the camera rejected."""
 
     exposure_ms: float | None
     gain_db: float | None

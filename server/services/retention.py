@@ -1,13 +1,13 @@
 """Implements retention: removes old jobs, captures and caches by age, by count and by free space.
 
-It never removes data that a queued or running job needs, or files that the service did not make itself. If the clock
-has jumped, compared with the last sweep and the machine's uptime, nothing is removed until an operator has intervened
-(``STOPPED``).
+Retention never removes data that a queued or running job needs, or files that the service did not make itself. If the
+clock has jumped, compared with the last sweep and the machine's uptime, nothing is removed until an operator has
+intervened (``STOPPED``).
 
-It removes unreferenced data from object stores: results of jobs that were removed while a worker still wrote, and
-results and captures' files that a restored database lacks. Several services may do this at once. The row of a job is
-written before its result, and the store is listed before the rows are read, so a new result is never mistaken for one
-without a job. Each database removes only results of its own store.
+Retention also removes unreferenced data from object stores: results of jobs that were removed while a worker still
+wrote, and results and captures' files that a restored database lacks. Several services may remove data from one store
+at once. The row of a job is written before its result, and the store is listed before the rows are read, so a new
+result is never mistaken for one without a job. Each database removes results only from its own store.
 """
 
 import json
@@ -83,9 +83,9 @@ def sweep(service: Service) -> dict[str, int]:
 
 
 def _trusts_clock(service: Service) -> bool:
-    """Compares the clock with the last sweep's. Since then the clock may have advanced by at most a day more than the
-    machine ran; after a restart of the machine any advance is accepted, unless half of all records, and at least
-    ``MANY``, would be removed at once. Otherwise ``STOPPED`` is written, and is valid until somebody removes it."""
+    """Compares the clock with the last sweep's. Since the last sweep the clock may have advanced by at most a day more
+    than the machine ran; after a restart of the machine any advance is accepted, unless half of all records, and at
+    least ``MANY``, would be removed at once. A doubtful clock is noted in the file ``STOPPED`` until its removal."""
     stopped, path = service.settings.data / STOPPED, service.settings.data / LAST_SWEEP
     now, up, boot = time.time(), time.clock_gettime(time.CLOCK_BOOTTIME), BOOT.read_text().strip()
     with suppress(FileNotFoundError, ValueError, KeyError, TypeError):
@@ -306,7 +306,7 @@ def collect(
 ) -> int:
     """Removes the results of unknown jobs that were written more than ``days`` days ago. ``owner`` names the database,
     ``known`` returns which ids are jobs of it, and ``is_name`` says whether a name may be an id. Returns the number of
-    jobs whose results were removed. If the store is unreachable, it stops, and the next call continues."""
+    jobs whose results were removed. If the store is unreachable, the removal stops, and the next call continues."""
     removed = 0
     try:
         if not _owns(objects, owner, scratch):

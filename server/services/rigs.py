@@ -1,7 +1,7 @@
 """Implements the rig behind ``POST /v1/captures``: the simulated studio, or real cameras that a rig.toml names.
 
-The calibration in use lies in ``<data>/rig/cameras.json``. Every later capture gets a copy of this file. Without it,
-captures get the default: the studio's layout, or the file that rig.toml names.
+The calibration in use lies in ``<data>/rig/cameras.json``. Every later capture gets a copy of the calibration in use.
+Without a calibration in use, captures get the default: the studio's layout, or the file that rig.toml names.
 """
 
 import json
@@ -44,8 +44,8 @@ PREVIEW_QUALITY = 80  # of JPEG, 0 to 100
 class RealRig:
     """Takes shots with the cameras of a rig.toml, one at a time.
 
-    The cameras are opened at the first use and stay open. If opening fails, the next use tries again. Settings that the
-    operator changed are stored beside the calibration in adjusted.json and apply after a restart.
+    The cameras are opened at the first use and stay open. If opening the cameras fails, the next use tries again.
+    Settings that the operator changed are stored beside the calibration in adjusted.json and apply after a restart.
     """
 
     def __init__(self, path: Path, calibration: Path) -> None:
@@ -76,7 +76,7 @@ class RealRig:
 
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument:
         """Takes a shot and writes the capture, with links to the clean plates, or copies of them if the disk has no
-        links. Nothing is written if a camera failed.
+        links. No file is written if a camera failed.
 
         Raises InputError for a seed, and Unavailable if the rig has no calibration (unless ``board`` is set), cannot be
         opened, or a camera fails.
@@ -117,7 +117,7 @@ class RealRig:
 
     def preview(self, camera: str) -> bytes:
         """Takes one picture with one camera and returns it as a JPEG file. Raises NotFound for an unknown camera, and
-        Unavailable if it delivers none."""
+        Unavailable if the camera delivers no picture."""
         check_camera(camera, self._config.names)
         with self._lock:
             image = self._opened().look([camera]).get(camera)
@@ -165,7 +165,7 @@ class RealRig:
         return RigAdjustment({})
 
     def _adjust(self, wanted: RigAdjustment) -> None:
-        """Stores the adjustment; an open rig is opened again, because drivers apply settings only then."""
+        """Stores the adjustment; an open rig is opened again, because drivers apply settings only when they open."""
         config = adjusted(self._from_file, wanted.cameras, wanted.lights)
         self._adjusted.parent.mkdir(exist_ok=True)
         write_atomically(self._adjusted, json.dumps(RIG_ADJUSTMENT.document(wanted), indent=1).encode())
@@ -176,8 +176,8 @@ class RealRig:
                 self._opened()
 
     def take_background(self) -> CleanPlates:
-        """Takes clean plates with all cameras and uses them for later captures. Raises Unavailable if cameras fail.
-        Raises Conflict if the plates show a person; they are kept as a version that ``use_plates`` can still select."""
+        """Takes clean plates with all cameras and uses them for later captures. Raises Unavailable if cameras fail, and
+        Conflict if the plates show a person; ``use_plates`` can still select such plates."""
         with self._lock:
             try:
                 plates = self._opened().take_plates()
@@ -214,7 +214,7 @@ class RealRig:
                 self._session.rig = rig
 
     def close(self) -> None:
-        """Closes the cameras. The next use opens them again."""
+        """Closes the cameras. The next use opens the cameras again."""
         with self._lock:
             if self._session is not None:
                 self._session.close()
@@ -274,7 +274,7 @@ class SimulatedRig:
         return shot
 
     def look(self) -> Mapping[str, ImageRgb]:
-        """Renders what each camera sees. The subject is the same every time."""
+        """Renders what each camera sees. The subject is the same in every call."""
         with self._one_at_a_time:
             return self._child.remote(look)(cameras=list(self._rig().names))
 
@@ -303,8 +303,8 @@ class SimulatedRig:
         raise Conflict("simulated-rig", compose("simulated-rig-fixed"))
 
     def take_background(self) -> CleanPlates:
-        """Takes no pictures, since the studio takes clean plates with every shot. Returns its cameras and a note on
-        this."""
+        """Takes no pictures, since the studio takes clean plates with every shot. Returns the studio's cameras and a
+        note that states the reason."""
         return CleanPlates(self._rig().names, 2, compose("hint-studio-plates"))
 
     def plates(self) -> list[PlatesVersion]:
@@ -316,8 +316,8 @@ class SimulatedRig:
         raise NotFound(compose("thing-plates-version"), version, compose("hint-studio-plates"))
 
     def use(self, calibration: Path) -> None:
-        """Writes the calibration into every later capture in place of the studio's true cameras. Raises Conflict if it
-        has other cameras."""
+        """Writes the calibration into every later capture in place of the studio's true cameras. Raises Conflict if the
+        calibration has other cameras."""
         check_names(read_rig(calibration), self._rig().names)
         self._calibration.parent.mkdir(exist_ok=True)
         write_rig(read_rig(calibration), self._calibration)
@@ -363,7 +363,7 @@ def rig_state(
 
 
 def jpeg(image: ImageRgb) -> bytes:
-    """Encodes an RGB image as a JPEG file. One wider than ``PREVIEW_WIDTH`` pixels is reduced to that width."""
+    """Encodes an RGB image as a JPEG file. An image wider than ``PREVIEW_WIDTH`` pixels is reduced to that width."""
     return encode_image(".jpg", reduced(image, PREVIEW_WIDTH), (cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY))
 
 

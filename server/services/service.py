@@ -37,7 +37,7 @@ from server.tasks.export_archive import export_archive
 
 
 class CheckOut(Answer):
-    """Holds one check of the service: whether it passed and, if not, the remedy. ``starting``: it will soon pass
+    """Holds one check of the service: whether it passed and, if not, the remedy. ``starting``: the check will soon pass
     without intervention."""
 
     ok: bool

@@ -70,7 +70,7 @@ class Sessions:
         return [capture for some in self._library.captures_of(sessions).values() for capture in some]
 
     def _record(self, identity: str) -> SessionRecord | None:
-        """Returns the record; None if it was removed after the index was read."""
+        """Returns a session's record; None if it was removed after the index was read."""
         with suppress(NotFound):
             return self._store.session(identity)
         return None
@@ -92,8 +92,8 @@ class Sessions:
         """Cancels the jobs of a session, then removes every trace of it: pictures, results, caches and rows of the job
         database.
 
-        The session's record is removed last, so an interrupted erasure can be repeated. Captures that arrive meanwhile
-        are removed too. Raises NotFound, and Unavailable while a worker still writes.
+        The session's record is removed last, so an interrupted erasure can be repeated. Captures that arrive during the
+        erasure are removed too. Raises NotFound, and Unavailable while a worker still writes results of the session.
         """
         self._store.session(identity)
         self._erase_captures(identity)

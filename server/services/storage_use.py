@@ -60,8 +60,8 @@ class StorageCount:
         self._at: float | None = None
 
     def use(self) -> StorageOut:
-        """Returns the last count and the disk's current free space. Starts a new count if the last is old, and does not
-        wait for it."""
+        """Returns the last count and the disk's current free space. Starts a new count if the last count is old, and
+        does not wait for its end."""
         old = self._at is None or time.time() - self._at > COUNT_AGAIN_S
         if old and self._looking.acquire(blocking=False):
             threading.Thread(target=self._look, args=(self._store.data,), daemon=True).start()

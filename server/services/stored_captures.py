@@ -1,8 +1,8 @@
 """Maintains the object store of captures: sends waiting files, removes unreferenced ones, and limits the copies in the
 data folder.
 
-A data folder whose captures have no records belongs to a worker. It is only a cache: erased captures are also removed
-from it.
+A data folder whose captures have no records belongs to a worker. A worker's data folder is only a cache, from which
+erased captures are also removed.
 """
 
 import time
@@ -46,7 +46,7 @@ def tend_captures(store: Store, jobs: Jobs, most: int) -> int:
 
 def bound_captures(store: Store, most: int, is_used: Callable[[str], bool]) -> int:
     """Removes the least recently used large files of captures from the data folder, until all of them take at most
-    ``most`` bytes. Each is first compared with its object. Returns the number of their captures."""
+    ``most`` bytes. Each file is first compared with its stored object. Returns how many captures lost files."""
     assert store.blobs is not None
     found, total, removed = [], 0, 0
     for identity in store.ids("captures"):

@@ -1,5 +1,5 @@
 """Checks the texts that people enter: names, labels, notes, and tags by which they find captures. HTTP, forms and the
-console all use these checks."""
+console all use the module's checks."""
 
 import re
 import unicodedata

@@ -23,8 +23,8 @@ AGAIN_S = 30  # Retry-After of one that is refused
 
 
 class Threads:
-    """Runs blocking functions in two thread pools separate from the web framework's. Fifty waiting uploads then do not
-    delay a request for a job's status.
+    """Runs blocking functions in two thread pools separate from the web framework's. With separate pools, fifty waiting
+    uploads do not delay a request for a job's status.
 
     ``checks``: number of checks at once (one key may use all but one); ``check_s``: longest duration of one.
     """
@@ -35,8 +35,8 @@ class Threads:
         self._in_line = Counter[str]()
 
     async def disk(self, function: Callable[..., T], *arguments: Any) -> T:
-        """Runs a function that reads or writes files in a thread and returns its result. At most ``disk`` run at once;
-        others wait."""
+        """Runs a function that reads or writes files in a thread and returns its result. At most ``disk`` such
+        functions run at once; others wait."""
         return await anyio.to_thread.run_sync(function, *arguments, limiter=self._disk)
 
     async def check(
@@ -46,11 +46,11 @@ class Threads:
         key: str,
         hung_up: Callable[[], Awaitable[None]] | None = None,
     ) -> T:
-        """Runs a function that unpacks or checks an upload in a thread and returns its result. Its work in child
-        processes ends after ``check_s`` seconds, or once ``hung_up()`` has returned (the client is gone).
+        """Runs a function that unpacks or checks an upload in a thread and returns its result. The function's work in
+        child processes ends after ``check_s`` seconds, or once ``hung_up()`` has returned (the client is gone).
 
-        At most ``checks`` run at once; others wait. Raises TooMany if too many requests of this key wait, InvalidInput
-        if the time or the memory does not suffice, and Conflict if the client has disconnected.
+        At most ``checks`` such functions run at once; others wait. Raises TooMany if too many requests of API key
+        ``key`` wait, InvalidInput if time or memory does not suffice, and Conflict if the client has disconnected.
         """
         if self._in_line[key] >= IN_LINE_MOST:
             raise TooMany("too-many-checks", compose("too-many-checks", most=IN_LINE_MOST), retry_after_s=AGAIN_S)

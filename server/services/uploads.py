@@ -49,7 +49,7 @@ class ResumableUploads:
         return record
 
     def get(self, identity: str) -> UploadRecord:
-        """Returns the record of an upload. Raises NotFound, also for one that expired."""
+        """Returns the record of an upload. Raises NotFound for an unknown or expired upload."""
         if not is_id(identity):
             raise NotFound(compose("thing-upload"), identity)
         with suppress(OSError, ValueError):
@@ -60,8 +60,8 @@ class ResumableUploads:
         raise NotFound(compose("thing-upload"), identity)
 
     def offset(self, record: UploadRecord) -> int:
-        """Returns how many bytes of an upload were received. After the capture was made this is the full length,
-        although the data was deleted."""
+        """Returns how many bytes of an upload were received. After the upload became a capture, this is the upload's
+        full length, although the data was deleted."""
         if record.capture is not None:
             return record.length
         return self.data(record).stat().st_size
@@ -81,7 +81,7 @@ class ResumableUploads:
     @contextmanager
     def lock(self, identity: str) -> Iterator[None]:
         """Locks an upload while the block runs, so that no other process writes or removes it. The lock ends with the
-        process. Raises Conflict if it is locked already, and NotFound."""
+        process. Raises Conflict if the upload is locked already, and NotFound."""
         with ExitStack() as stack:
             try:
                 stream = stack.enter_context((self._store.folder("uploads", identity) / "upload.json").open("rb"))
@@ -94,7 +94,7 @@ class ResumableUploads:
             yield
 
     def remove(self, identity: str) -> None:
-        """Removes an upload with its data. Does nothing if it is gone."""
+        """Removes an upload with its data. Does nothing if the upload is gone."""
         self._store.remove(self._store.folder("uploads", identity))
 
     def sweep(self) -> int:
@@ -119,5 +119,5 @@ class ResumableUploads:
 
 @lru_cache(maxsize=1 << 14)
 def _read(path: Path, _: int) -> UploadRecord:
-    """Reads a record once for each time (ns) at which it was written."""
+    """Reads an upload's record once for each time (ns) at which the record was written."""
     return UPLOAD.read(json.loads(path.read_bytes()))

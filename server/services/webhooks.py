@@ -1,8 +1,8 @@
 """Webhooks announce to other programs how a job or a batch ended.
 
 Messages and signatures follow https://www.standardwebhooks.com: ``webhook-id``, ``webhook-timestamp`` and
-``webhook-signature: v1,<base64 HMAC-SHA256 of "id.timestamp.body">``. A delivery is a workflow of the job engine, so it
-survives a restart; it is tried nine times in about eight minutes.
+``webhook-signature: v1,<base64 HMAC-SHA256 of "id.timestamp.body">``. The delivery of a message is a workflow of the
+job engine, so it survives a restart; it is tried nine times in about eight minutes.
 """
 
 import base64
@@ -71,8 +71,8 @@ class Webhooks:
         delivered_to: str | None = None,
     ) -> None:
         """Queues one message for each webhook about the state of a job, and one for the job's own webhook if it has
-        one. Each message has an id made of webhook, job and state, so repeating the call changes nothing. ``enqueue``
-        is the job engine's function. ``delivered_to``: where the result lies, if it was delivered."""
+        one. Each message has an id made of webhook, job and state, so a repeated call changes nothing. ``enqueue`` is
+        the job engine's function to queue a workflow; ``delivered_to`` is a delivered result's place."""
         for hook_id in [*(hook.id for hook in self.all()), *([] if job_webhook is None else [OWN])]:
             identity = f"{messages_of(job_id)}{hook_id}-{state}"
             message: WebhookMessage = {"webhook": hook_id, "type": f"job.{state}", "job_id": job_id, "id": identity}
@@ -118,7 +118,7 @@ class Webhooks:
         return httpx.post(hook.url, content=body, headers=headers, timeout=TIMEOUT_S).raise_for_status().status_code
 
     def _post_own(self, message: WebhookMessage, hook: JobWebhook) -> int:
-        """Posts to an address that a caller named, and checks it again, because it may have changed meanwhile."""
+        """Posts to an address that a caller named, after checking anew whether the address is allowed."""
         aim = target(hook["url"], self._origins)
         body, headers = _signed(message, hook["secret"])
         with httpx.Client(trust_env=False, timeout=TIMEOUT_S) as client:

@@ -25,7 +25,7 @@ class ReconstructionRequest:
 
     def check(self) -> None:
         """Raises InputError naming an invalid job name, an unknown model, every wrong setting and a template that the
-        model does not have. So no job fails hours later because of them."""
+        model does not have. The check keeps a job from failing hours later because of such faults."""
         check_texts({"name": self.name}, "request")
         model, settings = self._model_faults(), self._settings_faults()
         if model and settings:

@@ -27,9 +27,9 @@ NONE = "-"  # in the place of a job's id: none is to be made, since the capture 
 
 @dataclass(frozen=True, slots=True)
 class BatchRow:
-    """Holds a batch. ``wish`` is the state that its owner requested: running, paused or cancelled. ``finished`` is the
-    time at which no work remained (ms since 1970), None before. ``rounds`` grows whenever it finishes and whenever its
-    failed jobs are tried again."""
+    """Holds a batch. ``wish`` is the state that the batch's owner requested: running, paused or cancelled. ``finished``
+    is the time at which no work remained (ms since 1970), None before. ``rounds`` grows whenever the batch finishes and
+    whenever its failed jobs are tried again."""
 
     id: str
     created: int
@@ -58,8 +58,8 @@ class BatchItem:
 @dataclass(frozen=True, slots=True)
 class Tally:
     """Counts the items of a batch by status: the job engine's, ``waiting``, or ``gone`` if the capture or job was
-    removed. ``mean_s`` is the mean duration of the succeeded jobs, None before the first. On SQLite the engine stores
-    whole seconds."""
+    removed. ``mean_s`` is the mean duration of the succeeded jobs, None before the first. On SQLite the job engine
+    stores times in whole seconds."""
 
     statuses: Mapping[str, int]
     mean_s: float | None
@@ -72,7 +72,7 @@ class BatchIndex:
         self._engine, self._status = engine, engine_jobs(engine)
 
     def add(self, row: BatchRow, captures: Sequence[str]) -> None:
-        """Adds a batch with its captures in one transaction. Changes nothing if the id is taken."""
+        """Adds a batch with its captures in one transaction. Changes nothing if the batch's id is taken."""
         columns = {name: getattr(row, name) for name in BatchRow.__dataclass_fields__}
         columns |= {"label": storable(row.label), "words": folded(row.label), "settings": json.dumps(row.settings)}
         items = [{"batch_id": row.id, "position": place, "capture_id": one} for place, one in enumerate(captures)]
@@ -171,8 +171,8 @@ class BatchIndex:
         return [BatchItem(row.position, row.capture_id, row.job_id) for row in rows]
 
     def give_jobs_within(self, connection: sa.Connection, identity: str, jobs: Mapping[int, str | None]) -> None:
-        """Writes the job of each item, by position, in the caller's transaction. None: the capture was removed, so the
-        item gets no job."""
+        """Writes the job of each item, by position, in the caller's transaction. A job of None: the item's capture was
+        removed, so the item gets no job."""
         place, job = sa.bindparam("place"), sa.bindparam("job")
         change = sa.update(batch_items).where(batch_items.c.batch_id == identity, batch_items.c.position == place)
         rows = [{"place": position, "job": job_id or NONE} for position, job_id in jobs.items()]
@@ -180,7 +180,7 @@ class BatchIndex:
             connection.execute(change.values(job_id=job), rows)
 
     def recall(self, identity: str, jobs: Collection[str]) -> None:
-        """Marks jobs of a batch for withdrawal. The mark survives a kill, so that a later call can complete it."""
+        """Marks jobs of a batch for withdrawal, so that after a kill a later call can complete the withdrawal."""
         self._change_items(identity, list(jobs), {"recalled": True})
 
     def recalled(self) -> dict[str, list[str]]:
@@ -192,8 +192,8 @@ class BatchIndex:
         return found
 
     def settle_recall(self, identity: str, job_id: str, *, taken: bool) -> None:
-        """Removes the mark from a job. If the job was withdrawn (``taken``), its capture waits again; otherwise the job
-        had ended before and stays."""
+        """Removes the mark for withdrawal from a job. If the job was withdrawn (``taken``), its capture waits again; a
+        job that was not withdrawn had ended before and stays."""
         changed = {"recalled": False, "job_id": None} if taken else {"recalled": False}
         self._change_items(identity, [job_id], changed)
 

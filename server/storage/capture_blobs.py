@@ -2,7 +2,7 @@
 
 The database maps captures to blobs; workers without the service's data folder read both database and store. A blob
 without references is marked dead in the same transaction and is never used again: equal content that comes later gets a
-new name. So any number of processes may remove dead blobs at any time, and never remove one in use.
+new blob. Any number of processes may remove dead blobs at any time, and never remove a blob in use.
 """
 
 import os
@@ -129,7 +129,7 @@ class CaptureBlobs:
 
     def release(self, capture: str, *, later: bool = False) -> None:
         """Removes blobs that only this capture uses from the store, with every version; with ``later`` the next sweep
-        does it. A call that fails is completed by a second one."""
+        removes them. A removal that fails is completed by a second call."""
         self._claim(capture, {}, lambda _: 0)
         if not later:
             self.bury()

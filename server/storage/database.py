@@ -1,7 +1,7 @@
 """Defines the service's own tables, which lie beside the job engine's in one database (an SQLite file or PostgreSQL).
 
-Times of workers, keys and events are seconds since 1970 on the *database's* clock. Two hosts whose clocks differ then
-agree on which worker has stopped its heartbeat.
+Times of workers, keys and events are seconds since 1970 on the *database's* clock. On one clock, hosts whose own clocks
+differ agree on which worker has stopped its heartbeat.
 """
 
 import os

@@ -29,16 +29,16 @@ class JobEvent:
 
 
 class EventLog:
-    """Reads and writes the events of jobs. Within a job their numbers grow from 1, even if another worker takes the job
-    over. A number is missing where its event was superseded. The last event is the job's end, with the key ``END``."""
+    """Reads and writes the events of jobs. Within a job the numbers of events grow from 1, even if another worker takes
+    the job over. A superseded event's number is missing. The last event is the job's end, with the key ``END``."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
 
     def append(self, job_id: str, document: EventDocument, instead_of: int | None = None) -> int | None:
         """Adds an event to a job under the next number, which it returns. ``instead_of``: the number of an event that
-        the new one supersedes. If another writer takes the next number first, it tries again, up to twenty times; then,
-        or if the database does not answer, it drops the event and returns None, because the next event holds more."""
+        the new one supersedes. If another writer takes the next number first, up to twenty attempts follow; then, or if
+        the database does not answer, the event is dropped for the next one, which holds more, and None is returned."""
         event, text = events.c, json.dumps(document)
         following = sa.select(sa.func.coalesce(sa.func.max(event.seq), 0) + 1)
         following = following.where(event.job_id == job_id, event.seq < END)
@@ -61,8 +61,8 @@ class EventLog:
         return None
 
     def end(self, job_id: str, document: EventDocument, *, failure: str | None = None) -> bool:
-        """Adds the end of a job, and counts ``failure``, the kind of a failed job, with it. Returns whether the job had
-        no end before; otherwise nothing changes. A worker may be killed before the job engine knows of the end; the
+        """Adds the end of a job, and counts a failed job under its kind ``failure``. Returns whether the job had no end
+        before; an earlier end stays, uncounted. A worker may be killed before the job engine knows of the end; the
         worker that takes the job over then repeats the call."""
         insert = self._end(job_id, document).on_conflict_do_nothing().returning(events.c.seq)
         with self._engine.begin() as connection:

@@ -1,8 +1,8 @@
 """Caches the faces found in a capture on disk, so that the pages search each capture once.
 
 A file's name is the SHA-256 of everything that its content depends on: the capture's files, the program's version and
-code. It describes a face, so it lies in a folder that ``Store.remove_capture`` erases with its capture, even while a
-search runs. A file that cannot be read is made anew. A result that cannot be written is not cached.
+code. A cached file describes a face, so it lies in a folder that ``Store.remove_capture`` erases with its capture, even
+while a search runs. A cached file that cannot be read is made anew. A result that cannot be written is not cached.
 """
 
 import hashlib
@@ -26,8 +26,8 @@ PixelsOfPoints = dict[str, dict[str, list[float]]]  # by landmark and camera, as
 
 
 def faces_once(folder: Path, inputs: Mapping[str, str], find: Callable[[], JsonObject]) -> JsonObject:
-    """Returns the faces of a capture. If ``folder`` has them from an earlier call, ``find`` is not called; otherwise
-    its result is stored there. ``inputs``: SHA-256 of the capture's files by name."""
+    """Returns the faces of a capture. If ``folder`` has the faces from an earlier call, ``find`` is not called;
+    otherwise the result of ``find`` is stored there. ``inputs``: SHA-256 of the capture's files by name."""
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
     path = folder / (_key(inputs) + SUFFIX)
@@ -50,7 +50,7 @@ def _key(inputs: Mapping[str, str]) -> str:
 @cache
 def code_digest(rooms: tuple[str, ...]) -> str:
     """Returns the SHA-256 of all code in the named folders (paths below ``pipeline``), which is part of a cached file's
-    name, so that new code invalidates the cache. Each process computes it once."""
+    name, so that new code invalidates the cache. Each process computes the hash once."""
     digest = hashlib.sha256()
     for path in sorted(path for room in rooms for path in (PIPELINE / room).glob("*.py")):
         digest.update(path.read_bytes())

@@ -1,7 +1,7 @@
 """Finds jobs by the service's index rows, beside the job engine's own table, which holds the states of jobs.
 
-The engine's table is read only here and in ``batches``, by columns that its migrations keep. All other access goes
-through the engine's client.
+The job engine's table is read only here and in ``batches``, by columns that its migrations keep. All other access to
+that table goes through the engine's client.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -57,7 +57,7 @@ class JobIndex:
             self.add_within(connection, job_id, request, session)
 
     def add_within(self, connection: sa.Connection, job_id: str, request: JobRequest, session: str | None) -> None:
-        """Adds a new job to the index in the caller's transaction. Raises IntegrityError if the index has it
+        """Adds a new job to the index in the caller's transaction. Raises IntegrityError if the index has the job
         already."""
         row = {"job_id": job_id, "capture_id": request["capture_id"], "session": session}
         connection.execute(sa.insert(job_index).values(**row, words=words_of_job(request)))
@@ -69,7 +69,7 @@ class JobIndex:
 
     def complete(self, requests_of: Callable[[list[str]], Mapping[str, JobRequest]]) -> int:
         """Fills in the searchable words in index rows that an earlier version wrote without them. ``requests_of``
-        returns the requests of jobs by id. Returns how many rows there were."""
+        returns the requests of jobs by id. Returns how many rows lacked words."""
         with self._engine.connect() as connection:
             bare = [*connection.scalars(sa.select(job_index.c.job_id).where(job_index.c.words.is_(None)))]
         for some in portions(bare):

@@ -130,7 +130,7 @@ class Library:
 
     def heads_labelled(self, prefix: str) -> list[str]:
         """Lists the ids of the captures that show a head and whose label begins with ``prefix``, oldest first. Upper
-        and lower case count as the same."""
+        and lower case letters of a label count as the same."""
         table, begun = capture_index.c, folded(prefix)
         query = sa.select(table.id, table.label).where(
             table.board.is_(False), table.words.startswith(begun, autoescape=True)
@@ -189,7 +189,7 @@ class Library:
 
     def reconcile(self, changes: Callable[[str], Mapping[str, int]], found: Callable[[str, str], Record | None]) -> int:
         """Makes the index agree with the records in the data folder. Returns how many rows differed. A record that does
-        not fit a row is left out and logged. ``changes`` and ``found`` are those of the ``Store``."""
+        not fit a row is left out and logged. ``changes`` and ``found`` are methods of the ``Store``."""
         mended = 0
         for kind, table in TABLES.items():
             with self._engine.connect() as connection:
@@ -204,8 +204,8 @@ class Library:
         return mended
 
     def _put_fitting(self, table: sa.Table, records: Sequence[Record], changes: Mapping[str, int]) -> int:
-        """Writes the rows of records and returns how many. A record whose values fit no column is left out and logged,
-        so that it does not keep the service from starting."""
+        """Writes the rows of records and returns how many were written. A record whose values fit no column is left out
+        and logged, so that it does not keep the service from starting."""
         try:
             self._put(table, records, changes)
         except UNFIT as error:

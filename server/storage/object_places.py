@@ -3,7 +3,7 @@
 Buckets are S3-compatible and reached through botocore (the extra ``s3``). Credentials come from AWS's usual sources:
 variables, profile, or the role of machine, container or pod. Files of more than one part are uploaded in parts; the
 object appears when the last request completes it. Each request carries the SHA-256 of its bytes, and each object has
-the SHA-256 of its content in its metadata; every read is compared with it.
+the SHA-256 of its content in its metadata, with which every read is compared.
 """
 
 import base64
@@ -46,7 +46,7 @@ T = TypeVar("T")
 
 @lru_cache
 def _client(endpoint: str | None, region: str | None, timeout_s: float) -> Any:
-    """Makes a client, which threads may share; this takes up to a second."""
+    """Makes an S3 client, which threads may share, within about a second."""
     from botocore.config import Config
     from botocore.session import Session
 
@@ -66,8 +66,8 @@ def _client(endpoint: str | None, region: str | None, timeout_s: float) -> Any:
 
 
 class DamagedTransfer(StoreUnavailable):
-    """Reports bytes that were cut off or changed in transit. The transfer is repeated at once; the client itself
-    repeats requests without an answer."""
+    """Reports bytes that were cut off or changed in transit. A damaged transfer is repeated at once; the S3 client
+    itself repeats requests without an answer."""
 
 
 class S3Objects:
@@ -191,7 +191,7 @@ class S3Objects:
         return digest.hexdigest()
 
     def _fetch(self, key: str, path: Path, sha256: str | None, admit: Admission) -> str:
-        """Reads an object once. The client itself verifies the store's checksum; if an object lacks eigenhead's
+        """Reads an object once. The S3 client itself verifies the store's checksum; if an object lacks eigenhead's
         metadata, an ETag of 32 digits is the MD5 of the bytes, unless they are encrypted with a customer's key."""
         with self._asking(key):
             answer = self._client.get_object(**self._at(key))

@@ -92,7 +92,7 @@ class ObjectStore(Protocol):
 
     def erase(self, prefix: str) -> int:
         """Removes all objects whose keys begin with ``prefix``, with all versions and the parts of unfinished uploads.
-        Returns how many were removed."""
+        Returns how many objects were removed."""
         ...
 
 

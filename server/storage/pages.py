@@ -1,8 +1,8 @@
 """Reads pages of a list: the query, a cursor that marks where a page ended, and the condition for rows that come after.
 
 A list continues after the position of its last row (the sort value and, between equal values, the id), not after a
-number of rows. So rows that are added or removed meanwhile neither repeat nor drop others, and the last page is as fast
-as the first.
+number of rows. Rows that are added or removed between two pages neither repeat nor drop others, and the last page is as
+fast as the first.
 """
 
 import base64
@@ -64,7 +64,7 @@ class Order:
 
 def cursor_of(value: Value, identity: str, total: int) -> str:
     """Encodes where a page ended as a cursor: the value and the id of its last row, and how many rows the list had at
-    its first page. Clients send it back and need not understand it."""
+    its first page. Clients send the cursor back and need not understand it."""
     return base64.urlsafe_b64encode(json.dumps([value, identity, total]).encode()).decode().rstrip("=")
 
 
@@ -115,7 +115,7 @@ def page_of(
 
 
 def words_of(sought: str) -> Sequence[str]:
-    """Splits a search into its words, ``WORDS_MOST`` at most, all of which must occur."""
+    """Splits a search into its words, ``WORDS_MOST`` at most, all of which a found row must contain."""
     return folded(sought).split()[:WORDS_MOST]
 
 
@@ -136,5 +136,5 @@ def contains(column: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]
 
 def is_or_ends(identity: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]:
     """Returns the SQL condition that an id is ``word`` or ends with it, since pages show only the ends of ids. A word
-    of fewer than ``ID_LEAST`` characters never matches; it would match too many."""
+    of fewer than ``ID_LEAST`` characters never matches, as it would match too many ids."""
     return identity.endswith(word, autoescape=True) if len(word) >= ID_LEAST else sa.false()

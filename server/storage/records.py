@@ -111,8 +111,8 @@ class SessionRecord:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationRecord:
-    """Holds a calibration that was requested. ``pictures``: number of pictures by camera; ``kind``: their subject,
-    board or scene."""
+    """Holds a calibration that was requested. ``pictures``: number of pictures by camera; ``kind``: what the pictures
+    show, board or scene."""
 
     id: str
     created: str
@@ -137,8 +137,8 @@ class UploadRecord:
 
 @dataclass(frozen=True, slots=True)
 class RigAdjustment:
-    """Holds the settings of cameras, by name, and the lamps of a shot that the operator changed. None: the value of
-    rig.toml."""
+    """Holds the settings of cameras, by name, and the lamps of a shot that the operator changed. A None stands for the
+    value of rig.toml."""
 
     cameras: dict[str, dict[str, float | None]]
     lights: tuple[int, ...] | None = None
@@ -191,14 +191,14 @@ _CHECKS = TypeAdapter(dict[str, ViewChecksOut])
 
 
 def read_checks(document: Any) -> dict[str, ViewDocument]:
-    """Returns the measurements in a ``checks.json`` by camera. Raises ValueError for another document."""
+    """Returns the measurements in a ``checks.json`` by camera. Raises ValueError for a document of another shape."""
     _CHECKS.validate_python(document)
     return document
 
 
 class JobWebhook(TypedDict):
-    """Holds the address to which the end of one job is announced. ``secret`` signs the messages; without it they are
-    not signed."""
+    """Holds the address to which the end of one job is announced. ``secret`` signs the messages; without ``secret`` the
+    messages are not signed."""
 
     url: str
     secret: str | None

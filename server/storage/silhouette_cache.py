@@ -1,8 +1,8 @@
 """Caches the silhouettes of a capture on disk, for jobs with other settings and for the operator's pages.
 
 A file's name is the SHA-256 of everything that its content depends on: the capture's files and the code. Cached
-silhouettes equal those that ``segment`` returned bit for bit. They show a face: ``Store.remove_capture`` erases them
-with their capture. An unreadable file is made again. A file that cannot be written is not cached.
+silhouettes equal those that ``segment`` returned bit for bit. Silhouettes show a face: ``Store.remove_capture`` erases
+them. An unreadable cached file is made again. Silhouettes that cannot be written are not cached.
 """
 
 import dataclasses
@@ -43,8 +43,8 @@ QUICK = 1  # zlib's fastest level: 35 MB become 4.7 MB in 0.2 s, and no level ge
 
 
 def segment_once(folder: Path, capture: Capture, rig: Rig, *, report: Progress) -> dict[str, Silhouette]:
-    """Returns the silhouettes of a capture. If ``folder`` has them from an earlier call, they are read; otherwise
-    ``segment`` computes them and they are stored there. The capture must have been read from files."""
+    """Returns the silhouettes of a capture. Silhouettes that ``folder`` has from an earlier call are read; others are
+    computed by ``segment`` and stored there. The capture must have been read from files."""
     path = folder / (_key(capture) + SUFFIX)
     with suppress(OSError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
         found = _decoded(path.read_bytes())

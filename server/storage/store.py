@@ -12,8 +12,8 @@
     <data>/last-sweep.json  retention-stopped.txt         what retention knows of the clock
     <data>/has-keys                                      see server.services.keys
 
-A folder appears under its final name in one rename, after everything in it reached the disk. Other files in the data
-folder were put there by somebody else: they are never read and never deleted.
+A folder appears under its final name in one rename, after everything in it reached the disk. Files in the data folder
+that the service did not write itself are never read and never deleted.
 """
 
 import hashlib
@@ -64,7 +64,7 @@ def new_id() -> str:
 
 
 def repeatable_id(key: str, idempotency_key: str) -> str:
-    """Returns the id of the thing that an API key requests under an Idempotency-Key: the same one each time."""
+    """Returns the id of the thing that an API key requests under an Idempotency-Key: the same id each time."""
     return hashlib.sha256(f"{key}\0{idempotency_key}".encode()).hexdigest()[:28]
 
 
@@ -81,7 +81,7 @@ class StoredFile:
     sha256: str
 
     def is_intact(self) -> bool:
-        """Returns whether its content matches. It is read once, and again when its time, size or inode changes."""
+        """Returns whether the file's content matches. The file is read anew when its time, size or inode changed."""
         said = self.path.stat()
         return _digest(self.path, said.st_mtime_ns, said.st_size, said.st_ino) == self.sha256
 
@@ -101,7 +101,7 @@ _THINGS = {
 
 
 class DataFolder:
-    """Knows where things lie in the data folder, and what in it is to be swept away. Methods block. Every id that comes
+    """Knows where files lie in the data folder, and which of them are to be deleted. Methods block. Every id that comes
     from a request passes ``is_id`` before it becomes part of a path."""
 
     def __init__(self, data: Path) -> None:
@@ -111,14 +111,14 @@ class DataFolder:
         data.chmod(0o700)  # faces are biometric data
 
     def folder(self, kind: str, identity: str) -> Path:
-        """Returns the folder of a thing of a kind ("captures", "jobs" and so on), whether it exists or not. Raises
-        NotFound for a text that is no id."""
+        """Returns the folder of one stored object of a kind ("captures", "jobs" and so on), whether it exists or not.
+        Raises NotFound for a text that is no id."""
         if not is_id(identity):
             raise NotFound(_THINGS.get(kind) or compose("thing-file"), identity)
         return self.data / kind / identity
 
     def ids(self, kind: str) -> list[str]:
-        """Lists the ids of all things of a kind ("captures", "jobs" and so on), newest first."""
+        """Lists the ids of all stored objects of a kind ("captures", "jobs" and so on), newest first."""
         with suppress(FileNotFoundError):
             names = (entry.name.removesuffix(".json") for entry in os.scandir(self.data / kind))
             return sorted((name for name in names if is_id(name)), reverse=True)
@@ -126,8 +126,8 @@ class DataFolder:
 
     @contextmanager
     def incoming(self) -> Iterator[Path]:
-        """Yields a new folder for things that are being received. What was not moved out of it is removed at the end of
-        the block; after a kill ``sweep`` removes it."""
+        """Yields a new folder for files that are being received. Files that were not moved out of the folder are
+        removed at the end of the block; after a kill ``sweep`` removes them."""
         folder = self.data / "incoming" / new_id()
         folder.mkdir(parents=True)
         try:
@@ -149,8 +149,8 @@ class DataFolder:
         return self.folder("cache/captures", identity)
 
     def remove(self, path: Path) -> None:
-        """Deletes a file or folder. It is first renamed into ``trash``, so it disappears even if the deletion is
-        interrupted. Does nothing if it does not exist."""
+        """Deletes a file or folder. ``path`` is first renamed into ``trash``, so it disappears even if the deletion is
+        interrupted. Does nothing if ``path`` does not exist."""
         target = self.data / "trash" / f"{new_id()}"
         try:
             path.rename(target)
@@ -173,7 +173,7 @@ class DataFolder:
         return removed
 
     def _unfinished(self) -> Iterator[Path]:
-        """Yields unfinished files of the folders and of things in them; deeper ones go with their thing."""
+        """Yields unfinished files at the top of each kind's folder and of each stored object's folder."""
         for kind in FOLDERS:
             yield from unfinished(self.data / kind)
             for entry in os.scandir(self.data / kind):
@@ -198,7 +198,7 @@ class Store(DataFolder):
 
     def add_capture(self, folder: Path, record: CaptureRecord) -> None:
         """Writes a capture's record into ``folder``, which holds ``files/``, and moves the folder to its final place in
-        one rename. After a kill the capture is complete or absent. Its files are also sent to the store of captures."""
+        one rename. After a kill the capture is complete or absent. The store of captures also gets its files."""
         write_atomically(folder / "record.json", _encoded(CAPTURE.document(record)))
         move_durably(folder, self.folder("captures", record.id))
         self._tell(record)
@@ -226,8 +226,8 @@ class Store(DataFolder):
         return folder
 
     def found(self, kind: str, identity: str) -> CaptureRecord | SessionRecord | None:
-        """Returns the record of a capture or session (``kind``: "captures", "sessions"). Returns None if it is missing
-        or damaged."""
+        """Returns the record of a capture or session (``kind``: "captures", "sessions"). Returns None if the record is
+        missing or damaged."""
         with suppress(NotFound):
             return self.capture(identity) if kind == "captures" else self.session(identity)
         return None
@@ -277,8 +277,8 @@ class Store(DataFolder):
                 yield self.capture(identity)
 
     def change_capture(self, identity: str, change: Callable[[CaptureRecord], CaptureRecord]) -> CaptureRecord:
-        """Replaces the record of a capture by what ``change`` returns for it, and returns the new record. Changes wait
-        for each other, and the file is replaced atomically. Raises NotFound."""
+        """Replaces the record of a capture by what ``change`` returns for it, and returns the new record. Changes of a
+        record wait for each other, and its file is replaced atomically. Raises NotFound."""
         with self._change("captures", identity):
             before = self.capture(identity)
             record = change(before)
@@ -291,8 +291,8 @@ class Store(DataFolder):
 
     @contextmanager
     def _change(self, kind: str, identity: str) -> Iterator[None]:
-        """Allows one change or removal at a time, so that no change is lost and no removed thing comes back. Raises
-        NotFound, also for what another process removed meanwhile."""
+        """Allows one change or removal at a time, so that no change is lost and no removed object comes back. Raises
+        NotFound, also for an object that another process removed meanwhile."""
         with self._changing:
             try:
                 yield
@@ -301,8 +301,8 @@ class Store(DataFolder):
 
     def remove_capture(self, identity: str, *, later: bool = False) -> None:
         """Removes a capture and everything cached of it, which shows the face as well; its files in the store of
-        captures go first. Raises Unavailable if that does not answer; a second call completes the removal. ``later``:
-        the next sweep removes that part."""
+        captures go first. Raises Unavailable if the store does not answer; a second call completes the removal.
+        ``later``: the next sweep removes the files in the store."""
         if self.blobs is not None:
             self.blobs.release(identity, later=later)
         with self._change("captures", identity):
@@ -331,8 +331,8 @@ class Store(DataFolder):
         self._tell(record)
 
     def change_session(self, identity: str, change: Callable[[SessionRecord], SessionRecord]) -> SessionRecord:
-        """Replaces the record of a session by what ``change`` returns for it, and returns the new record. Changes wait
-        for each other, and the file is replaced atomically. Raises NotFound."""
+        """Replaces the record of a session by what ``change`` returns for it, and returns the new record. Changes of a
+        record wait for each other, and its file is replaced atomically. Raises NotFound."""
         with self._change("sessions", identity):
             record = change(self.session(identity))
             self.add_session(record)
@@ -354,7 +354,7 @@ class Store(DataFolder):
         return self._read("sessions", identity, SESSION)
 
     def _read(self, kind: str, identity: str, wanted: RecordFormat[T]) -> T:
-        """Reads a record. Raises NotFound where there is none, and for a damaged one, which is set aside."""
+        """Reads a record. Raises NotFound for a missing record, and for a damaged one, which is set aside."""
         path = self._record_path(kind, identity)
         whole = path if kind == "sessions" else path.parent
         try:

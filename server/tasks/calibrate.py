@@ -80,7 +80,7 @@ def _scene_pictures(root: Path, image_pixels: int) -> Mapping[str, Mapping[str, 
 
 
 def _board_pictures(root: Path) -> Mapping[str, Mapping[str, Path]]:
-    """Returns the pictures of a board by camera and shot. Raises InputError, also for a wrong board.toml."""
+    """Returns the pictures of a board by camera and shot. Raises InputError for a missing or wrong board.toml."""
     from calibration.board.board import read_board
     from calibration.board.picture_files import list_pictures
 
@@ -92,7 +92,7 @@ def _board_pictures(root: Path) -> Mapping[str, Mapping[str, Path]]:
 
 def forget_scene(folder: Path) -> None:
     """Removes the photographs of a scene once the calibration has ended, since they may show a person and only captures
-    can be erased on request. Does nothing for a board."""
+    can be erased on request. Does nothing for pictures of a board."""
     if not is_of_board(folder):
         shutil.rmtree(folder / "images", ignore_errors=True)
 
@@ -166,7 +166,7 @@ def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | 
 
 
 def _outcome(document: Mapping[str, Any], result: Path) -> JsonObject:
-    """Writes calibration.json beside cameras.json in ``result``. Returns what the calibration's record holds of it."""
+    """Writes calibration.json beside cameras.json in ``result``. Returns the fields for the calibration's record."""
     write_atomically(result / "calibration.json", json.dumps(document, indent=1).encode())
     kept = ("verdict", "missing", "missing_messages", "figures", "warnings", "warning_messages", "front")
     beside = {"checks": [*document.get("checks", ())], "sha256": sha256_of(result / "cameras.json")}

@@ -1,11 +1,11 @@
 """Implements a child process that stays alive and does one task after the other.
 
 Heavy work (reconstruction, checking images, rendering the simulated studio) runs outside the process that answers
-requests or sends a worker's heartbeat. So neither a GL context nor Python's interpreter lock delays that process, a
-crash in native code costs one job only, and a task that does not react to a cancellation can be killed.
+requests or sends a worker's heartbeat. In child processes, neither a GL context nor Python's interpreter lock delays
+the parent, a crash in native code costs one job only, and a task that does not react to a cancellation can be killed.
 
-The child runs this module and is connected by a socket. It ends when the socket closes, so it never outlives its
-parent.
+The child runs this module, is connected to its parent by a socket, and ends when the socket closes, so it never
+outlives the parent.
 """
 
 import errno
@@ -66,8 +66,8 @@ class WorkerContext:
         self._things: dict[str, object] = {}
 
     def keep(self, name: str, make: Callable[[], Any]) -> Any:
-        """Returns the resource called ``name``. The first call makes it by ``make``; if that is a context manager, it
-        is entered and its value returned."""
+        """Returns the resource called ``name``. The first call makes the resource by ``make``; if it is a context
+        manager, it is entered and its value returned."""
         if name not in self._things:
             thing: Any = make()
             self._things[name] = self._stack.enter_context(thing) if hasattr(thing, "__exit__") else thing
@@ -80,7 +80,7 @@ class WorkerContext:
 
 
 class Child:
-    """Runs tasks in one child process, which starts at the first one. Two threads must not use it at once.
+    """Runs tasks in one child process, which starts at the first task. Two threads must not use a child at once.
 
     ``variables``: environment variables of the child, which override those of this process; ``memory``: bytes that it
     may allocate (0: any number), beyond which its work fails as "out-of-memory".
@@ -131,7 +131,7 @@ class Child:
         return self._process is not None
 
     def close(self) -> None:
-        """Kills the child process. The next task starts a new one."""
+        """Kills the child process. The next task starts a new process."""
         self._kill()
 
     def start(self) -> None:

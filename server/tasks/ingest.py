@@ -131,7 +131,7 @@ def check_views(
     shot: Capture, rig: Rig, chosen: "Settings", networks: FaceNetworks | None, *, report: Progress
 ) -> tuple[ReportWarning, ...]:
     """Returns findings of outlines and faces on a capture's pictures and cameras, and all remarks on its files; faces
-    are searched only with ``networks``. Raises the refusals of the checks."""
+    are searched only with ``networks``. Raises the errors of the checks."""
     from pipeline.faces.subject import SearchEffort, find_subject
     from pipeline.segmentation.segment import segment
     from pipeline.settings import OutputSettings
@@ -221,8 +221,8 @@ def _face_networks(context: WorkerContext) -> FaceNetworks | None:
 
 
 def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image_pixels: int) -> CaptureContent:
-    """Checks a shot of the calibration board and removes everything but its images from ``folder``: one a camera, of
-    any size. Returns the content for the capture's record. Raises InputError naming the images that are too large."""
+    """Checks a shot of the calibration board and removes everything but each camera's image, of any size, from
+    ``folder``. Returns the content for the capture's record. Raises InputError naming the images that are too large."""
     root = Path(folder)
     for path in root.iterdir():
         if path.name != "images":

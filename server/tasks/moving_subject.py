@@ -1,8 +1,8 @@
 """Moves a subject of the simulated studio: it nods, turns, speaks and blinks, or sits still.
 
-It takes a person of a head model, a rig and a number of frames. It makes the pictures of every frame, and their ground
-truth: weights, pose and vertices. Backdrops, sensors, light, hair and shirt stay as they are over all frames; hair and
-shirt turn with the head. Every picture has its own noise.
+A film needs a person of a head model, a rig and a number of frames. The film consists of pictures of every frame, and
+their ground truth: weights, pose and vertices. Backdrops, sensors, light, hair and shirt stay as they are over all
+frames; hair and shirt turn with the head. Every picture has its own noise.
 """
 
 import io
@@ -72,7 +72,7 @@ class Person:
 
 
 def move(person: Person, frames: int, centre_world: Float[np.ndarray, " 3"], *, still: bool = False) -> list[Pose]:
-    """Returns a person's states at ``frames`` times, ``1 / FPS`` s apart. ``still``: all have the first pose."""
+    """Returns a person's states at ``frames`` times, ``1 / FPS`` s apart. ``still``: all states have the first pose."""
     rng = np.random.default_rng((person.seed, 1))
     time, phases = np.arange(frames) / FPS, rng.uniform(0.0, 2.0 * np.pi, 6)
     swings = np.sin(2.0 * np.pi * np.outer(time, (0.45, 0.21, 0.13, 0.17, 0.11, 0.07)) + phases)
@@ -175,7 +175,7 @@ def simulate_sequence(
 ) -> Path:  # fmt: skip
     """Films a person and writes the folder of a sequence: cameras.json, images/<camera>/<frame>.png, background/ and
     times.csv. Frames that an earlier call for the same film has written are kept. Returns the folder of the truth
-    beside it, with cameras.json and truth.npz: names of expressions, weights (frames, expressions), rotations,
+    beside ``out``, with cameras.json and truth.npz: names of expressions, weights (frames, expressions), rotations,
     translations (mm), vertices (frames, v, 3; world, mm), face (v)."""
     studio, poses = Film(person, rig, preset, renderer), move(person, frames, rig.centre_world(), still=still)
     lines = ["frame,time_s", *(f"{number:05},{number / FPS:.6f}" for number in range(frames))]

@@ -1,7 +1,7 @@
 """Turns a folder of photographs, with or without scale.json, into a capture: its cameras are estimated and stored.
 
 Each step writes its result to the folder ``kept``: cameras.json, calibration.json (figures, and SHA-256 of the input
-files), calibration.html, masks/. A second run with the same photographs reads them from there.
+files), calibration.html, masks/. A second run with the same photographs reads these files.
 """
 
 import json
@@ -66,7 +66,7 @@ def photographs_alone(folder: Path) -> bool:
 
 
 def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Progress) -> Prepared:
-    """Reads a capture folder. If it has no cameras, they are estimated from its photographs and written to ``kept``.
+    """Reads a capture folder. Missing cameras are estimated from the photographs and written to ``kept``.
 
     Raises InputError naming every fault, and CalibrationRefused naming the unregistered views and what to add.
     """
@@ -147,7 +147,7 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
 
 
 def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -> tuple[ReportWarning, ...] | None:
-    """Returns the warnings that ``calibrate_photographs`` wrote to ``kept``. Returns None if there are none, if
+    """Returns the warnings that ``calibrate_photographs`` wrote to ``kept``. Returns None if ``kept`` has none, if
     cameras.json was changed since, or if it was made from other files than ``made_of`` (SHA-256 by name)."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         document = json.loads((kept / FIGURES).read_text(encoding="utf-8"))

@@ -1,7 +1,7 @@
 """Compiles numerical loops ahead (those in ``pipeline.compute.kernel_list``), in several processes, so that no job
 waits for them.
 
-The installation does it (``eigenhead prepare``). A command that finds a loop missing compiles it before its work.
+The installation compiles the loops (``eigenhead prepare``). A command first compiles a loop that it finds missing.
 """
 
 import errno
@@ -49,7 +49,7 @@ def compile_kernel(context: WorkerContext, report: Progress, *, line: str) -> bo
 def prepare_kernels(report: Progress, settings: "Settings | None" = None) -> Prepared:
     """Compiles the listed loops that the cache folder lacks, in several processes, and logs one line about it.
 
-    If the cache folder cannot be written, it logs that and compiles nothing: each process will compile for itself.
+    If the cache folder cannot be written, this is logged and nothing is compiled: each process will compile for itself.
     ``report`` is called with "compiling 12 of 49 loops" and the fraction done, from several threads, one at a time; its
     exceptions end the work, and loops compiled until then are kept. Loops that a job of the ``settings`` does not call
     are left out. Returns how many loops were compiled, are missing, and are listed."""

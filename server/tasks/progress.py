@@ -68,7 +68,7 @@ class JobProgress:
         return self._progress
 
     def _rest_of_stage(self) -> float:
-        """Returns the expected remaining seconds of the stage: by its usual duration or its fraction, if larger."""
+        """Returns the expected remaining seconds of the stage: by usual duration or by fraction, the larger one."""
         spent, usual = self._spent_s() / self._pace(), self._expected.get(self._visit, 0.0)
         rest = max(usual - spent, OVERTIME * usual)
         if FRACTION_LEAST < self._fraction < 1:
@@ -117,7 +117,7 @@ class ProgressMeter:
         self.tick()
 
     def tick(self) -> None:
-        """Writes an event if one is due. Call it often during stages that report no progress themselves."""
+        """Writes an event if one is due. Call ``tick`` often during stages that report no progress themselves."""
         stage, now = self._progress.stage, time.monotonic()
         if not stage or (stage == self._last[0] and now - self._last[1] < self._every_s):
             return

@@ -127,8 +127,8 @@ def reconstruct_beside(
     model: str | None,
     settings: Mapping[str, object],
 ) -> None:
-    """Reconstructs a capture folder or archive into the new folder ``result``. It runs in a child process and ends with
-    the process ``parent``. All its temporary files lie in the folder ``scratch``."""
+    """Reconstructs a capture folder or archive into the new folder ``result``. The work runs in a child process and
+    ends with the process ``parent``. All temporary files lie in the folder ``scratch``."""
     end_with_parent(parent)
     share_one_heap()
     from pipeline.settings import settings_from_document

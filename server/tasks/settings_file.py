@@ -12,7 +12,7 @@ LOST = "picture-lost"  # the warning of a camera that takes no part because its 
 
 
 def read_settings_file(path: Path) -> dict[str, object]:
-    """Reads settings from a TOML or JSON file. Raises InputError if it cannot be read or holds no table."""
+    """Reads settings from a TOML or JSON file. Raises InputError if the file cannot be read or holds no table."""
     try:
         text = path.read_text(encoding="utf-8-sig")  # Windows editors add a byte order mark
         braced = path.suffix == ".json" or (path.suffix != ".toml" and text.lstrip().startswith("{"))
@@ -32,15 +32,15 @@ def reason_of(error: OSError | ValueError | RecursionError) -> str:
 def settings_document(
     path: Path | None, *, strict: bool = False, **options: str | bool | Mapping[str, object] | None
 ) -> dict[str, object]:
-    """Returns the settings of a TOML or JSON file, or none without a file, overridden by ``options``. Tables in both
-    are merged. ``strict``: a camera without usable pictures fails. Raises InputError if the file cannot be read."""
+    """Returns the settings of a TOML or JSON file (none without one), overridden by ``options``, whose tables are
+    merged with the file's. ``strict``: a camera without usable pictures fails. Raises InputError for a bad file."""
     document = merged_settings({} if path is None else read_settings_file(path), options)
     codes = document.get("fail_on", [])
     return document | ({"fail_on": [*codes, LOST]} if strict and isinstance(codes, list) else {})
 
 
 def merged_settings(document: Mapping[str, object], over: Mapping[str, object]) -> dict[str, object]:
-    """Returns ``document`` overridden by ``over``. Tables in both are merged. None in ``over`` overrides nothing."""
+    """Returns ``document`` overridden by ``over``, except by values of None; tables in both documents are merged."""
     merged = dict(document)
     for name, value in over.items():
         old = merged.get(name)

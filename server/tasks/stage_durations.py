@@ -80,8 +80,8 @@ class StageDurations:
         self._learnt: dict[str, dict[str, float]] = {}
 
     def of(self, settings: Settings, megapixels: float = USUAL_MEGAPIXELS) -> dict[str, float]:
-        """Returns the expected seconds of each stage, in order. For a new kind of job they are the first guess, scaled
-        by the pace of other kinds."""
+        """Returns the expected seconds of each stage, in order. For a new kind of job the seconds are the first guess,
+        scaled by the pace of other kinds."""
         learnt, guess = self._read(), first_guess(settings, megapixels)
         known, every = learnt.get(kind_of(settings), {}), [pace for of in learnt.values() for pace in of.values()]
         usual = median(every) if every else 1.0

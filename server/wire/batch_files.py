@@ -1,4 +1,4 @@
-"""Sends the table and the contact sheet of a batch. Both are made while they are sent."""
+"""Sends the table and the contact sheet of a batch. Table and sheet are made while they are sent."""
 
 from typing import Literal
 

@@ -93,7 +93,7 @@ def _failed(why: Message) -> InvalidInput:
 
 def fetch_stored_capture(url: str, folder: Path, store: Store, settings: ServiceSettings) -> Path:
     """Fetches the capture at an object store's ``url`` into ``folder`` and returns its archive: the object itself, or
-    where the URL ends with a slash one of all objects below it.
+    for a URL that ends with a slash one packed from all objects below it.
 
     Raises InvalidInput for a forbidden location ("url-refused"), a missing object ("object-missing") and a slow store
     ("import-failed"), TooLarge, DiskFull, and Unavailable if the store fails."""
@@ -113,7 +113,7 @@ def fetch_stored_capture(url: str, folder: Path, store: Store, settings: Service
 
 
 def _listed(url: str, objects: ObjectStore, prefix: str, settings: ServiceSettings) -> dict[str, StoredObject]:
-    """Lists the objects below a prefix, by their names there."""
+    """Lists the objects below a prefix, by their names relative to it."""
     found, total = dict[str, StoredObject](), 0
     for entry in objects.entries(prefix):
         found[entry.key.removeprefix(prefix)] = entry

@@ -1,8 +1,8 @@
 """Receives multipart bodies straight into the data folder.
 
-python-multipart parses, and limits the headers of a part. Its form parser and the framework's are not used for three
-reasons: API key and free space are checked before the first byte, no file is held in memory or in another temporary
-folder, and every write happens in a thread."""
+The library python-multipart parses, and limits the headers of a part. The form parsers of library and framework are not
+used for three reasons: API key and free space are checked before the first byte, no file is held in memory or in
+another temporary folder, and every write happens in a thread."""
 
 from collections.abc import Collection, Iterable
 from functools import partial
@@ -161,8 +161,8 @@ class _Form:
 
 
 def check_fields(names: Iterable[str], known: Collection[str]) -> None:
-    """Raises InputError naming each field that is not in ``known``, with the nearest known name. Otherwise a misspelt
-    ``settings`` would be ignored."""
+    """Raises InputError naming each field that is not in ``known``, with the nearest known name. Without this check a
+    misspelt ``settings`` would be ignored."""
     faults = []
     for name in names:
         if name not in known:

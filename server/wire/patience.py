@@ -15,8 +15,8 @@ IDLE_TIMEOUT_S = 30.0  # between two pieces: longer than a change of networks ta
 
 
 async def with_idle_timeout(stream: AsyncIterator[bytes], silent_s: float) -> AsyncIterator[bytes]:
-    """Yields the pieces of ``stream``. Raises a 408 problem if one does not arrive within ``silent_s`` seconds. The
-    total time is not limited."""
+    """Yields the pieces of ``stream``. Raises a 408 problem if a piece does not arrive within ``silent_s`` seconds. The
+    total time of a request is not limited."""
     while True:
         async with within(silent_s):
             piece = await anext(stream, None)

@@ -84,7 +84,7 @@ def _refuse_damaged(files: Sequence[StoredFile]) -> None:
 
 
 def _is_at_client(request: Request, etag: str) -> bool:
-    """Returns whether If-None-Match names the file. Proxies that compress mark its tag as weak (RFC 9110, 13.1.2)."""
+    """Returns whether If-None-Match names the file, whose tag compressing proxies mark as weak (RFC 9110, 13.1.2)."""
     held = re.split(r"\s*,\s*", request.headers.get("if-none-match", ""))
     return held == ["*"] or etag in (tag.removeprefix("W/") for tag in held)
 
@@ -101,8 +101,8 @@ def _zipped(folder: Path, names: list[str]) -> Iterator[bytes]:
 
 
 class _Sent(io.RawIOBase):
-    """Collects the bytes that the zip writer wrote and that are not sent yet. It cannot seek, so zipfile writes a
-    stream."""
+    """Collects the bytes that the zip writer wrote and that are not sent yet. The class cannot seek, so zipfile writes
+    a stream."""
 
     def __init__(self) -> None:
         self._pending = bytearray()

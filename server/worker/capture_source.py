@@ -74,7 +74,7 @@ class CaptureSource:
 
     @property
     def _is_own(self) -> bool:
-        """Returns whether the data folder is the worker's own, if a capture has no record."""
+        """Returns whether the data folder of a capture without a record is the worker's own."""
         return self._store.blobs is not None and self._settings.results_store is not None
 
     def _is_busy(self, capture: str) -> bool:

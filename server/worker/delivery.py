@@ -71,7 +71,7 @@ class Deliverer:
 
     def deliver(self, wanted: DeliveryRequest) -> bool:
         """Delivers a job's result, and waits for a store that does not answer. Returns False if the job or its delivery
-        was removed meanwhile. Raises JobFailed if it cannot be delivered and once ``until`` has passed, and
+        was removed meanwhile. Raises JobFailed if the result cannot be delivered and once ``until`` has passed, and
         WorkerStopped."""
         pause_s, folder = FIRST_PAUSE_S, self._store.folder("jobs", wanted["job_id"])
         was_there = folder.exists()

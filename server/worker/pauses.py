@@ -15,8 +15,8 @@ log = structlog.get_logger()
 
 
 class WorkerStopped(BaseException):
-    """Ends a step if its worker stops, or if the engine could not write to the database. It is no Exception: the engine
-    would record one as the failure of the job, but a worker is to continue the job later."""
+    """Ends a step if its worker stops, or if the engine could not write to the database. The class is no Exception: the
+    job engine would record an Exception as the failure of the job, which a worker is to continue."""
 
 
 def pause(stop: threading.Event, seconds: float) -> None:

@@ -6,11 +6,11 @@ If a worker is killed in a step, another worker repeats this step. The bytes of 
 it does no harm if two workers do the same step.
 
 Every worker writes a heartbeat row. A worker that finds another dead (stopped, its process gone on the same machine, or
-silent for ``silent_s``) puts its jobs back into their queue. The engine changes only rows that still belong to the dead
-worker, so several workers may do this at once. One statement on the table of the job engine (DBOS) does this before a
-new worker takes its first job, so an interrupted job keeps its place. The engine's own methods do not suffice:
-resume_workflow takes a job from its current worker, revives a cancelled one and forgets how many workers the job took
-down; its recovery is private, and begins only after jobs are taken.
+silent for ``silent_s``) puts its jobs back into their queue. The job engine changes only rows that still belong to the
+dead worker, so several workers may put back jobs at once. One statement on the table of the job engine (DBOS) puts jobs
+back before a new worker takes its first job, so an interrupted job keeps its place. The job engine's own methods do not
+suffice: resume_workflow takes a job from its current worker, revives a cancelled one and forgets how many workers the
+job took down; its recovery is private, and begins only after jobs are taken.
 """
 
 import json
@@ -279,8 +279,8 @@ class Worker:
 
     def calibrate(self, identity: str) -> JsonObject:
         """Computes one calibration in a child process and returns its outcome. The result is written under a temporary
-        name and renamed at the end. Pictures of a scene are then removed, and also after a failure that a repetition
-        would not mend (JobFailed)."""
+        name and renamed at the end. Pictures of a scene are removed after the calibration, and also after a failure
+        that a repetition would not mend (JobFailed)."""
         folder = self.store.folder("calibrations", identity)
         in_use = self.settings.data / "rig" / "cameras.json"
         attempt = folder / f"attempt-{secrets.token_hex(6)}"
@@ -316,7 +316,7 @@ class Worker:
         """Renames the folder of an attempt to ``result`` and removes other attempts. Returns size and SHA-256 of every
         file by name.
 
-        If another worker has published a result of the job already, that one stays; its files have the same bytes.
+        If another worker has published a result of the job already, that result stays; its files have the same bytes.
         """
         folder = self.store.folder("jobs", job_id)
         target = folder / "result"
@@ -353,8 +353,8 @@ def failure_of(error: BaseException) -> BaseException:
 
 
 class Heartbeat:
-    """Says that a worker lives, and puts the work of dead workers back into its queues. Any number of workers may do so
-    at once, and again."""
+    """Says that a worker lives, and puts the work of dead workers back into its queues. Any number of workers may put
+    back the same work."""
 
     def __init__(self, engine: sa.Engine, settings: ServiceSettings, events: EventLog, worker: str) -> None:
         self._engine, self._settings, self._events, self._id = engine, settings, events, worker
@@ -413,7 +413,7 @@ class Heartbeat:
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Records the id of a running workflow. One whose writes the database refuses ends without a verdict."""
+        """Records the id of a running workflow, which ends without an outcome if the database refuses its writes."""
         identity = DBOS.workflow_id or ""
         self._here.add(identity)
         try:
@@ -481,7 +481,7 @@ def dead_workers(engine: sa.Engine, silent_s: float, except_id: str = "") -> lis
 
 def take_over(engine: sa.Engine, dead: Collection[str]) -> list[str]:
     """Puts the running workflows of dead workers, and of those that have no row any more, back into their queues.
-    Workflows that another worker has taken meanwhile are left alone. Returns the ids of those put back."""
+    Workflows that another worker has taken meanwhile stay. Returns the ids of the workflows put back."""
     job = engine_jobs(engine)
     with engine.connect() as connection:
         holders = {*connection.scalars(sa.select(job.c.executor_id).where(job.c.status == RUNNING).distinct())}
@@ -551,7 +551,7 @@ def warnings_of(report: Path) -> list[MessageDocument]:
 
 
 def add_warning(report: Path, warning: Message) -> None:
-    """Adds a warning to a report.json; does nothing if the work wrote none."""
+    """Adds a warning to a report.json; does nothing if the work wrote no report."""
     with suppress(FileNotFoundError):
         document = json.loads(report.read_bytes())
         document["warnings"] = [*document["warnings"], warning.document()]

@@ -2,8 +2,8 @@
 
 One thread takes pictures, unless the console's live view provides them; another thread sends them to a child process
 (``looking``) and publishes the result. The next pictures are requested early enough to arrive when the child process is
-done. The child process has priority over a job and takes at most a quarter of its two cores; one that dies or hangs is
-replaced at the next pictures. ``IDLE_S`` seconds after the last request, threads and child process end.
+done. The child process has priority over a job and takes at most a quarter of its two cores; a child process that dies
+or hangs is replaced at the next pictures. ``IDLE_S`` seconds after the last request, threads and child process end.
 """
 
 import threading
@@ -69,7 +69,7 @@ class Live:
         self._closing = False
 
     def newest(self) -> LiveOut:
-        """Returns the newest result, and requests the next ones. Before the first result, and when the cameras are
+        """Returns the newest result, and requests further results. Before the first result, and when the cameras are
         lost, the answer has no cameras and states the reason. Does not block."""
         self._polled_s = time.monotonic()
         return self._newest()
@@ -205,7 +205,7 @@ def look(
     front: str | None,
     plates: tuple[str, str] | None,
 ) -> Seen:
-    """Finds the head in the child process, as ``looking.look``."""
+    """Finds the head in pictures, in the child process, by ``looking.look``."""
     from server.services.live import looking
 
     return looking.look(context, pictures, rig, front, plates)

@@ -1,7 +1,7 @@
 """Finds the head in one set of pictures after the other, in a child process that remembers the last head.
 
-The pictures are already reduced. Light and sharpness are measured on the pictures, sharpness for one camera in each
-set; faces are searched at ``SMALL_PX``. A missing face is searched again in one camera for each set.
+The pictures arrive already reduced in size. Light and sharpness are measured on the pictures, sharpness for one camera
+in each set; faces are searched at ``SMALL_PX``. A missing face is searched again in one camera of each set.
 """
 
 from collections.abc import Mapping
@@ -63,7 +63,7 @@ def look(
     front: str | None,
     plates: tuple[str, str] | None,
 ) -> Seen:
-    """Finds the head, and measures every camera.
+    """Finds the head in a set of pictures, and measures every camera's picture.
 
     ``pictures``: by camera, bytes being JPEG files; ``rig``: the calibrated cameras, at any size; ``front``: the camera
     that the subject looks at; ``plates``: folder and version of the clean plates.
@@ -199,7 +199,7 @@ def _measure_sharpness(
     kept: Kept, seen: dict[str, CameraSeen], images: Mapping[str, ImageRgb], rig: Rig, head: LiveHead
 ) -> None:
     """Measures the sharpness of the face in one camera for each set of pictures, and adds the last known value of every
-    camera. It does not measure a moving head, whose blur is not the lens's."""
+    camera. A moving head is not measured, since its blur is not the lens's."""
     before, kept.points = kept.points, head.points_world
     still = before is not None and float(np.linalg.norm(kept.points - before, axis=1).mean()) < STILL_MM
     kept.count += still

@@ -61,8 +61,8 @@ class HeadOut(Answer):
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """Holds the findings of one set of pictures. ``faces``: whether some camera shows a face, even if no head follows;
-    ``calibrated``: whether the cameras' poses are known; ``missing``: cameras that deliver no picture."""
+    """Holds the findings of one set of pictures. ``faces``: whether some camera shows a face, even if no head was
+    found; ``calibrated``: whether the cameras' poses are known; ``missing``: cameras that deliver no picture."""
 
     cameras: Mapping[str, CameraSeen]
     head: HeadOut | None
@@ -92,7 +92,7 @@ class Word:
 
 
 class WordOut(Answer):
-    """Describes one instruction. ``camera``: the camera that it is about; null: the subject."""
+    """Describes one instruction. ``camera``: the camera that the instruction concerns; null: the subject."""
 
     code: str
     text: str
@@ -101,9 +101,9 @@ class WordOut(Answer):
 
 
 class LiveOut(Answer):
-    """Describes the newest result. ``time``: when its pictures were taken, empty before the first; ``age_s``: their age
-    when the head was ready; ``points`` of ``cameras``: landmarks of the face, as fractions of width and height;
-    ``ready``: the head is steady, its eyes are open, and there are no instructions."""
+    """Describes the newest result. ``time``: when the result's pictures were taken, empty before the first result;
+    ``age_s``: the pictures' age when the head was ready; ``points`` of ``cameras``: landmarks of the face, as fractions
+    of width and height; ``ready``: the head is steady, its eyes are open, and there are no instructions."""
 
     time: str
     age_s: float

@@ -1,7 +1,7 @@
 """Converts the findings of one set of pictures to each camera's indicator lamps and to instructions before a shot.
 
-This module defines all limits for them. Most instructions appear after their cause has lasted ``HOLD_S`` seconds, so a
-blink has no effect, and disappear with it.
+All limits for lamps and instructions are defined here. Most instructions appear after their cause has lasted ``HOLD_S``
+seconds, so a blink has no effect, and disappear with it.
 """
 
 from collections import deque
@@ -30,7 +30,7 @@ LOOKING = 0.5  # cosine: both eyes are seen
 
 
 class Speaker:
-    """Converts successive sets of findings to lamps and instructions. It remembers the findings of the last second."""
+    """Converts successive sets of findings to lamps and instructions, remembering the last second's findings."""
 
     def __init__(self) -> None:
         self._since: dict[tuple[str, str | None], float] = {}
