@@ -60,7 +60,7 @@ def calibrate(
     workers: int = 2,
     report: Progress = discard_progress,
 ) -> Calibration:
-    """Calibrates cameras from pictures ``IMAGES/<camera>/<shot>.<ext>``. Pictures of one shot name are simultaneous.
+    """Calibrates cameras from pictures ``IMAGES/<camera>/<shot>.<ext>``. Pictures with one shot name are simultaneous.
 
     ``images`` is the folder IMAGES. ``front`` is the camera that the subject faces; None selects the middle camera.
     ``previous`` is the rig's last calibration, with which names, layout, scale and lenses are compared. The folder
@@ -229,8 +229,8 @@ def _take_shots(state: BundleState, shots: Sequence[str], used: set[str]) -> tup
 
 
 def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped: Sequence[Dropped]) -> list[Message]:
-    """Returns a message for each camera with more excluded views than valid views. A mirrored camera may have this
-    fault, because it can agree with other cameras in any single shot."""
+    """Returns a message for each camera with more excluded views than valid views. A mirrored camera may have many
+    excluded views, because it can agree with other cameras in any single shot."""
     left, lost = Counter(view.camera for view in views), Counter(drop.camera for drop in dropped)
     return [
         compose("views-contradict", camera=name, count=lost[name], all=lost[name] + left[name])

@@ -118,7 +118,7 @@ def _parameter_table(calibration: Calibration) -> str:
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Returns an HTML table. The cells of ``rows`` are HTML and are not escaped."""
+    """Returns an HTML table. The table cells ``rows`` are HTML and are not escaped."""
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><tr>{top}</tr>{body}</table>"

@@ -1,4 +1,4 @@
 """Estimates lenses, camera poses and time offsets from the detected corners of a calibration board.
 
-The input is corners (px) by camera and shot. The output is a rig (mm) with covariances, from a bundle adjustment
-(Triggs et al., 2000)."""
+The input of the adjustment is corners (px) by camera and shot. The output of the adjustment is a rig (mm) with
+covariances, from a bundle adjustment (Triggs et al., 2000)."""

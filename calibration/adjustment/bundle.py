@@ -1,8 +1,8 @@
 """Adjusts intrinsics with distortion, camera poses and board poses together, with a robust loss.
 
 Levenberg-Marquardt minimises the cost; ``CornerTerm`` adds each view's block to the normal equations. Eleven cameras
-and thirty shots have 339 unknowns. A dense Cholesky factor solves them in ten milliseconds, so a sparse solver would
-gain nothing (tests/laboratory/notes/calibration.md compares the times with those of scipy and Ceres).
+and thirty shots have 339 unknowns. A dense Cholesky factor solves this system in ten milliseconds, so a sparse solver
+would gain nothing (tests/laboratory/notes/calibration.md compares the times with those of scipy and Ceres).
 
 The cost is ``sum rho(|r|^2 / sigma_c^2) + priors``. The loss rho is Cauchy's during the search for outliers and Huber's
 at the end; sigma_c is the corner noise of camera c."""
@@ -140,8 +140,8 @@ class BundleSolution:
         return self.evidence.cost
 
     def covariance(self) -> Float[np.ndarray, "q q"]:
-        """Returns the covariance of all parameters in the order cameras (intrinsics, pose), boards, time offsets. Rows
-        and columns of fixed parameters are zero."""
+        """Returns the covariance of all parameters in the order cameras (intrinsics, pose), boards, time offsets. The
+        covariance's rows and columns of fixed parameters are zero."""
         full = np.zeros((len(self.free), len(self.free)))
         # Scaled to a unit diagonal first: parameters span from 1e-4 (distortion) to 1e3 (mm).
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self.normal), 1e-12))

@@ -8,8 +8,8 @@ this gauge is ``S = I - A (A^T W A)^-1 A^T W`` (an S-transformation: W. Baarda, 
 A Modern Synthesis", section 9).
 
 The world frame of a calibrated rig has x to the subject's left, y up, and z towards the front camera. The up direction
-is perpendicular to the image rows of all cameras, because a camera without roll has a horizontal x axis. The origin is
-the point nearest to all optical axes."""
+is perpendicular to the image rows of all cameras, because a camera without roll has a horizontal x axis. The world's
+origin is the point nearest to all optical axes."""
 
 from dataclasses import dataclass, replace
 
@@ -87,7 +87,7 @@ def _block_diagonal(blocks: Float[np.ndarray, "c 6 6"]) -> Float[np.ndarray, "p 
 
 def align_world(rig: Rig, reference: Rig, *, scale: bool = False) -> Rig:
     """Moves the world frame of ``rig`` so that its images of the subject's region are as near as possible to the images
-    in ``reference``. With ``scale``, the world is also scaled.
+    in ``reference``. With ``scale``, the rig's world is also scaled.
 
     The distances in the images are minimised, starting from the mean motion between the cameras' frames."""
     points = subject_points(reference)
@@ -157,8 +157,8 @@ def effective_pose(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Fl
     """Returns the matrix that converts an error of a camera's nine intrinsics and pose to the pose perturbation with
     the most similar effect on the subject's image.
 
-    A fit that treats the intrinsics as exact must allow for this error in the pose. A principal point that is 10 px
-    off, for example, acts almost like a rotation."""
+    A fit that treats the intrinsics as exact must allow for this error in the pose. A principal point that is 10 px off
+    acts almost like a rotation of the camera."""
     by_pose = pose_jacobian(camera, points_world).reshape(-1, 6)
     by_lens = intrinsics_jacobian(camera, points_world).reshape(-1, 9)
     good = np.isfinite(by_pose).all(axis=1) & np.isfinite(by_lens).all(axis=1)

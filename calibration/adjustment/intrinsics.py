@@ -1,8 +1,8 @@
-"""Estimates each camera's lens from that camera's views of the board. The bundle adjustment starts from these lenses.
+"""Estimates each camera's lens from that camera's views of the board. Bundle adjustment starts from these lenses.
 
-Cameras are treated separately, so shots need not be synchronised. IPPE computes the board's poses for each of several
-focal lengths (T. Collins, A. Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 2014). A bundle adjustment of
-that camera alone (``bundle.py``) completes the estimate. The covariance of the lens shows if the views suffice."""
+Cameras are treated alone, so shots need not be synchronised. IPPE computes the board's poses for each of several focal
+lengths (T. Collins, A. Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 2014). A bundle adjustment of a
+single camera (``bundle.py``) completes the estimate. A lens's covariance shows if the views suffice."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -104,8 +104,8 @@ def _lens(
 
 
 def noise_of(misses: Float[np.ndarray, "n 2"]) -> float:
-    """Returns the robust standard deviation (px) of one coordinate of 2D residuals. The estimate is the median length
-    of the residuals divided by 1.1774, the median length for unit variance. The result is at least
+    """Returns the robust standard deviation (px) of one coordinate of 2D residuals. The robust deviation is the
+    residuals' median length divided by 1.1774, the median length for unit variance. The deviation is at least
     ``CORNER_SIGMA_LEAST``, and 1 if there are no residuals."""
     if not len(misses):
         return 1.0

@@ -1,6 +1,6 @@
 """Defines Gaussian priors of the intrinsics, from knowledge about lenses that does not come from the corners.
 
-The default priors are weak: they only influence parameters that the views hardly determine."""
+The default lens priors are weak: they only influence parameters that the views hardly determine."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -93,7 +93,7 @@ class LinearisedAspectPrior:
 
 
 def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
-    """Returns wide priors of the intrinsics that suit any lens. The priors depend only on the image sizes (px)."""
+    """Returns wide priors of the intrinsics that suit any lens. The wide priors depend only on the image sizes (px)."""
     mean, sigma = [], []
     for width, height in sizes:
         long = max(width, height)

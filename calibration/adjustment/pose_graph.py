@@ -1,11 +1,11 @@
 """Estimates the poses of all cameras and boards (the pose graph), from which the bundle adjustment starts.
 
 Each view gives camera_from_board with two ambiguities: the image of a plane allows two poses (IPPE), and a checkerboard
-may be turned (``Board.turns``). The relative pose of two cameras must be the same in every shot. So each candidate for
-the relative pose is tested on all shared shots, and the candidate that fits most shots is chosen. A maximum spanning
-tree joins the pairs of cameras. The program refuses a tie between two candidates, cameras without common shots, and a
-camera whose views agree with no other camera. A camera that agrees with no other has mirrored pictures or misnamed
-shots."""
+may be turned (``Board.turns``). The relative pose of two cameras must be the same in every shot. Each candidate for two
+cameras' relative pose is therefore tested on all shared shots, and the candidate that fits most shots is chosen. A
+maximum spanning tree over pairs joins all cameras. The program refuses a tie between two candidates, cameras without
+common shots, and a camera whose views agree with no other camera. A camera that agrees with no other has mirrored
+pictures or misnamed shots."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

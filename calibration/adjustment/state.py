@@ -36,7 +36,7 @@ class Observations:
         return np.repeat(np.arange(len(self.camera)), np.diff(self.starts))
 
     def subset(self, retained: Bool[np.ndarray, " n"]) -> "Observations":
-        """Returns the corners that ``retained`` marks. All views remain, possibly without corners."""
+        """Returns the corners that ``retained`` marks. All views of the board remain, possibly without corners."""
         counts = np.bincount(self.view_of[retained], minlength=len(self.camera))
         starts = np.concatenate([[0], np.cumsum(counts)])
         return replace(self, starts=starts, points=self.points[retained], pixels=self.pixels[retained])

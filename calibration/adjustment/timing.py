@@ -1,7 +1,7 @@
 """Estimates a time offset of each camera from the dependence of its residuals on the board's motion.
 
-The board's velocity in a shot is the central difference of its poses in the shots before and after. So offsets are in
-units of the time between shots, and they are meaningful only if the shots are frames of one recording. The offsets are
+The board's velocity in a shot is the central difference of its poses in the shots before and after. Time offsets are in
+units of the time between shots, and are meaningful only if the shots are frames of one recording. The time offsets are
 estimated jointly with all other parameters; the first camera's offset is zero."""
 
 from dataclasses import dataclass, replace
@@ -17,8 +17,8 @@ from rig.geometry import RigidTransform, vector_from_rotation
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeOffsets:
-    """Holds each camera's time offset and its standard deviation (in intervals between shots). Also holds the RMS of
-    the residuals (px, 2D) without and with offsets."""
+    """Holds each camera's time offset and its standard deviation (in intervals between shots). Also holds the
+    residuals' RMS (px, 2D) without and with time offsets."""
 
     offsets: Float[np.ndarray, " c"]
     sigma: Float[np.ndarray, " c"]
@@ -27,8 +27,8 @@ class TimeOffsets:
 
 
 def board_velocities(state: BundleState) -> Float[np.ndarray, "s 6"]:
-    """Returns the board's motion per shot as a left perturbation of world_from_board (rad, mm). The first and last shot
-    use one-sided differences."""
+    """Returns the board's motion per shot as a left perturbation of world_from_board (rad, mm). The board's motion in
+    the first and last shot is a one-sided difference."""
     poses = [RigidTransform(r, t) for r, t in zip(state.board_rotations, state.board_translations, strict=True)]
     velocities = np.zeros((len(poses), 6))
     for i in range(len(poses)):

@@ -1,10 +1,10 @@
 """Describes the calibration board, prints it, computes its corners, and simulates its picture in a camera.
 
-The board frame is right-handed and matches OpenCV's. The frame's origin is the outer corner of the first square. The x
-axis runs along a row of squares, y down a column, and z *into* the board (away from the viewer). The first square is
-normally black. The first square of an ``inverted`` board is white. The first square is also white if a ChArUco board
-with an even number of rows is ``legacy``, as drawn by OpenCV before 4.6 and calib.io. The term corner means an inner
-corner; corners are numbered row by row.
+The board frame is right-handed and matches OpenCV's. The frame's origin is the outer corner of the first square. The
+board's x axis runs along a row of squares, y down a column, and z *into* the board (away from the viewer). The board's
+first square is normally black. The first square of an ``inverted`` board is white. The first square is also white if a
+ChArUco board with an even number of rows is ``legacy``, as drawn by OpenCV before 4.6 and calib.io. The term corner
+means an inner corner; corners are numbered row by row.
 """
 
 import tomllib
@@ -84,9 +84,9 @@ class Board:
         return 0.5 * self.square_mm * np.array([self.columns, self.rows, 0.0])
 
     def turns(self) -> list[Int[np.ndarray, " _"]]:
-        """Returns an order of the corners for each rotation of the board that leaves its colours unchanged. After the
-        rotation, corner ``order[i]`` appears at the position of corner i. A ChArUco board has only one order, because
-        its markers differ."""
+        """Returns an order of the corners for each rotation of the board that leaves its colours unchanged. After a
+        board's rotation, corner ``order[i]`` appears at the position of corner i. A ChArUco board has only one order,
+        because its markers differ."""
         index = np.arange(self.corner_count).reshape(self.rows - 1, self.columns - 1)
         if self.kind == "charuco":
             return [index.ravel()]

@@ -1,9 +1,9 @@
 """Finds the numbers and sub-pixel positions of a board's corners in one grey picture.
 
 OpenCV's ``findChessboardCornersSB`` finds checkerboards (A. Duda, U. Frese, "Accurate Detection and Localization of
-Checkerboard Corners for Calibration", BMVC 2018). If its exhaustive search also fails, the older detector and
-``cornerSubPix`` are used. ``CharucoDetector`` finds ChArUco boards. The detected corners must be the image of a flat
-grid seen from its front. A checkerboard must have the described size; its corners are ordered so that the grid is
+Checkerboard Corners for Calibration", BMVC 2018). If OpenCV's exhaustive search also fails, the older detector and
+``cornerSubPix`` are used. ``CharucoDetector`` finds ChArUco boards. The corners in a picture must be the image of a
+flat grid seen from its front. A checkerboard must have the described size; its corners are ordered so that the grid is
 right-handed and agrees with the colours. If a rotation leaves the colours unchanged (``Board.turns``), the pose graph
 chooses the order later. The option CALIB_CB_LARGER is not used: on real pictures it adds rows that do not exist.
 """

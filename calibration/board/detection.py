@@ -3,9 +3,9 @@ board is not found, the markers show which board is in the pictures.
 
 A ChArUco board's markers are numbered row by row over its white squares. The description of the board may be wrong in
 several ways. OpenCV before 4.6 and calib.io begin a board of an even number of rows with a white square. The second
-board of a pair begins with another marker number. The user may have miscounted squares, mismeasured the marker's side,
-or named the wrong dictionary. Each wrong description implies another layout of the markers. The layout to which a
-homography maps the markers' centres reveals the fault.
+ChArUco board of a pair begins with another marker number. The user may have miscounted squares, mismeasured the
+marker's side, or named the wrong dictionary. Each wrong description implies another layout of the markers. The layout
+to which a homography maps the markers' centres reveals the fault.
 """
 
 import contextlib
@@ -347,8 +347,8 @@ def _explain_charuco(grey: np.ndarray, board: Board) -> Message | None:
 
 
 def explain_markers(pictures: Sequence[Markers], board: Board) -> Message | None:
-    """Explains from the markers in pictures how the visible board differs from ``board``. Returns None if both
-    agree."""
+    """Explains from the markers in pictures how the visible board differs from ``board``. Returns None if the visible
+    board agrees with ``board``."""
     layout = find_layout(pictures, board)
     if layout is None:
         if any(map(is_april_grid, pictures)):

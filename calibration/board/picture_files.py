@@ -1,7 +1,7 @@
 """Lists the board pictures of a folder by camera and shot: ``IMAGES/<camera>/<shot>.<ext>``.
 
 Many programs instead make a folder for each shot, with a file for each camera. The names of files usually reveal such a
-structure. Otherwise the pictures reveal it, because a fixed camera sees the same room in every shot.
+structure. If names do not, the pictures reveal the structure, because a fixed camera sees the same room in every shot.
 """
 
 from collections.abc import Mapping, Sequence

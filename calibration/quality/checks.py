@@ -1,5 +1,5 @@
 """Checks properties of a calibration that a low reprojection error does not imply. A calibration that fails a check is
-refused with a remedy. The verdict on a calibration also lists what it lacks, even if all checks pass.
+refused with a remedy. The verdict on a calibration also lists missing shots, even if all checks pass.
 
 The limits of the verdict were chosen on simulated sessions of 4 to 30 shots (``tests.support.board_sessions``).
 """

@@ -92,8 +92,8 @@ def view_rms(state: BundleState, observed: Observations) -> Float[np.ndarray, " 
 
 
 def bad_views(state: BundleState, observed: Observations) -> np.ndarray:
-    """Returns a mask of the views that the joint solution does not fit. The camera at fault may be another one of the
-    same shot, which ``explain_shot`` decides."""
+    """Returns a mask of the views that the joint solution does not fit. Another camera of the same shot may be at
+    fault, which ``explain_shot`` decides."""
     rms = view_rms(state, observed)
     return rms > max(VIEW_RATIO * float(np.median(rms)), VIEW_LEAST_PX)
 

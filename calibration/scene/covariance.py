@@ -6,7 +6,7 @@ singular along the seven motions of the world (rotation, translation, scale). Th
 gauge of ``calibration.adjustment.gauge``, in which these motions are no error of a camera. Lens parameters that were
 not estimated get an assumed standard deviation, which is propagated ("consider" covariance: Tapley et al., Statistical
 Orbit Determination, 2004, 6.3). With few views the principal point is not estimated. If each camera has its own lens,
-distortion is not estimated either.
+distortion is not estimated.
 """
 
 from dataclasses import dataclass, replace
@@ -57,7 +57,7 @@ class Uncertainty:
 
 
 def uncertainty(structure: Structure) -> Uncertainty:
-    """Computes the covariances of the structure's cameras. Lengths of the structure must be in millimetres."""
+    """Computes the covariances of the structure's cameras. The structure's lengths must be in millimetres."""
     rig = structure.rig
     noise = max(NOISE_LEAST_PX, 1.4826 * float(np.median(np.abs(structure.residuals()))))
     places = camera_places(structure)
@@ -98,11 +98,11 @@ def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
 
 
 def lens_misfit(structure: Structure, noise_px: float) -> float:
-    """Computes how much better the points would fit if each camera had its own lens. The ratio is about 1 if one lens
-    fits all cameras, and larger if the lenses differ.
+    """Computes how much better the points would fit if each camera had its own lens. The ratio of fits is about 1 if
+    one lens fits all cameras, and larger if the lenses differ.
 
-    The ratio is that of a score test (Rao 1948): the decrease of chi-squared in one Gauss-Newton step, divided by the
-    number of added parameters. A wrong lens hardly increases the residuals, because the poses compensate for it.
+    The ratio of fits is that of a score test (Rao 1948): the decrease of chi-squared in one Gauss-Newton step, divided
+    by the number of added parameters. A wrong lens hardly increases the residuals, because the poses compensate for it.
     """
     if not structure.one_lens or len(structure.rig) < 2:
         return 1.0

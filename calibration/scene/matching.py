@@ -1,9 +1,9 @@
 """Matches SIFT keypoints between photographs that show the same points of the scene, with pycolmap on the CPU.
 
-Shots of one rig share its cameras but not the scene, because heads move between shots. Pictures are therefore matched
-only within each shot. The keypoints of all shots of a camera are then merged into one image, so that structure from
-motion gives one pose for the camera. All steps run in one thread with one seed. With more threads, the order of
-RANSAC's random draws, and so the result, would depend on the scheduler.
+Shots of one rig share its cameras but not the scene, because heads move between shots. Photographs are therefore
+matched only within each shot. The keypoints of all shots of a camera are then merged into one image, so that structure
+from motion gives one pose for the camera. All steps of the matching run in one thread with one seed. With more threads,
+the order of RANSAC's random draws, and so the result, would depend on the scheduler.
 """
 
 from collections.abc import Iterator

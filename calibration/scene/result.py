@@ -1,5 +1,5 @@
-"""Defines the result of a calibration from a scene: the rig with its covariances, its scale, and excluded views. Also
-judges the calibration with the limits of a board calibration, and writes its report as one HTML page."""
+"""Defines the result of a calibration from a scene: the rig with its covariances, its scale, and excluded views. The
+module also judges the calibration with the limits of a board calibration, and writes its report as one HTML page."""
 
 from dataclasses import dataclass
 from html import escape

@@ -2,7 +2,7 @@
 
 The file ``scale.json`` states a known length. Without a known length, the face in the photographs is assumed to have a
 mean adult's size. If no two views show a face, the scene points near the cameras' optical axes are assumed to be a head
-of the head model's mean size. Hair, the neck and furniture then make the scale less accurate. Reports mark assumed
+of the head model's mean size. Hair, neck and furniture make such an assumed scale less accurate. Reports mark assumed
 scales.
 
 A known length also converts cameras from another program, whose unit is unknown, to millimetres. If the cameras agree
@@ -158,7 +158,7 @@ def _tags_in(grey: UInt8[np.ndarray, "h w"], detector: cv2.aruco.ArucoDetector) 
 
 def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
     """Computes the scale from the known side of tags, as the median over all tags that two or more views show. Raises
-    InputError if there is no such tag."""
+    InputError if no tag is in two views."""
     markers = []
     for number, views in tags.items():
         joined = {camera: corners for camera, corners in views.items() if camera in rig}
@@ -230,8 +230,8 @@ def _median_radius(points: Float[np.ndarray, "p 3"]) -> float:
 
 
 def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> tuple[Rig, list[Message]]:
-    """Scales a rig so that a known length is correct (mm). Returns the rig and a message about the change. If the rig
-    agrees with the length within its uncertainty, returns the unchanged rig and no message.
+    """Scales a rig so that a known length is correct (mm). Returns the scaled rig and a message about the change. If
+    the rig agrees with the length within its uncertainty, returns the unchanged rig and no message.
 
     Args:
         capture: pictures as ``rig`` took them.

@@ -1,10 +1,10 @@
 """Calibrates a rig from photographs of a scene by structure from motion, and finds its scale and world frame.
 
-The input is one photograph, or a folder of shots, for each camera. The scene must have enough detail for matching, such
-as a room, a table with objects, or a head seen by cameras 10 to 25 degrees apart.
+The input of a calibration is one photograph, or a folder of shots, for each camera. The photographed scene must have
+enough detail for matching, such as a room, a table with objects, or a head seen by cameras 10 to 25 degrees apart.
 
 If a single shot has masks, its silhouettes refine the camera poses. A check on held-out pairs of cameras decides
-whether the refined poses are kept. Each view also takes part in pairs that are not held out, so this check does not
+whether refined camera poses are kept. Each view also takes part in pairs that are not held out, so this check does not
 reveal a faulty mask.
 """
 
@@ -133,7 +133,7 @@ def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, di
 def placed(
     structure: Structure, scale: Scale, matches: Matches, left_out: dict[str, Message], front: str | None
 ) -> SceneCalibration:
-    """Converts a structure to millimetres and the world frame. Returns the calibration with covariances. Raises
+    """Converts a structure to millimetres and the world frame. Returns the scene's calibration with covariances. Raises
     CalibrationRefused if the structure lacks the camera ``front``."""
     if front in left_out:
         raise CalibrationRefused([compose("front-left-out", camera=str(front), why=left_out[str(front)])])

@@ -1,9 +1,9 @@
 """Estimates cameras and points from matches by COLMAP's incremental structure from motion, which starts from the best
 pair of views and adds the others one by one.
 
-The method is that of J. L. Schoenberger, J.-M. Frahm, Structure-from-Motion Revisited, CVPR 2016. The resulting unit of
-length and frame are arbitrary. The centre of the top-left pixel is (0.5, 0.5) in COLMAP and (0, 0) in this project, so
-principal points and keypoints are shifted.
+The method is that of J. L. Schoenberger, J.-M. Frahm, Structure-from-Motion Revisited, CVPR 2016. The structure's unit
+of length and frame are arbitrary. The centre of the top-left pixel is (0.5, 0.5) in COLMAP and (0, 0) in this project,
+so principal points and keypoints are shifted.
 """
 
 from collections.abc import Collection
@@ -67,8 +67,8 @@ def solve_structure(matches: Matches, scratch: Path, *, report: Progress) -> Str
     suitable as a start.
 
     If each camera has its own lens, the estimate starts from the single lens that fits all views best. The distortion
-    of this lens is kept, because the 300 points of a view cannot separate distortion from noise. A good start is needed
-    because one view of a head cannot separate focal length from distance.
+    of this lens is kept, because the 300 points of a view cannot separate distortion from noise. A good initial lens is
+    needed because one view of a head cannot separate focal length from distance.
     """
     import pycolmap
 

@@ -7,12 +7,12 @@ covariance of the board calibration is the prior. Silhouettes do not determine a
 change.
 
 A frontier point is a point where an epipolar plane touches the subject. Consider the angle of a contour's rays about
-the line through two camera centres. At a local extremum of the angle the epipolar plane touches the subject. Unless the
-touching point is hidden, the other camera's contour has an extremum at the same angle. ``pipeline.multiview.tangency``
-uses only the smallest and the largest angle of two cameras; a head with hair and shoulders has several more extrema.
-Concave extrema are ignored: where two parts of an outline cross (a T-junction), the contour has a concave corner that
-is no point of the subject. Extrema are paired by their angles, so the cameras must already be accurate to about
-``GATE_PX``.
+the line through two camera centres. At a local extremum of this angle the epipolar plane touches the subject. Unless
+the touching point is hidden, the other camera's contour has an extremum at the same angle.
+``pipeline.multiview.tangency`` uses only the smallest and the largest angle of two cameras; a head with hair and
+shoulders has several more extrema. Concave extrema are ignored: where two parts of an outline cross (a T-junction), the
+contour has a concave corner that is no point of the subject. Extrema of two contours are paired by their angles, so the
+cameras must already be accurate to about ``GATE_PX``.
 
 The rims of a head fitted to one capture give normal equations for the head's shape, the head's pose and the cameras
 (the paper's section 4.4, ``pipeline.contour_fit.contour``). The Schur complement eliminates shape and pose, so that
@@ -294,8 +294,8 @@ class _Refining:
         return minimise(Problem((*terms, self.prior), len(correction), np.add), correction, ONE_STEP)
 
     def tangency_term(self, correction: Float[np.ndarray, " p"], *, outer: bool) -> TangencyTerm:
-        """Finds the tangencies of all captures in the corrected cameras. Returns their cost, with robustly estimated
-        noise."""
+        """Finds the tangencies of all captures in the corrected cameras. Returns the tangencies' cost, with robustly
+        estimated noise."""
         rig = self.rig(correction)
         tangencies = [t for capture in self.captures for t in _tangencies(capture, rig, self.pairs, outer=outer)]
         packed = PackedTangencies.of(tangencies, rig)
@@ -454,7 +454,7 @@ def rim_equations(
     """Returns the normal matrix and gradient of one capture's rim cost over the left pose perturbations (rad, mm) of
     all cameras.
 
-    Entries of cameras without a usable silhouette are zero. Raises ValueError if no silhouette is usable."""
+    The entries of cameras without a usable silhouette are zero. Raises ValueError if no silhouette is usable."""
     bare = Rig(tuple(replace(camera, covariance=None) for camera in rig))  # the caller adds the prior
     solved = solve_contour(heads.model, start, silhouettes, bare, replace(heads.settings, calibration_px=HELD_PX))
     problem = replace(solved.problem, camera_information=np.zeros_like(solved.problem.camera_information))

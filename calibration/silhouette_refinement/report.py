@@ -27,7 +27,7 @@ class RefinementRun:
     warnings: tuple[Message, ...] = ()
 
     def document(self) -> dict[str, Any]:
-        """Returns the document that ``refine --json`` prints. Residuals are robust RMS values (px)."""
+        """Returns the document that ``refine --json`` prints. Residuals in the document are robust RMS values (px)."""
         refinement = self.refinement
         return {
             "kept": refinement.kept,

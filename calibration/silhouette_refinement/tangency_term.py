@@ -7,10 +7,10 @@ planes is
 
     delta = |b| b . (d1 x d2) / (|b x d1| |b x d2|)
 
-The residual is the angle delta divided by the change of angle per pixel in both images together. The residual is the
-distance (px) by which each of two equally noisy contours would have to move. At a tangent point the contour runs along
-the plane, so to first order the tangent pixels do not move along it when a camera moves. With x' = R(w) x + v in camera
-1's frame,
+The residual of a tangency is the angle delta divided by the change of angle per pixel in both images together. The
+residual is the distance (px) by which each of two equally noisy contours would have to move. At a tangent point the
+contour runs along the plane, so to first order the tangent pixels do not move along it when a camera moves. With x' =
+R(w) x + v in camera 1's frame,
 
     d delta ~ w . (R1 (d2 x b)) x R1 d1 + v . R1 (d1 x d2)         and likewise, signs swapped, for camera 2.
 
@@ -57,8 +57,8 @@ class PackedTangencies:
 class TangencyTerm:
     """Computes Geman and McClure's cost of tangency residuals as a function of the corrections of all cameras.
 
-    A correction holds, for each camera, a left perturbation of its pose in ``start`` (rad, mm). With ``focal``, it also
-    holds the change of the focal length's logarithm."""
+    A correction holds, for each camera, a left perturbation of its pose in ``start`` (rad, mm). With ``focal``, a
+    correction also holds the change of the focal length's logarithm."""
 
     seen: PackedTangencies
     start: Rig

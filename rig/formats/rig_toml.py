@@ -1,7 +1,7 @@
 """Reads rig.toml: the cameras, trigger box and lights of a rig, and the limits for a shot.
 
-Every table of the file has a frozen dataclass whose fields are the keys. An unknown key is a fault, and the message
-suggests the most similar known key. A camera is identified by its serial number, its address or a path in
+Every table of the file has a frozen dataclass whose fields are the keys. An unknown key of rig.toml is a fault, and the
+message suggests the most similar known key. A camera is identified by its serial number, its address or a path in
 /dev/v4l/by-id or by-path, never by an index, because indices change at a reboot. See deploy/rig.example.toml."""
 
 import dataclasses
@@ -116,7 +116,7 @@ class ShotConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigConfig:
-    """Holds a whole rig.toml. Relative paths in the file start from ``folder``, the file's folder."""
+    """Holds a whole rig.toml. Relative paths in rig.toml start from ``folder``, the file's folder."""
 
     format: Literal["eigenhead-rig/1"]
     cameras: tuple[CameraConfig, ...]

@@ -39,7 +39,7 @@ class DeviceArray:
 
 
 class ComputeDevice:
-    """Runs compute shaders in a separate OpenGL context. Any thread may call the methods, which run in turn.
+    """Runs compute shaders in a separate OpenGL context. Any thread may call the methods, which run one after another.
 
     ``with ComputeDevice.create() as device: ...``. Raises ComputeUnavailable if there is no OpenGL 4.3.
     """

@@ -1,6 +1,6 @@
 """Provides the EGL context and its shader programs, and handles two conventions of OpenGL.
 
-OpenGL counts rows from the bottom. All code in ``rig.render`` draws image row v to framebuffer row v, because the
+OpenGL counts image rows from the bottom. All code in ``rig.render`` draws image row v to framebuffer row v, because the
 projection in ``shaders/camera.glsl`` maps v = 0 to y = -1. OpenGL returns the lowest row first, so that a read image
 has row 0 at the top. Anticlockwise triangles become clockwise by this projection, so the context treats clockwise
 triangles as front faces.
@@ -106,7 +106,7 @@ class GlContext:
             self._rest.use()  # moderngl keeps binding the last target, and fails once that is released
 
     def program(self, vertex: str, fragment: str, geometry: str | None = None) -> moderngl.Program:
-        """Returns the shader program from files in ``shaders/``. Each program is compiled once."""
+        """Returns the shader program from files in ``shaders/``. Each shader program is compiled once."""
         key = (vertex, fragment, geometry or "")
         if key not in self._programs:
             self._programs[key] = self.gl.program(

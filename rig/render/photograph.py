@@ -1,8 +1,8 @@
 """Draws the photographs of the simulated studio from the colours and the irradiance of a subject's vertices.
 
 Structure finer than the vertices is a function of the position on the subject, so that all views agree on every pore. A
-shader evaluates this function at each pixel (``shaders/grain.glsl``). A weak highlight depends on the view. Radiance is
-linear, and a pixel is the mean of several samples.
+shader evaluates the fine structure at each pixel (``shaders/grain.glsl``). A weak highlight on skin depends on the
+view. Radiance is linear, and a pixel is the mean of several samples.
 
 The software renderer llvmpipe computes both sides of every branch. Shading brows and lips at each pixel would therefore
 take three times as long (2.5 us for each pixel).

@@ -2,14 +2,14 @@
 4.5) or lie in shadow.
 
 The module also draws a model's silhouettes, and computes their boundary-weighted XOR with the input silhouettes
-(section 4.3, eqs. 4 and 5). One instanced draw call draws the silhouettes of all cameras to one shared texture. The sum
-of ``w |S - Sm|`` is computed in two steps. The GPU adds the pixels of each block of 8 x 8 in single precision, in a
-fixed order. The CPU adds the blocks' sums in double precision. Therefore the relative error of a cost is below 64 *
-2^-24 = 4e-6, equal masks cost exactly 0, and the same input always gives the same cost. Blocks that the model cannot
-cover get the cost of an empty model.
+(section 4.3, eqs. 4 and 5). One instanced draw call draws the silhouettes of all cameras to one shared texture. The
+cost ``w |S - Sm|`` is summed in two steps. The GPU adds the pixels of each block of 8 x 8 in single precision, in a
+fixed order. The CPU adds the sums of all blocks in double precision. Therefore the relative error of a cost is below 64
+* 2^-24 = 4e-6, equal masks cost exactly 0, and the same input always gives the same cost. Pixel blocks that the model
+cannot cover get the cost of an empty model.
 
 On two cores with Mesa's llvmpipe, eleven views of 512 x 384 pixels and 4,900 triangles take 8 ms to draw and 2 ms to
-add. Atomic additions, a compute shader and mipmaps were not faster.
+add. Adding by atomics, a compute shader or mipmaps was not faster.
 """
 
 from collections.abc import Mapping, Sequence
@@ -89,8 +89,8 @@ def draw_colour(
 def draw_antialiased(
     context: GlContext, draw: moderngl.VertexArray, page: Page, samples: int
 ) -> UInt8[np.ndarray, "h w 4"]:
-    """Draws one texture of ``page`` and returns the mean over ``samples`` samples of each pixel. Colours are multiplied
-    by the coverage (alpha)."""
+    """Draws one texture of ``page`` and returns the mean over ``samples`` samples of each pixel. The returned colours
+    are multiplied by the coverage (alpha)."""
     gl, size = context.gl, (page.width, page.height)
     with Owned() as owned:
         image = owned(gl.renderbuffer(size, 4, samples=samples))
@@ -159,7 +159,7 @@ class SilhouetteSet:
         self._surfaces = []
 
     def masks(self, vertices_world: Float[np.ndarray, "v 3"]) -> dict[str, Bool[np.ndarray, "_ _"]]:
-        """Returns the mask of the mesh in each camera. A pixel is True if the mesh covers its centre."""
+        """Returns the mask of the mesh in each camera. A mask's pixel is True if the mesh covers its centre."""
         silhouettes = {}
         with self._context.current():
             self._draw(vertices_world)
@@ -382,7 +382,7 @@ class Renderer:
         self.close()
 
     def close(self) -> None:
-        """Frees the renderer's resources. Raises WrongThread in another thread."""
+        """Frees the renderer's resources. Raises WrongThread outside the renderer's thread."""
         self.context.close()
 
     def silhouette_set(self, rig: Rig, faces: Int[np.ndarray, "f 3"], scale: float = 1.0) -> SilhouetteSet:

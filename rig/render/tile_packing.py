@@ -76,8 +76,8 @@ def _page(placed: list[tuple[int, tuple[int, int, int, int]]]) -> Page:
 
 
 def lens_limit(camera: Camera) -> float:
-    """Returns the radius, in units of ``X / Z``, beyond which no point is drawn. This limit is twice the radius of the
-    image's farthest corner."""
+    """Returns the radius, in units of ``X / Z``, beyond which no point is drawn. The returned radius is twice the
+    radius of the image's farthest corner."""
     k = camera.intrinsics
     corners = np.array([(x, y) for x in (-0.5, k.width - 0.5) for y in (-0.5, k.height - 0.5)])
     radii = np.linalg.norm(camera.undistort(corners), axis=1)

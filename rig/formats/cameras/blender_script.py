@@ -1,10 +1,10 @@
 """Writes a Python script that adds a rig's cameras to a Blender scene (``blender --python cameras.py``).
 
 A camera in Blender (https://docs.blender.org/api/current/bpy.types.Camera.html) has no distortion. With ``sensor_fit``
-HORIZONTAL its focal length in pixels is ``lens * width / sensor_width``. ``shift_x`` and ``shift_y`` move the frame to
-the right and up, as fractions of the width. Blender's camera axes are x right, y up and z backwards; lengths are in
-metres. Only undistorted photographs fit as backgrounds. A custom property of each camera holds the displacement of the
-picture's corners by the lens."""
+HORIZONTAL a Blender camera's focal length in pixels is ``lens * width / sensor_width``. Blender's ``shift_x`` and
+``shift_y`` move a camera's frame to the right and up, as fractions of the width. Blender's camera axes are x right, y
+up and z backwards; lengths are in metres. Only undistorted photographs fit as backgrounds. A custom property of each
+camera holds the displacement of the picture's corners by the lens."""
 
 import json
 from pathlib import Path
@@ -51,7 +51,7 @@ bpy.context.scene.camera = bpy.data.objects[CAMERAS[0]["name"]]
 
 
 def write_blender(rig: Rig, path: Path) -> None:
-    """Writes the script to ``path``."""
+    """Writes the Blender script for a rig to ``path``."""
     entries = ",\n".join(json.dumps(_entry(camera)) for camera in rig)
     write_atomically(path, _SCRIPT.replace("{cameras}", f"[{entries}]").encode())
 

@@ -6,13 +6,13 @@ for Blender. Every reader converts its file to an ``eigenhead-cameras/1`` docume
 documents of all formats alike. The module of each format cites a description of the file's layout.
 
 In this project and OpenCV the centre of the top-left pixel is (0, 0); in COLMAP, Metashape, RealityCapture and
-nerfstudio it is (0.5, 0.5). Readers convert lengths to millimetres. Files of caliscope, Metashape and RealityCapture
-are in metres. COLMAP's arbitrary unit is taken as millimetres. In files of aniposelib, nerfstudio and OpenCV, the
-distances between the cameras determine the unit. Gaussian splatting's ``cameras.json`` and NeRSemble's
+nerfstudio it is (0.5, 0.5). Readers of camera files convert lengths to millimetres. Files of caliscope, Metashape and
+RealityCapture are in metres. COLMAP's arbitrary unit is taken as millimetres. In files of aniposelib, nerfstudio and
+OpenCV, the distances between the cameras determine the unit. Gaussian splatting's ``cameras.json`` and NeRSemble's
 ``camera_params.json`` are also read.
 
 An unread key of ``cameras.json``, such as a misspelt ``covarianse`` or a ``k4`` that the lens model lacks, is no fault,
-because files may contain keys for other programs. A warning says that the key has no effect.
+because files may contain keys for other programs. A warning says that such a key has no effect.
 """
 
 import re
@@ -92,8 +92,8 @@ def _are_of_splatting(entries: list[Any]) -> bool:
 
 
 def no_rig_fault(folder: Path) -> Message:
-    """Returns a fault that reports a folder without a file of cameras. The fault names any captures, archives, or files
-    of unsupported programs in the folder."""
+    """Returns a fault that reports a folder without a file of cameras. The returned fault names any captures, archives,
+    or files of unsupported programs in the folder."""
     if unread := unread_programs(folder):
         return unread[0]
     archives = [path.name for path in sorted(folder.iterdir()) if path.name.lower().endswith(ARCHIVE_ENDINGS)]
@@ -112,10 +112,10 @@ def find_rig_file(folder: Path) -> Path | None:
 def rig_files(folder: Path) -> Iterator[Path]:
     """Yields the files in ``folder`` that may hold the rig, at most one for each program, the best one first.
 
-    The order is: ``cameras.json``; a COLMAP model (``cameras.bin`` or ``.txt``) in ``sparse/0``, ``sparse`` or
-    ``folder``; ``camera_array.toml``; another TOML file with aniposelib's keys; ``transforms.json``; ``intri.yml``;
-    another YAML file of OpenCV with a key ``K_<camera>``; an XML file of Metashape; XMP files of RealityCapture beside
-    the pictures or in ``folder``, or its CSV; a file like ``cameras.json`` with another name.
+    The order of the files is: ``cameras.json``; a COLMAP model (``cameras.bin`` or ``.txt``) in ``sparse/0``,
+    ``sparse`` or ``folder``; ``camera_array.toml``; another TOML file with aniposelib's keys; ``transforms.json``;
+    ``intri.yml``; another YAML file of OpenCV with a key ``K_<camera>``; an XML file of Metashape; XMP files of
+    RealityCapture beside the pictures or in ``folder``, or its CSV; a file like ``cameras.json`` with another name.
     """
     here = [path for path in sorted(folder.iterdir()) if path.is_file() and not is_junk(path.name)]
     images = entry(folder, "images")
@@ -228,8 +228,8 @@ def write_rig_file(rig: Rig, path: Path, kind: str) -> None:
 
 
 def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[Message, ...]:
-    """Returns messages about the unread keys of a decoded ``cameras.json``. A key of many cameras gets one message,
-    with the number of cameras."""
+    """Returns messages about the unread keys of a decoded ``cameras.json``. An unread key of many cameras gets one
+    message, with the number of cameras."""
     counts = Counter(_unread(document))
     faults = []
     for (place, key), times in list(counts.items())[:TOLD_MOST]:

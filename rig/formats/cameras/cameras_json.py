@@ -32,7 +32,7 @@ class PoseDocument(TypedDict):
 
 class CameraDocument(TypedDict):
     """Describes one camera in JSON. ``covariance`` (6 x 6) lists rotation (rad), then translation (mm). ``serial`` is
-    the body's serial number from EXIF."""
+    the camera body's serial number from EXIF."""
 
     name: str
     width: int
@@ -59,7 +59,7 @@ def read_rig(path: Path) -> Rig:
 
 
 def read_document(path: Path) -> Any:
-    """Decodes a JSON file. Raises InputError if that fails."""
+    """Decodes a JSON file. Raises InputError if the file is no JSON."""
     try:
         return json.loads(path.read_bytes())  # UTF-8, 16 or 32, which json recognises by the first bytes
     except OSError as error:

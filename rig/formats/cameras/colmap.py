@@ -54,8 +54,8 @@ COLMAP_NAMES = {number: name for name, (number, _) in COLMAP_MODELS.items()}
 
 
 def read_colmap(path: Path) -> CamerasRead:
-    """Returns the rig in the COLMAP model whose ``cameras`` file is ``path``. Each image becomes a camera, named after
-    the image file. Raises InputError naming every fault."""
+    """Returns the rig in the COLMAP model whose ``cameras`` file is ``path``. Each image of a COLMAP model becomes a
+    camera, named after the image file. Raises InputError naming every fault."""
     folder, suffix = path.parent, path.suffix.lower()
     files = [entry(folder, f"{kind}{suffix}") for kind in ("cameras", "images")]
     subject = "/".join([folder.name, f"cameras{suffix}"]) if folder.name else f"cameras{suffix}"
@@ -128,7 +128,7 @@ class _Records:
 
 @dataclass(frozen=True, slots=True)
 class ColmapCamera:
-    """Holds a camera of a COLMAP model. ``values`` are the parameters in the order of COLMAP's camera model."""
+    """Holds a camera of a COLMAP model. ``values`` are the lens parameters in the order of COLMAP's camera model."""
 
     model: str
     width: int
@@ -212,8 +212,8 @@ def _text_images(data: bytes) -> list[ColmapImage]:
 def _is_of_points(line: str) -> bool:
     """Returns whether a line is empty or can be a list of points, each with X, Y and an integer.
 
-    A line of an image has ten or more words, one of them a name. Ten numbers cannot be points, because 3 does not
-    divide 10."""
+    An image's line in COLMAP's text has ten or more words, one of them a name. Ten numbers cannot be a list of points,
+    each of three numbers, because 3 does not divide 10."""
     words = line.split()
     try:
         return len(words) % 3 == 0 and bool(np.isfinite([float(word) for word in words]).all())

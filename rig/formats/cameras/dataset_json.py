@@ -54,7 +54,7 @@ def picture_names(rig: Rig, form: DatasetFormat) -> dict[str, str]:
 def dataset_documents(
     rig: Rig, form: DatasetFormat, *, with_points: bool, with_flame: bool = False
 ) -> dict[str, bytes]:
-    """Returns the JSON files of a data set by file name. ``rig`` holds the pinhole cameras of the pictures.
+    """Returns the JSON files of a data set by file name. ``rig`` holds the pinhole cameras of the data set's pictures.
     ``with_points`` is True if the data set has a point cloud, and ``with_flame`` if it has FLAME parameters."""
     layout, names = LAYOUTS[form], picture_names(rig, form)
     head: dict[str, object] = {"camera_model": "OPENCV", "unit": "metre"}

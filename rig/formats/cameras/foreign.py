@@ -1,7 +1,7 @@
-"""Provides functions that all readers of other programs' camera files use. These functions report damaged files, name
-cameras, convert lenses and poses, and collect faults. The module also recognises camera files that no reader supports.
-If a capture has no readable cameras, the program estimates the cameras from the photographs, and a message names the
-unread camera files."""
+"""Provides functions that all readers of other programs' camera files use. The module's functions report damaged files,
+name cameras, convert lenses and poses, and collect faults. The module also recognises camera files that no reader
+supports. If a capture has no readable cameras, the program estimates the cameras from the photographs, and a message
+names the unread camera files."""
 
 import csv
 import re
@@ -172,7 +172,7 @@ class Malformed(ValueError):
 
 
 def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
-    """Applies ``parse`` to the bytes of a file. Converts any exception due to a damaged file to InputError."""
+    """Applies ``parse`` to the bytes of a file. Converts exceptions due to damaged files to InputError."""
     try:
         if path.stat().st_size > BYTES_MOST:
             raise InputError(path.name, [compose("file-large", most_mib=BYTES_MOST >> 20)])
@@ -189,8 +189,8 @@ def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
 
 
 def camera_names(files: list[str]) -> list[str]:
-    """Returns camera names from the paths of pictures: the file names without suffix. If file names repeat
-    (``cam00/shot.png``), uses the names of the innermost folders that differ for all pictures."""
+    """Returns camera names from the paths of pictures: the file names without suffix. If pictures' file names repeat
+    (``cam00/shot.png``), cameras get the names of the innermost folders that differ for all pictures."""
     paths = [tuple(part for part in file.replace("\\", "/").split("/") if part not in ("", ".")) for file in files]
     stems = [picture_stem(path[-1]) if path else "" for path in paths]
     if len(set(stems)) == len(stems):
@@ -211,7 +211,7 @@ def camera_entry(
     translation: Float[np.ndarray, " 3"],
 ) -> dict[str, object]:
     """Returns a camera's entry of ``eigenhead-cameras/1``. ``size`` is width and height (px), ``intrinsics`` fx fy cx
-    cy (px), ``lens`` a result of ``lens_entry``. Rotation and translation (mm) are of camera_from_world."""
+    cy (px), ``lens`` a result of ``lens_entry``. The pose (mm) is camera_from_world."""
     return {
         "name": name,
         "width": size[0],
@@ -228,7 +228,7 @@ def matrix_intrinsics(matrix: Float[np.ndarray, "3 3"]) -> list[float]:
 
 
 def pose_rotation(value: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Converts a rotation vector to a matrix. Returns any other array unchanged."""
+    """Converts a rotation vector to a matrix. Returns an array of another size than 3 unchanged."""
     if value.size != 3:
         return value
     return rotation_from_vector(value.ravel()) if np.isfinite(value).all() else np.full((3, 3), np.nan)
@@ -237,10 +237,10 @@ def pose_rotation(value: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 def lens_entry(
     parameters: Mapping[str, float], where: str, faults: list[Message], *, fisheye: bool = False, skew: float = 0.0
 ) -> dict[str, str | float]:
-    """Returns the ``distortion`` entry of ``eigenhead-cameras/1`` for coefficients with OpenCV's names. A missing
+    """Returns the ``distortion`` entry of ``eigenhead-cameras/1`` for coefficients with OpenCV's names. A missing lens
     coefficient is 0. ``skew`` is entry (0, 1) of the camera matrix divided by fx.
 
-    The function chooses the lens model from the coefficients. A nonzero coefficient that the model lacks is a fault."""
+    The coefficients determine the lens model. A nonzero coefficient that the lens model lacks is a fault."""
     model: LensModel | None = "kannala-brandt" if fisheye else None
     if model is None and any(parameters.get(key, 0.0) for key in ("k4", "k5", "k6")):
         model = "rational"
@@ -254,8 +254,8 @@ def lens_entry(
 
 
 def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: list[Message]) -> np.ndarray:
-    """Converts ``value`` to an array. If that fails, appends a fault and returns an array of NaN of the wanted shape,
-    so that the reader can find further faults."""
+    """Converts ``value`` to an array. If ``value`` has another form, appends a fault and returns NaN in the wanted
+    shape, so that the reader can find further faults."""
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -331,7 +331,7 @@ def brown_conrady(
     radial: Sequence[float], radius: float, focal: float, where: str, faults: list[Message]
 ) -> list[float]:
     """Approximates the polynomial ``radial`` with coefficients k1 k2 k3 k4 ... by three coefficients k1 k2 k3.
-    ``radius`` is that of the picture's corner, in units of ``X / Z``. Appends a fault if the error exceeds
+    ``radius`` is the radius of the picture's corner, in units of ``X / Z``. Appends a fault if the error exceeds
     ``LENS_LOSS_PX`` at the focal length ``focal`` (px)."""
     if not any(radial[3:]) or not np.isfinite([*radial, radius, focal]).all():
         return list(radial[:3])
@@ -361,7 +361,7 @@ def unread_programs(folder: Path) -> list[Message]:
 
 
 def program_of(path: Path) -> str | None:
-    """Returns the program that wrote an unsupported camera file, and a remedy. Returns None for any other file."""
+    """Returns the program that wrote an unsupported camera file, and a remedy, or None for any other file."""
     named = (program for pattern, program in PATTERNS if fnmatch(path.name.lower(), pattern))
     held = (
         program

@@ -1,9 +1,9 @@
 """Declares how the readers treat each key in the camera files of other programs.
 
-The reader uses a key that is ``read``. A key that is ``refused`` changes a camera in a way that this project cannot
-represent, so a file with a value that has an effect is refused. The reader ignores the value of a key that is ``told``,
-and reports the key by the warning ``unknown-key``. A key that is ``nothing`` has no influence on poses and lenses. A
-key missing from the table also gives a warning. ``docs/foreign-cameras.md`` is generated from this table."""
+A reader of camera files uses a key that is ``read``. A key that is ``refused`` changes a camera in a way that this
+project cannot represent, so a file with a value that has an effect is refused. The reader ignores the value of a key
+that is ``told``, and reports the key by the warning ``unknown-key``. A key that is ``nothing`` has no influence on
+poses and lenses. Unlisted keys also give a warning. ``docs/foreign-cameras.md`` is generated from this module."""
 
 from collections.abc import Iterator, Mapping
 from typing import Literal, NamedTuple

@@ -1,10 +1,10 @@
 """Reads and writes cameras in Agisoft Metashape's XML format (File > Export > Export Cameras).
 
-A chunk is Metashape's group of aligned cameras. Each camera has a 4 x 4 transform to the chunk's frame, with OpenCV's
-camera axes. The transform of the camera's component or of the chunk then converts to the world, in metres. The lens
-model (user manual, appendix "Camera models") is ``u = w / 2 + cx + x' f + x' b1 + y' b2``. The picture's corner is at
-0, so half a pixel is subtracted. The coefficients p1 and p2 are exchanged relative to OpenCV. A lens of type
-``fisheye`` with k1 to k4 is Kannala and Brandt's lens."""
+A chunk is Metashape's group of aligned cameras. Each Metashape camera has a 4 x 4 transform to its group's frame, with
+OpenCV's camera axes. The transform of the camera's component or chunk converts from there to the world, in metres. The
+lens model (user manual, appendix "Camera models") is ``u = w / 2 + cx + x' f + x' b1 + y' b2``. Metashape's pixels
+count from the picture's corner, so half a pixel is subtracted. Metashape's coefficients p1 and p2 are exchanged
+relative to OpenCV. A lens of type ``fisheye`` with k1 to k4 is Kannala and Brandt's lens."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -169,8 +169,8 @@ def write_metashape(rig: Rig, path: Path) -> None:
 
 
 def _similarity(node: ElementTree.Element, faults: list[Message]) -> Similarity:
-    """Returns the transform from the chunk to the world (mm). Without a transform, the chunk's arbitrary unit is taken
-    as millimetres."""
+    """Returns the transform from the chunk to the world (mm). If the chunk has no transform, its arbitrary unit is
+    taken as millimetres."""
     found = node.find("transform")
     if found is None or not len(found):
         return np.eye(3), np.zeros(3), 1.0

@@ -3,12 +3,12 @@
 
 The file ``intri.yml`` contains ``names``, ``K_<name>`` and ``dist_<name>``. The file ``extri.yml`` contains
 camera_from_world as ``T_<name>`` and ``Rot_<name>`` (or ``R_<name>``, a rotation vector). One file of another name may
-contain all these keys. Lengths are in metres if all cameras lie within 30 units of each other, otherwise in
-millimetres. If the size keys ``W_<name>`` and ``H_<name>`` are missing, the size is read from the pictures.
+contain the keys of ``intri.yml`` and ``extri.yml``. Lengths are in metres if all cameras lie within 30 units of each
+other, otherwise in millimetres. If the size keys ``W_<name>`` and ``H_<name>`` are missing, pictures give the size.
 
 The module also reads and writes two TOML formats: caliscope's ``camera_array.toml`` (metres;
-https://mprib.github.io/caliscope) and aniposelib's (in the unit of the board; https://anipose.readthedocs.io). All
-these formats have OpenCV's pixel centres, so no principal point is shifted."""
+https://mprib.github.io/caliscope) and aniposelib's (in the unit of the board; https://anipose.readthedocs.io). The
+module's formats have OpenCV's pixel centres, so no principal point is shifted."""
 
 import json
 import re
@@ -96,7 +96,7 @@ def read_yaml(path: Path) -> CamerasRead:
 
 def _taking_part(held: list[str], listed: list[str] | None, reading: Reading) -> list[str]:
     """Returns the cameras that the file's list ``names`` contains, or all cameras without such a list. Appends a fault
-    if the file lacks a listed camera."""
+    if the file lacks a camera of ``names``."""
     if not listed:
         return held
     lacking = [name for name in listed if name not in held]
@@ -296,8 +296,8 @@ def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults:
 def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]], reading: Reading) -> float:
     """Returns how many millimetres the unit of an aniposelib file has.
 
-    The key ``metadata.unit`` states the unit. Without this key, cameras within 30 units of each other are taken to be
-    in metres, because aniposelib uses the unit of the board."""
+    The key ``metadata.unit`` states the unit. Without ``metadata.unit``, cameras within 30 units of each other are
+    taken to be in metres, because aniposelib uses the unit of the board."""
     metadata = document.get("metadata")
     unit = metadata.get("unit") if isinstance(metadata, dict) else None
     if isinstance(metadata, dict):

@@ -3,10 +3,10 @@
 
 In XMP (https://support.capturingreality.com/hc/en-us/articles/360017783459), ``Rotation`` is camera_from_world with
 OpenCV's axes, and ``Position`` is the camera's centre in metres. The focal length is for a film whose longer side is 36
-mm. The principal point is relative to the middle, in multiples of the longer side. The CSV has the same focal length,
-the principal point in millimetres on the film, and heading, pitch and roll in degrees. With all three angles zero, a
-camera points down with its top to the north. The picture's size comes from the picture files. Distortion applies to ``X
-/ Z`` with k1 to k4; t1 and t2 are OpenCV's p1 and p2."""
+mm. In XMP the principal point is relative to the picture's middle, in multiples of the longer side. The CSV has the
+focal length of XMP, the principal point in millimetres on the film, and heading, pitch and roll in degrees. With all
+three angles zero, a camera points down with its top to the north. The picture's size comes from the picture files.
+Distortion applies to ``X / Z`` with k1 to k4; t1 and t2 are OpenCV's p1 and p2."""
 
 import csv
 import io
@@ -63,8 +63,8 @@ _XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
 
 
 def read_xmp(file: Path) -> CamerasRead:
-    """Returns the rig in all XMP files of the folder that contains ``file``; each file holds one camera. Cameras that
-    are not aligned or not used for meshing are excluded. Raises InputError naming every fault."""
+    """Returns the rig in all XMP files of the folder that contains ``file``, each with one camera. Cameras that are not
+    aligned or not used for meshing are excluded. Raises InputError naming every fault."""
     folder = file.parent
     reading = Reading(f"{folder.name}/*.xmp")
     entries = []

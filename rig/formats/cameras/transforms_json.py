@@ -94,7 +94,7 @@ def _frames_of_one_moment(
 
 
 def read_splatting(document: Any, path: Path) -> CamerasRead:
-    """Returns the rig in Gaussian splatting's ``cameras.json``. The file holds world_from_camera with OpenCV's axes, in
+    """Returns the rig in Gaussian splatting's ``cameras.json``. The JSON holds world_from_camera with OpenCV's axes, in
     an arbitrary unit, of pinholes with a central principal point. Raises InputError naming every fault."""
     reading = Reading(path.name)
     faults, entries, names = reading.faults, [], camera_names([str(camera["img_name"]) for camera in document])
@@ -111,9 +111,9 @@ def read_splatting(document: Any, path: Path) -> CamerasRead:
 
 
 def read_nersemble(document: Any, path: Path) -> CamerasRead:
-    """Returns the rig in NeRSemble's ``camera_params.json``. The file holds camera_from_world in metres with OpenCV's
-    axes, and one camera matrix for all cameras. The size is read from the pictures. Raises InputError naming every
-    fault."""
+    """Returns the rig in NeRSemble's ``camera_params.json``. NeRSemble's file holds camera_from_world in metres with
+    OpenCV's axes, and one camera matrix for all cameras. NeRSemble's image size is read from the pictures. Raises
+    InputError naming every fault."""
     reading = Reading(path.name)
     faults, poses = reading.faults, document["world_2_cam"]
     if not isinstance(poses, dict):

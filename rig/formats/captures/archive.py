@@ -1,12 +1,12 @@
 """Extracts an uploaded .zip, .tar or .tar.gz archive safely.
 
-An uploaded archive may be malicious, so the module does not trust the sizes and names that it states. Each member's
-name and kind are checked before the member is written, and bytes are counted while unpacking. If the archive is
-refused, the folder stays empty. Every fault names a member of the archive.
+An uploaded archive may be malicious, so the module does not trust the sizes and names that it states. An archive
+member's name and kind are checked before the member is written, and bytes are counted while unpacking. If the archive
+is refused, the destination folder stays empty. Every fault of an archive names one of its members.
 
 A member's name is decoded as UTF-8 if its bytes are valid UTF-8, because macOS writes UTF-8 without setting the zip
-flag for it. Other names are decoded as code page 437, the default of the zip format. Folders that enclose the capture,
-and files that file managers add, are not written, so their names are checked less strictly.
+flag for it. Member names that are not UTF-8 are decoded as code page 437, the default of the zip format. Folders that
+enclose the capture, and files that file managers add, are not written, so their names are checked less strictly.
 
 Known attacks are described at https://www.bamsoftware.com/hacks/zipbomb (overlapping members), CVE-2007-4559 (traversal
 and links in tar), https://www.unicode.org/reports/tr39 (confusable names)."""
@@ -72,7 +72,7 @@ class ArchiveLimits:
 
 @dataclass(frozen=True, slots=True)
 class _Member:
-    """Holds one member of an archive. ``guessed`` is True if the archive does not state the encoding of the name."""
+    """Holds one member of an archive. ``guessed`` is True if the archive does not state its name's encoding."""
 
     name: str
     size: int
@@ -115,7 +115,7 @@ def is_archive(path: Path) -> bool:
 def extract_archive(path: Path, folder: Path, limits: ArchiveLimits = ArchiveLimits()) -> tuple[str, ...]:
     """Unpacks ``path`` into the empty or absent ``folder`` and returns the relative names of the files written.
 
-    Raises InputError naming every fault, and OSError for a full disk. After an error, ``folder`` is empty."""
+    Raises InputError naming every fault, and OSError for a full disk. After a failed unpacking, ``folder`` is empty."""
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise InputError(folder.name, [compose("archive-folder-not-empty")])
@@ -289,8 +289,8 @@ def _buffered(stream: object) -> BufferedIOBase:
 
 
 def _extract(members: Iterable[_Member], folder: Path, limits: ArchiveLimits, packed_bytes: int) -> tuple[str, ...]:
-    """Writes the files until the first fault, and only checks later members. Faults in names of folders that enclose
-    all files are ignored at the end, because such folders are not written."""
+    """Writes an archive's files until the first fault, and only checks later members. Faults in names of folders that
+    enclose all files are ignored at the end, because such folders are not written."""
     faults = _Faults()
     seen: dict[str, tuple[str, str]] = {}
     odd: dict[tuple[str, ...], list[Message]] = {}
@@ -359,7 +359,7 @@ def _judge(
     faults: _Faults,
     limits: ArchiveLimits,
 ) -> str | None:
-    """Returns the relative name to which a member is written, or None to skip it. Adds the member's faults to
+    """Returns the relative name to which a member is written, or None to skip it. Adds the archive member's faults to
     ``faults``. ``odd`` collects faults of folder names by path, which are ignored if the folder is not written."""
     if member.kind not in ("file", "folder"):
         faults.add(compose("member-no-file", member=member.shown, kind=_NO_FILES[member.kind]))
@@ -401,7 +401,7 @@ def _empty(folder: Path) -> None:
 
 
 def decoded_name(raw: bytes) -> tuple[str, bool]:
-    """Decodes a member's name. Returns the name, and whether its encoding is a guess."""
+    """Decodes a member's name. Returns the archive member's name, and whether its encoding is a guess."""
     try:
         return raw.decode("utf-8"), False
     except UnicodeDecodeError:
@@ -428,7 +428,7 @@ def unicode_path(extra: bytes, raw: bytes) -> bytes | None:
 
 def name_clash(parts: list[str], shown: str, kind: str, seen: dict[str, tuple[str, str]]) -> Message | None:
     """Returns a fault if a name equals another member's name, or if some file systems do not distinguish the two names.
-    Adds the name to ``seen``."""
+    Adds the member's name to ``seen``."""
     name = "/".join(parts)
     key = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
     other = seen.get(key)
@@ -443,7 +443,7 @@ def name_clash(parts: list[str], shown: str, kind: str, seen: dict[str, tuple[st
 
 
 def path_faults(name: str, shown: str, *, depth: int, name_length: int) -> list[Message]:
-    """Returns faults of a member's path that not even skipped members may have. ``shown`` is its name in messages."""
+    """Returns faults of a member's path that not even skipped members may have. Messages name the member ``shown``."""
     if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
         return [compose("member-name-invisible", member=shown)]
     if "\\" in name or re.match(r"^[A-Za-z]:", name):

@@ -62,7 +62,7 @@ SETS_ALIKE = 0.9  # to texture_sets: "texture_set" 0.96, "texture-sets" 0.92; "t
 
 
 def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Capture, Rig]:
-    """Reads a capture folder. Returns its capture and cameras, without cameras whose pictures are unusable.
+    """Reads a capture folder. Returns the folder's capture and cameras, without cameras whose pictures are unusable.
 
     Pictures and feature points of cameras with a ``recorded`` lens are undistorted. Pictures of more than
     ``pixels_most`` pixels are reduced, and the cameras' intrinsics scaled. Raises InputError naming every fault of the
@@ -314,7 +314,7 @@ def _cut_outs(
 ) -> MaskSubjects | None:
     """Returns masks from the alpha channels, if every picture has a transparent background.
 
-    Returns None, and no fault, if one picture is opaque or its alpha channel is no valid mask."""
+    Returns None, and no fault, if any picture is opaque or its alpha channel is no valid mask."""
     found = {}
     for _, name, path in (job for job in jobs if job[0] == "images"):
         alpha, k = cut_out_alpha(path), rig[name].intrinsics
@@ -330,7 +330,7 @@ def _sample_bits(
     jobs: Sequence[tuple[str, str, Path]], faults: list[Message]
 ) -> tuple[Mapping[str, int], list[Message]]:
     """Returns the number of used bits in 16-bit files by kind of file, and a warning if not all bits are used. Appends
-    a fault for files with a raw sensor mosaic."""
+    a fault for picture files with a raw sensor mosaic."""
     kinds = [*dict.fromkeys(("images", "background", *(kind for kind, _, _ in jobs if kind != "masks")))]
     samples = {kind: measure_samples([path for of, _, path in jobs if of == kind]) for kind in kinds}
     mosaics = [f"{kind}/" for kind in kinds if samples[kind].mosaic]
@@ -393,8 +393,8 @@ def _in_read_pictures(features: Features, rig: Rig) -> Features:
 def decode_picture(
     folder: Path, kind: str, name: str, path: Path, *, rig: Rig, pixels_most: int | None, bits: int
 ) -> tuple[np.ndarray | None, str, Message | None]:
-    """Decodes, reduces and undistorts a picture file of camera ``name``. Returns its pixels and the file's SHA-256, or
-    a fault if it is damaged. ``kind`` is images, background, masks or a texture set's folder."""
+    """Decodes, reduces and undistorts a picture file of camera ``name``. Returns the picture's pixels and the file's
+    SHA-256, or a fault if the file is damaged. ``kind`` is images, background, masks or a texture set's folder."""
     camera = rig[name]
     wanted, share = (camera.intrinsics.width, camera.intrinsics.height), work_share(camera.intrinsics, pixels_most)
     where, whole = path.relative_to(folder).as_posix(), kind == "masks"
@@ -436,7 +436,7 @@ def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> Message:
 
 def full_size_reader(folder: Path, rig: Rig, left_out: Sequence[str] = ()) -> ReadImage:
     """Returns a function that reads and undistorts the picture of a camera at full size. ``folder`` is the capture's
-    folder. ``left_out`` lists cameras that are in its camera file but not in ``rig``."""
+    folder. ``left_out`` lists cameras that are in the capture's camera file but not in ``rig``."""
     files = find_files(folder, rig, left_out)
     paths = {name: path for name in rig.names for kind, path in files.of_camera(name) if kind == "images"}
     bits = measure_samples([*paths.values()]).bits or WHOLE_BITS

@@ -1,7 +1,7 @@
 """Reads the masks of one capture together, to decide whether black or white is the subject.
 
 The input is the decoded pixels of a mask file for each camera. The output is masks (True = subject) at the size of the
-reduced pictures, grey values of masks with soft edges, and warnings. Files with the same fault share one message."""
+reduced pictures, grey values of masks with soft edges, and warnings. Masks with equal faults share one message."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -74,7 +74,7 @@ def mask_subjects(
 
 
 def _without_specks(share: Share) -> tuple[Share, float]:
-    """Removes small components beside the subject and fills small holes. Returns the mask and the changed area,
+    """Removes small components beside the subject and fills small holes. Returns the cleaned mask and the changed area,
     relative to the subject's.
 
     A small component would otherwise distort the outline that is compared between cameras."""
@@ -116,7 +116,7 @@ def _in_picture(
 
 
 def _middles(rig: Rig) -> dict[str, np.ndarray]:
-    """Projects the point nearest to all optical axes to each camera. Returns an empty result for a single camera."""
+    """Projects the point nearest to all optical axes to each camera. Returns no projected point for a single camera."""
     if len(rig) < 2:
         return {}
     point = rig.centre_world()[None]

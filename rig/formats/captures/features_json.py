@@ -74,7 +74,7 @@ def features_from_document(document: Any, rig: Rig, faults: list[Message]) -> Fe
 
 def _fault_of_all(points: dict[str, Any], rig: Rig) -> Message | None:
     """Returns a fault that all points share: cameras and landmarks nested in the wrong order, fractions of the picture
-    instead of pixels, or pixels of pictures of another size. Returns None without a common fault."""
+    instead of pixels, or pixels of pictures of another size. Returns None if the points have no common fault."""
     inner = {name for views in points.values() if isinstance(views, dict) for name in views}
     if points and inner and all(name in rig for name in points) and not any(name in rig for name in inner):
         return compose("features-by-camera")

@@ -2,9 +2,9 @@
 
 A file with the name of a camera belongs to that camera. If a camera has no such file, a similar name is accepted if it
 fits only one camera (``rig.formats.pictures.picture_names``). If no name matches, the camera body's serial number in
-the file decides. The number is EXIF's BodySerialNumber (CIPA DC-008, tag 0xA431), for Canon's CR3 in its box CMT2, or
-DNG's CameraSerialNumber (0xC62F). Files may also lie in a folder with the camera's name, and all folders in one
-enclosing folder."""
+the file decides. A camera body's serial number is EXIF's BodySerialNumber (CIPA DC-008, tag 0xA431), for Canon's CR3 in
+its box CMT2, or DNG's CameraSerialNumber (0xC62F). Pictures may also lie in a folder with the camera's name, and all
+folders in one enclosing folder."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -82,7 +82,7 @@ def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
 
 
 def pictures_by_serial(folder: Path, rig: Rig, faults: list[Message]) -> dict[str, Path]:
-    """Matches pictures of ``folder`` to cameras by serial number. Returns the pictures by camera.
+    """Matches pictures of ``folder`` to cameras by serial number. Returns the matched pictures by camera.
 
     If every camera has a picture with its name, reads no file. Appends a fault for each unmatched picture, and for two
     pictures by one camera body."""
@@ -249,7 +249,7 @@ def _folders(place: Path) -> list[Path]:
 
 
 def _one(paths: Sequence[Path], root: Path, faults: list[Message]) -> Path | None:
-    """Returns a camera's only picture or mask, which may lie in a folder. Appends a fault if there are several."""
+    """Returns a camera's only picture or mask, which may lie in a folder. Appends a fault if the camera has several."""
     files = [path for path in paths if path.is_file()]
     if len(files) > 1:
         where = files[0].parent.relative_to(root).as_posix()

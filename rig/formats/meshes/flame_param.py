@@ -1,8 +1,8 @@
 """Reads and writes flame_param.npz, the parameters of a FLAME head that VHAP writes and GaussianAvatars reads.
 
-The file is a NumPy archive of float32 arrays (https://github.com/ShenhanQian/VHAP,
+The file flame_param.npz is a NumPy archive of float32 arrays (https://github.com/ShenhanQian/VHAP,
 https://github.com/ShenhanQian/GaussianAvatars). Lengths are in metres and rotation vectors in radians. The first axis
-is time. ``static_offset`` is added to each vertex before any joint rotates.
+of the FLAME arrays is time. ``static_offset`` is added to each vertex before any joint rotates.
 """
 
 import io
@@ -30,7 +30,7 @@ def flame_param(
     translation: Float[np.ndarray, " 3"],
     offsets: Float[np.ndarray, "v 3"],
 ) -> FlameParam:
-    """Returns the arrays of the file for one moment. ``pose`` holds rotations of root, neck, jaw and both eyes."""
+    """Returns the arrays of flame_param.npz for one moment. ``pose`` holds rotations of root, neck, jaw and eyes."""
     parts = np.split(pose.ravel(), np.cumsum([*POSES.values()])[:-1])
     arrays = {"shape": shape, "expr": expression[None]}
     arrays |= {name: part[None] for name, part in zip(POSES, parts, strict=True)}
@@ -39,7 +39,7 @@ def flame_param(
 
 
 def canonical(parameters: FlameParam) -> FlameParam:
-    """Returns the parameters of the same head at the origin, facing along z, without expression and with open mouth."""
+    """Returns a FLAME head's parameters at the origin, facing along z, without expression and with open mouth."""
     out = {name: array if name in ("shape", "static_offset") else 0.0 * array for name, array in parameters.items()}
     return out | {"jaw_pose": np.array([[CANONICAL_JAW_RAD, 0.0, 0.0]], np.float32)}
 
@@ -53,7 +53,7 @@ def encode_flame_param(parameters: FlameParam) -> bytes:
 
 
 def read_flame_param(path: Path) -> FlameParam:
-    """Reads the arrays of a file with one moment. Raises InputError if the file is damaged or contains other arrays."""
+    """Reads the arrays of a flame_param.npz with one moment. Raises InputError for a damaged file or other arrays."""
     try:
         with open_npz(path) as file:
             arrays = {name: file[name].astype(np.float32) for name in file}

@@ -4,7 +4,7 @@ The library trimesh is not used, because its output differs between versions.
 If a scene has pivots, the top node is ``neck``, at the joint of skull and spine. The child nodes of ``neck`` are the
 parts that turn with it, and a node for every other pivot (``jaw``, ``eye_right``, ``eye_left``). A part with the name
 of a pivot is the mesh of the pivot's node. Morph targets are sparse, because an expression moves only a part of the
-face. Their names are in ``extras.targetNames``, where three.js and Blender read them.
+face. Morph targets' names are in ``extras.targetNames``, where three.js and Blender read them.
 """
 
 import json
@@ -90,7 +90,7 @@ class _Writer:
         return header + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
 
     def append_mesh(self, part: Part, vertices: Float[np.ndarray, "v 3"]) -> int:
-        """Appends a part as a mesh and returns the mesh's index. The vertices (mm) are relative to the part's node.
+        """Appends a part as a mesh and returns the mesh's index. Vertices (mm) are relative to the part's node.
 
         The sRGB colours are converted to linear values for glTF's ``COLOR_0``, with 16 bits to keep dark tones
         distinct. https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes
@@ -152,7 +152,7 @@ class _Writer:
         return len(materials) - 1
 
     def _texture(self, image: bytes, mime: str) -> int:
-        """Returns the index of the texture of an encoded image. Identical images share one texture."""
+        """Returns the index of the texture of an encoded image. Identical images share one texture of the GLB file."""
         if image in self._textures:
             return self._textures[image]
         self.document.setdefault("samplers", [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}])

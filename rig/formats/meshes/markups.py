@@ -1,7 +1,7 @@
 """Reads and writes point lists of 3D Slicer (``.mrk.json``, markups schema 1.0.3).
 
-A file states whether its axes are LPS (x to the patient's left, y to the back, z up) or RAS (x to the right, y to the
-front, z up). A half turn about z converts one to the other. Lengths are in millimetres.
+A point list states whether its axes are LPS (x to the patient's left, y to the back, z up) or RAS (x to the right, y to
+the front, z up). A half turn about z converts between LPS and RAS axes. Lengths are in millimetres.
 """
 
 import json

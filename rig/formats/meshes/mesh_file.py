@@ -34,7 +34,7 @@ SURFACE_ENDINGS = (*MESH_ENDINGS, ".stl")  # STL has neither colours nor joined 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TexturedMesh:
-    """Holds a mesh in the unit of its file, with an optional texture. Vertices are repeated along texture seams."""
+    """Holds a mesh in the unit of its file, with an optional texture. Mesh vertices are repeated along seams."""
 
     mesh: Mesh
     uv: Float[np.ndarray, "v 2"] | None = None  # of the vertices, v upwards

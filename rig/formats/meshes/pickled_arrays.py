@@ -2,7 +2,7 @@
 
 Loading a pickle normally imports and calls the classes and functions that it names. This module does not import
 anything that a pickle names. Objects of NumPy, SciPy and chumpy are replaced by harmless stand-in classes that decode
-plain numbers. A pickle with any other name is refused. Pickles of Python 2 are also read.
+plain numbers. A pickle with the name of any other object is refused. Pickles of Python 2 are read.
 """
 
 import io
@@ -51,7 +51,7 @@ def open_npz(source: Path | io.BytesIO) -> Iterator[Any]:
 
 def read_pickled_arrays(path: Path) -> dict[str, np.ndarray]:
     """Returns the arrays of a pickled dictionary by name. Omits entries without numbers, and converts sparse matrices
-    to dense arrays. Raises InputError with the fault."""
+    to dense arrays. Raises InputError with the pickle's fault."""
     if path.stat().st_size > MAX_BYTES:
         large = compose("mesh-file-large", size_mb=path.stat().st_size >> 20, most_mb=MAX_BYTES >> 20)
         raise InputError(path.name, [large])
@@ -81,7 +81,7 @@ class _StandIn:
         """Ignores the constructor arguments in a pickle."""
 
     def __setstate__(self, state: Any) -> None:
-        """Ignores the object's state in a pickle."""
+        """Ignores the state that a pickle sets on an object."""
 
 
 class _Type(_StandIn):
@@ -100,7 +100,7 @@ class _Type(_StandIn):
 
 
 class _Array(_StandIn):
-    """Replaces numpy.ndarray. Stores shape, type, memory order and bytes."""
+    """Replaces numpy.ndarray. Stores a pickled array's shape, type, memory order and bytes."""
 
     value: np.ndarray | None = None
 

@@ -39,7 +39,7 @@ def ply_bytes(
     """Encodes a surface (mm) as binary little-endian PLY with unit normals and sRGB colours. ``quality`` is the
     standard deviation of each vertex along its normal (mm), ``views`` the number of images that coloured it, and
     ``part`` its label (skin, hair or clothes). ``corner_uv`` holds texture coordinates of the faces' corners with v
-    downwards, written as MeshLab's ``texcoord`` with v upwards. ``comments`` are lines of the header."""
+    downwards, written as MeshLab's ``texcoord`` with v upwards. ``comments`` are lines of the PLY header."""
     kind = PLY_VERTEX if part is None else PLY_PART_VERTEX
     vertices = np.empty(len(mesh.vertices), kind)
     for i, axis in enumerate("xyz"):

@@ -27,8 +27,8 @@ KEPT_STATEMENTS = ("o", "g", "s", "usemtl")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolygonMesh:
-    """Holds a polygon mesh with the order of its file. ``corners`` concatenates the corners of all polygons. In ``uv``,
-    v points upwards."""
+    """Holds a polygon mesh with the order of its file. The array ``corners`` concatenates the corners of all polygons.
+    In the texture coordinates ``uv``, v points upwards."""
 
     vertices: Float[np.ndarray, "v 3"]
     sizes: Int[np.ndarray, " p"]  # corners of each polygon, 3 or more
@@ -70,7 +70,7 @@ def read_polygons(path: Path) -> PolygonMesh:
 
 
 def _whole_lines(file: Iterable[str]) -> Iterable[tuple[int, str]]:
-    """Yields lines with their numbers. Joins a line that ends with a backslash with the next line."""
+    """Yields lines with their numbers. Joins a line of OBJ that ends with a backslash with the next line."""
     begun = ""
     for number, raw in enumerate(file, start=1):
         line = raw.rstrip()
@@ -141,7 +141,7 @@ class _Reading:
         self.sizes.append(len(named))
 
     def _row(self, number: int, index: int | None, count: int) -> int:
-        """Converts an index of OBJ, which counts from 1 or backwards from -1, to a row number. Indices beyond the
+        """Converts an index of OBJ, which counts from 1 or backwards from -1, to a row number. OBJ indices beyond the
         ``count`` rows so far are checked at the end of the file."""
         row = -1 if index is None else index - 1 if index > 0 else count + index
         if not index or row < 0:
@@ -153,7 +153,7 @@ class _Reading:
         return len(self.vertices) > MOST_VERTICES or len(self.corners) > MOST_CORNERS or len(self.uv) > MOST_CORNERS
 
     def finished(self, name: str) -> PolygonMesh:
-        """Returns the mesh after the end of the file. Raises InputError naming every fault."""
+        """Returns the mesh after the end of the OBJ file. Raises InputError naming every fault."""
         faults = self.faults
         if self.untold:
             faults.append(compose("lines-more", more=self.untold))
@@ -192,8 +192,8 @@ def polygon_obj_bytes(
     decimals: int = 4,
 ) -> bytes:
     """Encodes ``mesh`` as OBJ with the vertex positions ``vertices``. sRGB colours follow the position on a line, as
-    MeshLab and Blender expect. ``comments`` are lines at the top. ``library`` is the name of an .mtl file in the same
-    folder. ``decimals`` applies to positions."""
+    MeshLab and Blender expect. ``comments`` are lines at the top of the OBJ file. ``library`` is the name of an .mtl
+    file in the same folder. ``decimals`` applies to positions."""
     text = io.StringIO()
     text.writelines(f"# {line}\n" for line in comments)
     position = " ".join([f"%.{decimals}f"] * 3)

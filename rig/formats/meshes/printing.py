@@ -1,4 +1,4 @@
-"""Writes closed meshes in millimetres as STL and 3MF, for 3D printing. Only 3MF files state their unit."""
+"""Writes closed meshes in millimetres as STL and 3MF, for 3D printing. STL files state no unit, 3MF files do."""
 
 import io
 import zipfile
@@ -34,8 +34,8 @@ def stl_bytes(mesh: Mesh) -> bytes:
 
 
 def threemf_bytes(mesh: Mesh) -> bytes:
-    """Encodes a mesh as 3MF core 1.3 (https://github.com/3MFConsortium/spec_core). The file contains no time, so that
-    equal meshes give equal bytes."""
+    """Encodes a mesh as 3MF core 1.3 (https://github.com/3MFConsortium/spec_core). The 3MF file contains no time, so
+    that equal meshes give equal bytes."""
     text = io.StringIO()
     text.write(
         '<?xml version="1.0" encoding="UTF-8"?>\n<model unit="millimeter" xml:lang="en-US" '

@@ -56,7 +56,7 @@ def openusd_module(name: str) -> Any:
 
 
 def write_layer(path: Path, scene: Scene) -> None:
-    """Writes the scene's parts to ``path`` (.usdc). The texture files must lie in the same folder."""
+    """Writes the scene's parts to ``path`` (.usdc). The scene's texture files must lie in the same folder."""
     Gf, Usd, UsdGeom = map(openusd_module, ("Gf", "Usd", "UsdGeom"))
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)

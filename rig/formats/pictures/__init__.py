@@ -1,3 +1,3 @@
 """Reads and writes pictures and masks, and interprets their file names and pixel values.
 
-The output is 8-bit arrays and, for masks, the subject's share in every pixel."""
+The output of readers is 8-bit arrays and, for masks, the subject's share in every pixel."""

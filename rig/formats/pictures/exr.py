@@ -1,7 +1,7 @@
 """Writes OpenEXR pictures of linear light in half precision, with lossless compression (ZIP, 16 rows in a block).
 
-The format is described at https://openexr.com/en/latest/OpenEXRFileLayout.html. No library of this project writes
-OpenEXR.
+The format OpenEXR is described at https://openexr.com/en/latest/OpenEXRFileLayout.html. No library of this project
+writes OpenEXR.
 """
 
 import struct
@@ -58,7 +58,7 @@ def _header(width: int, height: int) -> bytes:
 
 def _block(samples: Float[np.ndarray, "r 3 w"]) -> bytes:
     """Compresses some rows: separates low from high bytes, takes differences of neighbours, and applies zlib. Returns
-    the samples uncompressed if that is shorter."""
+    the rows' samples uncompressed if that is shorter."""
     raw = np.frombuffer(np.ascontiguousarray(samples).tobytes(), np.uint8)
     parted = np.concatenate([raw[::2], raw[1::2]])
     differences = np.concatenate([parted[:1], parted[1:] - parted[:-1] + np.uint8(128)])

@@ -1,7 +1,7 @@
 """Reads picture files, whose content determines the format, and writes picture files atomically.
 
 OpenCV decodes ordinary pictures (8 or 16 bits), LibRaw decodes RAW and DNG, and libheif decodes HEIC. Photographs are
-converted to 8-bit sRGB. The header of a Netpbm file states the value of white (4095 for 12 bits), which becomes 255.
+converted to 8-bit sRGB. A Netpbm picture's header states the value of white (4095 for 12 bits), which becomes 255.
 EXIF's orientation is ignored, because calibrations refer to the sensor's rows and columns."""
 
 import hashlib
@@ -100,8 +100,8 @@ def read_image(path: Path) -> ImageRgb:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Returns width and height (px) from the header. The file is not decoded, because a small file may claim a huge
-    size. Raises InputError without a valid header."""
+    """Returns a picture's width and height (px) from the file's header. The picture file is not decoded, because a
+    small file may claim a huge size. Raises InputError if the picture file has no valid header."""
     with _faults_of(path.name):
         return _header_size(path.read_bytes(), path.suffix.lower())[0]
 
@@ -128,9 +128,9 @@ def open_picture(path: Path) -> Image.Image:
 def decode_image_file(
     path: Path, where: str, kind: PictureKind, *, share: float = 1.0, bits: int = 16
 ) -> tuple[np.ndarray | None, str, Message | None]:
-    """Decodes a picture file, called ``where`` in messages. Returns its pixels and the file's SHA-256, or a fault if it
-    is damaged. For ``kind`` colour the pixels are RGB, for grey one channel, and for mask the unchanged values of the
-    channel with the mask (``rig.formats.pictures.mask_values``). ``share`` scales width and height, except for masks.
+    """Decodes a picture file, called ``where`` in messages. Returns the picture's pixels and the file's SHA-256, or a
+    fault if the file is damaged. For ``kind`` colour the pixels are RGB, for grey one channel, and for mask the mask's
+    unchanged channel (``rig.formats.pictures.mask_values``). ``share`` scales width and height, except of masks.
     ``bits`` is the number of used bits in a 16-bit file (``rig.formats.pictures.picture_samples``)."""
     suffix, data = path.suffix.lower(), b""
     try:
@@ -157,7 +157,7 @@ def cut_out_alpha(path: Path) -> Plane | None:
 
     Returns None if the file has no alpha channel, is too large or damaged, or if the opaque part cannot be a subject. A
     subject is in the middle, and at least the fraction ``CUT_AWAY_LEAST`` of the picture around it is transparent.
-    Rounded corners and empty rims of undistorted pictures are smaller than this fraction."""
+    Rounded corners and empty rims of undistorted pictures are smaller than ``CUT_AWAY_LEAST``."""
     data, suffix = path.read_bytes(), path.suffix.lower()
     if data.startswith(PNG):
         if len(data) <= PNG_COLOUR_TYPE or data[PNG_COLOUR_TYPE] not in PNG_WITH_ALPHA:
@@ -198,7 +198,7 @@ def _faults_of(where: str, fault: Message | None = None) -> Iterator[None]:
 
 
 def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
-    """Returns width and height (px) and the colour profile, which is empty for sRGB."""
+    """Returns a picture's width and height (px) and colour profile, which is empty for sRGB."""
     if suffix in RAW_SUFFIXES:
         with _raw(data) as raw:
             return (raw.sizes.width, raw.sizes.height), b""

@@ -1,15 +1,15 @@
 """Interprets the values of mask files as the subject's share in every pixel.
 
 Programs write masks as 0 and 1, 0 and 255, 16 bits, two colours, an alpha channel, soft greys, and as JPEG, whose
-ringing leaves values of 1 to 40 ten pixels outside an outline. All these masks have two values that fill areas, and the
+ringing leaves values of 1 to 40 ten pixels outside an outline. All masks have two values that fill areas, and the
 outline lies at the mean of both values. The values are measured over all masks of a capture, so that noise in an empty
-mask is not mistaken for a subject. Files with other content, such as labels, depth or a photograph, are faults.
+mask is no subject. Mask files with labels, depth or a photograph are faults.
 
-The subject is white by this project's convention, but black in programs that mark the pixels to ignore. Two criteria
-decide which value is the subject. The background covers all borders of a picture but one, which shows the subject's
-shoulders. The subject covers the middle. A mask is inverted if both criteria say that the subject is black. The
-criteria disagree for a close-up that fills the frame and for a subject beside the middle. Such undecided masks are
-treated as most other masks of the capture.
+In masks the subject is white by this project's convention, but black in programs that mark the pixels to ignore. Two
+criteria decide which of a mask's values is the subject: the background covers all borders but one, which shows the
+shoulders, and the subject covers the middle. A mask is inverted if both criteria say that the subject is black. The two
+criteria disagree for a close-up that fills the frame and for a subject beside the middle. Masks that the criteria leave
+undecided are treated as most other masks of the capture.
 """
 
 from collections.abc import Mapping
@@ -143,7 +143,7 @@ def _constant_fault(value: float, common: tuple[float, float]) -> Message:
 
 
 def _levels(plane: Plane, span: tuple[float, float]) -> list[float]:
-    """Returns the values that fill areas, in ascending order. Of close values, returns the most frequent."""
+    """Returns the values that fill areas, in ascending order. Of close mask values, returns the most frequent."""
     low, high = span
     exact = plane.dtype.kind in "ui" and high - low < BINS
     count = int(high - low) + 1 if exact else BINS
@@ -181,7 +181,7 @@ def _share_between(plane: Plane, black: float, white: float) -> Share:
 
 
 def _read_trimap(plane: Plane, levels: list[float]) -> MaskReading:
-    """Reads a trimap. The outline becomes the middle of the band of undecided pixels, which must be narrow and lie
+    """Reads a trimap. A mask's outline becomes the middle of the band of undecided pixels, which must be narrow and lie
     between black and white."""
     named = [f"{level:g}" for level in levels[:VALUES_NAMED]] + ["..."] * (len(levels) > VALUES_NAMED)
     labels = compose("mask-of-labels", count=len(levels), values=named)

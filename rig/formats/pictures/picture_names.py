@@ -1,8 +1,8 @@
 """Lists the suffixes of picture files, and matches files to cameras by file names.
 
 The mask of "cam00.png" may be named "cam00.png.png" (COLMAP), "cam00.png.mask.png" (RealityScan) or "cam00_mask.png",
-and a picture of "cam00" may be named "shot_0001_cam00.tif". Names are therefore split into words: runs of letters, and
-numbers without leading zeros. Separators, case and suffixes of pictures are ignored."""
+and a picture of "cam00" may be named "shot_0001_cam00.tif". File names are therefore split into words: runs of letters,
+and numbers without leading zeros. Separators, case and suffixes of picture names are ignored."""
 
 import re
 import unicodedata
@@ -56,7 +56,7 @@ def is_junk(name: str) -> bool:
 def entry(folder: Path, name: str) -> Path:
     """Returns the path of the file or folder ``name`` in a folder, ignoring case, because operating systems change it.
 
-    If none exists, returns the path with exactly this name. Raises InputError if two names differ only in case."""
+    Without such a file, returns the path with this name. Raises InputError if two names differ only in case."""
     found = [path for path in sorted(folder.iterdir()) if path.name.casefold() == name] if folder.is_dir() else []
     if len(found) > 1:
         raise InputError(folder.name, [compose("names-of-other-case", names=[path.name for path in found])])
@@ -82,7 +82,7 @@ def safe_name(name: str) -> str:
 
 
 def picture_stem(name: str) -> str:
-    """Removes a picture's suffix from a file name. Any other text after a dot is kept."""
+    """Removes a picture's suffix from a file name. Text after a dot that is no picture's suffix is kept."""
     stem, dot, ending = name.rpartition(".")
     return stem if dot and stem and f".{ending.lower()}" in (*IMAGE_SUFFIXES, *UNREAD_PICTURES) else name
 
@@ -128,8 +128,8 @@ def _equal(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
 
 
 def _alike_about(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Matches files whose names have the same words before and after each camera's words. Uses the words before and
-    after that fit most cameras."""
+    """Matches files whose names have the same words before and after each camera's words. Uses the surrounding words
+    that fit most cameras."""
     fitting: dict[tuple[Words, Words], dict[str, list[str]]] = {}
     for name, words in strays.items():
         for camera, known in cameras.items():

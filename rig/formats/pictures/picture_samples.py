@@ -1,12 +1,12 @@
 """Determines the bit depth of picture files, and detects raw sensor mosaics.
 
-Machine vision software writes 10 or 12 bits into 16-bit files. Without scaling, such pictures are nearly black. Machine
-vision software also writes the sensor's colour filter mosaic as a grey picture, in which a quarter of the pixels is red
-and a quarter blue.
+Machine vision software writes 10 or 12 bits into 16-bit files. Without scaling, pictures of 10 or 12 bits in 16-bit
+files are nearly black. Machine vision software also writes the sensor's colour filter mosaic as a grey picture, in
+which a quarter of the pixels is red and a quarter blue.
 
 The module also fills the empty rims of pictures if their clean plates (pictures of the empty studio) have no rims, and
 the reverse. Undistortion leaves an empty rim that is transparent, black or white. In a comparison with a plate without
-a rim, the rim would seem to be a subject. The filled rim counts as background."""
+a rim, a picture's empty rim would seem to be a subject. A picture's filled rim counts as background."""
 
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -124,7 +124,7 @@ def fill_rims(
 
 
 def _without_rim(image: ImageRgb, other: ImageRgb) -> ImageRgb:
-    """Fills the empty rim of a picture from ``other``. Returns it unchanged if it has no rim or both have one."""
+    """Fills the empty rim of a picture from ``other``. The picture is unchanged unless only it has a rim."""
     rim = empty_rim(image)
     if rim is None or rim.mean() > MAX_SHARE or (rim & ~_empty(other)).mean() < MIN_SHARE:
         return image

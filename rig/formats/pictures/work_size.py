@@ -1,9 +1,9 @@
 """Computes the reduced size at which large photographs are read, and the intrinsics for pictures of this size.
 
-A head fills 60 % of a picture's height, so that a pixel of a four-megapixel picture covers 0.24 mm. Depth is measured
-only at 0.4 mm (``PIXEL_MM`` of pipeline/stereo/estimate.py), and vertices are farther apart. The program's limits in
-pixels were tuned on pictures of 0.8 Mpx. At 12 Mpx correct outlines still satisfy the limits; at 24 Mpx correct
-outlines are reported to contradict their cameras."""
+A head fills 60 % of a picture's height, so that a pixel of a four-megapixel picture covers 0.24 mm. The program
+measures depth only at 0.4 mm (``PIXEL_MM`` of pipeline/stereo/estimate.py), and vertices are farther apart. The
+program's limits in pixels were tuned on pictures of 0.8 Mpx. At 12 Mpx correct outlines still satisfy the limits in
+pixels; at 24 Mpx correct outlines are reported to contradict their cameras."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def halvings(share: float, size: tuple[int, int]) -> int:
     """Returns how many times a decoder may halve a picture of ``size`` (width, height) that will be scaled by
     ``share``.
 
-    Halving stops if width or height is odd, so that every pixel averages a whole block."""
+    A decoder's halving stops if width or height is odd, so that every pixel averages a whole block."""
     count = 0
     while count < HALVINGS_MOST and share <= 0.5 ** (count + 1) and not any(side % 2 ** (count + 1) for side in size):
         count += 1
@@ -67,8 +67,8 @@ def halvings(share: float, size: tuple[int, int]) -> int:
 def at_share(
     pixels: UInt8[np.ndarray, "h w *channels"], size: tuple[int, int], share: float
 ) -> UInt8[np.ndarray, "r c *channels"]:
-    """Resizes a picture to ``share`` times the ``size`` (width, height) of its file. A decoder may have reduced
-    ``pixels`` before."""
+    """Resizes a picture to ``share`` times the ``size`` (width, height) of its file. A decoder may have reduced the
+    array ``pixels`` before."""
     wanted = (round(size[0] * share), round(size[1] * share))
     if wanted == (pixels.shape[1], pixels.shape[0]):
         return pixels

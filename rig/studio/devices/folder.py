@@ -24,8 +24,8 @@ def simulate_to_folder(out: Path, simulated: SimulatedCapture, *, seed: int | No
     The truth folder contains the true cameras (cameras.json) and the head (head.ply, world frame, mm, lit colours) with
     a Boolean for each vertex in face_mask.npy and colour_mask.npy. Masks of the subject with hair and clothes are in
     silhouettes/, masks of the bare head in head_silhouettes/, and the coverage of pixels (0 to 255) in coverage/. The
-    labels in parts/ are 0 background, 1 skin, 2 hair or beard, 3 clothes, cap or glasses. Surface points that two or
-    more cameras see are in visible.npz.
+    pixel labels in parts/ are 0 background, 1 skin, 2 hair or beard, 3 clothes, cap or glasses. Surface points that two
+    or more cameras see are in visible.npz.
     """
     write_capture(out, simulated.capture, simulated.rig)
     truth = out.with_name(out.name + ".truth")

@@ -1,8 +1,8 @@
 """Serves the simulated studio as devices: motion-JPEG streams on loopback and a trigger box on a pseudo-terminal.
 
 The program's camera driver and trigger client use these devices as they use real ones. The caller provides an
-``ImageSource`` of the empty studio and one with the seated subject. This module simulates lamps, cables, triggers and
-their faults.
+``ImageSource`` of the empty studio and one with the seated subject. This module simulates a studio's lamps, cables,
+triggers and their faults.
 """
 
 import json
@@ -69,7 +69,7 @@ class DeviceFault:
 
 def device_fault_from_text(text: str) -> DeviceFault:
     """Reads a fault from ``kind[:camera][=amount]``. Raises InputError for another form or an unknown kind.
-    ``StudioDevices.inject`` checks whether the camera exists."""
+    ``StudioDevices.inject`` checks whether the fault's camera exists."""
     kind, camera, amount = fault_parts(text)
     if kind not in KINDS:
         raise InputError("fault", [compose("none-of", value=f"{kind!r}", known=KINDS)])
@@ -88,7 +88,7 @@ class _Look:
 
 class StudioDevices:
     """Runs camera streams and a trigger box during a ``with`` block. ``folder`` receives rig.toml and a link to the
-    box's port.
+    trigger box's port.
 
     ``takes`` is the number of pictures of the empty studio, with different noise, that the live view repeats. More
     clean plates than ``takes`` would be duplicates. ``close`` leaves no thread, port or link behind.
@@ -146,7 +146,7 @@ class StudioDevices:
         return self.folder.resolve() / "trigger-box"
 
     def seat(self, present: bool) -> None:
-        """Adds the subject to all cameras' pictures, or removes it. Returns when every camera shows the change."""
+        """Adds the subject to all cameras' pictures, or removes it. Returns when all pictures show the change."""
         with self._busy:
             self.present = present
             self._refresh()

@@ -29,8 +29,8 @@ class ImageSource(Protocol):
 
 
 class SceneImages:
-    """Takes pictures of a static scene with or without the subject. Every picture has different noise. Any thread may
-    call it.
+    """Takes pictures of a static scene with or without the subject. Every simulated picture has different noise. Any
+    thread may call the image source.
 
     The light differs between pictures with and without the subject by the drift in the scene's preset.
     """
@@ -44,7 +44,7 @@ class SceneImages:
         self._busy = threading.Lock()
 
     def __call__(self, camera: str, time_s: float) -> ImageRgb:
-        """Takes one picture with the named camera. The scene does not change, so ``time_s`` has no effect."""
+        """Takes one picture with the named camera. The studio scene is static, so ``time_s`` has no effect."""
         with self._busy:
             rng = np.random.default_rng((self._seed, next(self._takes)))
             light = self._light.get(camera)
@@ -64,7 +64,7 @@ _building = threading.Lock()
 
 
 def scene_of_file(mesh_file: Path) -> Scene:
-    """Returns the default studio with the head of a mesh file (head frame, mm). The last scene is cached.
+    """Returns the default studio with the head of a mesh file (head frame, mm). The last studio is cached.
 
     Raises InputError for a file that is not a mesh.
     """

@@ -1,7 +1,7 @@
 """Serves the cameras of the simulated studio as motion-JPEG streams on one HTTP port (on loopback by default).
 
-A stream behaves like a network camera with a trigger input. The camera's live view at ``fps`` pauses while the trigger
-box is armed. When the trigger input rises, the stream sends one frame at once and then continues the live view. A
+A stream behaves like a network camera with a trigger input. A camera's live view at ``fps`` pauses while the trigger
+box is armed. When a trigger input rises, the stream sends one frame at once and then continues the live view. A
 ``Film`` holds a camera's pictures, which differ in their noise: some for the live view, others for triggered frames.
 
 Only the server's event loop changes the state; other threads pass it functions to call (``call_soon_threadsafe``).
@@ -88,7 +88,7 @@ class StreamServer:
         return f"{self.address}/{name}.mjpeg"
 
     def close(self) -> None:
-        """Ends every connection, the port and the thread. The call may be repeated."""
+        """Ends the server's connections, port and thread. The call may be repeated."""
         if self._closed:
             return
         self._closed = True

@@ -69,8 +69,8 @@ def directions_of(elevation: Float[np.ndarray, "r c"], azimuth: Float[np.ndarray
 
 
 def finer_grid(field: Float[np.ndarray, "r c *_"], times: int) -> Float[np.ndarray, "_ _ *_"]:
-    """Interpolates a field linearly to a grid that is finer by the factor ``times``. The field is periodic: its last
-    column is next to its first."""
+    """Interpolates a field linearly to a grid that is finer by the factor ``times``. The interpolated field is
+    periodic: its last column is next to its first."""
     if times == 1:
         return field
     rows, columns = field.shape[:2]

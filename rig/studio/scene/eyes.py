@@ -1,8 +1,8 @@
 """Creates a simulated subject's eyeballs, directed by a gaze, with white, limbus, iris, pupil and a reflecting cornea.
 
-An adult's eyeball has a radius of 12 mm. The cornea has a radius of 7.8 mm, and meets the eyeball at the limbus of
-radius 5.85 mm (visible iris diameter 11.7 mm; Ruefer et al. 2005). At the limbus, the colour changes gradually over
-some tenths of a millimetre. If the mesh of a head closes the eyes with skin, the skin is cut open between the lids.
+An adult's eyeball has a radius of 12 mm. An eye's cornea has a radius of 7.8 mm, and meets the eyeball at the limbus of
+radius 5.85 mm (visible iris diameter 11.7 mm; Ruefer et al. 2005). At the limbus, an eye's colour changes gradually
+over some tenths of a millimetre. If a head's mesh closes the eyes with skin, the skin is cut open between the lids.
 """
 
 from collections.abc import Mapping
@@ -124,7 +124,7 @@ def _step(x: Float[np.ndarray, "r s"], middle: float, width: float) -> Float[np.
 
 def opened(mesh: Mesh, landmarks: Landmarks) -> Mesh:
     """Removes the skin between a head's lids (head frame), after subdividing triangles there, and gives the lids a
-    thickness. The result's first vertices are those of ``mesh``. Eyes that are already open in the mesh keep their
+    thickness. The opened mesh's first vertices are those of ``mesh``. Eyes that are already open in the mesh keep their
     border."""
     for side in SIDES:
         mesh, cut = _cut(mesh, landmarks, side)
@@ -133,7 +133,7 @@ def opened(mesh: Mesh, landmarks: Landmarks) -> Mesh:
 
 
 def _cut(mesh: Mesh, landmarks: Landmarks, side: str) -> tuple[Mesh, Int[np.ndarray, "e 2"]]:
-    """Cuts the skin of one eye open. Also returns the edges of the cut, or none if the eye is already open."""
+    """Cuts the skin of one eye open. Also returns the cut's edges, or none if the eye is already open."""
     inner, outer = landmarks[f"endocanthion_{side}"], landmarks[f"exocanthion_{side}"]
     middle = 0.5 * (inner + outer)
     border = mesh.vertices[np.unique(boundary_edges(mesh.faces))]

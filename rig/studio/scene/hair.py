@@ -1,8 +1,8 @@
 """Creates hair as meshes: an uneven shell over the scalp, and strands that roughen its outline.
 
-The shell has a vertex in each direction of a grid around the middle of the skull. The shell's radius is the radius of
-the head plus the thickness of the hair. Beyond the hairline the shell lies below the skin. Further shapes are a sheet
-that hangs down around the neck, a bun on the crown, a full beard, and curls, which are winding ridges on the surface.
+The shell of hair has a vertex in each direction of a grid around the middle of the skull. The shell's radius is the
+head's radius plus the hair's thickness. Beyond the hairline the shell lies below the skin. Further shapes are a sheet
+that hangs around the neck, a bun on the crown, a full beard, and curls, which are winding ridges on the surface.
 """
 
 from dataclasses import dataclass
@@ -82,7 +82,7 @@ class Hair:
 
 
 def grow(vertices: Float[np.ndarray, "v 3"], body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
-    """Creates the hair over a head's scalp. Vertices are in the head frame (mm)."""
+    """Creates the hair over a head's scalp. The hair's vertices are in the head frame (mm)."""
     centre = body.ears + np.array([0.0, 28.0, -6.0]) * body.unit
     elevation, azimuth = np.meshgrid(
         np.radians(np.linspace(90.0, LOWEST_DEG, ROWS)), np.arange(COLUMNS) * 2 * np.pi / COLUMNS, indexing="ij"

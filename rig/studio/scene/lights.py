@@ -1,8 +1,8 @@
 """Computes soft light on the subject, with the shadows that the subject casts on itself.
 
-The lamps are soft boxes on a dome. The dome is sampled in ``DIRECTIONS`` directions. A depth map from each direction
-shows which vertices its light reaches. The sum over many directions makes the shadows soft. Irradiance is computed for
-each vertex.
+The lamps are soft boxes on a dome. The dome of lamps is sampled in ``DIRECTIONS`` directions. A depth map from each
+direction shows which vertices its light reaches. The sum over many directions makes the shadows soft. Irradiance is
+computed for each vertex of the subject.
 """
 
 from collections.abc import Sequence

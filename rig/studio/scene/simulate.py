@@ -37,8 +37,8 @@ Plane = Float[np.ndarray, "h w"]
 def matt_light(
     renderer: Renderer, rig: Rig, parts: Sequence[Part], gallery: Gallery, preset: Preset
 ) -> Mapping[str, Float[np.ndarray, "_ _ 4"]]:
-    """Renders the subject without highlights in all cameras, as ``Renderer.photograph`` does. Returns an empty mapping
-    unless the preset requests it."""
+    """Renders the subject without highlights in all cameras, as ``Renderer.photograph`` does. Returns nothing unless
+    the preset requests matt pictures."""
     if not preset.polarised:
         return {}
     matt = [replace(part, oil=None, grain=replace(part.grain, gloss=0.0)) for part in parts]
@@ -113,7 +113,7 @@ class View:
 
     @property
     def mask(self) -> Bool[np.ndarray, "h w"]:
-        """Returns the true silhouette. A pixel is True if the subject covers at least half of it."""
+        """Returns the true silhouette. A mask's pixel is True if the subject covers at least half of it."""
         return self.subject[:, :, 3] >= 0.5
 
 
@@ -329,8 +329,8 @@ def _rolling(
     rig: Rig, light: Mapping[str, Float[np.ndarray, "_ _ 4"]], at_world: Vector, sway_mm: Vector
 ) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
     """Distorts pictures as a rolling shutter does if the subject moves while rows are read. The middle row shows the
-    true position. All parts move like the head's origin, although parts nearer to the camera should move by a tenth
-    more."""
+    true position. All parts of the subject move like the head's origin, although parts nearer to the camera should move
+    by a tenth more."""
     shifts = {camera.name: camera.project_with_jacobian(at_world[None])[1][0] @ sway_mm for camera in rig}
     return {name: rolled(light[name], shifts[name]) for name in light}
 

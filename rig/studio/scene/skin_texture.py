@@ -43,7 +43,7 @@ def skin_paint(
 
 def oily_zones(vertices: Vertices, body: Anatomy) -> Float[np.ndarray, " v"]:
     """Returns the oiliness (0 to 1) of the skin at each vertex. The skin is oiliest on forehead, nose, cheeks and chin.
-    Without landmarks, the oiliness is constant."""
+    Without landmarks, the skin's oiliness is constant."""
     marks = body.landmarks
     if not marks:
         return np.full(len(vertices), DRY)

@@ -30,7 +30,7 @@ def scattered(
     vertices: Vertices, faces: Int[np.ndarray, "f 3"], irradiance: Vertices, scattering_mm: tuple[float, float, float]
 ) -> Vertices:
     """Simulates scattering of light within the skin, by one implicit step of heat flow on the surface for each channel.
-    The integral of the light over the surface does not change. A channel with 0 mm is unchanged.
+    The integral of the light over the surface does not change. A colour channel that scatters by 0 mm is unchanged.
 
     Args:
         vertices: mm.
@@ -115,7 +115,7 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Holds the appearance of a subject. All colours are linear RGB albedos."""
+    """Holds the appearance of a subject. All colours of an appearance are linear RGB albedos."""
 
     skin: Colour
     cloth: Colour
@@ -164,7 +164,7 @@ class Dressed:
 
 
 def with_gaze(subject: Subject, azimuth_deg: float, elevation_deg: float, rng: np.random.Generator) -> Subject:
-    """Adds eyeballs of a random colour to a subject, directed at a point ``GAZE_MM`` away. The direction is relative to
+    """Adds eyeballs of a random colour to a subject, directed at a point ``GAZE_MM`` away. The gaze is relative to
     straight ahead: azimuth to the subject's left, elevation upwards. Raises InputError for a head without landmarks."""
     marks = anatomy(subject.mesh.vertices, subject.landmarks).landmarks
     if not marks:

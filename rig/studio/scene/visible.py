@@ -1,7 +1,7 @@
 """Samples points on the visible true surface of a simulated subject: head, hair and clothes.
 
-The points are the reference for a reconstruction of the whole visible surface. Strands of hair are left out, because
-they are thinner than a pixel and no reconstructed mesh contains them.
+The sampled points are the reference for a reconstruction of the whole visible surface. Strands of hair are left out,
+because they are thinner than a pixel and no reconstructed mesh contains them.
 """
 
 from collections.abc import Mapping

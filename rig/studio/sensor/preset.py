@@ -11,8 +11,8 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """Holds the imperfections of the simulated studio. A number whose name states no unit is a fraction of full scale
-    or of the light."""
+    """Holds the imperfections of the simulated studio. A preset's number whose name states no unit is a fraction of
+    full scale or of the light."""
 
     noise: float = (
         0.015  # sensor noise at mid grey, standard deviation; grows with the light's square root (shot noise)

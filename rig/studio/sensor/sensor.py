@@ -1,5 +1,5 @@
-"""Converts linear light to an 8-bit photograph with lens blur, vignetting, gains, shot noise and the sRGB curve. Also
-draws smooth random fields."""
+"""Converts linear light to an 8-bit photograph with lens blur, vignetting, gains, shot noise and the sRGB curve. The
+module also draws smooth random fields."""
 
 from dataclasses import dataclass
 
@@ -44,7 +44,7 @@ def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarra
 
 def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "h w 4"]:
     """Returns the subject's image by a rolling shutter while the subject moves. ``shift_px`` is the motion between the
-    readouts of the first and the last row. The middle row shows the true position."""
+    readouts of the first and the last row. The picture's middle row shows the true position."""
     height, width = subject.shape[:2]
     across, down = shift_px / (height - 1)
     source = np.array([[1.0, -across, shift_px[0] / 2], [0.0, 1.0 - down, shift_px[1] / 2]])
@@ -126,8 +126,8 @@ def around(
 def waves(
     rng: np.random.Generator, points: Float[np.ndarray, "n 3"], shortest_mm: float, longest_mm: float
 ) -> Float[np.ndarray, " n"]:
-    """Draws a random field in space with standard deviation 1, and returns its values at ``points`` (mm). The field is
-    a sum of waves in random directions, with wavelengths from ``shortest_mm`` to ``longest_mm``."""
+    """Draws a random field in space with standard deviation 1, and returns its values at ``points`` (mm). The random
+    field is a sum of waves in random directions, with wavelengths from ``shortest_mm`` to ``longest_mm``."""
     count = 32
     directions = rng.normal(0, 1, (count, 3))
     lengths = rng.uniform(shortest_mm, longest_mm, (count, 1))
