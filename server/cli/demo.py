@@ -23,7 +23,8 @@ START_S = 60.0
 
 
 class ServiceDied(EigenheadError):
-    """Reports that the demo's service process ended before the demo did. The message has the end of its log."""
+    """Reports that the demo's service process ended before the demo did. The message has the end of the process's
+    log."""
 
     def __init__(self, log: Path) -> None:
         super().__init__(f"the service did not start:\n{log.read_text(errors='replace')[-2000:]}")
@@ -31,8 +32,9 @@ class ServiceDied(EigenheadError):
 
 def run_demo(out: Path, *, seed: int, full: bool, report: Progress) -> dict[str, Any]:
     """Starts a service in a temporary data folder, triggers its simulated rig with the subject of ``seed``, submits a
-    job, waits for it, and downloads its result into ``out``. ``full``: the default job, with the dense stage; otherwise
-    a head at level ``photo``. Returns what ``demo --json`` prints: files, ``error_mm`` from the truth, warnings."""
+    job, waits for it, and downloads its result into ``out``. ``full``: whether to run the default job, with the dense
+    stage, instead of making a head at the lower level ``photo``. Returns what ``demo --json`` prints: files,
+    ``error_mm`` (the distance from the true head), and warnings."""
     began = time.monotonic()
     requested: dict[str, object] = {} if full else {"detail": "photo", "outputs": {"surface": "head"}}
     prepare_kernels(lambda stage, _: report(stage, 0.0), settings_from_document(requested))

@@ -60,7 +60,8 @@ def worker(
 
 
 def _worker_lives(settings: "ServiceSettings") -> bool:
-    """Returns whether a worker of this host is alive; True if the database is away, since workers survive that."""
+    """Returns whether a worker of this host is alive; returns True if the database cannot be reached, since workers
+    survive that."""
     import platform
 
     import sqlalchemy as sa
